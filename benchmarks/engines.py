@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from mjrec.engines.jobs import Job, Run, Work
+from mjrec.engines.jobs import Run, Work
 from mjrec.engines.local import LocalEngine
 
 from .children import call
@@ -88,21 +88,18 @@ class Idle:
         del arguments
         return {"peak": peak_memory()}
 
-    def close(self) -> None:
-        """Do nothing."""
-
 
 def hand_out(workers: int, jobs: int) -> list[float]:
     """Return seconds to the first outcome, outcomes per second, and MB of a worker."""
     start = time.perf_counter()
     work = Work(entry=f"{__name__}:{Idle.__name__}")
     with Run(LocalEngine(workers), work) as run:
-        run.submit(Job(key="first", arguments={}))
+        run.submit("first")
         outcome = next(iter(run.results()))
         assert outcome is not None
         first = time.perf_counter() - start
         for number in range(jobs):
-            run.submit(Job(key=str(number), arguments={}))
+            run.submit(str(number))
         # Until all workers are there.
         results = run.results()
         for _ in range(jobs // 2):

@@ -12,8 +12,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 import mjrec
 from mjrec.rendering.views import View
 
@@ -107,9 +105,8 @@ def draw_as_worker(trajectory: str, height: int, width: int) -> dict[str, float]
     start = time.perf_counter()
     view = View(height=height, width=width).as_json()
     drawing = open_drawing({"trajectory": trajectory, "view": view}, Canvas())
-    out = np.empty((height, width, 3), np.uint8)
     count = _frame_count(trajectory)
-    return _timed((drawing.draw(index, out=out) for index in range(count)), start)
+    return _timed((drawing.draw(index) for index in range(count)), start)
 
 
 _BARE, _RENDER, _WORKER = "mujoco.Renderer", "mjrec.render(workers=1)", "worker alone"

@@ -24,7 +24,7 @@ from processes import children
 from trajectories_by_hand import Painter
 
 from mjrec.formats.ffmpeg import ffmpeg_executable
-from mjrec.rendering import finish as finishing
+from mjrec.rendering import finisher as finishing
 
 _HAS_DM_CONTROL = importlib.util.find_spec("dm_control") is not None
 

@@ -11,7 +11,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from mjrec.engines.jobs import Job, JobOutcome, Run, Work
+from mjrec.engines.jobs import JobOutcome, Run, Work
 
 
 def odd_work(
@@ -24,7 +24,7 @@ def odd_work(
 def submit(run: Run, *jobs: str, **arguments: Any) -> None:
     """Hand out jobs that differ in nothing but their keys."""
     for key in jobs:
-        run.submit(Job(key=key, arguments=arguments))
+        run.submit(key, **arguments)
 
 
 def outcomes(run: Run) -> dict[str, JobOutcome]:

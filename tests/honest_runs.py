@@ -152,6 +152,7 @@ def killed(directory: Path) -> None:
         os.kill(os.getpid(), signal.SIGKILL)
     os.waitpid(child, 0)
     mjrec.recover(directory)
+    mjrec.render_videos(directory)
 
 
 def unseeded(directory: Path) -> None:

@@ -9,16 +9,17 @@ import os
 import signal
 import subprocess
 import sys
-import warnings
+import time
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import mjrec
+from mjrec.engines.worker import time_limit
 
 
 class OddJobs:
-    """Does what a job's `do` names, and notes in a file that it was closed."""
+    """Does what a job's `do` names."""
 
     def __init__(self, settings: Mapping[str, Any]) -> None:
         self._settings = settings
@@ -27,24 +28,22 @@ class OddJobs:
         job: Mapping[str, Any] = getattr(self, arguments["do"])(arguments)
         return job
 
-    def close(self) -> None:
-        if "closed" in self._settings:
-            with Path(self._settings["closed"]).open("a") as file:
+    def leave(self) -> None:
+        if "left" in self._settings:
+            with Path(self._settings["left"]).open("a") as file:
                 file.write(f"{os.getpid()}\n")
-        if self._settings.get("closes") == "badly":
-            raise OSError("the disk is gone")
 
     def echo(self, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
         return {"arguments": dict(arguments), "settings": self._settings}
 
     def where(self, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
-        main = sys.modules["__main__"]
+        payload = self._settings.get("payload")
         return {
             "pid": os.getpid(),
             "directory": str(Path.cwd()),
-            "main": Path(str(main.__file__)).name,
             "session": os.getsid(0),
             "threads": os.environ.get("OMP_NUM_THREADS"),
+            "payload": payload and Path(payload).read_text(),
         }
 
     def die(self, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -55,15 +54,13 @@ class OddJobs:
             except FileExistsError:
                 return {"alive": True}
         print(f"{arguments['how']} is near")
-        if arguments["how"] == "exit":
-            os._exit(7)
         os.kill(os.getpid(), signal.Signals[arguments["how"]])
         raise AssertionError("dead")
 
     def fail(self, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
         raise ValueError("not\n  today")
 
-    def leave(self, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
+    def leave_python(self, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
         sys.exit("enough")
 
     def no_json(self, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -74,12 +71,9 @@ class OddJobs:
         print("to the error output", file=sys.stderr)
         subprocess.run(["echo", "of a child"], check=True)
         logging.getLogger("odd").warning("a warning of %d", 7)
-        print("50 %\r100 %", end="")
+        print("50 %\r100 %")
+        print("x" * arguments.get("more", 0))
         return {"read": sys.stdin.read()}
-
-    def shout(self, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
-        print("x" * 1_000_000)
-        return {}
 
     def meet(self, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
         """Wait until another job has opened the other end of a pipe."""
@@ -88,41 +82,33 @@ class OddJobs:
             return {"pid": os.getpid(), "gpus": gpus}
 
     def hold(self, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
-        """Keep at it until a signal comes; a file says when it has begun."""
-        with self._begun(arguments):
-            signal.pause()
-        raise AssertionError("the signal was to raise something")
-
-    def hold_on(self, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
-        """Take no notice of signals."""
-        with self._begun(arguments):
-            while True:
-                with contextlib.suppress(SystemExit):
-                    signal.pause()
-
-    def fork(self, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
-        """Die, and leave a child that goes on."""
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            child = os.fork()
-        if not child:
-            signal.signal(signal.SIGTERM, signal.SIG_DFL)
-            while True:
-                signal.pause()
-        with Path(arguments["children"]).open("a") as file:
-            file.write(f"{child}\n")
-        os.kill(os.getpid(), signal.SIGKILL)
-        raise AssertionError("dead")
-
-    @contextlib.contextmanager
-    def _begun(self, arguments: Mapping[str, Any]) -> Any:
+        """Keep at it until a file is there; a file says when it has begun."""
         # A new file, so that nothing is ever replaced.
         with Path(arguments["begun"]).open("x") as file:
             file.write(str(os.getpid()))
-        try:
-            yield
-        finally:
-            print("let go")
+        go = Path(arguments.get("go", "/no/such/file"))
+        while not go.exists():
+            with contextlib.suppress(SystemExit):
+                time.sleep(0.02)
+        return {"pid": os.getpid()}
+
+    def hang(self, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
+        """Hold the interpreter for minutes, where there is no file yet."""
+        import re
+
+        mark = Path(arguments["mark"])
+        if not mark.exists():
+            with time_limit(0.3, mark, "too slow"):
+                re.match(r"(a+)+b", "a" * 40)
+        return {"mark": mark.read_text()}
+
+    def fork(self, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
+        """Die, and leave a child of another session that goes on."""
+        child = subprocess.Popen(["sleep", "600"], start_new_session=True)
+        with Path(arguments["children"]).open("a") as file:
+            file.write(f"{child.pid}\n")
+        os.kill(os.getpid(), signal.SIGKILL)
+        raise AssertionError("dead")
 
 
 def make(settings: Mapping[str, Any]) -> OddJobs:
@@ -130,7 +116,6 @@ def make(settings: Mapping[str, Any]) -> OddJobs:
 
 
 def make_nothing(settings: Mapping[str, Any]) -> OddJobs:
-    print("about to raise")
     raise ValueError("there is no handler")
 
 
@@ -139,27 +124,16 @@ def make_no_name(settings: Mapping[str, Any]) -> OddJobs:
 
 
 def make_and_die(settings: Mapping[str, Any]) -> OddJobs:
-    with Path(settings["begun"]).open("a") as file:
-        file.write("begun\n")
     print("a library is missing", flush=True)
     os._exit(3)
 
 
-def make_and_be_told_to_end(settings: Mapping[str, Any]) -> OddJobs:
-    """As a SIGTERM may come while modules are imported: in a class's body."""
-
-    class Ends:
-        def __set_name__(self, owner: type, name: str) -> None:
-            signal.raise_signal(signal.SIGTERM)
-
-    type("Imported", (), {"part": Ends()})
-    return OddJobs(settings)
-
-
-def make_and_die_at_first(settings: Mapping[str, Any]) -> OddJobs:
-    """Two die as they begin, each with a file of its own; others do their jobs."""
-    for number in range(2):
-        with contextlib.suppress(FileExistsError):
-            Path(settings["deaths"], str(number)).touch(exist_ok=False)
-            os._exit(3)
+def make_one(settings: Mapping[str, Any]) -> OddJobs:
+    """The first begins; all others die, each noting that."""
+    place = Path(settings["place"])
+    try:
+        (place / "first").touch(exist_ok=False)
+    except FileExistsError:
+        (place / f"died-{os.getpid()}").touch()
+        os._exit(3)
     return OddJobs(settings)

@@ -78,7 +78,10 @@ def task(
         ),
         episodes=episodes,
         failures=failures or {},
-        provenance=[("Policy", "random"), ("Selection rule", "best, median and worst")],
+        provenance=[
+            ("Policy", "random"),
+            ("Selection of videos", "best, median and worst"),
+        ],
     )
     return replace(made, **changes)
 
@@ -127,7 +130,7 @@ def hostile_report() -> ReportContents:
             [1.0, 2.0, 3.0],
             source=text,
             failures={1: text},
-            provenance=[(text, text), ("Selection rule", text)],
+            provenance=[(text, text), ("Selection of videos", text)],
             videos=[
                 video(
                     path=Path(text),

@@ -119,7 +119,12 @@ def write_evaluation(
     directory.mkdir(parents=True, exist_ok=True)
     for task in plan.tasks:
         entries = [
-            entry(r.episode_id or 0, reward=r.total_reward, seed=r.seed)
+            entry(
+                r.episode_id or 0,
+                reward=r.total_reward,
+                seed=r.seed,
+                evaluation={"seed": r.seed, "episode": r.episode},
+            )
             for r in results
             if r.task == task.name and r.total_reward is not None
         ]

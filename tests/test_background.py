@@ -315,12 +315,12 @@ def wait_for_a_disk_that_does_not_answer(*a, **k):
     child = subprocess.Popen(['sleep', '60'], start_new_session=True)
     open({pids!r}, 'a').write(f'{{child.pid}}\\n')
     threading.Lock().acquire() and threading.Event().wait()
-import mjrec.rendering.finish as f
+import mjrec.rendering.finisher as f
 f.finish_trajectory = wait_for_a_disk_that_does_not_answer
 """
 SLOW = """
 import time
-import mjrec.rendering.finish as f
+import mjrec.rendering.finisher as f
 finish = f.finish_trajectory
 def slowly(log):
     for _ in range(40):

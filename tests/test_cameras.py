@@ -9,7 +9,6 @@ import pytest
 
 from mjrec.errors import InvalidArgument, UnknownName
 from mjrec.simulation.cameras import (
-    camera_from_members,
     camera_label,
     camera_names,
     raw_data,
@@ -78,11 +77,11 @@ def test_a_free_camera() -> None:
     assert camera_label(model, -1) == -1
     label: Any = camera_label(model, camera)
     members = {k: v for k, v in label.items() if k not in ("type", "trackbodyid")}
-    assert camera_label(model, camera_from_members(model, members)) == label
+    assert camera_label(model, resolve_camera(model, members)) == label
     with pytest.raises(InvalidArgument, match="zoom"):
-        camera_from_members(model, {"zoom": 2})
+        resolve_camera(model, {"zoom": 2})
     with pytest.raises(InvalidArgument, match="has 2"):
-        camera_from_members(model, {"type": 1, "trackbodyid": 9})
+        resolve_camera(model, {"type": 1, "trackbodyid": 9})
 
 
 @pytest.mark.parametrize(

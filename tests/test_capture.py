@@ -15,12 +15,12 @@ import pytest
 
 from mjrec.errors import PicturesDiffer
 from mjrec.simulation.capture import Capture, EpisodeStart
-from mjrec.simulation.captured_arrays import read_state
 from mjrec.simulation.fields import apply_fields
 from mjrec.simulation.model_store import load_model, saved_model
 from mjrec.simulation.raw_memory import WORDS
 from mjrec.simulation.self_check import differences
 from mjrec.simulation.snapshot import restore_snapshot
+from mjrec.simulation.states import read_state
 from mjrec.simulation.view import SceneView, view_from_facts
 
 BALL = """

@@ -8,8 +8,9 @@ import pty
 import signal
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import gymnasium
@@ -309,6 +310,46 @@ def test_existing_recordings_need_force_or_resume(mjrec: Any, tmp_path: Path) ->
     assert len(results_of(tmp_path)["episode_lengths"]) == 2
 
 
+NAN = """
+import gymnasium
+import numpy as np
+
+class Nan(gymnasium.Env):
+    observation_space = action_space = gymnasium.spaces.Box(-1, 1, (1,))
+
+    def reset(self, *, seed=None, options=None):
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action):
+        return np.zeros(1, np.float32), float("nan"), True, False, {}
+
+gymnasium.register("Nan-v0", Nan)
+"""
+
+
+@pytest.mark.parametrize(("allowed", "expected"), [([], 1), (["--allow-nan"], 0)])
+def test_a_return_that_is_nan_is_no_success(
+    mjrec: Any,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    allowed: list[str],
+    expected: int,
+) -> None:
+    """It is said, and fails recording and evaluating unless it is allowed."""
+    monkeypatch.chdir(tmp_path)
+    Path("nan_env.py").write_text(NAN)
+    run = ("nan_env:Nan-v0", "--policy", "zero", "--episodes", 2, *allowed)
+    status, out, _ = mjrec("record", *run, "--out", "r", "--schedule", "none")
+    assert status == expected
+    assert "2 returns NaN or infinite" in out
+    small = ("--keep", "none", "--num-seeds", 1, "--workers", 1)
+    status, out, _ = mjrec("evaluate", *run, *small, "--out", "e")
+    assert status == expected
+    assert "2 returns NaN or infinite" in out
+    # None of them is the best.
+    assert "best" not in out
+
+
 def test_messages_are_said_once(mjrec: Any, tmp_path: Path) -> None:
     """However often the command ran in one process."""
     handlers = logging.getLogger("mjrec").handlers[:]
@@ -438,6 +479,40 @@ def test_list_shows_an_evaluation_as_one(mjrec: Any, tmp_path: Path) -> None:
     first, *_ = (json.loads(line) for line in out.splitlines())
     assert (first["task"], first["seed"], first["reward"]) == ("a/x", 0, 3.0)
     assert (first["video"], first["pending"]) == (str(tmp_path / "a-x" / name), False)
+
+
+def test_list_shows_what_is_over_of_an_evaluation_that_is_not(
+    mjrec: Any, tmp_path: Path
+) -> None:
+    """By task and seed, too; which get a video is not chosen yet."""
+    write_evaluation(tmp_path, ["a/x"], finished=False)
+    status, out, _ = mjrec("list", tmp_path)
+    assert status == 0
+    assert [line.split() for line in out.splitlines() if "/" in line] == [
+        ["a/x", "0", "0", "10", "3", "truncated"],
+        ["a/x", "0", "1", "10", "1", "truncated"],
+        ["a/x", "7", "1", "10", "2", "truncated"],
+    ]
+    _, out, _ = mjrec("list", tmp_path, "--json")
+    assert [json.loads(line)["seed"] for line in out.splitlines()] == [0, 0, 7]
+
+
+def test_a_long_list_is_printed_as_it_is_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The first rows are there before the last are read."""
+    from mjrec.commands import terminal
+
+    printed: list[str] = []
+    monkeypatch.setattr(sys, "stdout", SimpleNamespace(write=printed.append))
+
+    def rows() -> Iterator[tuple[str, str]]:
+        for number in range(3000):
+            assert len(printed) >= number - 1000
+            yield str(number), "a" * (number % 7)
+
+    assert terminal.print_rows(("number", "text"), rows(), left=("text",))
+    assert printed[-1] == f"  2999  {'a' * 3}\n"
 
 
 def test_list_says_that_there_is_nothing(mjrec: Any, tmp_path: Path) -> None:

@@ -100,35 +100,6 @@ def test_failed_episodes_fail_the_command(run: Run, tmp_path: Path) -> None:
     assert (tmp_path / "e" / "results.json").exists()
 
 
-NAN = """
-import gymnasium
-import numpy as np
-
-class Nan(gymnasium.Env):
-    observation_space = action_space = gymnasium.spaces.Box(-1, 1, (1,))
-
-    def reset(self, *, seed=None, options=None):
-        return np.zeros(1, np.float32), {}
-
-    def step(self, action):
-        return np.zeros(1, np.float32), float("nan"), True, False, {}
-
-gymnasium.register("Nan-v0", Nan)
-"""
-
-
-@parametrize(("allowed", "expected"), [([], 1), (["--allow-nan"], 0)])
-def test_a_return_that_is_nan_is_no_success(
-    run: Run, tmp_path: Path, allowed: list[str], expected: int
-) -> None:
-    """It is said, and fails the command unless it is allowed."""
-    (tmp_path / "nan_env.py").write_text(NAN)
-    arguments = ["nan_env:Nan-v0", "--policy", "zero", "--keep", "none", *allowed]
-    status, out, _ = run(*arguments)
-    assert status == expected
-    assert "2 returns NaN or infinite" in out
-
-
 def test_a_directory_is_enough_to_go_on(
     run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -160,6 +131,14 @@ def test_an_evaluation_is_recovered_and_rendered_as_one(
     table = (tmp_path / "e" / "timing.csv").read_text()
     videos = [row.split(",") for row in table.splitlines()[1:]]
     assert not list(tmp_path.rglob("*.mp4"))
+    # One of them by its number, as `mjrec list` has it; then all.
+    assert commands.main(["render", "e", "--episode", "1"]) == 0
+    assert [path.name[-10:] for path in tmp_path.rglob("*.mp4")] == ["000001.mp4"]
+    again = ["--size", "48x32", "--out", "again.mp4"]
+    assert commands.main(["render", "e", "--episode", "1", *again]) == 0
+    assert (tmp_path / "again.mp4").is_file()
+    assert commands.main(["render", "e", "--episode", "9"]) == 1
+    assert "No episode 9 is recorded" in capsys.readouterr().err
     assert commands.main(["render", "e"]) == 0
     assert all((tmp_path / "e" / row[5] / row[-1]).is_file() for row in videos)
     assert (tmp_path / "e" / "timing.csv").read_text() == table

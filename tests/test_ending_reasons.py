@@ -238,23 +238,28 @@ def test_a_signal_whose_exception_is_lost_comes_again(tmp_path: Path) -> None:
 def test_the_end_of_an_episode_that_is_interrupted(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Ctrl-C while its trajectory is written: the episode is complete all the same."""
+    """Ctrl-C while that is written down: recovery makes it, and the next, complete."""
     env = gymnasium.make("InvertedPendulum-v5", max_episode_steps=3)
     monitor = Monitor(env, tmp_path, lambda _: True, workers=0)
     monitor.reset(seed=0)
     steps(monitor, 2)
     with monkeypatch.context() as patch:
         patch.setattr(
-            "mjrec.recorder.recording.Recording.end",
+            "mjrec.recorder.states.StateRecorder.end",
             lambda *_: signal.raise_signal(signal.SIGINT),
         )
         with pytest.raises(KeyboardInterrupt):
             steps(monitor, 1)
+    monitor.reset(seed=0)
+    steps(monitor, 3)
     monitor.close()
-    [path] = tmp_path.glob("*.h5")
-    facts = mjrec.load_trajectory(path).facts
-    assert (facts["complete"], facts["truncated"]) == (True, True)
-    assert stats_of(tmp_path)["episode_lengths"] == [3]
+    mjrec.recover(tmp_path)
+    paths = list(tmp_path.glob("*.h5"))
+    assert len(paths) == 2
+    for facts in (mjrec.load_trajectory(path).facts for path in paths):
+        ending = [facts[key] for key in ("complete", "truncated", "length")]
+        assert ending == [True, True, 3]
+    assert stats_of(tmp_path)["episode_lengths"] == [3, 3]
 
 
 def test_a_handlers_exception_between_a_step_and_its_row(
@@ -268,7 +273,7 @@ def test_a_handlers_exception_between_a_step_and_its_row(
     def handler(*_: object, **__: object) -> None:
         raise ArithmeticError("the handler's")
 
-    row = "mjrec.recorder.recording.Recording.step"
+    row = "mjrec.recorder.states.StateRecorder.step"
     monkeypatch.setattr(row, handler)
     with pytest.raises(ArithmeticError), monitor:
         steps(monitor, 1)

@@ -608,7 +608,7 @@ def test_a_directory_belongs_to_one_evaluation(reference: Path, tmp_path: Path) 
     for resume in (False, True):
         with pytest.raises(InvalidArgument, match=r"notes\.txt"):
             run(tmp_path, resume=resume)
-    lock = try_lock(reference / ".mjrec.evaluation.lock", "")
+    lock = try_lock(reference / ".mjrec.evaluation.lock")
     assert lock is not None
     with pytest.raises(DirectoryInUse):
         run(reference, tasks=[PENDULUM, DOUBLE], resume=True)

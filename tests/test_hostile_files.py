@@ -43,7 +43,7 @@ from mjrec.formats.spans import is_in_flight, recordings_in_flight, remove_if_do
 from mjrec.formats.trajectory import ModelChange, row_dtype
 from mjrec.formats.trajectory_file import finish_trajectory
 from mjrec.results.manifest_writing import update_manifests
-from mjrec.simulation.model_sources import compile_sources
+from mjrec.simulation.foreign_files import compile_sources
 from mjrec.simulation.model_trust import note_models
 
 NAME = trajectory_prefix(INFIX, 0)

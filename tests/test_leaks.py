@@ -48,10 +48,7 @@ def held() -> Held:
     return Held(
         memory=pages * os.sysconf("SC_PAGE_SIZE"),
         files=sorted(_file(fd) for fd in Path("/proc/self/fd").iterdir()),
-        # One comes and goes with the episodes.
-        threads=sorted(
-            {thread.name for thread in threading.enumerate()} - {"mjrec-flushing"}
-        ),
+        threads=sorted({thread.name for thread in threading.enumerate()}),
         children=children(),
     )
 

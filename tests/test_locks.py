@@ -12,8 +12,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-from full_disk import file_size_limit
 
+from mjrec import DirectoryNotWritable
 from mjrec.formats.locks import Lock, is_locked, try_lock, wait_for_lock
 
 HOLD = """
@@ -31,7 +31,7 @@ LEFT = {
 COUNT = """
 number = path.with_name("number")
 for _ in range(300):
-    held = wait_for_lock(path, "")
+    held = wait_for_lock(path)
     number.write_text(str(int(number.read_text()) + 1))
     held.release()
 """
@@ -66,7 +66,7 @@ def test_a_lock_is_held_until_it_is_released(path: Path) -> None:
     assert is_locked(path)
     with pytest.raises(FileExistsError):
         Lock(path, "second")
-    assert try_lock(path, "second") is None
+    assert try_lock(path) is None
     assert path.read_text() == "who holds it"
     path.unlink()
     path.write_text("another's")
@@ -80,24 +80,21 @@ def test_a_lock_is_held_until_it_is_released(path: Path) -> None:
 def test_a_killed_process_holds_no_lock(
     path: Path, left: str, way: str, start: Callable[[str], subprocess.Popen[str]]
 ) -> None:
-    """Whatever it leaves behind; the file is taken over, with new content."""
-    holder = start(f'lock = {way}(path, "a long content")\n{LEFT[left]}{WAIT}')
+    """Whatever it leaves behind; the file is taken over, with what it says."""
+    call = 'Lock(path, "content")' if way == "Lock" else "try_lock(path)"
+    holder = start(f"lock = {call}\n{LEFT[left]}{WAIT}")
     assert holder.stdout is not None
     assert holder.stdout.readline() == "held\n"
     assert is_locked(path)
-    assert try_lock(path, "") is None
+    assert try_lock(path) is None
     holder.kill()
     holder.wait()
     assert not is_locked(path)
-    with file_size_limit(0):
-        # Its content is for people; the lock is in the kernel.
-        lock = try_lock(path, "me")
+    said = path.read_text()
+    lock = try_lock(path)
     assert lock is not None
     assert is_locked(path)
-    lock.let_go()
-    lock = try_lock(path, "me")
-    assert lock is not None
-    assert path.read_text() == "me"
+    assert path.read_text() == said
     lock.release()
     assert not path.exists()
 
@@ -108,7 +105,7 @@ def test_a_lock_that_is_looked_at_can_be_got(path: Path) -> None:
     looking = path.open()
     fcntl.flock(looking, fcntl.LOCK_SH)
     threading.Timer(0.003, looking.close).start()
-    lock = try_lock(path, "")
+    lock = try_lock(path)
     assert lock is not None
     lock.release()
 
@@ -127,14 +124,14 @@ def test_one_process_at_a_time_has_a_lock(
 @pytest.mark.parametrize("put", [os.symlink, os.link, lambda _, path: os.mkfifo(path)])
 def test_no_other_file_is_taken_for_a_lock(
     put: Callable[[Path, Path], None],
-    get: Callable[[Path, str], Lock | None],
+    get: Callable[[Path], Lock | None],
     path: Path,
 ) -> None:
     """Neither through a link nor by its second name; a pipe is not waited for."""
     victim = path.with_name("victim")
     victim.write_text("valuable")
     put(victim, path)
-    with pytest.raises(OSError, match="no lock is"):
-        get(path, "me")
+    with pytest.raises(DirectoryNotWritable, match="no lock is"):
+        get(path)
     assert victim.read_text() == "valuable"
     assert not is_locked(path)

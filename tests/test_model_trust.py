@@ -158,30 +158,14 @@ def test_where_the_home_cannot_be_written_the_other_place_has_a_list(
     note_models([third := digest_of(3)])
     monkeypatch.setenv("XDG_STATE_HOME", str(state_home))
     assert all(map(is_stored, [DIGEST, OTHER, third]))
-    assert not caplog.records
-
-
-def test_the_home_is_that_of_the_password_file_and_ones_own(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Without variables, as in a cron job; it is not made, and no other user's."""
+    # Without variables, as in a cron job, the home is that of the password file.
     user = type("User", (), {"pw_dir": str(tmp_path / "home")})
     monkeypatch.setattr("pwd.getpwuid", lambda uid: user)
     monkeypatch.setenv("XDG_STATE_HOME", "relative/is/ignored")
     monkeypatch.delenv("HOME")
-    note_models([OTHER])
-    assert is_stored(OTHER)
-    assert not (tmp_path / "home").exists()
-    (tmp_path / "home").mkdir()
-    note_models([DIGEST])
-    assert list_in(tmp_path / "home/.local/state").exists()
-    if os.geteuid() == 0:
-        # As with `sudo` and the user's HOME: that user could not write there any more.
-        monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "another"))
-        (tmp_path / "another").mkdir()
-        os.chown(tmp_path / "another", 65534, -1)
-        note_models([digest_of(3)])
-        assert not list((tmp_path / "another").iterdir())
+    note_models([fourth := digest_of(4)])
+    assert fourth in list_in(tmp_path / "home/.local/state").read_text()
+    assert not caplog.records
 
 
 def a_pipe(path: Path) -> None:
@@ -196,8 +180,7 @@ def a_link(path: Path) -> None:
 @pytest.mark.parametrize(
     "spoil",
     [
-        *(a_pipe, a_link, lambda path: a_link(path.parent)),
-        *(lambda path: path.chmod(0o640), lambda path: path.parent.chmod(0o750)),
+        *(a_pipe, a_link, lambda path: path.chmod(0o640)),
         pytest.param(lambda path: os.chown(path, 65534, -1), marks=BY_ROOT),
     ],
 )
@@ -287,14 +270,12 @@ def test_mujoco_never_sees_what_nobody_vouches_for(
         load_model(directory, {**crafted, "sha256": facts["sha256"]})
 
 
-def test_a_strangers_sources_are_compiled(
+def test_where_a_strangers_sources_fail_the_ways_out_are_told(
     directory: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """In a process with limits; where that fails, the ways out are told too."""
+    """What they are compiled to is tried with recordings, below."""
     facts = stored(directory)
     become_another_user(monkeypatch, tmp_path)
-    forbid_compiled_models(monkeypatch, directory)
-    assert load_model(directory, facts).ngeom == 1
     (directory / facts["xml"]).write_bytes(b"no zip")
     with pytest.raises(UntrustedModel, match=r"not a zip file.*--trust-models"):
         load_model(directory, facts)

@@ -36,7 +36,7 @@ HIDDEN = {
     ".openaigym.clip.0.1.step000000137.lock": ("0.1", None),
     ".openaigym.video.0.1.video000027.lock": ("0.1", 27),
     ".openaigym.video.0.1.video000027.mp4.0123abcd.part": ("0.1", 27),
-    ".openaigym.manifest.0.1.manifest.json.0123abcd.part": (None, None),
+    ".openaigym.manifest.0.1.manifest.json.0123abcd.part": ("0.1", None),
 }
 # A part of a clip is only ever in a log.
 NO_FILE = {"openaigym.clip.0.1.step000000137.part000000": ("0.1", None)}

@@ -51,7 +51,7 @@ CONFINED = {
     "scipy": {"evaluation"},
     "rich": {"commands", "monitors"},
     "ray": {"engines.ray"},
-    "submitit": {"engines.slurm_arrays", "engines.slurm_cluster"},
+    "submitit": {"engines.slurm"},
 }
 
 HEAVY = (

@@ -530,7 +530,7 @@ def test_workers_stay_while_cpus_come_and_go(tmp_path: Path) -> None:
     both = children() - before
     assert len(both) == 2
     shared.rest()
-    other = try_lock(tmp_path / render_lock_name(0), "1\n")
+    other = try_lock(tmp_path / render_lock_name(0))
     assert other is not None
     alone = list(shared.frames(ride.path, range(4)))
     other.release()

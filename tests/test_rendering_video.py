@@ -39,7 +39,8 @@ from mjrec.formats.monitor_directory import trajectory_prefix
 from mjrec.formats.trajectory import packed, row_dtype
 from mjrec.formats.trajectory_file import open_trajectory
 from mjrec.formats.video_metadata import is_done, metadata_path
-from mjrec.rendering.finish import Finisher, bring_up_to_date, finish
+from mjrec.rendering.finish import bring_up_to_date, finish
+from mjrec.rendering.finisher import Finisher
 from mjrec.rendering.jobs import RecordingKey, VideoJob
 from mjrec.rendering.recorded_facts import captions, video_path
 from mjrec.rendering.recordings import look_at

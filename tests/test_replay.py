@@ -16,8 +16,7 @@ from parts import parametrize
 import mjrec
 from mjrec.errors import InvalidArgument
 from mjrec.formats.trajectory import columns_of, packed
-from mjrec.simulation.captured_arrays import read_state, state_dtype
-from mjrec.simulation.replay import set_state
+from mjrec.simulation.states import read_state, set_state, state_dtype
 
 GYMNASIUM = ["HalfCheetah-v5", "Humanoid-v5", "Pusher-v5"]
 GYMNASIUM += ["Ant-v5", "Hopper-v5", "HumanoidStandup-v5", "Swimmer-v5"]

@@ -147,7 +147,7 @@ def test_the_same_contents_give_the_same_page() -> None:
 
 def test_a_card_says_what_a_video_shows() -> None:
     """Its episode, its size, how it is made again, and by which rule it was chosen."""
-    page = page_of(with_videos(video(12, notes=["Chosen by best:2,median."])))
+    page = page_of(with_videos(video(12, notes=["Chosen by best:2, median."])))
     (image,) = Elements(page).named("img")
     assert (image["width"], image["height"]) == ("64", "48")
     assert image["src"] == "./videos/a%20b.png"
@@ -189,8 +189,8 @@ def test_why_figures_are_missing_or_made_in_another_way_is_said() -> None:
     assert usual.endswith("50 resamples, seed 0")
     notes = re.findall(r"<li><span[^>]*>(\w+)</span>: ([^<]*)\.</li>", page)
     assert notes == [
-        ("odd", "No figures of the returns: 1 of 3 returns is no finite number"),
         ("large", f"Intervals by another method, {method}"),
+        ("odd", "No figures of the returns: 1 of 3 returns is no finite number"),
     ]
 
 

@@ -470,17 +470,15 @@ def test_what_a_full_disk_did_not_let_be_said_is_said_later(
     with file_size_limit(len(before) + room):
         for fail in (
             lambda: add_facts(path, {"candidate": False, "text": "x" * 100}),
+            lambda: span.note({"noted": 1, "text": "x" * 100}),
             lambda: span.end({"complete": True}),
-            lambda: span.end({"complete": False}),
             lambda: write(logs, 3, episode=28),
         ):
-            span.note({"noted": 1, "text": "x" * 100})
             with pytest.raises(FileNotWritten, match=rf"{found.name}: "):
                 fail()
         assert found.read_bytes() == before
         check(read(path), 3)
     write(logs, 5, episode=28)
-    span.end({})
     content = read(path)
     check(content, 3)
     assert (content.facts["noted"], content.facts["complete"]) == (1, True)

@@ -57,8 +57,12 @@ def test_a_pattern_may_name_a_module_that_registers(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """It may lie in the working directory, and is not imported here."""
-    (tmp_path / "my_environments.py").write_text(
+    (tmp_path / "their_environments.py").write_text(
         "import gymnasium\n"
+        "gymnasium.register('Theirs-v0', 'gymnasium.envs.mujoco:HopperEnv')\n"
+    )
+    (tmp_path / "my_environments.py").write_text(
+        "import gymnasium, their_environments\n"
         "for n in (0, 1, 10):\n"
         "    gymnasium.register(f'Mine-v{n}', 'gymnasium.envs.mujoco:HopperEnv')\n"
     )

@@ -20,8 +20,8 @@ from mjrec.errors import InvalidArgument, UnknownName, UnreadableFile
 from mjrec.formats.monitor_directory import trajectory_prefix
 from mjrec.formats.trajectory import ModelChange, packed, row_dtype
 from mjrec.formats.trajectory_file import finish_trajectory
-from mjrec.simulation.captured_arrays import STATE_SPEC, state_dtype
 from mjrec.simulation.model_store import ModelStore
+from mjrec.simulation.states import STATE_SPEC, state_dtype
 
 HALF_CHEETAH = (
     Path(gymnasium.__file__).parent / "envs/mujoco/assets/half_cheetah.xml"

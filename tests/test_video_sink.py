@@ -14,7 +14,7 @@ from recordings import frames_of
 
 from mjrec import FileNotWritten
 from mjrec.annotation import Caption
-from mjrec.formats.unfinished_video import note_path, read_note
+from mjrec.formats.unfinished_video import read_note
 from mjrec.formats.video_metadata import StepRuns, timing_facts
 from mjrec.formats.video_sink import VideoSink
 from mjrec.frames import Frame
@@ -79,7 +79,7 @@ def test_a_note_says_what_an_unfinished_video_is(tmp_path: Path) -> None:
     sink = VideoSink(path, fps=Fraction(20), note=lambda: ({"seed": 3}, timing))
     assert names(tmp_path) == []
     sink.write(moving(0))
-    video = read_note(note_path(path))
+    video = read_note(path)
     assert video.path == path
     assert video.metadata == {"seed": 3}
     assert (video.facts["height"], video.facts["timestep"]) == (48, "1/20")

@@ -127,10 +127,15 @@ def write_log(
     frames: bool = True,
     video: str | None = "deferred",
     ended: bool = True,
+    over: bool | None = None,
     fps: str | None = None,
     **facts: Any,
 ) -> Path:
-    """Record an episode at 20 steps a second; return the file that it would become."""
+    """Record an episode at 20 steps a second; return the file that it would become.
+
+    Where it has `ended`, its last words are there; where it is `over`, its last row
+    says so.
+    """
     logs = new_logs(directory, infix)
     name = trajectory_prefix(infix, episode_id)
     span = logs.begin(
@@ -165,7 +170,7 @@ def write_log(
         if frames and (step % stride == 0 or step == steps):
             values["snapshot"] = grey(taken)
             taken += 1
-        last = ended and step == steps
+        last = (ended if over is None else over) and step == steps
         add_row(span, step, reward=0.5 * bool(step), truncated=last, **values)
     if ended:
         ending = {"complete": True, "terminated": False, "truncated": True}

@@ -376,6 +376,9 @@ def _forked(
 
 
 def _end_child(process: _Process, files: tuple[IO[bytes], ...], owner: int) -> None:
+    for file in files:
+        with contextlib.suppress(OSError):
+            file.close()
     # A forked child has copies; the process is its parent's.
     if os.getpid() == owner:
         process.send_signal(signal.SIGTERM)
@@ -383,9 +386,6 @@ def _end_child(process: _Process, files: tuple[IO[bytes], ...], owner: int) -> N
             process.send_signal(signal.SIGKILL)
             # One whose disk or driver does not answer cannot die.
             process.wait(_SECONDS_TO_END)
-    for file in files:
-        with contextlib.suppress(OSError):
-            file.close()
 
 
 def _pids_of_children(pid: int) -> list[int]:

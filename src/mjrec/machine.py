@@ -17,6 +17,8 @@ from collections.abc import Mapping
 from pathlib import Path, PurePosixPath
 from types import MappingProxyType
 
+from .errors import InvalidArgument
+
 _CGROUPS = Path("/sys/fs/cgroup")
 _OWN_CGROUPS = Path("/proc/self/cgroup")
 _CPUINFO = Path("/proc/cpuinfo")
@@ -123,3 +125,18 @@ def _cpuinfo() -> Mapping[str, str]:
         if colon:
             said.setdefault(name.strip(), value.strip())
     return MappingProxyType(said)
+
+
+def check_workers(workers: int | None) -> int | None:
+    """Return `workers` if it is a number of processes, or None.
+
+    Raises:
+        InvalidArgument: it is something else.
+    """
+    whole = isinstance(workers, int) and not isinstance(workers, bool)
+    if workers is not None and not (whole and workers >= 1):
+        raise InvalidArgument(
+            "workers must be a positive whole number, or None for one on each CPU that "
+            f"can be used, got {workers!r}."
+        )
+    return workers

@@ -59,9 +59,11 @@ def _run(argv: Sequence[str] | None) -> int:
     try:
         command = importlib.import_module(f".{module}", __name__)
         # Later than the overview, which must be quick.
+        from .help_text import flowing_help
+
         tyro = importlib.import_module("tyro")
         status: int = tyro.cli(
-            getattr(command, module),
+            flowing_help(getattr(command, module)),
             prog=f"mjrec {name}",
             args=arguments,
             config=(tyro.conf.FlagCreatePairsOff,),

@@ -4,30 +4,33 @@
 from __future__ import annotations
 
 import dataclasses
-import sys
-from collections.abc import Iterator, Sequence
+import itertools
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Literal
 
-import rich.box
 import rich.markup
 import rich.table
 import tyro
 
-from .. import json_text
 from ..errors import InvalidArgument
 from ..evaluation.comparing import TASK_FIGURES, Comparison
 from ..evaluation.comparing import compare as compare_evaluations
 from ..evaluation.requirements import parse_requirement
 from ..evaluation.statistics import Estimate
-from .counted import counted
-from .help_text import flowing_help
-from .terminal import printable, result_console
+from .options import AsJson
+from .terminal import (
+    counted,
+    print_json,
+    print_lines,
+    printable,
+    result_console,
+    table,
+)
 
 _UNMET = 1
 
 
-@flowing_help
 def compare(
     a: Annotated[
         tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="DIRECTORY...")
@@ -41,7 +44,8 @@ def compare(
     confidence: float = 0.95,
     resamples: int = 10_000,
     seed: int = 0,
-    as_json: Annotated[bool, tyro.conf.arg(name="json")] = False,
+    allow_nan: bool = False,
+    as_json: AsJson = False,
 ) -> int:
     """Compare evaluations: every figure is of B against A.
 
@@ -72,6 +76,7 @@ def compare(
         confidence: the share of intervals that hold the true value.
         resamples: of the bootstrap that intervals come from.
         seed: of its generator.
+        allow_nan: returns that are NaN or infinite do not make the exit status 1.
         as_json: print one JSON object, instead of text.
     """
     if not against:
@@ -97,14 +102,20 @@ def compare(
     if required:
         unmet += _failures(comparison, no_worse_than == "B")
     if as_json:
-        fields = {**dataclasses.asdict(comparison), "unmet": unmet}
-        for side in ("a", "b"):
-            fields[side] = list(map(str, fields[side]))
-        sys.stdout.write(json_text.dumps(fields) + "\n")
+        sides = {side: list(map(str, getattr(comparison, side))) for side in "ab"}
+        print_json({**dataclasses.asdict(comparison), **sides, "unmet": unmet})
     else:
-        _show(comparison, unmet)
-    is_unknown = any(task.unknown for task in comparison.tasks)
-    return _UNMET if unmet or is_unknown else 0
+        console = result_console()
+        print_lines(console, map(printable, _lines_before(comparison)))
+        console.print(_table(comparison))
+        after = (f"Not met: {why}." for why in unmet)
+        lines = itertools.chain(_lines_after(comparison), after)
+        print_lines(console, map(printable, lines))
+    unknown = any(
+        task.unknown and not (allow_nan and any(task.not_finite))
+        for task in comparison.tasks
+    )
+    return _UNMET if unmet or unknown else 0
 
 
 def _failures(comparison: Comparison, of_a: bool) -> Iterator[str]:
@@ -113,17 +124,6 @@ def _failures(comparison: Comparison, of_a: bool) -> Iterator[str]:
         if failed:
             name = "A" if of_a else "B"
             yield f"{task.task}: {counted(failed, 'episode')} of {name} failed"
-
-
-def _show(comparison: Comparison, unmet: Sequence[str]) -> None:
-    console = result_console()
-    lines = [*_lines_after(comparison), *(f"Not met: {why}." for why in unmet)]
-    for shown in (*_lines_before(comparison), _table(comparison), *lines):
-        if isinstance(shown, str):
-            text = printable(shown)
-            console.print(text, highlight=False, markup=False, soft_wrap=True)
-        else:
-            console.print(shown)
 
 
 def _lines_before(comparison: Comparison) -> Iterator[str]:
@@ -137,22 +137,17 @@ def _lines_before(comparison: Comparison) -> Iterator[str]:
 
 
 def _table(comparison: Comparison) -> rich.table.Table:
-    table = rich.table.Table(
-        box=rich.box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False
-    )
-    # All but that of paired differences, which not all comparisons have.
+    # Not all comparisons have that of paired differences.
     names = [n for n in TASK_FIGURES if any(n in t.figures for t in comparison.tasks)]
-    table.add_column("task", overflow="fold")
-    for name in ("episodes", *names):
-        table.add_column(name, justify="right", overflow="fold")
+    made = table(["task", "episodes", *names])
     for task in comparison.tasks:
         label = f"{task.task}: {task.unknown}" if task.unknown else task.task
-        table.add_row(
+        made.add_row(
             rich.markup.escape(printable(label)),
             ", ".join(map(str, task.episodes)),
             *(_cell(name, task.figures.get(name)) for name in names),
         )
-    return table
+    return made
 
 
 def _cell(name: str, estimate: Estimate | None) -> str:

@@ -4,16 +4,15 @@
 from __future__ import annotations
 
 import dataclasses
-import sys
 
 from rich.console import Console
 from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
-from .. import json_text
 from ..gl import EglDevice, Probe
 from ..machine_report import Cpus, Ffmpeg, MachineReport, Package, examine_machine
+from .terminal import print_json
 
 _INDENT = 2
 # Where values stand, right of names.
@@ -34,7 +33,7 @@ def doctor(*, json: bool = False) -> int:
     with waiting.status("Trying OpenGL, ffmpeg and the packages ..."):
         report = examine_machine()
     if json:
-        sys.stdout.write(json_text.dumps(dataclasses.asdict(report), indent=2) + "\n")
+        print_json(dataclasses.asdict(report))
     else:
         show_report(report, Console(highlight=False))
     return 0 if report.can_render else 1

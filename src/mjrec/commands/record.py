@@ -4,15 +4,15 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import secrets
-import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Literal
 
 import rich.console
 import tyro
 
-from .. import json_text
 from ..environments.named_environment import EnvironmentOptions
 from ..formats.video_metadata import finished_videos
 from ..monitors.progress import progress_bar
@@ -23,15 +23,13 @@ from ..sessions import (
     record_session,
     with_chosen_videos,
 )
-from .counted import counted
-from .environment_options import kwargs_of
-from .help_text import flowing_help
-from .view_options import camera_of, number_or_name, size_of
+from .options import AsJson, camera_of, kwargs_of, number_or_name, size_of
+from .terminal import counted, print_json, print_lines
 
+_FAILED = 1
 _INTERRUPTED = 130
 
 
-@flowing_help
 def record(
     env: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="ENV")],
     /,
@@ -57,9 +55,12 @@ def record(
     workers: int | None = None,
     quality: Literal["full", "draft"] = "full",
     env_kwargs: str = "{}",
-    as_json: Annotated[bool, tyro.conf.arg(name="json")] = False,
+    allow_nan: bool = False,
+    as_json: AsJson = False,
 ) -> int:
     """Record episodes of an environment.
+
+    The exit status is 1 where a return is NaN or infinite.
 
     Args:
         env: a Gymnasium id (HalfCheetah-v5), dm_control/<domain>-<task>
@@ -102,6 +103,7 @@ def record(
             mjrec render DIR makes them.
         quality: full, or draft: several times faster, with coarser edges and shadows.
         env_kwargs: more arguments for the environment, as a JSON object.
+        allow_nan: returns that are NaN or infinite do not make the exit status 1.
         as_json: print one JSON object at the end, and nothing else.
     """
     height, width = size_of(size)
@@ -141,11 +143,18 @@ def record(
     recorded, interrupted = _run(session, console)
     if keep is not None:
         recorded = with_chosen_videos(recorded)
+    not_finite = [e.episode_id for e in recorded if not math.isfinite(e.reward)]
     if as_json:
-        _print_json(session, recorded, interrupted=interrupted)
+        print_json(_fields(session, recorded, interrupted))
     else:
-        _print_summary(session, console, recorded, interrupted=interrupted)
-    return _INTERRUPTED if interrupted else 0
+        print_lines(console, _summary(session, recorded, interrupted))
+        if not_finite:
+            what = counted(len(not_finite), "return")
+            why = f"which is no success (--allow-nan): episode {not_finite[0]}"
+            print_lines(console, [f"{what} NaN or infinite, {why}"])
+    if interrupted:
+        return _INTERRUPTED
+    return _FAILED if not_finite and not allow_nan else 0
 
 
 def _run(
@@ -177,50 +186,45 @@ def _run(
                     recorded.append(episode)
                     show_progress()
                     if not console.is_terminal:
-                        _print_episode(episode, len(recorded), total, console)
+                        print_lines(console, [_ended(episode, len(recorded), total)])
             except KeyboardInterrupt:
                 return recorded, True
     return recorded, False
 
 
-def _print_episode(
-    episode: SessionEpisode, done: int, total: int, console: rich.console.Console
-) -> None:
-    console.print(
+def _ended(episode: SessionEpisode, done: int, total: int) -> str:
+    return (
         f"episode {episode.episode_id} ({done}/{total}): {episode.length} steps, "
-        f"return {episode.reward:.6g}",
-        highlight=False,
-        soft_wrap=True,
+        f"return {episode.reward:.6g}"
     )
 
 
-def _print_summary(
-    session: Session,
-    console: rich.console.Console,
-    recorded: list[SessionEpisode],
-    *,
-    interrupted: bool,
-) -> None:
+def _summary(
+    session: Session, recorded: list[SessionEpisode], interrupted: bool
+) -> Iterator[str]:
     if interrupted:
-        console.print("Interrupted. What was recorded so far is complete:")
+        yield "Interrupted. What was recorded so far is complete:"
     videos = [episode.video for episode in recorded if episode.video]
     files = [name for video in videos for name in _files(video)]
-    shown = session.directory.absolute()
-    lines = [
-        f"{counted(len(recorded), 'episode')} of {session.environment}, "
-        f"seed {session.seed}, in",
-        f"  {shown}",
-        counted(len(files), "video") + (":" if files else ""),
-        *(f"  {name}" for name in files),
-    ]
-    # Names must survive copying, so no line is folded.
-    console.print("\n".join(lines), highlight=False, markup=False, soft_wrap=True)
+    episodes = counted(len(recorded), "episode")
+    yield f"{episodes} of {session.environment}, seed {session.seed}, in"
+    yield f"  {session.directory.absolute()}"
+    yield counted(len(files), "video") + ":" * bool(files)
+    yield from (f"  {name}" for name in files)
 
 
-def _print_json(
-    session: Session, recorded: list[SessionEpisode], *, interrupted: bool
-) -> None:
-    summary = {
+def _files(video: Path) -> list[str]:
+    """Return the names of an episode's videos, those of further cameras too."""
+    # Nothing incomplete has a video's final name.
+    if video.exists():
+        return [name for name, _ in finished_videos(video)]
+    return [f"{video.name}  (pending: mjrec render {video.parent})"]
+
+
+def _fields(
+    session: Session, recorded: list[SessionEpisode], interrupted: bool
+) -> dict[str, object]:
+    return {
         "directory": str(session.directory.absolute()),
         "environment": session.environment,
         "seed": session.seed,
@@ -236,12 +240,3 @@ def _print_json(
             for episode in recorded
         ],
     }
-    sys.stdout.write(json_text.dumps(summary) + "\n")
-
-
-def _files(video: Path) -> list[str]:
-    """Return the names of an episode's videos, those of further cameras too."""
-    # Nothing incomplete has a video's final name.
-    if video.exists():
-        return [name for name, _ in finished_videos(video)]
-    return [f"{video.name}  (pending: mjrec render {video.parent})"]

@@ -3,30 +3,27 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import Annotated
 
-import rich.console
 import tyro
 
-from .. import json_text
 from ..evaluation.results_files import is_evaluation
 from ..formats.monitor_directory import monitor_directories_in
 from ..rendering.recovery import RecoveredFile, Recovery
 from ..rendering.recovery import recover as recover_directory
-from .help_text import flowing_help
+from .options import AsJson
+from .terminal import print_json, print_lines, result_console
 
 _FAILED = 1
 
 
-@flowing_help
 def recover(
     directory: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="DIR")],
     /,
     *,
     timeout: float = 5.0,
-    as_json: Annotated[bool, tyro.conf.arg(name="json")] = False,
+    as_json: AsJson = False,
 ) -> int:
     """Put a directory in order whose recording, or rendering, was killed.
 
@@ -43,12 +40,9 @@ def recover(
     """
     recovery = _recover_all(directory, timeout)
     if as_json:
-        sys.stdout.write(json_text.dumps(_fields(recovery)) + "\n")
+        print_json(_fields(recovery))
     else:
-        # Names must survive copying, so no line is folded.
-        rich.console.Console().print(
-            str(recovery), highlight=False, markup=False, soft_wrap=True
-        )
+        print_lines(result_console(), [str(recovery)])
     return _FAILED if recovery.failures else 0
 
 

@@ -4,32 +4,34 @@
 from __future__ import annotations
 
 import itertools
-import sys
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Literal
 
 import rich.console
 import tyro
 
-from .. import json_text
 from ..annotation import check_annotation
 from ..errors import InvalidArgument
-from ..formats.monitor_directory import iter_monitor_files, monitor_directories_in
+from ..evaluation.chunk_results import recorded_results
+from ..evaluation.results_files import is_evaluation
+from ..formats.monitor_directory import (
+    Infix,
+    iter_monitor_files,
+    monitor_directories_in,
+    trajectory_prefix,
+)
 from ..monitors.progress import render_progress
 from ..rendering.jobs import RenderedVideos
 from ..rendering.render_videos import iter_rendered_videos
 from ..rendering.views import Variant, View
-from .counted import counted
-from .engine_options import NO_ENGINE, EngineOptions
-from .help_text import flowing_help
-from .view_options import camera_of, size_of
+from .options import NO_ENGINE, AsJson, Engine, camera_of, size_of
+from .terminal import counted, names_by, print_json, print_lines
 
 _FAILED = 1
 _INTERRUPTED = 130
 
 
-@flowing_help
 def render(
     target: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="DIR|FILE")],
     /,
@@ -47,10 +49,8 @@ def render(
     workers: int | None = None,
     strict: bool = False,
     trust_models: bool = False,
-    as_json: Annotated[bool, tyro.conf.arg(name="json")] = False,
-    engine_options: Annotated[
-        tyro.conf.OmitArgPrefixes[EngineOptions], tyro.conf.arg(name="engine")
-    ] = NO_ENGINE,
+    as_json: AsJson = False,
+    engine_options: Engine = NO_ENGINE,
 ) -> int:
     """Render the pending videos of a directory, or recorded episodes again.
 
@@ -68,7 +68,8 @@ def render(
             in one, for that episode only.
         pending: render the pending videos, which is also what is done without any
             option.
-        episode: its number; all recorded ones, if it is not given.
+        episode: its number; all recorded ones, if it is not given. Of an evaluation the
+            one of this number in each task and seed.
         camera: name or number; as recorded, if it is not given. So with all of these.
         size: WIDTHxHEIGHT in pixels.
         max_fps: the most frames per second of simulated time; every n-th recorded
@@ -89,18 +90,28 @@ def render(
         engine_options: where it is done, in place of processes of this command.
     """
     height, width = size_of(size)
+    if annotate and no_annotate:
+        raise InvalidArgument("Give one of --annotate and --no-annotate, or neither.")
+    if annotate:
+        check_annotation()
     variant = Variant(
         view=View(
             camera=camera_of(camera), height=height, width=width, quality=quality
         ),
         max_fps=max_fps,
         fps=fps,
-        annotate=_annotation(annotate, no_annotate),
+        annotate=annotate if annotate or no_annotate else None,
     )
     if pending and (variant != Variant() or out is not None):
         raise InvalidArgument(
             "--pending renders videos as they were to be. To render an episode another "
             "way, leave it out."
+        )
+    places, number = _places(target, episode)
+    if out is not None and len(places) > 1:
+        raise InvalidArgument(
+            f"--out is for one episode, and {target} has several: name its trajectory "
+            "(openaigym.trajectory.*.h5)."
         )
     engine = engine_options.chosen(workers)
     console = rich.console.Console(quiet=as_json)
@@ -109,7 +120,7 @@ def render(
             iter_rendered_videos(
                 place,
                 variant,
-                episode=episode,
+                episode=number,
                 out=out,
                 workers=workers if engine is None else None,
                 strict=strict,
@@ -117,31 +128,52 @@ def render(
                 engine=engine,
                 on_progress=on_progress,
             )
-            for place in _places(target, episode)
+            for place in places
         )
         done, is_interrupted = _collect(results, console)
-    report = RenderedVideos.joined(done, target if target.is_dir() else target.parent)
+    directory = target if target.is_dir() else target.parent
+    report = RenderedVideos.joined(done, directory)
     nothing = report.is_empty and not is_interrupted
     if nothing and (episode is not None or not target.is_dir()):
+        what = target.name if episode is None else f"episode {episode}"
         raise InvalidArgument(
-            f"No video of {_what(target, episode)} is pending. To render it again, say "
-            "what is to be other (--camera, --size, --max-fps, --quality, --fps, "
-            "--annotate) or where to write it (--out)."
+            f"No video of {what} is pending. To render it again, say what is to be "
+            "other (--camera, --size, --max-fps, --quality, --fps, --annotate) or "
+            "where to write it (--out)."
         )
     if as_json:
-        _print_json(report, is_interrupted=is_interrupted)
+        print_json(_fields(report, is_interrupted))
     else:
-        _print_summary(report, console, is_interrupted=is_interrupted)
+        print_lines(console, _summary(report, is_interrupted))
     if is_interrupted:
         return _INTERRUPTED
     return _FAILED if report.failures or report.blank else 0
 
 
-def _places(target: Path, episode: int | None) -> list[Path]:
-    """Return what is named; of an evaluation the monitor directories in it."""
-    if episode is not None or not target.is_dir() or any(iter_monitor_files(target)):
-        return [target]
-    return monitor_directories_in(target) or [target]
+def _places(target: Path, episode: int | None) -> tuple[list[Path], int | None]:
+    """Return the directories, or recordings, that are named, and which episode of each.
+
+    Those of an evaluation are the monitor directories in it or, of one number, the
+    trajectories.
+    """
+    if episode is not None and is_evaluation(target):
+        found = list(_trajectories(target, episode))
+        if not found:
+            raise InvalidArgument(
+                f"No episode {episode} is recorded in {target}. To see which are: "
+                f"mjrec list {target}"
+            )
+        return found, None
+    if episode is None and target.is_dir() and not any(iter_monitor_files(target)):
+        return monitor_directories_in(target) or [target], None
+    return [target], episode
+
+
+def _trajectories(directory: Path, episode: int) -> Iterator[Path]:
+    for folder, result in recorded_results(directory):
+        infix = Infix.parse(result.monitor or "")
+        if result.episode == episode and infix and result.episode_id is not None:
+            yield folder / f"{trajectory_prefix(infix, result.episode_id)}.h5"
 
 
 def _collect(
@@ -156,75 +188,46 @@ def _collect(
     try:
         for result in results:
             done.append(result)
-            for name, count in result.videos.items():
-                _print(console, f"{name}: {counted(count, 'frame')}")
+            videos = result.videos.items()
+            print_lines(
+                console, (f"{name}: {counted(n, 'frame')}" for name, n in videos)
+            )
     except KeyboardInterrupt:
         return done, True
     return done, False
 
 
-def _annotation(annotate: bool, no_annotate: bool) -> bool | None:
-    """Return what is asked for; None is as recorded.
-
-    Raises:
-        InvalidArgument: both are.
-        MissingDependency: there is no Pillow to write with.
-    """
-    if annotate and no_annotate:
-        raise InvalidArgument("Give one of --annotate and --no-annotate, or neither.")
-    if annotate:
-        check_annotation()
-    return annotate if annotate or no_annotate else None
-
-
-def _what(target: Path, episode: int | None) -> str:
-    return target.name if episode is None else f"episode {episode}"
-
-
-def _print_summary(
-    report: RenderedVideos, console: rich.console.Console, *, is_interrupted: bool
-) -> None:
+def _summary(report: RenderedVideos, is_interrupted: bool) -> Iterator[str]:
     shown = report.directory.absolute()
     if is_interrupted:
-        _print(console, "Interrupted. What is not done stays as it was.")
+        yield "Interrupted. What is not done stays as it was."
     elif report.is_empty:
-        _print(console, f"Nothing is pending in {shown}.")
+        yield f"Nothing is pending in {shown}."
     if report.videos:
-        _print(
-            console, f"{counted(len(report.videos), 'video')} rendered, in\n  {shown}"
-        )
+        yield f"{counted(len(report.videos), 'video')} rendered, in"
+        yield f"  {shown}"
     if report.elsewhere:
         what = counted(len(report.elsewhere), "video")
-        _print(console, f"{what} left to another process, which is rendering now.")
-    _print_reasons("could not be rendered:", report.failures, console)
-    _print_reasons("rendered, with nothing to be seen:", report.blank, console)
+        yield f"{what} left to another process, which is rendering now."
+    yield from _reasons("could not be rendered:", report.failures)
+    yield from _reasons("rendered, with nothing to be seen:", report.blank)
 
 
-def _print_reasons(
-    what: str, failures: Mapping[str, str], console: rich.console.Console
-) -> None:
+def _reasons(what: str, failures: Mapping[str, str]) -> Iterator[str]:
     if failures:
-        _print(console, f"{counted(len(failures), 'video')} {what}")
-    for reason in dict.fromkeys(failures.values()):
-        names = [name for name, why in failures.items() if why == reason]
-        _print(console, "\n".join(f"  {name}" for name in names))
-        _print(console, "\n".join(f"    {line}" for line in reason.splitlines()))
+        yield f"{counted(len(failures), 'video')} {what}"
+    for reason, names in names_by(failures).items():
+        yield from (f"  {name}" for name in names)
+        yield from (f"    {line}" for line in reason.splitlines())
 
 
-def _print_json(report: RenderedVideos, *, is_interrupted: bool) -> None:
-    content = {
+def _fields(report: RenderedVideos, is_interrupted: bool) -> dict[str, object]:
+    videos = report.videos.items()
+    return {
         "directory": str(report.directory.absolute()),
-        "videos": [
-            {"name": n, "frame_count": count} for n, count in report.videos.items()
-        ],
+        "videos": [{"name": name, "frame_count": count} for name, count in videos],
         "failures": report.failures,
         "blank": report.blank,
         "elsewhere": report.elsewhere,
         "interrupted": is_interrupted,
     }
-    sys.stdout.write(json_text.dumps(content) + "\n")
-
-
-def _print(console: rich.console.Console, text: str) -> None:
-    # Names must survive copying, so no line is folded.
-    console.print(text, highlight=False, markup=False, soft_wrap=True)

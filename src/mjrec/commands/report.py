@@ -10,13 +10,12 @@ from typing import Annotated
 import rich.console
 import tyro
 
-from .. import json_text
 from ..monitors.progress import progress_bar
 from ..reporting.report_folder import write_report
-from .help_text import flowing_help
+from .options import AsJson
+from .terminal import print_json
 
 
-@flowing_help
 def report(
     directories: Annotated[
         tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="DIR")
@@ -28,7 +27,7 @@ def report(
     max_single_file_bytes: int = 50_000_000,
     title: str | None = None,
     verification: tyro.conf.UseAppendAction[tuple[Path, ...]] = (),
-    as_json: Annotated[bool, tyro.conf.arg(name="json")] = False,
+    as_json: AsJson = False,
 ) -> int:
     """Write a page that shows recordings: figures, curves, videos, how they came about.
 
@@ -68,7 +67,7 @@ def report(
             ),
         )
     if as_json:
-        sys.stdout.write(json_text.dumps({"page": str(page.absolute())}) + "\n")
+        print_json({"page": str(page.absolute())})
     else:
         sys.stdout.write(f"{page.absolute()}\n")
     return 0

@@ -9,13 +9,11 @@ from typing import Annotated, Literal
 
 import tyro
 
-from .. import json_text
 from ..reporting.film_strips import film_strip, write_film_strip
-from .help_text import flowing_help
-from .view_options import camera_of, size_of
+from .options import AsJson, camera_of, size_of
+from .terminal import print_json
 
 
-@flowing_help
 def strip(
     file: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="FILE")],
     /,
@@ -26,7 +24,7 @@ def strip(
     size: str | None = None,
     quality: Literal["full", "draft"] | None = None,
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])] = Path("strip.png"),
-    as_json: Annotated[bool, tyro.conf.arg(name="json")] = False,
+    as_json: AsJson = False,
 ) -> int:
     """Make a film strip: pictures of an episode side by side, with their times.
 
@@ -57,7 +55,7 @@ def strip(
     write_film_strip(out, picture)
     shown = {"strip": str(out), "width": picture.shape[1], "height": picture.shape[0]}
     if as_json:
-        sys.stdout.write(json_text.dumps(shown) + "\n")
+        print_json(shown)
     else:
         sys.stdout.write(f"{out}: {shown['width']}x{shown['height']} pixels\n")
     return 0

@@ -1,11 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is shown to people, on a terminal or in a log."""
+"""What commands print: for people, on a terminal or in a log, and for programs."""
 
 from __future__ import annotations
 
+import itertools
+import sys
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+
+import rich.box
 import rich.console
+import rich.table
+
+from .. import json_text
 
 _LOG_WIDTH = 160
+# Of a long table, these rows say how wide its columns are.
+_ROWS_MEASURED = 1000
 
 
 def result_console() -> rich.console.Console:
@@ -23,3 +33,71 @@ def printable(text: str) -> str:
     What cannot be printed stands there as Python writes it.
     """
     return "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
+
+
+def counted(number: int, noun: str) -> str:
+    """Return `1 video`, `2 videos`."""
+    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
+
+
+def and_more(names: Sequence[str]) -> str:
+    """Return the first of some names, and how many there are besides."""
+    more = len(names) - 1
+    return f"{names[0]} and {more} more" if more else names[0]
+
+
+def names_by(reasons: Mapping[str, str]) -> dict[str, list[str]]:
+    """Return the names of each reason, from the reason of each name."""
+    names: dict[str, list[str]] = {}
+    for name, reason in reasons.items():
+        names.setdefault(reason, []).append(name)
+    return names
+
+
+def print_lines(console: rich.console.Console, lines: Iterable[str]) -> None:
+    """Print texts as they are. Names must survive copying, so no line is folded."""
+    for line in lines:
+        console.print(line, highlight=False, markup=False, soft_wrap=True)
+
+
+def print_json(value: object) -> None:
+    """Print a line of JSON."""
+    sys.stdout.write(json_text.dumps(value) + "\n")
+
+
+def table(names: Iterable[str], *, left: Iterable[str] = ("task",)) -> rich.table.Table:
+    """Return an empty table of numbers; those `left` are texts."""
+    made = rich.table.Table(
+        box=rich.box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False
+    )
+    for name in names:
+        is_text = name in left
+        made.add_column(name, justify="left" if is_text else "right", overflow="fold")
+    return made
+
+
+def print_rows(
+    names: Sequence[str], rows: Iterator[Sequence[str]], *, left: Sequence[str]
+) -> bool:
+    """Print a table of any length, of which only the beginning is kept in memory.
+
+    Args:
+        names: of the columns.
+        rows: the cells, which may be of foreign text.
+        left: the columns that are texts; the others are numbers.
+
+    Returns:
+        Whether there was a row.
+    """
+    first = list(itertools.islice(rows, _ROWS_MEASURED))
+    widths = [max(map(len, column)) for column in zip(names, *first, strict=True)]
+    places = ["<" if name in left else ">" for name in names]
+
+    def shown(cells: Sequence[str]) -> str:
+        parts = zip(map(printable, cells), places, widths, strict=True)
+        return "  ".join(f"{c:{place}{width}}" for c, place, width in parts).rstrip()
+
+    if first:
+        for cells in itertools.chain([names], first, rows):
+            sys.stdout.write(f"{shown(cells)}\n")
+    return bool(first)

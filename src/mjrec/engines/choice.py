@@ -11,7 +11,7 @@ from concurrent.futures import Executor
 from ..errors import Error, InvalidArgument, MissingDependency, UnknownName
 from .local import LocalEngine
 from .ray import RayEngine
-from .slurm import SlurmEngine
+from .slurm import SlurmEngine, slurm_options
 
 _DASK = "dask:"
 ENGINES = ("local", "ray", "slurm", f"{_DASK}ADDRESS")
@@ -95,8 +95,8 @@ def engine_from(
     if name == "ray":
         return RayEngine(workers, address=address, gpus=gpus, require_gpu=require_gpu)
     if name == "slurm":
-        return SlurmEngine.from_texts(
-            options or {}, workers=workers, gpus=gpus, require_gpu=require_gpu
+        return SlurmEngine(
+            workers, gpus=gpus, require_gpu=require_gpu, **slurm_options(options or {})
         )
     return LocalEngine(workers, gpus=gpus, require_gpu=require_gpu)
 

@@ -50,6 +50,11 @@ class GpuShare:
         """Whether workers get any."""
         return self.each > 0
 
+    @property
+    def sharing(self) -> int:
+        """How many workers share a GPU; 1 where none was asked for."""
+        return max(1, math.floor(1 / self.each + 1e-9)) if self.asked_for else 1
+
     def of(self, seat: int, gpus: Sequence[str]) -> str | None:
         """Return which GPUs a worker gets, as `CUDA_VISIBLE_DEVICES` names them.
 
@@ -64,25 +69,22 @@ class GpuShare:
         """
         if not (gpus and self.asked_for):
             return None
-        if self.each >= 1:
-            count = int(self.each)
-            first = seat * count
-            return ",".join(
-                dict.fromkeys(gpus[(first + n) % len(gpus)] for n in range(count))
-            )
-        sharing = math.floor(1 / self.each + 1e-9)
-        return gpus[seat // sharing % len(gpus)]
+        count = max(1, int(self.each))
+        first = seat // self.sharing * count
+        return ",".join(
+            dict.fromkeys(gpus[(first + n) % len(gpus)] for n in range(count))
+        )
 
 
-def check_worker_count(workers: int | None) -> int | None:
-    """Return `workers` if it is a number of workers, or None.
+def check_worker_count(count: int | None, name: str = "workers") -> int | None:
+    """Return a number of at least 1, or None.
 
     Raises:
         InvalidArgument: it is something else.
     """
-    whole = isinstance(workers, int) and not isinstance(workers, bool)
-    if workers is not None and not (whole and workers >= 1):
+    whole = isinstance(count, int) and not isinstance(count, bool)
+    if count is not None and not (whole and count >= 1):
         raise InvalidArgument(
-            f"workers must be a whole number of at least 1, got {workers!r}."
+            f"{name} must be a whole number of at least 1, got {count!r}."
         )
-    return workers
+    return count

@@ -11,26 +11,24 @@ Doing a job twice is harmless: a job whose child died is handed out again.
 
 from __future__ import annotations
 
-import collections
 import contextlib
+import fcntl
 import json
 import logging
 import os
+import queue
 import shutil
 import sys
-import time
-import weakref
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from concurrent.futures import FIRST_COMPLETED, CancelledError, Executor, Future, wait
+from collections.abc import Iterator, Mapping
+from concurrent.futures import CancelledError, Executor, Future, wait
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Self
 
-from ..errors import ClosedError, DirectoryNotWritable, Error, InvalidArgument
+from ..errors import DirectoryNotWritable, Error, InvalidArgument
 from ..messages import unpacked
 from .local import LocalEngine
-from .worker import STOP, do_job, end_idle_children
+from .worker import BEGUN, WORK, do_job, end_idle_children
 
 logger = logging.getLogger(__name__)
 
@@ -50,31 +48,20 @@ class Work:
     Attributes:
         entry: `module:name` of what makes a handler. It is called once in each child,
             with the settings. The handler is called with the arguments of one job
-            after the other and returns a small JSON object; its `close()` lets go of
-            what it holds.
+            after the other and returns a small JSON object. If it has `leave()`, that
+            is called on another thread when the child is ended by no fault of its own.
         settings: for all jobs; JSON.
         environ: environment variables of the children, besides their worker's.
         shared_directory: one that all workers see under this name; a folder in it is
             used while the run lasts. None is enough for processes of this machine.
+        payload: bytes for all children; the settings get their file as `payload`.
     """
 
     entry: str
     settings: Mapping[str, Any] = field(default_factory=dict)
     environ: Mapping[str, str] = field(default_factory=dict)
     shared_directory: Path | None = None
-
-
-@dataclass(frozen=True, kw_only=True)
-class Job:
-    """A piece of work. Doing it twice is doing it once.
-
-    Attributes:
-        key: tells it from all others of its run.
-        arguments: JSON.
-    """
-
-    key: str
-    arguments: Mapping[str, Any]
+    payload: bytes | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -96,91 +83,77 @@ class JobOutcome:
 
 @dataclass
 class _Task:
-    job: Job
+    key: str
+    arguments: Mapping[str, Any]
     deaths: int = 0
 
 
 class Run:
     """Jobs of one work on one executor. Leaving `with` cancels what is not done.
 
-    For one thread at a time, in the process that made it.
-
     Args:
         engine: where the jobs run. It is not shut down.
         work: what is done.
 
     Raises:
-        InvalidArgument: the settings are no JSON, or the executor's workers may be on
-            other machines and there is no shared directory.
+        InvalidArgument: the executor's workers may be on other machines and there is no
+            shared directory.
         DirectoryNotWritable: that directory.
     """
 
     def __init__(self, engine: Executor, work: Work) -> None:
-        self.engine = engine
-        _check_json(dict(work.settings), "The settings of the work")
+        self._engine = engine
         is_here = isinstance(engine, LocalEngine)
         if not is_here and work.shared_directory is None:
             raise InvalidArgument(
                 "Workers elsewhere need a directory that all workers see, and this "
                 "work names none (shared_directory)."
             )
-        shared = None if is_here else work.shared_directory
-        is_new = shared is not None and not shared.exists()
-        self._place = _new_place(shared)
-        self._work = {
-            "entry": work.entry,
-            "settings": dict(work.settings),
-            "environ": dict(work.environ),
-            "place": str(self._place),
-            "require_gpu": getattr(engine, "require_gpu", None),
-            # Modules of a policy are found where the driver finds them.
-            "directory": str(Path.cwd()),
-            "path": [str(Path(entry).absolute()) for entry in sys.path],
-        }
-        self._keys: set[str] = set()
-        self._waiting: collections.deque[_Task] = collections.deque()
-        self._tasks: dict[Future[Any], _Task] = {}
-        self._told: set[tuple[str, int, str]] = set()
-        self._any_is_done = False
-        self._owner = os.getpid()
-        self._leave = weakref.finalize(
-            self,
-            _leave,
-            self._place,
-            self._owner,
-            is_new=is_new,
-            # Slurm's, whose jobs outlive their futures.
-            end_run=getattr(engine, "end_run", None),
+        self._place = _new_place(None if is_here else work.shared_directory)
+        settings = dict(work.settings)
+        if work.payload is not None:
+            settings["payload"] = str(self._place / "payload")
+            (self._place / "payload").write_bytes(work.payload)
+        share = getattr(engine, "share", None)
+        # Locked while this process lives.
+        self._file = (self._place / WORK).open("w")
+        fcntl.flock(self._file, fcntl.LOCK_EX)
+        json.dump(
+            {
+                "entry": work.entry,
+                "settings": settings,
+                "environ": dict(work.environ),
+                "require_gpu": share.required if share and share.asked_for else None,
+                # Modules of a policy are found where the driver finds them.
+                "directory": str(Path.cwd()),
+                "path": [str(Path(entry).absolute()) for entry in sys.path],
+            },
+            self._file,
         )
-
-    @property
-    def workers(self) -> int | None:
-        """How many jobs the executor does at once; None where it does not say."""
-        return getattr(self.engine, "workers", None)
+        self._file.flush()
+        self._tasks: dict[Future[Any], _Task] = {}
+        self._parked: list[_Task] = []
+        self._done: queue.SimpleQueue[Future[Any]] = queue.SimpleQueue()
+        self._told: set[tuple[str, int, str]] = set()
 
     @property
     def unfinished(self) -> int:
         """How many jobs have no outcome yet."""
-        return len(self._waiting) + len(self._tasks)
+        return len(self._tasks) + len(self._parked)
 
-    def submit(self, job: Job) -> None:
+    def submit(self, key: str, **arguments: Any) -> None:
         """Add a job, also while results come.
 
-        Raises:
-            InvalidArgument: there was one with that key, or its arguments are no JSON.
-            ClosedError: the run is cancelled, or another process's.
+        Args:
+            key: tells it from all others of the run.
+            **arguments: JSON.
         """
-        self._check_usable()
-        if job.key in self._keys:
-            raise InvalidArgument(f"There was a job {job.key!r} in this run already.")
-        _check_json(dict(job.arguments), f"The arguments of the job {job.key!r}")
-        self._keys.add(job.key)
-        self._waiting.append(_Task(job))
+        self._hand_out(_Task(key, arguments))
 
     def results(
         self, *, patience_s: float | None = None
     ) -> Iterator[JobOutcome | None]:
-        """Yield outcomes as they come, until there is no job left or all is cancelled.
+        """Yield outcomes as they come, until there is no job left.
 
         A job whose child dies is done again behind the others, `TRIES` times in all.
 
@@ -189,46 +162,57 @@ class Run:
                 if it is None.
 
         Raises:
-            InvalidArgument: `patience_s` is no positive number.
-            ClosedError: the run is cancelled, or another process's.
             Error: no child can begin; or what the handler's maker raised.
         """
-        return results_of(self, patience_s=patience_s)
+        while self._tasks or self._parked:
+            outcome = None
+            if not self._tasks:
+                self._hand_out_parked()
+            try:
+                future = self._done.get(timeout=patience_s)
+            except queue.Empty:
+                yield None
+                continue
+            if future in self._tasks:
+                outcome = self._take(future)
+            if outcome is not None:
+                # There is a worker that can do jobs.
+                self._hand_out_parked()
+                yield outcome
 
     def cancel(self) -> None:
-        """End all jobs; those at work may close their files. Idempotent."""
-        if os.getpid() != self._owner or not self._leave.alive:
-            return
-        _stop(self._place)
+        """End all jobs. Idempotent."""
+        # Children, and those who wait for them, see it.
+        (self._place / WORK).unlink(missing_ok=True)
         running = {future for future in self._tasks if not future.cancel()}
         self._tasks.clear()
+        self._parked.clear()
         try:
+            # Slurm's, whose jobs outlive their futures.
+            if end_run := getattr(self._engine, "end_run", None):
+                end_run(str(self._place))
             wait(running)
         finally:
             # Also where Ctrl-C has cut the waiting short.
             end_idle_children(str(self._place))
-            self._leave()
+            _remove(self._place)
+            self._file.close()
 
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self.cancel()
 
-    def _hand_out(self) -> None:
-        while self._waiting and self._leave.alive:
-            task = self._waiting.popleft()
-            message = {
-                "work": self._work,
-                "key": task.job.key,
-                "arguments": dict(task.job.arguments),
-            }
-            self._tasks[self.engine.submit(do_job, message)] = task
+    def _hand_out(self, task: _Task) -> None:
+        job = {"key": task.key, "arguments": dict(task.arguments)}
+        future = self._engine.submit(do_job, str(self._place), job)
+        self._tasks[future] = task
+        future.add_done_callback(self._done.put)
+
+    def _hand_out_parked(self) -> None:
+        while self._parked:
+            self._hand_out(self._parked.pop(0))
 
     def _take(self, future: Future[Any]) -> JobOutcome | None:
         """Return the outcome of a job; None where it is to be done again."""
@@ -236,43 +220,46 @@ class Run:
         try:
             said = future.result()
         except CancelledError:
-            said = {"died": "was cancelled by its executor"}
+            said = {"died": "was cancelled by its executor", "begun": True}
+        except Error:
+            raise
         except Exception as error:
             # The executor's own: a worker of it is gone.
-            if isinstance(error, Error):
-                raise
             why = f"{type(error).__name__}: {error}".splitlines()
-            said = {"died": f"is gone: {why[0]} {why[-1] if why[1:] else ''}"}
-            said["begun"] = False
+            how = f"is gone: {why[0]} {why[-1] if why[1:] else ''}"
+            said = {"died": how, "begun": True}
         self._log(said.get("log", ()))
         if "error" in said:
             raise unpacked(said["error"])
         if "died" in said:
-            return self._bury(task, said["died"], has_begun=said.get("begun", True))
-        self._any_is_done = True
+            return self._bury(task, said["died"], has_begun=said["begun"])
         return JobOutcome(
-            key=task.job.key,
+            key=task.key,
             value=said.get("value"),
             failure=said.get("failure"),
             tries=task.deaths + 1,
         )
 
     def _bury(self, task: _Task, how: str, *, has_begun: bool) -> JobOutcome | None:
+        can_any_begin = (self._place / BEGUN).exists()
+        if not has_begun and can_any_begin and self._tasks:
+            # It never came to the job, which waits for a worker that can do jobs.
+            logger.warning("A worker could not begin. It %s", how)
+            self._parked.append(task)
+            return None
         task.deaths += 1
         if task.deaths < TRIES:
             logger.warning(
                 "A worker died at the job %s, which is begun again. It %s",
-                task.job.key,
+                task.key,
                 how,
             )
-            self._waiting.append(task)
+            self._hand_out(task)
             return None
-        if not has_begun and not self._any_is_done:
+        if not can_any_begin:
             raise Error(f"No worker can begin. The last one {how}")
         failure = f"Its worker died, which was try {task.deaths} of {TRIES}: it {how}"
-        return JobOutcome(
-            key=task.job.key, value=None, failure=failure, tries=task.deaths
-        )
+        return JobOutcome(key=task.key, value=None, failure=failure, tries=task.deaths)
 
     def _log(self, lines: Any) -> None:
         """Log here what children logged, each text once in a run."""
@@ -280,54 +267,6 @@ class Run:
             if (name, level, text) not in self._told:
                 self._told.add((name, level, text))
                 logging.getLogger(name).log(level, "%s", text)
-
-    def _check_usable(self) -> None:
-        if os.getpid() != self._owner:
-            raise ClosedError(
-                f"The run belongs to process {self._owner}: begin one in the process "
-                "that uses it."
-            )
-        if not self._leave.alive:
-            raise ClosedError("The run is cancelled.")
-
-
-def results_of(
-    *runs: Run, patience_s: float | None = None
-) -> Iterator[JobOutcome | None]:
-    """Yield the outcomes of several runs as they come; see `Run.results`."""
-    for run in runs:
-        run._check_usable()
-    if patience_s is not None and not patience_s > 0:
-        raise InvalidArgument(
-            f"patience_s must be a positive number of seconds, got {patience_s!r}."
-        )
-    return _results_of(set(runs), patience_s)
-
-
-def _results_of(
-    runs: Iterable[Run], patience_s: float | None
-) -> Iterator[JobOutcome | None]:
-    last = time.monotonic()
-    while True:
-        for run in runs:
-            run._hand_out()
-        futures = {future: run for run in runs for future in run._tasks}
-        if not futures:
-            return
-        rest = None if patience_s is None else last + patience_s - time.monotonic()
-        seconds = None if rest is None else max(0.0, rest)
-        done, _ = wait(futures, seconds, return_when=FIRST_COMPLETED)
-        outcomes = [futures[future]._take(future) for future in done]
-        for run in runs:
-            # The workers shall not wait for the caller.
-            run._hand_out()
-        for outcome in outcomes:
-            if outcome is not None:
-                yield outcome
-                last = time.monotonic()
-        if not done:
-            yield None
-            last = time.monotonic()
 
 
 def _new_place(shared: Path | None) -> Path:
@@ -339,6 +278,7 @@ def _new_place(shared: Path | None) -> Path:
         else:
             place = shared.absolute() / WORK_FOLDER / name
             place.parent.mkdir(parents=True, exist_ok=True)
+            _end_earlier_runs(place.parent)
         # Only its owner says what is run.
         place.mkdir(mode=0o700)
     except OSError as error:
@@ -346,31 +286,19 @@ def _new_place(shared: Path | None) -> Path:
     return place
 
 
-def _stop(place: Path) -> None:
-    with contextlib.suppress(OSError):
-        (place / STOP).touch()
+def _end_earlier_runs(folder: Path) -> None:
+    """Remove the folders of killed drivers, which ends what still works for them."""
+    for path in folder.glob(f"*/{WORK}"):
+        with contextlib.suppress(OSError), path.open("rb") as file:
+            # Raises where the driver lives.
+            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+            logger.info("The run in %s has no driver, and is ended.", path.parent)
+            path.unlink()
+            _remove(path.parent)
 
 
-def _leave(
-    place: Path, owner: int, *, is_new: bool, end_run: Callable[[str], None] | None
-) -> None:
-    # A forked child's copy; the run is its parent's.
-    if os.getpid() != owner:
-        return
-    _stop(place)
-    if end_run is not None:
-        end_run(str(place))
+def _remove(place: Path) -> None:
     shutil.rmtree(place, ignore_errors=True)
     if place.parent.name == WORK_FOLDER:
-        # What a run had to make goes with it, where nothing else is there.
         with contextlib.suppress(OSError):
             place.parent.rmdir()
-            if is_new:
-                place.parent.parent.rmdir()
-
-
-def _check_json(said: Mapping[str, Any], what: str) -> None:
-    try:
-        json.dumps(said)
-    except (TypeError, ValueError) as error:
-        raise InvalidArgument(f"{what} cannot be written as JSON: {error}.") from error

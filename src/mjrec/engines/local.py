@@ -3,8 +3,10 @@
 
 from __future__ import annotations
 
+import functools
 import queue
 import threading
+import weakref
 from collections.abc import Callable
 from concurrent.futures import Executor, Future
 from typing import Any
@@ -14,8 +16,6 @@ from ..gl.devices import visible_gpus
 from ..machine import usable_cpus
 from . import worker
 from .gpu_shares import GpuShare, check_worker_count
-
-_SECONDS_IDLE = 5.0
 
 
 class LocalEngine(Executor):
@@ -42,13 +42,10 @@ class LocalEngine(Executor):
     ) -> None:
         self.workers = check_worker_count(workers) or usable_cpus()
         self.share = GpuShare(each=gpus, required=require_gpu)
-        self.require_gpu = self.share.required if self.share.asked_for else None
         self._calls: queue.SimpleQueue[_Call | None] = queue.SimpleQueue()
-        # The numbers of the threads, and how many of them wait for a call.
-        self._seats: set[int] = set()
-        self._idle = 0
-        self._one_at_a_time = threading.Lock()
-        self._is_shut_down = False
+        self._threads = 0
+        # So that an engine that is forgotten leaves no threads.
+        self._end = weakref.finalize(self, self._calls.put, None)
 
     def __repr__(self) -> str:
         gpus = f", gpus={self.share.each:g}" if self.share.asked_for else ""
@@ -62,66 +59,42 @@ class LocalEngine(Executor):
         Raises:
             ClosedError: it was shut down.
         """
-        if self._is_shut_down:
+        if not self._end.alive:
             raise ClosedError("The engine was shut down.")
-        call = _Call(fn, args, kwargs)
-        with self._one_at_a_time:
-            self._calls.put(call)
-            if self._idle:
-                self._idle -= 1
-            elif len(self._seats) < self.workers:
-                seat = min({*range(self.workers)} - self._seats)
-                self._seats.add(seat)
-                # Daemons: a forgotten run must not hold up the interpreter's end.
-                threading.Thread(
-                    target=self._work,
-                    args=[seat],
-                    name=f"mjrec-worker-{seat}",
-                    daemon=True,
-                ).start()
-        return call.future
+        future: Future[Any] = Future()
+        self._calls.put((future, functools.partial(fn, *args, **kwargs)))
+        if self._threads < self.workers:
+            # Daemons: they must not hold up the interpreter's end. They know their
+            # queue only, which does not keep the engine.
+            threading.Thread(
+                target=_work,
+                args=[self._calls, self.share, self._threads],
+                name=f"mjrec-worker-{self._threads}",
+                daemon=True,
+            ).start()
+            self._threads += 1
+        return future
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
         """Take no more calls, and let the threads end. Idempotent."""
         del wait, cancel_futures
-        self._is_shut_down = True
-        for _ in range(self.workers):
-            self._calls.put(None)
+        self._end()
 
-    def _work(self, seat: int) -> None:
-        if self.share.asked_for:
-            worker.seat.gpus = self.share.of(seat, visible_gpus())
-        while True:
+
+_Call = tuple[Future[Any], Callable[[], Any]]
+
+
+def _work(calls: queue.SimpleQueue[_Call | None], share: GpuShare, number: int) -> None:
+    if share.asked_for:
+        worker.seat.gpus = share.of(number, visible_gpus())
+    while (call := calls.get()) is not None:
+        future, do = call
+        if future.set_running_or_notify_cancel():
             try:
-                call = self._calls.get(timeout=_SECONDS_IDLE)
-            except queue.Empty:
-                with self._one_at_a_time:
-                    if self._idle and self._calls.empty():
-                        # So that an engine is not kept by threads that wait for it.
-                        self._idle -= 1
-                        self._seats.remove(seat)
-                        return
-                continue
-            if call is None:
-                return
-            call.do()
-            # So that nothing of it lives on until the next one.
-            del call
-            with self._one_at_a_time:
-                self._idle += 1
-
-
-class _Call:
-    """A call, and its future."""
-
-    def __init__(self, fn: Callable[..., Any], args: Any, kwargs: Any) -> None:
-        self.future: Future[Any] = Future()
-        self._fn, self._args, self._kwargs = fn, args, kwargs
-
-    def do(self) -> None:
-        if not self.future.set_running_or_notify_cancel():
-            return
-        try:
-            self.future.set_result(self._fn(*self._args, **self._kwargs))
-        except BaseException as error:
-            self.future.set_exception(error)
+                future.set_result(do())
+            except BaseException as error:
+                future.set_exception(error)
+        # So that nothing of it lives on until the next one.
+        del call, future, do
+    # For the other threads.
+    calls.put(None)

@@ -30,9 +30,6 @@ from .gpu_shares import GpuShare, check_worker_count
 
 logger = logging.getLogger(__name__)
 
-_ADDRESS = "RAY_ADDRESS"
-_TOKEN = "RAY_AUTH_TOKEN"
-_TOKEN_PATH = "RAY_AUTH_TOKEN_PATH"
 # Ray starts with no less than 75 MiB; jobs and their outcomes need next to nothing.
 _SMALLEST_STORE = 80 << 20
 _SECONDS_TO_REACH = 10.0
@@ -68,7 +65,6 @@ class RayEngine(Executor):
         self.workers = check_worker_count(workers)
         self.address = address
         self.share = GpuShare(each=gpus, required=require_gpu)
-        self.require_gpu = self.share.required if self.share.asked_for else None
         self._ray = _import_ray()
         self._task: Any = None
         self._disconnect: weakref.finalize[Any, Any] | None = None
@@ -112,8 +108,14 @@ class RayEngine(Executor):
         if not self._ray.is_initialized():
             is_started = _connect(self._ray, self.address, self.workers)
             self._disconnect = weakref.finalize(self, _disconnect, self._ray)
-            if is_started and self.share.asked_for:
-                self._check_gpus()
+            # No worker shall wait for ever for a GPU that there is not.
+            has_gpus = self._ray.cluster_resources().get("GPU")
+            if is_started and self.share.asked_for and not has_gpus:
+                lack = "Workers are to get GPUs, and Ray finds none on this machine."
+                if self.share.required:
+                    raise GLError(f"{lack} `nvidia-smi -L` lists those that there are.")
+                logger.warning("%s They draw in software.", lack)
+                self.share = GpuShare()
         self._task = self._ray.remote(
             # A task that is lost is handed out again by its run, which says so.
             num_cpus=1,
@@ -121,27 +123,16 @@ class RayEngine(Executor):
             max_retries=0,
         )(_call)
 
-    def _check_gpus(self) -> None:
-        """See to it that no worker waits for ever for a GPU that there is not."""
-        if self._ray.cluster_resources().get("GPU"):
-            return
-        lack = "Workers are to get GPUs, and Ray finds none on this machine."
-        if self.share.required:
-            raise GLError(f"{lack} `nvidia-smi -L` lists those that there are.")
-        logger.warning("%s They draw in software.", lack)
-        self.share, self.require_gpu = GpuShare(), None
-
     def _begin(self) -> None:
         with self._one_at_a_time:
-            while self._waiting and (
-                self.workers is None or self._running < self.workers
-            ):
+            while self._waiting and self._running < (self.workers or float("inf")):
                 future, call = self._waiting.popleft()
-                if not future.set_running_or_notify_cancel():
-                    continue
-                self._running += 1
-                theirs = self._task.remote(mjrec.__version__, *call).future()
-                theirs.add_done_callback(lambda done, to=future: self._end(done, to))
+                if future.set_running_or_notify_cancel():
+                    self._running += 1
+                    theirs = self._task.remote(mjrec.__version__, *call).future()
+                    theirs.add_done_callback(
+                        lambda done, to=future: self._end(done, to)
+                    )
 
     def _end(self, done: Future[Any], future: Future[Any]) -> None:
         with self._one_at_a_time:
@@ -192,15 +183,15 @@ def _disconnect(ray: Any) -> None:
 
 def _connect(ray: Any, address: str | None, cpus: int | None) -> bool:
     """Connect to Ray, and return whether it had to be started."""
-    address = address or os.environ.get(_ADDRESS) or None
-    if address is not None and address.startswith("ray://"):
+    address = address or os.environ.get("RAY_ADDRESS") or "local"
+    if address.startswith("ray://"):
         raise InvalidArgument(
             f"{address} is an address for Ray's client, with which workers cannot be "
             "watched. Start mjrec on a machine of the cluster, with --address auto."
         )
     try:
         with _signals_as_they_are():
-            if address is None or address == "local":
+            if address == "local":
                 _start(ray, cpus or usable_cpus())
                 return True
             _check_reachable(address)
@@ -210,7 +201,16 @@ def _connect(ray: Any, address: str | None, cpus: int | None) -> bool:
     except Exception as error:
         with contextlib.suppress(Exception):
             ray.shutdown()
-        raise Error(_why_not(address, error)) from error
+        told = " ".join(str(error).split()) or type(error).__name__
+        if address == "local":
+            why = f"Ray could not be started on this machine: {told}"
+        else:
+            why = (
+                f"There is no Ray cluster to be had at {address}. It must be running "
+                "(ray status), be reached from here, and have the same versions of Ray "
+                f"and Python. Ray says: {told}"
+            )
+        raise Error(why) from error
 
 
 def _check_reachable(address: str) -> None:
@@ -225,19 +225,20 @@ def _check_reachable(address: str) -> None:
         socket.create_connection((host, int(port)), _SECONDS_TO_REACH).close()
 
 
-def _why_not(address: str | None, error: Exception) -> str:
-    told = " ".join(str(error).split()) or type(error).__name__
-    if address is None or address == "local":
-        return f"Ray could not be started on this machine: {told}"
-    return (
-        f"There is no Ray cluster to be had at {address}. It must be running "
-        "(ray status), be reached from here, and have the same versions of Ray and "
-        f"Python. Ray says: {told}"
-    )
-
-
 def _start(ray: Any, cpus: int) -> None:
-    with _environment(_private_environment()):
+    environ = {
+        "RAY_USAGE_STATS_ENABLED": "0",
+        # Workers that were given no GPU see what they would without Ray.
+        "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",
+    }
+    is_token_known = (
+        {"RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH"}
+        & {*filter(os.environ.get, os.environ)}
+    ) or (Path.home() / ".ray" / "auth_token").exists()
+    if not is_token_known:
+        # Else it would write one into the home, and leave it there.
+        environ["RAY_AUTH_TOKEN"] = secrets.token_hex(32)
+    with _environment(environ):
         ray.init(
             address="local",
             num_cpus=cpus,
@@ -245,26 +246,6 @@ def _start(ray: Any, cpus: int) -> None:
             object_store_memory=_SMALLEST_STORE,
             logging_level=logging.ERROR,
         )
-
-
-def _private_environment() -> dict[str, str]:
-    """Return what a Ray of ours is started with."""
-    environ = {
-        "RAY_USAGE_STATS_ENABLED": "0",
-        # Workers that were given no GPU see what they would without Ray.
-        "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",
-        # Processes of jobs end by themselves, when they have closed their files.
-        "RAY_kill_child_processes_on_worker_exit": "0",
-    }
-    known = (
-        os.environ.get(_TOKEN)
-        or os.environ.get(_TOKEN_PATH)
-        or (Path.home() / ".ray" / "auth_token").exists()
-    )
-    if not known:
-        # Else it would write one into the home, and leave it there.
-        environ[_TOKEN] = secrets.token_hex(32)
-    return environ
 
 
 @contextlib.contextmanager

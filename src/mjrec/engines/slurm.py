@@ -1,30 +1,78 @@
 # SPDX-License-Identifier: Apache-2.0
 """Jobs on a Slurm cluster: arrays of Slurm jobs, and each does some of ours.
 
-The outcomes of a run are files in its folder, which all machines see, so that nothing
+The outcomes are files in the run's folder, which all machines see, so that nothing
 depends on one Slurm job's life: a job that Slurm begins again does what it has not
-done, and what an array has left undone is submitted once more.
+done, and what an array has left undone is submitted once more. In that folder::
+
+    slurm/outcomes/17.json   what `worker.do_job` returned of job 17
+    slurm/logs/              what the Slurm jobs print, and submitit's own files
+
+`submitit` writes the scripts and submits them. What became of a Slurm job is asked of
+`squeue`, which every cluster has; submitit asks `sacct`, which needs a database that
+not every cluster keeps, and only every ten minutes.
 """
 
 from __future__ import annotations
 
+import contextlib
+import inspect
+import itertools
+import json
+import logging
 import math
-from collections.abc import Callable, Mapping, Sequence
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, Future
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Self
+from types import ModuleType
+from typing import Any
 
-from ..errors import ClosedError, InvalidArgument, UnknownName
+from ..atomic_files import write_text
+from ..errors import ClosedError, Error, InvalidArgument, MissingDependency, UnknownName
 from ..machine import usable_cpus
 from .gpu_shares import GpuShare, check_worker_count
-from .slurm_arrays import ArrayRun
-from .slurm_cluster import Cluster
-from .worker import do_job
+from .local import LocalEngine
+from .worker import do_job, end_idle_children
+
+logger = logging.getLogger(__name__)
 
 # What a cluster would grant is not known before; four are what nobody minds.
 DEFAULT_WORKERS = 4
 
+_CLUSTERS = ("slurm", "local")
+_COMMANDS = ("sbatch", "squeue", "scancel", "srun")
 _SBATCH = "sbatch."
+# So that the last jobs of an array end at about the same time.
+_ELEMENTS_PER_WORKER = 4
+_SECONDS_BETWEEN_LOOKS = 0.2
+_SECONDS_BETWEEN_QUESTIONS = 10.0
+_SECONDS_FOR_COMMAND = 60.0
+_SECONDS_WITHOUT_START = 60.0
+_SECONDS_TO_END = 15.0
+_END_OF_LOG = 2000
+_NOT_OVER = frozenset(
+    {"PENDING", "REQUEUED", "REQUEUE_HOLD", "REQUEUE_FED", "SPECIAL_EXIT"}
+    | {"RESV_DEL_HOLD", "RUNNING", "COMPLETING", "CONFIGURING", "RESIZING"}
+    | {"SIGNALING", "STAGE_OUT", "STOPPED", "SUSPENDED"}
+)
+
+
+@dataclass(frozen=True, eq=False)
+class _Task:
+    """A job of a run, and its future."""
+
+    number: int
+    place: Path
+    job: Mapping[str, Any]
+    future: Future[Any]
 
 
 class SlurmEngine(Executor):
@@ -79,106 +127,63 @@ class SlurmEngine(Executor):
         setup: Sequence[str] = (),
         sbatch: Mapping[str, str | int | bool] | None = None,
     ) -> None:
-        given = check_worker_count(workers)
+        check_worker_count(cpus_per_worker, "cpus_per_worker")
+        check_worker_count(time_min, "time_min")
+        check_worker_count(workers_per_job, "workers_per_job")
         self.share = GpuShare(each=gpus, required=require_gpu)
-        self.require_gpu = self.share.required if self.share.asked_for else None
-        _check_whole("cpus_per_worker", cpus_per_worker)
-        _check_whole("time_min", time_min)
-        if workers_per_job is not None:
-            _check_whole("workers_per_job", workers_per_job)
         if mem_gb is not None and not mem_gb > 0:
             raise InvalidArgument(f"mem_gb is more than 0, got {mem_gb!r}.")
-        if notice_s is None:
-            notice_s = min(120.0, 60 * time_min / 4)
-        if not 0 <= notice_s < 60 * time_min:
+        notice = min(120.0, 60 * time_min / 4) if notice_s is None else notice_s
+        if not 0 <= notice < 60 * time_min:
             raise InvalidArgument(
                 f"notice_s is less than the time limit of {time_min} minutes (time_min)"
                 f", in seconds, got {notice_s!r}."
             )
-        is_local = cluster == "local"
-        self.workers = given or (usable_cpus() if is_local else DEFAULT_WORKERS)
-        per_job = min(workers_per_job or _sharing(self.share), self.workers)
+        self._cluster = cluster or "slurm"
+        self._submitit = _submitit(self._cluster)
+        default = usable_cpus() if cluster == "local" else DEFAULT_WORKERS
+        self.workers = check_worker_count(workers) or default
+        per_job = min(workers_per_job or self.share.sharing, self.workers)
+        cpus = cpus_per_worker * per_job
+        others = {k.replace("-", "_"): v for k, v in (sbatch or {}).items()}
+        names_gpus = any(name.startswith(("gpu", "gres")) for name in others)
         self._per_job = per_job
         self._most_jobs = math.ceil(self.workers / per_job)
-        gpus_per_job = math.ceil(self.share.each * per_job - 1e-9)
-        if is_local:
-            parameters: dict[str, Any] = {
-                "timeout_min": time_min,
-                "signal_delay_s": math.ceil(notice_s),
-                "gpus_per_node": gpus_per_job,
-                "setup": list(setup),
-            }
-        else:
-            others = {k.replace("-", "_"): v for k, v in (sbatch or {}).items()}
-            cpus = cpus_per_worker * per_job
-            memory = None if mem_gb is None else math.ceil(1024 * mem_gb * per_job)
-            asked = {
-                "job_name": "mjrec",
-                "time": time_min,
-                "cpus_per_task": cpus,
-                "mem": memory and f"{memory}M",
-                "partition": partition,
-                "account": account,
-                "qos": qos,
-                "constraint": constraint,
-                "signal_delay_s": math.ceil(notice_s),
-                "array_parallelism": self._most_jobs,
-                "setup": list(setup) or None,
-                # Since Slurm 22.05 a step does not get the job's CPUs by itself.
-                "srun_args": [f"--cpus-per-task={cpus}"],
-                "gpus_per_node": gpus_per_job or None,
-            }
-            if any(name.startswith(("gpu", "gres")) for name in others):
-                asked["gpus_per_node"] = None
-            parameters = {k: v for k, v in asked.items() if v is not None}
-            parameters["additional_parameters"] = others
-        self._cluster = Cluster(cluster or "slurm", parameters)
-        self._runs: dict[str, ArrayRun] = {}
+        self._parameters = {
+            "name": "mjrec",
+            "timeout_min": time_min,
+            "cpus_per_task": cpus,
+            "mem_gb": mem_gb and mem_gb * per_job,
+            "gpus_per_node": None
+            if names_gpus
+            else math.ceil(gpus * per_job - 1e-9) or None,
+            "slurm_partition": partition,
+            "slurm_account": account,
+            "slurm_qos": qos,
+            "slurm_constraint": constraint,
+            "slurm_signal_delay_s": math.ceil(notice),
+            "slurm_array_parallelism": self._most_jobs,
+            "slurm_setup": list(setup) or None,
+            "local_setup": list(setup),
+            # Since Slurm 22.05 a step does not get the job's CPUs by itself.
+            "slurm_srun_args": [f"--cpus-per-task={cpus}"],
+            "slurm_additional_parameters": others,
+        }
+        self._numbers = itertools.count()
+        self._waiting: list[_Task] = []
+        # By the Slurm job that does them.
+        self._elements: dict[str, list[_Task]] = {}
+        # Those of `cluster="local"`.
+        self._processes: dict[str, Any] = {}
+        self._last_added = self._last_asked = -math.inf
+        self._last_progress = 0.0
+        self._one_at_a_time = threading.Lock()
+        self._thread: threading.Thread | None = None
         self._is_shut_down = False
-
-    @classmethod
-    def from_texts(
-        cls,
-        options: Mapping[str, str],
-        *,
-        workers: int | None = None,
-        gpus: float = 0.0,
-        require_gpu: bool = False,
-    ) -> Self:
-        """Return an engine from options as the command line has them.
-
-        Args:
-            options: parameters of the class by name, as texts; `sbatch.NAME` is an
-                option of `sbatch`, and `setup` one line.
-            workers: as of the class.
-            gpus: likewise.
-            require_gpu: likewise.
-
-        Raises:
-            UnknownName: there is no such option.
-            InvalidArgument: one of them cannot be.
-            MissingDependency: submitit is not installed.
-            Error: this machine has no commands of Slurm's.
-        """
-        known: dict[str, Any] = {}
-        sbatch: dict[str, str | int | bool] = {}
-        for name, text in options.items():
-            if name.startswith(_SBATCH):
-                sbatch[name.removeprefix(_SBATCH)] = text or True
-            elif name in _FROM_TEXT:
-                known[name] = _value_of(name, text)
-            else:
-                raise UnknownName(
-                    "option of Slurm's",
-                    name,
-                    [*_FROM_TEXT, f"{_SBATCH}NAME"],
-                    hint=f"Any other option of sbatch is {_SBATCH}NAME=VALUE.",
-                )
-        return cls(workers, gpus=gpus, require_gpu=require_gpu, sbatch=sbatch, **known)
 
     def __repr__(self) -> str:
         gpus = f", gpus={self.share.each:g}" if self.share.asked_for else ""
-        where = ", cluster='local'" if self._cluster.name == "local" else ""
+        where = ", cluster='local'" if self._cluster == "local" else ""
         return f"SlurmEngine(workers={self.workers}{where}{gpus})"
 
     def submit(
@@ -192,69 +197,323 @@ class SlurmEngine(Executor):
         """
         if self._is_shut_down:
             raise ClosedError("The engine was shut down.")
-        if fn is not do_job or len(args) != 1 or kwargs:
+        if fn is not do_job:
             raise InvalidArgument(
                 "SlurmEngine does only jobs of mjrec, whose outcomes are files. For "
                 "other functions use an executor of submitit's."
             )
-        [message] = args
-        place = message["work"]["place"]
-        if place not in self._runs:
-            self._runs[place] = ArrayRun(
-                self._cluster,
-                Path(place),
-                most=self._most_jobs,
-                workers=self._per_job,
-                share=self.share,
-            )
-        future: Future[Any] = Future()
-        self._runs[place].add(message, future)
-        return future
+        place, job = args
+        task = _Task(next(self._numbers), Path(place, "slurm"), job, Future())
+        with self._one_at_a_time:
+            self._waiting.append(task)
+            self._last_added = time.monotonic()
+            if self._thread is None:
+                self._last_progress = time.monotonic()
+                self._thread = threading.Thread(
+                    target=self._follow, name="mjrec-slurm", daemon=True
+                )
+                self._thread.start()
+        return task.future
 
     def end_run(self, place: str) -> None:
         """End the Slurm jobs of a run, and wait until they have ended. Idempotent."""
-        run = self._runs.pop(place, None)
-        if run is not None:
-            run.cancel()
+        with self._one_at_a_time:
+            self._waiting = [t for t in self._waiting if t.place.parent != Path(place)]
+            ending = {
+                job
+                for job, tasks in self._elements.items()
+                if tasks[0].place.parent == Path(place)
+            }
+            if ending and self._cluster == "slurm":
+                _command("scancel", "--quiet", *sorted(ending))
+            deadline = time.monotonic() + _SECONDS_TO_END
+            # Where Slurm does not answer, the deadline ends this. What stands in for
+            # Slurm jobs ends by itself.
+            while ending and time.monotonic() < deadline:
+                states = self._states(ending)
+                ending -= {job for job in states if states[job][0] not in _NOT_OVER}
+                time.sleep(_SECONDS_BETWEEN_LOOKS)
+            self._elements = {
+                job: tasks
+                for job, tasks in self._elements.items()
+                if tasks[0].place.parent != Path(place)
+            }
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        """Take no more jobs, and end those that run. Idempotent."""
+        """Take no more jobs. Idempotent."""
         del wait, cancel_futures
         self._is_shut_down = True
-        for place in [*self._runs]:
-            self.end_run(place)
 
+    def _follow(self) -> None:
+        """Submit jobs and look for their outcomes, as long as there are any."""
+        while True:
+            time.sleep(_SECONDS_BETWEEN_LOOKS)
+            with self._one_at_a_time:
+                if not (self._waiting or self._elements):
+                    self._thread = None
+                    return
+                try:
+                    self._submit_waiting()
+                    self._take_outcomes()
+                    self._ask()
+                except Exception as error:
+                    tasks = [*self._waiting, *itertools.chain(*self._elements.values())]
+                    self._waiting.clear()
+                    self._elements.clear()
+                    for task in tasks:
+                        if not task.future.done():
+                            task.future.set_exception(error)
 
-def _sharing(share: GpuShare) -> int:
-    return max(1, math.floor(1 / share.each + 1e-9)) if share.asked_for else 1
+    def _submit_waiting(self) -> None:
+        now = time.monotonic()
+        free = self._most_jobs - len(self._elements)
+        # Those that come at once share an array.
+        is_whole = now - self._last_added > _SECONDS_BETWEEN_LOOKS
+        if not self._waiting or not is_whole or free <= 0:
+            return
+        # With nothing running the cluster keeps the limit itself, array by array.
+        most = free if self._elements else self._most_jobs * _ELEMENTS_PER_WORKER
+        place = self._waiting[0].place
+        tasks = [task for task in self._waiting if task.place == place]
+        self._waiting = [task for task in self._waiting if task.place != place]
+        count = min(len(tasks), most)
+        shares = [tasks[first::count] for first in range(count)]
+        (place / "outcomes").mkdir(parents=True, exist_ok=True)
+        executor = self._submitit.AutoExecutor(place / "logs", cluster=self._cluster)
+        executor.update_parameters(**self._parameters)
+        do = ArrayElement(place, self._per_job, self.share)
+        each = [{task.number: dict(task.job) for task in share} for share in shares]
+        try:
+            with _as_from_outside():
+                jobs = executor.map_array(do, each)
+        except (OSError, RuntimeError, subprocess.SubprocessError) as error:
+            said = " ".join(str(error).split())
+            raise Error(f"No job could be submitted: {said}") from error
+        for job, share in zip(jobs, shares, strict=True):
+            self._elements[job.job_id] = share
+            self._processes[job.job_id] = job
 
+    def _take_outcomes(self) -> None:
+        for place in {tasks[0].place for tasks in self._elements.values()}:
+            done = {path.stem: path for path in (place / "outcomes").glob("*.json")}
+            for tasks in self._elements.values():
+                for task in tasks:
+                    if str(task.number) in done and not task.future.done():
+                        self._last_progress = time.monotonic()
+                        _resolve(task, json.loads(done[str(task.number)].read_bytes()))
 
-def _check_whole(name: str, value: object) -> None:
-    if not isinstance(value, int) or isinstance(value, bool) or value < 1:
-        raise InvalidArgument(
-            f"{name} must be a whole number of at least 1, got {value!r}."
+    def _ask(self) -> None:
+        """See what became of Slurm jobs."""
+        now = time.monotonic()
+        is_local = self._cluster == "local"
+        if not is_local and now - self._last_asked < _SECONDS_BETWEEN_QUESTIONS:
+            return
+        self._last_asked = now
+        states = self._states(self._elements)
+        over = {job for job, (state, _) in states.items() if state not in _NOT_OVER}
+        if over:
+            # What they have done before their end.
+            self._take_outcomes()
+        for job in over:
+            for task in self._elements.pop(job):
+                how = (
+                    f"was in the Slurm job {job}, which ended ({states[job][0]}). The "
+                    f"end of what that said: {_end_of_log(task.place, job)}"
+                )
+                _resolve(task, {"died": how, "begun": True})
+        if states and now - self._last_progress > _SECONDS_WITHOUT_START:
+            self._last_progress = now
+            if {state for state, _ in states.values()} == {"PENDING"}:
+                reasons = {reason for _, reason in states.values() if reason}
+                logger.warning(
+                    "%d Slurm jobs have waited for a minute. Slurm's reason: %s.",
+                    len(states),
+                    ", ".join(sorted(reasons)) or "none",
+                )
+
+    def _states(self, jobs: Collection[str]) -> dict[str, tuple[str, str]]:
+        """Return states and reasons of Slurm jobs; nothing where there is no answer."""
+        if self._cluster == "local":
+            return {job: (self._processes[job].state, "") for job in jobs}
+        if not jobs:
+            return {}
+        of_arrays = sorted({job.partition("_")[0] for job in jobs})
+        asked = _command(
+            *("squeue", "--noheader", "--array", "--states=all"),
+            *("--format=%i|%T|%r", f"--jobs={','.join(of_arrays)}"),
         )
+        if asked is None or (asked.returncode and "Invalid job id" not in asked.stderr):
+            return {}
+        states = dict.fromkeys(jobs, ("GONE", ""))
+        for line in asked.stdout.splitlines():
+            job, state, reason = line.strip().split("|", 2)
+            if job in states:
+                states[job] = state, reason
+        return states
 
 
-_FROM_TEXT: Mapping[str, Callable[[str], Any]] = {
-    "cluster": str,
-    "cpus_per_worker": int,
-    "workers_per_job": int,
-    "partition": str,
-    "account": str,
-    "qos": str,
-    "constraint": str,
-    "time_min": int,
-    "notice_s": float,
-    "mem_gb": float,
-    "setup": lambda line: (line,),
-}
+# In a Slurm job: it was told to end.
+_is_ending = threading.Event()
 
 
-def _value_of(name: str, text: str) -> Any:
-    try:
-        return _FROM_TEXT[name](text)
-    except ValueError as error:
+@dataclass
+class ArrayElement:
+    """What submitit runs in a Slurm job, and puts back into Slurm's queue.
+
+    Attributes:
+        place: `slurm` in the run's folder.
+        workers: how many do the jobs at once.
+        share: what each gets of the Slurm job's GPUs.
+    """
+
+    place: Path
+    workers: int
+    share: GpuShare
+
+    def __call__(self, jobs: Mapping[int, Mapping[str, Any]]) -> None:
+        """Do jobs, by their numbers, as far as they are not done."""
+        # submitit takes no notice of it.
+        signal.signal(signal.SIGTERM, lambda *_: _is_ending.set())
+        run = str(self.place.parent)
+
+        def do(number: int) -> None:
+            path = self.place / "outcomes" / f"{number}.json"
+            if path.exists() or _is_ending.is_set():
+                return
+            said = do_job(run, jobs[number])
+            # A child that was told to end with this process is no job's fault.
+            if "died" not in said or not _is_ending.wait(_SECONDS_BETWEEN_LOOKS):
+                with contextlib.suppress(Error):
+                    write_text(path, json.dumps(said))
+
+        with LocalEngine(self.workers, gpus=self.share.each) as engine:
+            for future in [engine.submit(do, number) for number in jobs]:
+                future.result()
+        end_idle_children(run)
+
+    def checkpoint(self, jobs: Mapping[int, Mapping[str, Any]]) -> Any:
+        """Return what goes on after the job's time limit, or its preemption."""
+        _is_ending.set()
+        return _submitit("local").helpers.DelayedSubmission(self, jobs)
+
+
+def slurm_options(texts: Mapping[str, str]) -> dict[str, Any]:
+    """Return parameters of `SlurmEngine` from options as the command line has them.
+
+    Args:
+        texts: parameters by name; `sbatch.NAME` is an option of `sbatch`, and `setup`
+            one line.
+
+    Raises:
+        UnknownName: there is no such option.
+        InvalidArgument: one is no number.
+    """
+    options: dict[str, Any] = {}
+    sbatch: dict[str, str | bool] = {}
+    kinds = inspect.signature(SlurmEngine).parameters
+    known = [name for name in kinds if name not in _ELSEWHERE]
+    for name, text in texts.items():
+        if name.startswith(_SBATCH):
+            sbatch[name.removeprefix(_SBATCH)] = text or True
+        elif name not in known:
+            raise UnknownName(
+                "option of Slurm's",
+                name,
+                [*known, f"{_SBATCH}NAME"],
+                hint=f"Any other option of sbatch is {_SBATCH}NAME=VALUE.",
+            )
+        elif name == "setup":
+            options[name] = (text,)
+        else:
+            kind = str(kinds[name].annotation).partition(" ")[0]
+            try:
+                options[name] = {"int": int, "float": float, "str": str}[kind](text)
+            except ValueError as error:
+                raise InvalidArgument(
+                    f"The option {name} of Slurm's is a number, got {text!r}."
+                ) from error
+    return {**options, "sbatch": sbatch}
+
+
+# What the command line has options of its own for.
+_ELSEWHERE = ("workers", "gpus", "require_gpu", "sbatch")
+
+
+def _resolve(task: _Task, said: Any) -> None:
+    if not task.future.done() and task.future.set_running_or_notify_cancel():
+        task.future.set_result(said)
+
+
+def _end_of_log(place: Path, job: str) -> str:
+    said = b""
+    for path in (place / "logs").glob(f"{job}_*log.err"):
+        with contextlib.suppress(OSError):
+            said = path.read_bytes()[-_END_OF_LOG:]
+    return said.decode(errors="replace").strip() or "(nothing)"
+
+
+def _submitit(cluster: str) -> ModuleType:
+    if cluster not in _CLUSTERS:
         raise InvalidArgument(
-            f"The option {name} of Slurm's is a number, got {text!r}."
+            f"cluster is {' or '.join(map(repr, _CLUSTERS))}, got {cluster!r}."
+        )
+    # Else it would configure the process's logging, and close handlers on the way.
+    # Slurm jobs do not inherit it, and have submitit's words in their logs.
+    before = os.environ.get("SUBMITIT_LOG_LEVEL")
+    if "submitit" not in sys.modules and before is None:
+        os.environ["SUBMITIT_LOG_LEVEL"] = "NOCONFIG"
+    try:
+        # Optional, and not quick to import.
+        import submitit
+    except ImportError as error:
+        raise MissingDependency(
+            "submitit", purpose='engine="slurm"', install='pip install "mjrec[slurm]"'
         ) from error
+    finally:
+        if before is None:
+            os.environ.pop("SUBMITIT_LOG_LEVEL", None)
+    missing = [command for command in _COMMANDS if shutil.which(command) is None]
+    if cluster == "slurm" and missing:
+        raise Error(
+            f"This machine has no {', '.join(missing)} on its PATH, with which "
+            "jobs of a Slurm cluster are submitted and looked after. Run mjrec "
+            "where Slurm's commands are: on the cluster's login node, or in a "
+            'Slurm job. cluster="local" (--engine-option cluster=local) tries it '
+            "out with processes of this machine."
+        )
+    return submitit
+
+
+@contextlib.contextmanager
+def _as_from_outside() -> Iterator[None]:
+    """Submit from inside a Slurm job as from outside.
+
+    What that job was given (its CPUs, its memory) would be taken for what is asked for.
+    """
+    inside = "SLURM_JOB_ID" in os.environ
+    hidden = {
+        name: os.environ.pop(name)
+        for name in [*os.environ]
+        # Where the cluster is stays as it is.
+        if inside and name != "SLURM_CONF"
+        if name.startswith(("SLURM_", "SLURMD_", "SRUN_"))
+    }
+    try:
+        yield
+    finally:
+        os.environ.update(hidden)
+
+
+def _command(*words: str) -> subprocess.CompletedProcess[str] | None:
+    """Run a command of Slurm's; return nothing if it does not answer."""
+    try:
+        return subprocess.run(
+            words,
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            text=True,
+            timeout=_SECONDS_FOR_COMMAND,
+            check=False,
+        )
+    except (OSError, subprocess.TimeoutExpired):
+        return None

@@ -250,7 +250,7 @@ def picture_moment(drawn: Any) -> Callable[[Callable[[], None]], None] | None:
     ):
         return None
     # Loaded where there is a simulation, and so mujoco, already.
-    from ..simulation.replay import PreservedState
+    from ..simulation.states import PreservedState
 
     simulation = PreservedState()
 

@@ -14,6 +14,7 @@ import os
 import re
 import sys
 from collections.abc import Iterable, Sequence
+from types import FrameType
 from typing import Any
 
 from ..child_python import Child
@@ -141,21 +142,48 @@ def _main(arguments: Sequence[str]) -> None:
 def _names(framework: str, what: str) -> list[str]:
     if framework == _SUITE:
         return _suite_names(what)
-    from gymnasium.envs.registration import registry
+    from gymnasium.envs import registration
 
     if not what:
-        return list(registry)
-    before = dict(registry)
+        return list(registration.registry)
     # The working directory may hold it, as it may hold a policy.
     sys.path.append(os.getcwd())  # noqa: PTH109  sys.path holds texts
-    importlib.import_module(what)
+    found = _ids_registered_by(what)
+    # Gymnasium itself has loaded its own before.
+    below = (f"{what}.", f"{what}:")
     return [
         env_id
-        for env_id, spec in registry.items()
-        # Gymnasium itself may have loaded it before.
-        if before.get(env_id) is not spec
-        or f"{spec.entry_point}".startswith((f"{what}.", f"{what}:"))
+        for env_id, spec in registration.registry.items()
+        if env_id in found or f"{spec.entry_point}".startswith(below)
     ]
+
+
+def _ids_registered_by(module: str) -> set[str]:
+    """Import a module, and return the ids that it registers, and no other module."""
+    import gymnasium
+    from gymnasium.envs import registration
+
+    registered: set[str] = set()
+    register = registration.register
+
+    def noting(*args: Any, **kwargs: Any) -> None:
+        before = dict(registration.registry)
+        register(*args, **kwargs)
+        # A module that imports another one has not registered what that one does.
+        if f"{_module_being_imported()}.".startswith(f"{module}."):
+            after = registration.registry.items()
+            registered.update(key for key, spec in after if before.get(key) is not spec)
+
+    gymnasium.register = registration.register = noting
+    importlib.import_module(module)
+    return registered
+
+
+def _module_being_imported() -> str:
+    frame: FrameType | None = sys._getframe()
+    while frame is not None and frame.f_code.co_name != "<module>":
+        frame = frame.f_back
+    return "" if frame is None else str(frame.f_globals.get("__name__"))
 
 
 def _suite_names(tag: str) -> list[str]:

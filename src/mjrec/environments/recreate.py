@@ -155,7 +155,7 @@ class Recreated:
         # They load MuJoCo.
         import mujoco
 
-        from ..simulation.replay import set_state
+        from ..simulation.states import set_state
 
         simulated = simulation_below(self.environment)
         model, data = simulated.model, simulated.data

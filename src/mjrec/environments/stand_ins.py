@@ -85,6 +85,7 @@ def stand_ins(
     Returns:
         The outermost, and the one that is to be told of the steps.
     """
+    around: Any = env
     first: StandIn | None = None
     for name, given in reversed(list(zip(names, arguments, strict=True))):
         module, _, qualified = name.rpartition(".")
@@ -92,11 +93,9 @@ def stand_ins(
         if given is not None:
             bases = (*bases, RecordConstructorArgs)
         # A recording says the name of its class, which is compared.
-        kind = type(qualified, bases, {"__module__": module})
-        env = kind(env)
+        around = type(qualified, bases, {"__module__": module})(around)
         if given is not None:
-            env._saved_kwargs = dict(given)
-        if isinstance(env, StandIn):
-            first = env
+            around._saved_kwargs = dict(given)
+        first = first or around
     assert first is not None, "there are names"
-    return env, first
+    return around, first

@@ -17,7 +17,7 @@ A monitor that closes says so in its journal. Where neither that nor an end foll
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -25,9 +25,10 @@ from typing import Any
 from ..formats.journal import JournalEntry, JournalReader
 from ..formats.json_fields import field as field_of
 from ..formats.json_fields import integer, mapping, number, optional, text, unreadable
-from ..formats.monitor_directory import infix_of
+from ..formats.monitor_directory import infix_of, monitor_directories_in
 from .episode_results import EpisodeResult
 from .plan import Unit
+from .plan_file import read_plan
 
 _JOURNALS = "openaigym.episodes.*.jsonl"
 
@@ -63,6 +64,26 @@ def read_chunk(folder: Path, task: str) -> ChunkResults:
     for unit in found.results:
         del found.deaths[unit]
     return found
+
+
+def recorded_results(directory: Path) -> Iterator[tuple[Path, EpisodeResult]]:
+    """Yield the episodes of an evaluation that are over, with their directories.
+
+    They are in the order of the plan, also where it is not finished.
+
+    Raises:
+        UnreadableFile: the plan, or a journal, cannot be read.
+    """
+    plan = read_plan(directory)
+    for task in plan.tasks:
+        found: list[tuple[Path, EpisodeResult]] = []
+        top = directory / task.folder
+        for folder in [top, *monitor_directories_in(top)] if top.is_dir() else []:
+            results = read_chunk(folder, task.name).results
+            found += ((folder, result) for result in results.values())
+        place = {seed: index for index, seed in enumerate(plan.seeds)}
+        found.sort(key=lambda each: (place.get(each[1].seed, 0), each[1].episode))
+        yield from found
 
 
 def _read(path: Path, task: str, found: ChunkResults) -> None:

@@ -432,19 +432,14 @@ def _clear(directory: Path) -> None:
 @contextlib.contextmanager
 def _held(directory: Path) -> Iterator[None]:
     """Keep other evaluations out of the directory."""
-    try:
-        lock = try_lock(directory / _LOCK_NAME, f"{os.getpid()}\n")
-    except OSError as error:
-        raise DirectoryNotWritable(directory, error.strerror) from error
+    lock = try_lock(directory / _LOCK_NAME)
     if lock is None:
         raise DirectoryInUse(
             f"Another evaluation writes into {directory}. Wait for its end, or use "
             "another directory."
         )
-    try:
+    with lock:
         yield
-    finally:
-        lock.release()
 
 
 def _evaluation_of(

@@ -16,12 +16,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from ..engines.jobs import Job, JobOutcome, Run
+from ..engines.jobs import JobOutcome, Run
 from ..errors import EnvironmentNotMade, Error
 from ..formats.monitor_directory import Infix
 from ..messages import unpacked
 from ..rendering.engine_jobs import result_of
-from ..rendering.finish import bring_up_to_date, do_jobs
+from ..rendering.finish import bring_up_to_date
+from ..rendering.finisher import do_jobs
 from ..rendering.jobs import Progress, RecordingKey, RenderedVideos, VideoJob
 from ..simulation.model_trust import note_models
 from .choosing import write_choice
@@ -124,7 +125,7 @@ def check_tasks(
     """
     names = {f"check/{task.folder}": task.name for task in tasks}
     for key, name in names.items():
-        run.submit(Job(key=key, arguments={"kind": "check", "task": name}))
+        run.submit(key, kind="check", task=name)
     checked: dict[str, Mapping[str, Any]] = {}
     for outcome in run.results():
         # Without patience there is always one.
@@ -232,8 +233,7 @@ class Runner:
         key = f"run/{folder}/{each.rounds}"
         self._by_key[key] = of, each
         chunk = dataclasses.asdict(each.chunk)
-        arguments = {"kind": "run", "task": of.task.name, "folder": folder}
-        self._run.submit(Job(key=key, arguments={**arguments, "chunk": chunk}))
+        self._run.submit(key, kind="run", task=of.task.name, folder=folder, chunk=chunk)
 
     def _take_chunk(self, outcome: JobOutcome) -> None:
         of, each = self._by_key.pop(outcome.key)
@@ -268,9 +268,13 @@ class Runner:
                 key = f"draw/{video.path.relative_to(self._directory)}"
                 self._videos[key] = video
                 folder = str(video.folder.relative_to(self._directory))
-                arguments = {"kind": "draw", "folder": folder, "models": video.models}
-                recording = {"recording": video.key.told_name}
-                self._run.submit(Job(key=key, arguments={**arguments, **recording}))
+                self._run.submit(
+                    key,
+                    kind="draw",
+                    folder=folder,
+                    models=video.models,
+                    recording=video.key.told_name,
+                )
         if all(each.results for each in self.tasks):
             self._on_results(self.tasks)
 

@@ -107,17 +107,13 @@ class EvaluationWorker:
         folder = self._directory / arguments["folder"]
         try:
             folder.mkdir(parents=True, exist_ok=True)
-            # That of a run whose driver was killed may be at it still.
-            lock = wait_for_lock(folder / _LOCK, f"{os.getpid()}\n")
         except OSError as error:
             raise DirectoryNotWritable(folder, error.strerror) from error
-        try:
+        # That of a run whose driver was killed may be at it still.
+        with wait_for_lock(folder / _LOCK), noting_models() as models:
             recover(folder)
-            with noting_models() as models:
-                chunk = from_json(Chunk, arguments["chunk"])
-                self._evaluator.complete(arguments["task"], folder, chunk)
-        finally:
-            lock.release()
+            chunk = from_json(Chunk, arguments["chunk"])
+            self._evaluator.complete(arguments["task"], folder, chunk)
         return {"models": list(dict.fromkeys(models))}
 
     def _draw(self, arguments: Mapping[str, Any]) -> dict[str, Any]:

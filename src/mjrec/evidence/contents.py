@@ -41,7 +41,7 @@ from ..formats.monitor_directory import (
     where_recordings_are,
 )
 from ..formats.regular_files import regular_path
-from ..rendering.leftovers import leftovers_in
+from ..rendering.leftovers import leftovers_of
 from ..rendering.recorded_facts import open_for_rendering
 from ..rendering.recordings import look_at, recordings
 from ..results import iter_episodes
@@ -153,13 +153,13 @@ def _check_nobody_writes(directory: Path) -> None:
 
 
 def _check_all_is_done(directory: Path) -> None:
-    closed = [each for each in leftovers_in(directory) if not each.is_open]
-    killed = [str(leftovers.infix) for leftovers in closed if leftovers.has_work]
+    closed = [files for files in monitors_of(directory) if not files.is_open]
+    killed = [each.infix for each in closed if leftovers_of(directory, each)]
     if killed:
         raise UnfinishedRecordings(directory, killed, advice=_RECOVER.format(directory))
     visible = [
-        [path.name for path in leftovers.paths if not path.name.startswith(".")]
-        for leftovers in closed
+        [path.name for path in files.paths if not path.name.startswith(".")]
+        for files in closed
     ]
     strays = [name for own in visible if not any(map(is_manifest, own)) for name in own]
     if strays:

@@ -101,8 +101,9 @@ _BY_NAME: Final[Mapping[str, _Rule]] = {
     ),
     "wrappers": _Rule(
         kind=ExcuseKind.CODE,
-        costs="beginnings, steps and rewards that differ without it are believed",
-        excludes=(Topic.REWARDS, Topic.BEGINNING, Topic.PHYSICS),
+        costs="rewards and ends that differ without it are believed",
+        excludes=(Topic.REWARDS,),
+        is_fed=True,
     ),
     **dict.fromkeys(
         ("schedule", "rule", "step_trigger"),

@@ -120,6 +120,8 @@ class RecordingInputs:
         clip_starts: the numbers of steps at which clips were begun by a trigger.
         episodes: in their order.
         evaluation_keep: what the choice among all recordings of an evaluation said.
+        monitor_csv_start: the time in Stable-Baselines3's file, a statement; None where
+            that was not asked for.
         surroundings: the provenance, a statement; None where it was not known.
         surroundings_after: how many episodes were completed when it became known.
         was_killed: another process has put the recording in order.
@@ -138,6 +140,7 @@ class RecordingInputs:
     clip_starts: Sequence[int] = ()
     episodes: Sequence[EpisodeInputs] = ()
     evaluation_keep: Mapping[str, Any] | None = None
+    monitor_csv_start: float | None = None
     surroundings: Mapping[str, Any] | None = None
     surroundings_after: int = 0
     was_killed: bool = False

@@ -14,10 +14,12 @@ from typing import Any
 
 from numpy.typing import NDArray
 
+from .. import json_text
 from ..errors import UnreadableFile
 from ..formats.journal import JournalEntry, JournalReader
 from ..formats.json_fields import read_object
-from ..formats.monitor_directory import Infix
+from ..formats.monitor_directory import FILE_PREFIX, Infix
+from ..formats.regular_files import open_regular
 from ..formats.trajectory import TrajectoryReader
 from ..formats.trajectory_hdf5 import open_hdf5
 from ..results.monitor_files import MonitorFiles, monitors_of
@@ -28,6 +30,7 @@ from .packed_run import PackingOptions
 from .portable_names import portable_parts
 
 _SOURCES = re.compile(r"openaigym\.model\.[0-9a-f]{16}\.zip", re.ASCII)
+_LONGEST_HEADER = 10_000
 _MOST_EPISODES = 1_000_000
 _DTYPES = frozenset(
     f"{kind}{bits}" for kind in ("float", "int", "uint") for bits in (8, 16, 32, 64)
@@ -113,11 +116,21 @@ def _recording(files: MonitorFiles, arrays: dict[str, NDArray[Any]]) -> Recordin
         clip_starts=tuple(sorted(journal.clip_starts())),
         episodes=tuple(_episodes(files, journal, arrays)),
         evaluation_keep=journal.evaluation_keep,
+        monitor_csv_start=_monitor_csv_start(files),
         surroundings=journal.surroundings,
         surroundings_after=journal.surroundings_after,
         was_killed=journal.was_killed,
         is_closed=journal.is_closed,
     )
+
+
+def _monitor_csv_start(files: MonitorFiles) -> float | None:
+    name = f"{FILE_PREFIX}.results.{files.infix}.monitor.csv"
+    if files.journal is None or not (path := files.journal.with_name(name)).is_file():
+        return None
+    with open_regular(path) as file:
+        header = file.readline(_LONGEST_HEADER).decode()
+    return _time(json_text.loads(header.removeprefix("#")).get("t_start"))
 
 
 class _Journal:

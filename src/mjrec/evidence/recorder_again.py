@@ -15,8 +15,9 @@ from ..formats.monitor_directory import Infix
 from ..monitors.base import EnvironmentMonitor
 from ..recorder.opening import JOIN, Statements
 from ..recorder.options import RecorderOptions
-from ..recorder.tracking import FinishedEpisode
+from ..recorder.tracking import FinishedEpisode, Tracker
 from ..schedules import Schedule, schedule_from_text
+from ..trackers.monitor_csv import MonitorCsvTracker
 from .inputs import RecordingInputs
 from .notes import Notes
 
@@ -75,6 +76,7 @@ def monitor_again(
             seed=given.get("seed"),
             annotate=given.get("annotate", False),
             tiled=given.get("tiled", False),
+            trackers=_trackers(recording),
             statements=Statements(
                 infix=infix,
                 first_episode_id=recording.first_episode_id,
@@ -167,6 +169,11 @@ def _step_trigger(
         unit="clip",
     )
     return _named(name, set(recording.clip_starts).__contains__)
+
+
+def _trackers(recording: RecordingInputs) -> Sequence[Tracker]:
+    start = recording.monitor_csv_start
+    return () if start is None else [MonitorCsvTracker(clock=lambda: start)]
 
 
 def _named(name: str, function: Callable[[Any], Any]) -> Callable[[Any], Any]:

@@ -23,8 +23,6 @@ anywhere. A reader leaves out what is no event, keeps the rest, and says so.
 
 from __future__ import annotations
 
-import errno
-import io
 import itertools
 import logging
 import os
@@ -36,6 +34,7 @@ from typing import Any
 
 from ..errors import ClosedError
 from ..json_text import dumps
+from .appending import append_whole, open_for_appending
 from .json_fields import (
     boolean,
     field,
@@ -129,9 +128,7 @@ class JournalWriter:
     def __init__(self, path: Path, *, run: Mapping[str, Any] | None = None) -> None:
         self._path = path
         self._run = run
-        self._file: io.FileIO | None = None
-        # Of the whole lines; beyond it is what a failed write has left.
-        self._size = 0
+        self._descriptor: int | None = None
         self._unwritten = b""
         self._closed = False
 
@@ -172,44 +169,27 @@ class JournalWriter:
     def close(self) -> None:
         """Close the file; further calls do nothing."""
         self._closed = True
-        file, self._file = self._file, None
-        if file is not None:
-            file.close()
+        descriptor, self._descriptor = self._descriptor, None
+        if descriptor is not None:
+            os.close(descriptor)
 
     def _append(self, line: bytes) -> None:
         if self._closed:
             raise ClosedError(f"The journal {self._path} is closed.")
-        if self._file is None:
-            self._file = io.FileIO(self._path, "a+")
-            self._size = self._file.seek(0, os.SEEK_END)
-            if self._size and os.pread(self._file.fileno(), 1, self._size - 1) != b"\n":
-                # Its writer was killed in the middle of a line.
-                line = b"\n" + line
         self._unwritten += line
+        if self._descriptor is None:
+            self._descriptor = open_for_appending(self._path)
         first = b""
-        if self._size == 0 and self._run is not None:
+        if self._run is not None and not os.fstat(self._descriptor).st_size:
             first = f"{dumps({'run': self._run})}\n".encode()
-        self._write(self._file, first + self._unwritten)
+        try:
+            append_whole(self._descriptor, first + self._unwritten, torn=b"\n")
+        except FileNotFoundError:
+            # The next event begins another file.
+            os.close(self._descriptor)
+            self._descriptor = None
+            raise
         self._unwritten = b""
-
-    def _write(self, file: io.FileIO, line: bytes) -> None:
-        status = os.fstat(file.fileno())
-        if status.st_nlink == 0:
-            # What is written there is nowhere. The next entry begins another file.
-            file.close()
-            self._file = None
-            raise OSError(
-                errno.ENOENT, "it was removed while it was written", str(self._path)
-            )
-        if status.st_size > self._size:
-            # Half a line would damage the one after it. Taking it back had failed, or
-            # was interrupted.
-            os.ftruncate(file.fileno(), self._size)
-        # Unbuffered: the line is with the operating system when `write` returns.
-        if file.write(line) != len(line):
-            os.ftruncate(file.fileno(), self._size)
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(self._path))
-        self._size += len(line)
 
 
 class JournalReader:

@@ -24,6 +24,9 @@ import stat
 import time
 import weakref
 from pathlib import Path
+from typing import Self
+
+from ..errors import DirectoryNotWritable
 
 # Whoever asks `is_locked` holds a lock for a moment, which is no reason to give up.
 _MOMENTS = 5
@@ -55,12 +58,13 @@ class Lock:
         # Python opens every descriptor close-on-exec: an encoder that outlives this
         # process does not keep the lock.
         flags = os.O_RDWR | os.O_CREAT | os.O_EXCL
-        self._take(path, os.open(path, flags, mode))
+        descriptor = os.open(path, flags, mode)
+        self._take(path, descriptor)
         try:
             if not self._lock(fcntl.LOCK_EX):
                 # Before it was locked it looked like a dead monitor's.
                 raise FileExistsError(f"{path} was removed while it was being locked")
-            self._write(content)
+            os.write(descriptor, content.encode())
         except BaseException:
             self.release()
             raise
@@ -74,10 +78,6 @@ class Lock:
         """Lock the file; False where another one is in its place by now."""
         fcntl.flock(self.fileno(), operation)
         return _is_at(self.fileno(), self._path)
-
-    def _write(self, content: str) -> None:
-        os.ftruncate(self.fileno(), 0)
-        os.write(self.fileno(), content.encode())
 
     def fileno(self) -> int:
         """Return the descriptor. A process that inherits it holds the lock too."""
@@ -103,53 +103,57 @@ class Lock:
         finally:
             self.let_go()
 
+    def __enter__(self) -> Self:
+        return self
 
-def try_lock(path: Path, content: str) -> Lock | None:
-    """Return a lock at `path`, or None where somebody else holds it.
+    def __exit__(self, *_: object) -> None:
+        self.release()
 
-    A file that nobody holds is taken over, whoever left it.
 
-    Args:
-        path: the file; made where it is missing.
-        content: what others may read about its holder.
+def try_lock(path: Path) -> Lock | None:
+    """Return a lock at `path`, or None where another process holds it.
+
+    A file that no process holds is taken over with its content, and made where it is
+    missing.
 
     Raises:
-        OSError: it cannot be made or opened, or something else stands there.
+        DirectoryNotWritable: it cannot be made or opened, or something else stands
+            there.
     """
     for _ in range(_MOMENTS):
         with contextlib.suppress(BlockingIOError):
-            return _taken(path, content, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            return _taken(path, fcntl.LOCK_EX | fcntl.LOCK_NB)
         time.sleep(_MOMENT)
     return None
 
 
-def wait_for_lock(path: Path, content: str) -> Lock:
-    """Return a lock at `path`, as soon as nobody else holds it.
-
-    It is `try_lock` with patience, for what is never held for long.
+def wait_for_lock(path: Path) -> Lock:
+    """Return a lock at `path`, as soon as no other process holds it.
 
     Raises:
-        OSError: as `try_lock`.
+        DirectoryNotWritable: as `try_lock`.
     """
-    return _taken(path, content, fcntl.LOCK_EX)
+    return _taken(path, fcntl.LOCK_EX)
 
 
-def _taken(path: Path, content: str, operation: int) -> Lock:
-    while True:
-        lock = Lock.__new__(Lock)
-        lock._take(path, _opened(path))
-        try:
-            # Its holder may have removed it after it was opened, and somebody else
-            # have made another: then this one guards nothing.
-            if lock._lock(operation):
-                # A full disk takes no content; what counts is who holds the file.
-                with contextlib.suppress(OSError):
-                    lock._write(content)
-                return lock
-        except BaseException:
+def _taken(path: Path, operation: int) -> Lock:
+    try:
+        while True:
+            lock = Lock.__new__(Lock)
+            lock._take(path, _opened(path))
+            try:
+                # Its holder may have removed it after it was opened, and another
+                # process have made a new one: then this one guards nothing.
+                if lock._lock(operation):
+                    return lock
+            except BaseException:
+                lock.let_go()
+                raise
             lock.let_go()
-            raise
-        lock.let_go()
+    except BlockingIOError:
+        raise
+    except OSError as error:
+        raise DirectoryNotWritable(path.parent, error.strerror) from error
 
 
 def _opened(path: Path) -> int:

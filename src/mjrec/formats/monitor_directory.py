@@ -41,6 +41,7 @@ monitors ever share one in a directory. Names that start with a dot and end in
 
 from __future__ import annotations
 
+import glob
 import os
 import re
 import shlex
@@ -72,6 +73,10 @@ _TRAJECTORY = (
 # Not the number of an episode: no part of a clip is taken for an episode's file.
 _CLIP = rf"openaigym\.clip\.{_INFIX_PART}\.step(?P<step>[0-9]{{9,18}})"
 _CLIP_PART = re.compile(rf"{_CLIP}\.part(?P<part>[0-9]{{6,18}})")
+_VIDEO_FILE = re.compile(
+    rf"{_VIDEO}(\.step(?P<step>[0-9]{{6,18}}))?(\.(?P<view>[^/\n\0]+?))??"
+    r"\.(?P<ending>mp4|avi|json|framehash|meta\.json|failed\.json)"
+)
 _STATES = rf"openaigym\.states\.{_INFIX_PART}\.[0-9]{{6,9}}"
 
 _MANIFEST = re.compile(rf"openaigym\.manifest\.{_INFIX_PART}\.manifest\.json")
@@ -96,8 +101,11 @@ _HIDDEN = (
     re.compile(r"\.openaigym\.render\.[0-9]+\.lock"),
     re.compile(rf"\.openaigym\.manifest\.{_INFIX_PART}\.lock"),
     re.compile(rf"\.openaigym\.{_INFIX_PART}\.lock"),
-    re.compile(rf"\.{_VIDEO}\.[^/\n\0]*\.part"),
     re.compile(r"\.openaigym\.[^/\n\0]+\.part"),
+)
+# A note is rewritten as every file is: an unfinished one has both endings.
+_PART = re.compile(
+    r"\.(?P<final>openaigym\..+?)(?P<note>\.note(\.part)?)?(?P<hex>\.[0-9a-f]{8})?\.part"
 )
 
 
@@ -147,6 +155,52 @@ class ClipPart:
         return cls(infix, int(match["step"]), int(match["part"]))
 
 
+@dataclass(frozen=True)
+class VideoName:
+    """What the name of a video, or of a file that belongs to one, says.
+
+    Attributes:
+        name: the name of the file.
+        infix: of its monitor.
+        episode_id: the episode that it shows, or in which a clip began.
+        first_step: as of `ClipPart`; None where no step began it.
+        view: which of several videos; empty for the first camera's as recorded.
+        ending: what kind of file it is, such as `mp4` or `meta.json`.
+    """
+
+    name: str
+    infix: str
+    episode_id: int
+    first_step: int | None
+    view: str
+    ending: str
+
+    @classmethod
+    def parse(cls, name: str) -> VideoName | None:
+        """Return what a file's name says; None for other files."""
+        match = _VIDEO_FILE.fullmatch(name)
+        if match is None:
+            return None
+        step = None if match["step"] is None else int(match["step"])
+        return cls(
+            *(name, match["infix"], int(match["episode"]), step),
+            *(match["view"] or "", match["ending"]),
+        )
+
+    @property
+    def video(self) -> str:
+        """The name of the mp4."""
+        return f"{self.name.removesuffix(self.ending)}mp4"
+
+    @property
+    def is_episodes(self) -> bool:
+        """Whether it is of an episode's first video, and of no clip that a step began.
+
+        A clip that began with an episode has such a name, too.
+        """
+        return not self.view and self.first_step is None
+
+
 def check_uid(uid: object) -> str:
     """Return `uid` as the text that goes into file names.
 
@@ -177,7 +231,7 @@ def journal_name(infix: Infix) -> str:
     return f"{FILE_PREFIX}.episodes.{infix}.jsonl"
 
 
-def video_prefix(infix: Infix, episode_id: int) -> str:
+def video_prefix(infix: Infix | str, episode_id: int) -> str:
     """Return the name of an episode's video without its extensions."""
     return f"{FILE_PREFIX}.video.{infix}.video{episode_id:06d}"
 
@@ -266,6 +320,26 @@ def episode_of(name: str) -> int | None:
     return None if number is None else int(number)
 
 
+def final_name(name: str) -> str | None:
+    """Return the name that an unfinished file, or the file of a note, will get."""
+    part = _PART.fullmatch(name)
+    return None if part is None else part["final"]
+
+
+def is_note(name: str) -> bool:
+    """Tell whether `name` is that of a note beside an unfinished video."""
+    part = _PART.fullmatch(name)
+    return part is not None and bool(part["note"]) and not part["hex"]
+
+
+def unfinished_files(path: Path) -> list[Path]:
+    """Return the hidden files under which `path` is written, or was."""
+    pattern = f".{glob.escape(path.name)}.{8 * '[0-9a-f]'}.part"
+    found = sorted(path.parent.glob(pattern))
+    # A link may lead anywhere.
+    return [part for part in found if part.is_file() and not part.is_symlink()]
+
+
 def iter_monitor_files(directory: Path, *, hidden: bool = False) -> Iterator[Path]:
     """Yield the monitor files of `directory`, sorted by name.
 
@@ -340,6 +414,9 @@ def _is_file(entry: os.DirEntry[str]) -> bool:
 def _match(name: str) -> re.Match[str] | None:
     """Return what tells a name to be a monitor file's; None for other files."""
     if name.startswith("."):
+        final = final_name(name)
+        if final is not None and (match := _match(final)) is not None:
+            return match
         matches = (pattern.fullmatch(name) for pattern in _HIDDEN)
         return next((match for match in matches if match is not None), None)
     _, _, rest = name.partition(".")

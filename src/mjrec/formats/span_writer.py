@@ -107,10 +107,7 @@ class SpanLogs:
             path = self.directory / states_name(self._infix, next(self._numbers))
             tail = self._tail_bytes // _TAILS_OF_ONE if alone else self._tail_bytes
             self._log = OpenLog(path, facts, dtype, tail_bytes=tail)
-        span = SpanWriter(self._log, name, facts)
-        if alone:
-            self._log.is_alone = True
-        return span
+        return SpanWriter(self._log, name, facts, alone=alone)
 
     def close(self) -> None:
         """Write what the log lacks, and close it. Idempotent.
@@ -118,14 +115,9 @@ class SpanLogs:
         Raises:
             FileNotWritten: the disk is full; the next call tries again.
         """
-        log = self._log
-        if log is None:
-            return
-        try:
-            log.close()
-        finally:
-            if not log.rows.is_open:
-                self._log = None
+        if self._log is not None:
+            self._log.close()
+            self._log = None
 
     def release(self) -> None:
         """Let go of the log as it is: in a forked process it is its parent's."""
@@ -144,7 +136,7 @@ class OpenLog:
         columns: what the slots of its tail hold: `state` as float64, `snapshot` in
             words, `action` and `observation`; what rows do not have is not there.
         bodies: for each slot all words behind its head.
-        is_alone: it is one recording's only.
+        is_alone: it is one recording's only, and ends with it.
         look_size: the bytes of all changes of the model so far.
     """
 
@@ -162,6 +154,8 @@ class OpenLog:
         self.look_size = 0
         self._dtype = dtype
         self._looks: int | None = None
+        # What the disk was too full for, until it is said.
+        self._unsaid: list[Mapping[str, Any]] = []
         line = {"format": FORMAT, "version": FORMAT_VERSION, "rows": dtype.descr}
         # First of all, so that whatever a killed process leaves is found.
         self._list: int | None = create_list(path, {**line, "facts": dict(facts)})
@@ -185,15 +179,35 @@ class OpenLog:
         """Tell whether a recording with such rows can go on in this log."""
         is_short = self.rows.size + self.look_size < _LONG
         is_free = self.rows.is_open and not self.is_alone
-        return is_short and is_free and self._dtype == dtype
+        return is_short and is_free and (self._dtype is dtype or self._dtype == dtype)
 
     def say(self, values: Mapping[str, Any]) -> None:
-        """Add a line to the list.
+        """Add a line to the list; one that finds no room comes before the next.
 
         Raises:
             FileNotWritten: the disk is full, or the list was removed.
         """
+        self._unsaid.append(values)
+        self._say_all()
+
+    @property
+    def is_behind(self) -> bool:
+        """Whether the disk was too full for a line."""
+        return bool(self._unsaid)
+
+    def say_at_once(self, values: Mapping[str, Any]) -> None:
+        """Add a line to the list, or forget it.
+
+        Raises:
+            FileNotWritten: as `say`.
+        """
+        self._say_all()
         append_line(self.path, values, descriptor=self._list)
+
+    def _say_all(self) -> None:
+        while self._unsaid:
+            append_line(self.path, self._unsaid[0], descriptor=self._list)
+            del self._unsaid[0]
 
     def add_change(self, change: ModelChange) -> None:
         """Add a change of the model that holds from the next row on.
@@ -215,14 +229,16 @@ class OpenLog:
         self.look_size += len(record)
 
     def close(self) -> None:
-        """Write the last rows, and remove the files if nothing is in flight.
+        """Write the last rows; remove the files if nothing is in flight. Idempotent.
 
         Raises:
             FileNotWritten: the disk is full; the next call tries again.
         """
+        if not self.rows.is_open:
+            return
         try:
             self.rows.write()
-            self.say({"closed": True})
+            self.say_at_once({"closed": True})
         except FileNotWritten:
             if not self.path.exists():
                 # The directory was removed; there is nothing to try again.
@@ -230,8 +246,11 @@ class OpenLog:
             raise
         self.rows.close()
         self.release()
+        self.remove_if_done()
+
+    def remove_if_done(self) -> None:
+        """Remove the files if nothing is in flight; else the finisher does it."""
         with contextlib.suppress(DirectoryNotWritable):
-            # The next one that finishes a recording tries again.
             remove_if_done(self.path)
 
     def release(self) -> None:
@@ -252,6 +271,7 @@ class SpanWriter:
         log: where its rows go.
         name: of its file, without suffix.
         facts: what is known of it.
+        alone: nothing else goes into the log.
 
     Attributes:
         log: as given.
@@ -263,22 +283,26 @@ class SpanWriter:
         FileNotWritten: the disk is full.
     """
 
-    def __init__(self, log: OpenLog, name: str, facts: Mapping[str, Any]) -> None:
+    def __init__(
+        self, log: OpenLog, name: str, facts: Mapping[str, Any], *, alone: bool = False
+    ) -> None:
         self.log = log
         self.steps = self.frame_count = 0
         self.last_frame = -1
         self._name = name
         self._first_row = log.rows.count
-        self._unsaid: dict[str, Any] = {}
-        self._ending: dict[str, Any] | None = None
-        self._has_ended = self._is_dropped = False
+        known = log.facts
         own = {
-            k: v for k, v in facts.items() if k not in log.facts or log.facts[k] != v
+            key: value
+            for key, value in facts.items()
+            # Most values are the very same objects in each recording.
+            if key not in known or (known[key] is not value and known[key] != value)
         }
-        without = [key for key in log.facts if key not in facts]
+        without = [key for key in known if key not in facts]
         line = {"begin": name, "row": self._first_row, "look": log.look_size}
         line |= {"facts": own, **({"without": without} if without else {})}
-        log.say(line)
+        log.say_at_once(line)
+        log.is_alone = alone
 
     @property
     def size(self) -> int:
@@ -336,50 +360,31 @@ class SpanWriter:
         rows.settle()
 
     def note(self, facts: Mapping[str, Any]) -> None:
-        """Add to the facts; on a full disk they wait for the next note or the end."""
-        self._unsaid.update(facts)
-        with contextlib.suppress(FileNotWritten):
-            self.add(self._unsaid)
-            self._unsaid = {}
-
-    def add(self, facts: Mapping[str, Any]) -> None:
         """Add to the facts, also after the end; of a key, the newest counts.
 
         Raises:
-            FileNotWritten: the disk is full; nothing was added.
+            FileNotWritten: the disk is full; it is said before the next line.
         """
         self.log.say({"note": self._name, "facts": dict(facts)})
 
-    def remove(self) -> None:
-        """Give up its rows after its end; its log goes where nothing else is in it.
-
-        Raises:
-            FileNotWritten: the disk is full.
-            DirectoryNotWritable: files cannot be removed.
-        """
-        self.drop()
-        remove_if_done(self.log.path)
-
     def end(self, facts: Mapping[str, Any]) -> None:
-        """Say how it ended. Idempotent; what the first call says counts.
+        """Say how it ended. A log that is its own is closed.
 
         Raises:
-            FileNotWritten: the disk is full; the next call tries again.
+            FileNotWritten: the disk is full; it is said before the next line.
         """
-        if self._ending is None:
-            # Others may follow before it can be said.
-            ending = {"end": self._name, "row": self.log.rows.count}
-            self._ending = {**ending, "facts": {**self._unsaid, **facts}}
-        if not self._has_ended:
-            self.log.say(self._ending)
-            self._has_ended = True
+        row = self.log.rows.count
+        self.log.say({"end": self._name, "row": row, "facts": dict(facts)})
+        if self.log.is_alone:
+            self.log.close()
 
     def drop(self) -> None:
-        """Leave nothing of it that anybody would read. Idempotent.
+        """Give up its rows. A log that is its own is removed.
 
         Raises:
-            FileNotWritten: the disk is full.
+            FileNotWritten: the disk is full; it is said before the next line.
         """
-        if not self._is_dropped:
-            self.log.say({"drop": self._name})
-            self._is_dropped = True
+        self.log.say({"drop": self._name})
+        if self.log.is_alone:
+            self.log.close()
+            self.log.remove_if_done()

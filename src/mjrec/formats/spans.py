@@ -24,7 +24,6 @@ A recording is called by the path of the file that it will become.
 from __future__ import annotations
 
 import contextlib
-import errno
 import os
 import threading
 import time
@@ -37,6 +36,7 @@ import numpy as np
 
 from ..errors import DirectoryNotWritable, FileNotWritten, UnreadableFile
 from ..json_text import dumps
+from .appending import append_whole, open_for_appending
 from .json_fields import base_name, integer, json_object, mapping, unreadable
 from .locks import is_locked
 from .monitor_directory import (
@@ -53,9 +53,6 @@ from .trajectory import check_version, dtype_from_json
 
 FORMAT = "mjrec spans"
 SPANS, LOG, LOOKS, FINISHED = ".spans", ".log", ".looks", ".h5"
-
-_LONGEST_LINE = 1 << 26
-_APPENDING = os.O_RDWR | os.O_APPEND | os.O_NOFOLLOW
 
 
 @dataclass
@@ -125,6 +122,12 @@ class SpanList:
         rows = self.log.stat().st_size if self.log.exists() else 0
         return self.dtype is None and rows > 0
 
+    @property
+    def last_write(self) -> float:
+        """When its last row was written, in seconds since the epoch."""
+        files = (self.log, tail_path(self.log))
+        return max((f.stat().st_mtime for f in files if f.exists()), default=0.0)
+
     def in_flight(self) -> list[Recording]:
         """Return the recordings that only the log has."""
         return [each for each in self.recordings.values() if each.is_in_flight]
@@ -140,7 +143,7 @@ class SpanList:
         if size < self._offset or file.read(len(self._first)) != self._first:
             return False
         file.seek(self._offset)
-        while line := file.readline(min(_LONGEST_LINE, size - self._offset)):
+        while line := file.readline(size - self._offset):
             if not line.endswith(b"\n"):
                 # It is being written, or its writer was killed.
                 break
@@ -194,7 +197,7 @@ def create_list(path: Path, first_line: Mapping[str, Any]) -> int:
         FileNotWritten: the disk is full, or the directory is gone; nothing is left.
     """
     try:
-        descriptor = os.open(path, _APPENDING | os.O_CREAT | os.O_EXCL, 0o666)
+        descriptor = open_for_appending(path, new=True)
     except OSError as error:
         raise FileNotWritten(path, error.strerror or error) from error
     try:
@@ -218,44 +221,23 @@ def append_line(
         descriptor: of the list, where it is open.
 
     Raises:
-        FileNotWritten: the disk is full, and the list says what it said before; the
-            list was removed; or the line is longer than any that is read.
+        FileNotWritten: the disk is full, and the list says what it said before; or the
+            list was removed.
     """
     line = dumps(values).encode() + b"\n"
+    own = None
     try:
-        if len(line) > _LONGEST_LINE:
-            raise OSError(errno.EFBIG, os.strerror(errno.EFBIG))
-        if descriptor is not None:
-            _append(descriptor, line)
-            return
-        descriptor = os.open(path, _APPENDING)
-        try:
-            _append(descriptor, line)
-        finally:
-            os.close(descriptor)
+        if descriptor is None:
+            # It is there: its recordings are named in it.
+            path.lstat()
+            descriptor = own = open_for_appending(path)
+        # The torn end says nothing, also where nothing but its end is missing.
+        append_whole(descriptor, line, torn=b"?\n")
     except OSError as error:
         raise FileNotWritten(path, error.strerror or error) from error
-
-
-def _append(descriptor: int, line: bytes) -> None:
-    status = os.fstat(descriptor)
-    if status.st_nlink == 0:
-        # What is written there is nowhere.
-        raise OSError(errno.ENOENT, os.strerror(errno.ENOENT))
-    if status.st_size and os.pread(descriptor, 1, status.st_size - 1) != b"\n":
-        # The torn end says nothing, also where nothing but its end is missing.
-        line = b"?\n" + line
-    written = os.write(descriptor, line)
-    if written != len(line):
-        _take_back(descriptor, written)
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-
-def _take_back(descriptor: int, written: int) -> None:
-    """Cut off half a line; where another one follows, it stays and is passed over."""
-    end = os.lseek(descriptor, 0, os.SEEK_CUR)
-    if os.fstat(descriptor).st_size == end:
-        os.ftruncate(descriptor, end - written)
+    finally:
+        if own is not None:
+            os.close(own)
 
 
 def infix_of_recording(name: str) -> str | None:

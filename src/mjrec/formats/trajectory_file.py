@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +12,7 @@ from .journal import KILLED
 from .json_fields import unreadable
 from .monitor_directory import Infix, trajectory_prefix
 from .regular_files import open_regular
-from .spans import FINISHED, find_recording, remove_if_done
+from .spans import FINISHED, Recording, find_recording, remove_if_done
 from .trajectory import TrajectoryReader, added_up
 from .trajectory_hdf5 import SIGNATURE, open_hdf5, write_hdf5
 from .trajectory_log import open_recording
@@ -54,16 +54,16 @@ def find_trajectory(
     return path if is_there else None
 
 
-def finish_trajectory(path: Path, *, facts: Mapping[str, Any] | None = None) -> Path:
+def finish_trajectory(path: Path) -> Path:
     """Make the HDF5 file of an ended recording; its rows are not needed then.
 
-    One that does not say how it ended is that of a process that was killed, and the
-    file says so. This may be killed at any point and run again, and two may do it at
-    the same time: the rows are there until the file is.
+    One that does not say how it ended is that of a process that was killed, or whose
+    disk was full: its last row tells whether all of it is there. This may be killed at
+    any point and run again, and two may do it at the same time: the rows are there
+    until the file is.
 
     Args:
         path: of the file.
-        facts: what else is known of the episode, and counts more than the log.
 
     Returns:
         The path.
@@ -76,7 +76,9 @@ def finish_trajectory(path: Path, *, facts: Mapping[str, Any] | None = None) -> 
     recording = find_recording(path)
     if not path.is_file():
         try:
-            _make_hdf5(path, facts or {})
+            with open_recording(path) as reader:
+                reader.facts = {**reader.facts, **_how_it_ended(reader, recording)}
+                write_hdf5(reader, path)
         except UnreadableFile:
             if not path.is_file():
                 raise
@@ -84,13 +86,6 @@ def finish_trajectory(path: Path, *, facts: Mapping[str, Any] | None = None) -> 
     if recording is not None:
         remove_if_done(recording.spans.path)
     return path
-
-
-def _make_hdf5(path: Path, facts: Mapping[str, Any]) -> None:
-    with open_recording(path) as reader:
-        known = {**reader.facts, **facts}
-        reader.facts = {**known, **_how_it_ended(reader, known)}
-        write_hdf5(reader, path)
 
 
 def amend_trajectory(finished: Path, change: Callable[[Any], Any]) -> None:
@@ -112,16 +107,28 @@ def amend_trajectory(finished: Path, change: Callable[[Any], Any]) -> None:
         write_hdf5(reader, finished)
 
 
-def _how_it_ended(reader: TrajectoryReader, facts: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what there is to say where nobody could say it."""
+def _how_it_ended(
+    reader: TrajectoryReader, recording: Recording | None
+) -> dict[str, Any]:
+    """Return what its rows say of an episode's end; nothing where it is said."""
+    facts = reader.facts
     if "complete" in facts:
         return {}
     known: dict[str, Any] = {
         "complete": False,
-        "reason": KILLED,
         "length": reader.step_count,
         "reward": added_up(reader.rewards),
     }
+    if reader.step_count and (reader.terminated[-1] or reader.truncated[-1]):
+        # All of it is there but the last words, which a kill or a full disk cut off.
+        known |= {
+            "complete": True,
+            "terminated": bool(reader.terminated[-1]),
+            "truncated": bool(reader.truncated[-1]),
+            "end_time": 0.0 if recording is None else recording.spans.last_write,
+        }
+    else:
+        known["reason"] = KILLED
     video = facts.get("video")
     is_deferred = isinstance(video, dict) and video.get("recording") == "deferred"
     if is_deferred and not reader.frame_count:

@@ -6,7 +6,7 @@ whose members bear MuJoCo's names: `file["states"]["qpos"]` is an array. The shu
 filter, which goes by whole rows there, puts the same byte of one row after the other
 side by side, so that what does not change costs nothing.
 
-Nothing here bounds the memory or time that a file asks for: `foreign_trajectories`
+Nothing here bounds the memory or time that a file asks for: `foreign_files`
 does.
 """
 

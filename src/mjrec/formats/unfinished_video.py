@@ -1,21 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A live video under its temporary name: what a finder needs to finish it.
+"""A live video under its hidden name, and the note by which any process finishes it.
 
-That stands in a note beside it, a hidden file `.<name of the video>.note.part`, which
-is there before the video is. The hidden video is locked as long as it is written: by
-the process that feeds ffmpeg, and by ffmpeg, which goes on to the end of its file when
-that process dies.
+The note, `.<name of the video>.note.part`, is there before the video is. The hidden
+video is locked as long as it is written: by the process that feeds ffmpeg, and by
+ffmpeg, which goes on to the end of its file when that process dies.
 """
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ..atomic_files import file_sha256, write_text
+from ..atomic_files import write_text
 from ..errors import DirectoryNotWritable
 from ..json_text import dumps
 from .ffmpeg import ffmpeg_sha256, ffmpeg_version
@@ -30,7 +28,8 @@ from .json_fields import (
     text,
     unreadable,
 )
-from .video_file import count_frames
+from .monitor_directory import unfinished_files
+from .video_file import content_facts
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,51 +38,64 @@ class UnfinishedVideo:
 
     Attributes:
         path: the file, by its final name.
-        temporary: the file now.
-        hashes: its frame hashes now; None where there are to be none.
         metadata: what its metadata file is to say of what was recorded, as far as it
             is known.
         facts: what it is to say of the file and its timing; and `frames_per_step`.
     """
 
     path: Path
-    temporary: Path
-    hashes: Path | None
     metadata: Mapping[str, Any]
     facts: Mapping[str, Any]
+
+    @property
+    def temporary(self) -> Path:
+        """The file now."""
+        return next(iter(unfinished_files(self.path)), self.path)
+
+    @property
+    def hashes(self) -> list[Path]:
+        """Its frame hashes now, where there are some."""
+        return unfinished_files(frame_hash_path(self.path))
+
+    @property
+    def hashed_frames(self) -> int:
+        """How many frames the encoder was given, or was to be given next."""
+        texts = [path.read_text("ascii", "replace") for path in self.hashes]
+        return sum(not line.startswith("#") for t in texts for line in t.splitlines())
 
     def finish(self) -> dict[str, Any]:
         """Give the video and the hashes of its frames their names.
 
         Returns:
-            `facts` with what the file holds: `frame_count`, and its hashes.
+            `facts` with what the file holds.
 
         Raises:
             EncoderError: it cannot be decoded to its end.
             DirectoryNotWritable: the files cannot be renamed.
         """
-        source = self.temporary if self.temporary.exists() else self.path
-        frame_count, digest = count_frames(
-            source,
+        part = self.temporary
+        found = content_facts(
+            part,
             height=self.facts["padded_height"],
             width=self.facts["padded_width"],
             pixel_format=self.facts["pixel_format"],
         )
         encoder = field(self.facts, "encoder_version", mapping)
         is_same_ffmpeg = encoder.get("version") == ffmpeg_version()
-        found = {
-            "frame_count": frame_count,
-            "file_sha256": file_sha256(source),
-            "decoded_sha256": digest,
-            "ffmpeg_sha256": ffmpeg_sha256() if is_same_ffmpeg else None,
-        }
         try:
-            if self.hashes is not None and self.hashes.exists():
-                _finish_hashes(self.hashes, frame_hash_path(self.path), frame_count)
-            source.replace(self.path)
+            for hashes in self.hashes:
+                _finish_hashes(hashes, frame_hash_path(self.path), found["frame_count"])
+            part.replace(self.path)
         except OSError as error:
             raise DirectoryNotWritable(self.path.parent, error) from error
-        return {**self.facts, **found}
+        sha256 = ffmpeg_sha256() if is_same_ffmpeg else None
+        return {**self.facts, **found, "ffmpeg_sha256": sha256}
+
+    def forget(self) -> None:
+        """Remove the note, and before it what it is about."""
+        parts = [*unfinished_files(self.path), *self.hashes]
+        for path in (*parts, note_path(self.path)):
+            path.unlink(missing_ok=True)
 
 
 def note_path(video: Path) -> Path:
@@ -97,24 +109,19 @@ def write_note(video: UnfinishedVideo) -> None:
     Raises:
         FileNotWritten: the disk is full, or the directory is gone.
     """
-    content = {
-        "temporary": video.temporary.name,
-        "hashes": video.hashes and video.hashes.name,
-        "metadata": video.metadata,
-        "facts": video.facts,
-    }
+    content = {"metadata": video.metadata, "facts": video.facts}
     write_text(note_path(video.path), dumps(content))
 
 
-def read_note(path: Path) -> UnfinishedVideo:
-    """Return what a note says; all that it names is in its own directory.
+def read_note(video: Path) -> UnfinishedVideo:
+    """Return what the note beside a video says.
 
     Raises:
-        UnreadableFile: it is missing or damaged, or belongs to another video.
+        UnreadableFile: it is missing or damaged.
     """
+    path = note_path(video)
     with unreadable(path):
         values = read_object(path)
-        metadata = field(values, "metadata", mapping)
         facts = field(values, "facts", mapping)
         for key in ("padded_height", "padded_width", "stride", "frames_per_step"):
             field(facts, key, positive)
@@ -122,16 +129,8 @@ def read_note(path: Path) -> UnfinishedVideo:
         field(facts, "timestep", optional(rate))
         field(facts, "pixel_format", text)
         field(facts, "encoder_version", mapping)
-        video = path.with_name(path.name[1:].removesuffix(".note.part"))
-        temporary = _hidden(video, field(values, "temporary", text))
-        hashes = field(values, "hashes", optional(text))
-        return UnfinishedVideo(
-            path=video,
-            temporary=temporary,
-            hashes=None if hashes is None else _hidden(frame_hash_path(video), hashes),
-            metadata=metadata,
-            facts=facts,
-        )
+        metadata = field(values, "metadata", mapping)
+        return UnfinishedVideo(path=video, metadata=metadata, facts=facts)
 
 
 def _finish_hashes(part: Path, final: Path, frame_count: int) -> None:
@@ -143,9 +142,3 @@ def _finish_hashes(part: Path, final: Path, frame_count: int) -> None:
         part.unlink()
     else:
         part.replace(final)
-
-
-def _hidden(final: Path, name: str) -> Path:
-    if not re.fullmatch(rf"\.{re.escape(final.name)}\.[0-9a-f]{{8}}\.part", name):
-        raise ValueError(f"{name!r:.200} is no temporary name of {final.name!r:.200}")
-    return final.with_name(name)

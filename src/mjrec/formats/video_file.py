@@ -73,10 +73,12 @@ class VideoFile:
         return self.width + self.width % 2
 
 
-def count_frames(
+def content_facts(
     path: Path, *, height: int, width: int, pixel_format: str
-) -> tuple[int, str]:
-    """Decode a video; return how many frames it holds and the sha256 of all of them.
+) -> dict[str, Any]:
+    """Decode a video; return what metadata says of its content.
+
+    That is `frame_count`, `file_sha256` and `decoded_sha256`.
 
     Args:
         path: the file.
@@ -104,7 +106,11 @@ def count_frames(
             digest.update(block)
             total += len(block)
         process.wait()
-    return -(-total // frame_bytes), digest.hexdigest()
+    return {
+        "frame_count": -(-total // frame_bytes),
+        "file_sha256": file_sha256(path),
+        "decoded_sha256": digest.hexdigest(),
+    }
 
 
 class Encoding:
@@ -227,27 +233,22 @@ class Encoding:
             FrameCountError: it does not hold what was encoded.
         """
         file = self._file
-        count, digest = count_frames(
+        found = content_facts(
             self.temporary,
             height=file.padded_height,
             width=file.padded_width,
             pixel_format=file.pixel_format,
         )
-        if count != self._encoded:
+        if found["frame_count"] != self._encoded:
             raise FrameCountError(
                 f"{file.path} was to hold {self._encoded} frames, and decoding gives "
-                f"{count}. It was not kept.",
+                f"{found['frame_count']}. It was not kept.",
                 command=self._process.command,
                 returncode=0,
                 stderr="",
             )
-        return replace(
-            file,
-            encoder={**file.encoder, "sha256": ffmpeg_sha256()},
-            frame_count=count,
-            file_sha256=file_sha256(self.temporary),
-            decoded_sha256=digest,
-        )
+        encoder = {**file.encoder, "sha256": ffmpeg_sha256()}
+        return replace(file, encoder=encoder, **found)
 
     def _remove_files(self) -> None:
         with contextlib.suppress(OSError):

@@ -25,6 +25,8 @@ import urllib.parse
 from collections.abc import Sequence
 from typing import Any
 
+from .monitor_directory import VideoName
+
 _VIDEO = ".mp4"
 _TILED = "tiled"
 
@@ -36,10 +38,6 @@ _AMBIGUOUS = re.compile(
 # Directories have names of 255 bytes, and there are other parts.
 _LONGEST_PART = 80
 _DIGEST = 8
-
-_VIEW = re.compile(
-    r"\.video\d{6,18}(?:\.step\d+)?(?:\.(?P<view>[^.]+))?\.mp4$", re.ASCII
-)
 
 # What Gymnasium's RecordVideo calls its files, for any `name_prefix` that is portable.
 _SECOND_NAME = re.compile(
@@ -132,8 +130,9 @@ def view_of(video: str) -> str:
     >>> view_of("openaigym.video.0.7.video000027.step000137.side.mp4")
     'side'
     """
-    match = _VIEW.search(video)
-    return "" if match is None else match["view"] or ""
+    name = VideoName.parse(video)
+    # One that was rendered again has more than a camera's part.
+    return "" if name is None or "." in name.view else name.view
 
 
 def is_second_name(name: str) -> bool:

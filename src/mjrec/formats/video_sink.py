@@ -153,8 +153,6 @@ class VideoSink:
         write_note(
             UnfinishedVideo(
                 path=self.path,
-                temporary=self._writer.temporary,
-                hashes=self._writer.temporary_hashes,
                 metadata=metadata,
                 facts={**timing, **file_facts(file)},
             )

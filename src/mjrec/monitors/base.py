@@ -15,7 +15,7 @@ from ..environments.scenes import Scenes
 from ..errors import NotPicklable, PicturesDiffer, RenderError
 from ..recorder.ending_reasons import last_error
 from ..recorder.exit_guard import ExitGuard
-from ..recorder.monitored_run import Finisher
+from ..recorder.finishers import Finisher
 from ..recorder.options import (
     DEFERRED,
     LIVE,
@@ -25,7 +25,7 @@ from ..recorder.options import (
     RenderingChoice,
 )
 from ..recorder.recorder import Recorder
-from ..recorder.recording import DeferredVideo
+from ..recorder.states import DeferredVideo
 from ..recorder.stats_recorder import StatsRecorder
 from ..recorder.subject import Subject
 from ..recorder.video_recorder import VideoRecorder, declared_rate

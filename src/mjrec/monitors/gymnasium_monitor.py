@@ -16,7 +16,7 @@ from gymnasium.envs.registration import EnvSpec
 
 from ..environments.gymnasium_pictures import close_environment, gymnasium_pictures
 from ..environments.gymnasium_scenes import gymnasium_scenes, own_camera
-from ..recorder.monitored_run import Finisher
+from ..recorder.finishers import Finisher
 from ..recorder.options import RecorderOptions
 from .base import NO_SIMULATION, EnvironmentMonitor
 from .cameras import camera_pictures, recorded_view

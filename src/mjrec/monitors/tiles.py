@@ -189,10 +189,9 @@ class TiledVideo:
         self._end(complete=False, **(self._ending or {"reason": reason}))
 
     def _end(self, **facts: Any) -> None:
-        if self._video is not None:
-            self._live(self._video).end(facts, self._list)
-
-    def _list(self, video: VideoRecorder) -> None:
-        self._video = None
-        if video.path is not None:
-            self._first._recorder.run.trackers.expect(Path(video.path))
+        video, self._video = self._video, None
+        if video is not None:
+            try:
+                LiveVideos([video], tolerates=self._tolerates).end(facts)
+            finally:
+                self._first._recorder.run.trackers.expect(Path(str(video.path)))

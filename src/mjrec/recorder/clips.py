@@ -18,14 +18,13 @@ The last part ends as an episode's trajectory does, with `complete`; those befor
 from __future__ import annotations
 
 from collections.abc import Mapping
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..formats.monitor_directory import clip_part_name, clip_video_prefix
-from .live_videos import LiveVideos
+from .live_videos import LiveVideos, live_videos
 from .monitored_run import MonitoredRun
 from .options import DEFERRED, LIVE
-from .recording import Recording
+from .states import StateRecorder
 
 if TYPE_CHECKING:
     from ..simulation.capture import EpisodeStart
@@ -49,8 +48,6 @@ class Clips:
         self._length = run.options.video_length
         self._trigger = run.options.step_trigger
         self._clip: _Clip | None = None
-        # How the running one has ended, until that is all written down.
-        self._ending: Mapping[str, Any] | None = None
 
     def reset(self, *, is_chosen: bool) -> None:
         """Take the picture of an episode that has just begun.
@@ -58,7 +55,6 @@ class Clips:
         Args:
             is_chosen: a video begins with it, unless one is running.
         """
-        self._settle()
         if self._clip is not None:
             self._clip.reset()
         elif is_chosen:
@@ -66,7 +62,6 @@ class Clips:
 
     def before_step(self) -> None:
         """Begin a video, if it is its time."""
-        self._settle()
         taken = self._run.stats.total_steps
         if self._clip is None and self._trigger is not None:
             try:
@@ -81,19 +76,18 @@ class Clips:
     def step(
         self, reward: float, *, terminated: bool, truncated: bool, has_picture: bool
     ) -> None:
-        """Take the picture of a step; as `Recording.step`."""
+        """Take the picture of a step; as `StateRecorder.step`."""
         clip = self._clip
         if clip is None:
             return
         clip.steps += 1
         clip.reward += reward
         is_over = self._length is None and (terminated or truncated)
-        if clip.steps == self._length or is_over:
-            self._ending = {"complete": True}
         try:
             clip.step(reward, terminated, truncated, has_picture=has_picture)
         finally:
-            self._settle()
+            if clip.steps == self._length or is_over:
+                self._end({"complete": True})
 
     def close(self, facts: Mapping[str, Any]) -> None:
         """End the running video, if there is one. Idempotent.
@@ -101,8 +95,7 @@ class Clips:
         Args:
             facts: why it ends early.
         """
-        self._ending = self._ending or {"complete": False, **facts}
-        self._settle()
+        self._end({"complete": False, **facts})
 
     def leave(self) -> None:
         """Let go of the files as they are; recovery finishes them."""
@@ -110,20 +103,13 @@ class Clips:
             self._clip.live.leave()
 
     def _start(self, steps: int | None) -> None:
-        self._clip, self._ending = _Clip(self._run, steps), None
+        self._clip = _Clip(self._run, steps)
         self._clip.begin()
 
-    def _settle(self) -> None:
-        """End the running video, if it is over."""
-        if self._clip is None or self._ending is None:
-            return
-        try:
-            self._clip.end(self._ending)
-        except Exception:
-            # There is nothing more to be had of it.
-            self._clip = None
-            raise
-        self._clip = None
+    def _end(self, facts: Mapping[str, Any]) -> None:
+        clip, self._clip = self._clip, None
+        if clip is not None:
+            clip.end(facts)
 
 
 class _Clip:
@@ -150,7 +136,7 @@ class _Clip:
         second_name = run.second_name("episode", self._episode_id)
         if taken is not None:
             second_name = run.second_name("step", taken)
-        self._part: Recording | None = None
+        self._part: StateRecorder | None = None
         self._parts = 0
         start = None
         if run.subject.rendering.mode == DEFERRED:
@@ -158,14 +144,13 @@ class _Clip:
             start = run.subject.clip_states.begin_episode()
             start = start if run.can_be_deferred(start) else None
         if start is not None:
-            self._promise = run.promise(path, DEFERRED, second_name=second_name)
+            self._promise = run.promise(path.name, DEFERRED, second_name=second_name)
             self._video = path.with_name(f"{path.name}.mp4")
-            self._part = self._new_part(start)
-            self._parts = 1
+            self._begin_part(start)
         else:
-            self.live = run.live_videos(path, second_name=second_name)
-            self._video = Path(str(self.live.recorders[0].path))
-            self._say(first_step=self._first_step, last_episode_id=self._episode_id)
+            self.live = live_videos(run, path, second_name=second_name)
+            self._video = self.live.path
+            self.live.say(first_step=self._first_step, last_episode_id=self._episode_id)
 
     def begin(self) -> None:
         """Take the picture of this moment, where it is drawn live."""
@@ -176,22 +161,19 @@ class _Clip:
         """Take the picture of an episode that has just begun."""
         self._last_episode_id = self._run.episode.episode_id
         if self.live is not None:
-            self._say(last_episode_id=self._last_episode_id)
+            self.live.say(last_episode_id=self._last_episode_id)
             self.live.begin()
-        part, states = self._part, self._run.subject.clip_states
+        part, capture = self._part, self._run.subject.clip_states
         if part is None or part.broken_reason is not None:
             return
-        assert states is not None
-        start = states.begin_episode()
+        assert capture is not None
+        start = capture.begin_episode()
         if start.refusal is not None:
             part.end_frames(start.refusal)
             return
-        coming = self._new_part(start)
-        part.note(continues=True, end_time=self._run.clock())
-        part.end({})
+        part.end({"continues": True, "end_time": self._run.clock()})
         if part.broken_reason is None:
-            self._part = coming
-            self._parts += 1
+            self._begin_part(start)
 
     def step(
         self, reward: float, terminated: bool, truncated: bool, *, has_picture: bool
@@ -204,49 +186,38 @@ class _Clip:
             return
         if not has_picture:
             part.note(final_frame="missing")
-        # What was done is of no use to a picture.
-        part.before_step(None)
         part.step(
             reward, terminated=terminated, truncated=truncated, has_picture=has_picture
         )
 
     def end(self, facts: Mapping[str, Any]) -> None:
-        """Write what is known of the end."""
+        """Write what is known of the end, and hand the video on."""
+        run = self._run
         known = {**facts, "length": self.steps, "reward": self.reward}
-        try:
-            if self.live is not None:
-                self._end_live(self.live, known)
-            if self._part is not None:
-                known["last_episode_id"] = self._last_episode_id
-                # It may have been said before that it goes on.
-                self._part.note(**known, end_time=self._run.clock())
-                self._part.end({})
-        finally:
-            self._list()
-
-    def _end_live(self, live: LiveVideos, facts: Mapping[str, Any]) -> None:
-        try:
-            live.take_last()
-        finally:
-            live.end(facts)
-
-    def _list(self) -> None:
-        run, facts = self._run, {"episode_id": self._episode_id}
+        said = {"episode_id": self._episode_id, "video": self._video.name}
         if self.live is not None:
-            video = {**facts, "recording": LIVE, "video": self._video.name}
-            run.journal.note("clip", video)
-            run.trackers.expect(self._video)
-            self.live.name_again()
-        elif self._part is not None and (self._parts > 1 or self._part.is_there):
-            # Else the disk was too full for a single row: there is nothing to promise.
-            first_part = self._name(0)
-            video = {**facts, "clip": first_part, "video": self._video.name}
-            run.journal.note("clip", video)
-            run.trackers.expect(self._video)
-            run.finisher.submit(run.directory / first_part)
+            try:
+                try:
+                    self.live.take_last()
+                finally:
+                    self.live.end(known)
+            finally:
+                run.note("clip", {**said, "recording": LIVE})
+                run.trackers.expect(self._video)
+                self.live.name_again()
+        elif self._part is not None:
+            try:
+                last = {"last_episode_id": self._last_episode_id}
+                self._part.end({**known, **last, "end_time": run.clock()})
+            finally:
+                # Else the disk was too full for a single row: nothing is promised.
+                if self._parts > 1 or self._part.is_there:
+                    run.note("clip", {**said, "clip": self._name(0)})
+                    run.trackers.expect(self._video)
+                    self._part.submit(run.directory / self._name(0))
 
-    def _new_part(self, start: EpisodeStart) -> Recording:
-        """Return what records the part that begins now. Its rows come later."""
+    def _begin_part(self, start: EpisodeStart) -> None:
+        """Record the part that begins now."""
         run = self._run
         clip = {
             "first_step": self._first_step,
@@ -256,22 +227,20 @@ class _Clip:
             "reset_time": run.episode.reset_clock,
         }
         facts = {"kept": False, "video": self._promise, "clip": clip}
-        return Recording(
+        self._part = StateRecorder(
             run,
             self._name(self._parts),
             logs=run.clip_logs,
             what="video",
             facts={**run.recording_facts(start), **facts},
-            states=run.subject.clip_states,
+            capture=run.subject.clip_states,
             start=start,
-            # Which of the frames are wanted is chosen when they are drawn: they are
-            # counted over all parts. So `max_fps` is not said here.
+            # What was done is of no use to a picture. Which frames are wanted is chosen
+            # when they are drawn, because they are counted over all parts: so `max_fps`
+            # is not said here.
+            has_actions=False,
         )
+        self._parts += 1
 
     def _name(self, number: int) -> str:
         return clip_part_name(self._run.infix, self._first_step, number)
-
-    def _say(self, **facts: Any) -> None:
-        assert self.live is not None
-        for recorder in self.live.recorders:
-            recorder.metadata.update(facts)

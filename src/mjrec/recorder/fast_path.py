@@ -76,17 +76,19 @@ def gathering(
     *,
     set_action: Callable[[Any], bool],
     is_current: Callable[[], bool],
+    is_on_pace: Callable[[], bool],
     stride: int,
 ) -> FastPath:
     """Return what records steps with one copy of memory each.
 
     Args:
         stats: counts the steps.
-        span: the recording, which has its first rows.
+        span: the recording, which has its first row.
         words: those of a row but its head, in `WORDS`.
         set_action: puts the action into the memory that is gathered; False where it is
             not like those before.
         is_current: tells, after the step, whether nothing but the state is new.
+        is_on_pace: tells, after the first step, whether it lasted as long as supposed.
         stride: only steps of which this is a factor have a frame.
     """
     log, bodies = span.log.rows, span.log.bodies
@@ -105,9 +107,11 @@ def gathering(
             if type(reward) is not int or abs(reward) > _LARGEST:
                 return False
             reward = float(reward)
+        number = span.steps + 1
+        if number == 1 and not is_on_pace():
+            return False
         slot = row % capacity
         take(words, None, bodies[slot], "clip")
-        number = span.steps + 1
         is_last = terminated or truncated
         is_frame = is_last or number % stride == 0
         flags = both if is_frame else STEP

@@ -13,8 +13,8 @@ from collections.abc import Iterable
 from typing import Any
 
 from ..errors import Error, InvalidArgument
-from .episode_recording import EpisodeRecording
 from .keep_rules import Selection, Standing
+from .recording import EpisodeRecording
 from .tracking import FinishedEpisode
 
 logger = logging.getLogger(__name__)
@@ -50,13 +50,12 @@ class KeptVideos:
             episode_id: its number.
             episode: the episode; None where it was not completed.
         """
-        if episode is None:
-            return Standing.DROPPED
-        self.selection.add(episode)
+        if episode is not None:
+            self.selection.add(episode)
         return self.selection.standing(episode_id)
 
     def hold(self, recording: EpisodeRecording) -> None:
-        """Hold what there is of an episode that has ended and is a candidate."""
+        """Hold what there is of an episode that has ended, until it is decided on."""
         if self.selection.holds_all and not self._most_bytes_held:
             logger.info(
                 "Which episodes get a video is decided at the end (keep=%s): until "
@@ -66,7 +65,8 @@ class KeptVideos:
         size = recording.size
         self._held[recording.episode_id] = recording, size
         self._bytes_held += size
-        self._most_bytes_held = max(self._most_bytes_held, self._bytes_held)
+        if self.selection.standing(recording.episode_id) is Standing.CANDIDATE:
+            self._most_bytes_held = max(self._most_bytes_held, self._bytes_held)
 
     def settle(self) -> None:
         """Hand on what is chosen by now, and delete what has fallen out.

@@ -3,13 +3,17 @@
 
 from __future__ import annotations
 
-import contextlib
+import functools
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from ..errors import Error
+from ..errors import DirectoryNotWritable, Error
+from ..formats.frame_hashes import frame_hash_path
 from ..formats.second_names import give_second_names
+from ..formats.video_metadata import amend_metadata
+from ..formats.video_names import second_name_of
+from .monitored_run import MonitoredRun
 from .video_recorder import VideoRecorder
 
 
@@ -36,6 +40,16 @@ class LiveVideos:
         self.recorders = recorders
         self._tolerates = tolerates
         self._on_picture_error = on_picture_error
+
+    @property
+    def path(self) -> Path:
+        """The first camera's video."""
+        return Path(str(self.recorders[0].path))
+
+    @property
+    def size(self) -> int:
+        """The bytes of all files."""
+        return sum(path.stat().st_size for path in self._files() if path.exists())
 
     def begin(self) -> None:
         """Take the frames of a reset."""
@@ -65,6 +79,11 @@ class LiveVideos:
         """Take the frames of the last step, where they were left out."""
         self._each(VideoRecorder.capture_last)
 
+    def say(self, **facts: Any) -> None:
+        """Add to the metadata."""
+        for recorder in self.recorders:
+            recorder.metadata.update(facts)
+
     def give_up(self, reason: str) -> None:
         """Take no more pictures, and say why; those that were taken stay."""
         for recorder in self.recorders:
@@ -80,33 +99,73 @@ class LiveVideos:
         for recorder in self.recorders:
             recorder.leave()
 
-    def end(
-        self,
-        facts: Mapping[str, Any],
-        on_closed: Callable[[VideoRecorder], object] = lambda _: None,
-    ) -> None:
-        """Finish the files. Where it was interrupted, the next call goes on.
+    def end(self, facts: Mapping[str, Any]) -> None:
+        """Finish the files.
 
         The metadata of the first camera's video is the sign that all are there, and
         names the others: it comes last, also where ending another one raises.
 
         Args:
             facts: what is known of the episode, for the metadata.
-            on_closed: called with each that is closed.
         """
+        self.say(**facts)
         first, *others = self.recorders
-        with contextlib.ExitStack() as ends:
-            # Run from the last to the first.
-            ends.callback(self._end_one, first, facts, on_closed)
-            ends.callback(_name_further_videos, first, others)
-            for recorder in others:
-                ends.callback(self._end_one, recorder, facts, on_closed)
+        failure: Error | None = None
+        for recorder in (*others, first):
+            if recorder is first:
+                names = [Path(str(each.path)).name for each in others if each.finished]
+                first.metadata.update({"further_videos": names} if names else {})
+            try:
+                recorder.close()
+            except Error as error:
+                if not self._tolerates(error):
+                    failure = failure or error
+        if failure is not None:
+            raise failure
 
     def name_again(self) -> None:
         """Give the finished videos their second names, if they have any."""
         first = self.recorders[0]
-        if first.finished and first.path is not None and "also_named" in first.metadata:
-            give_second_names(Path(first.path))
+        if first.finished and "also_named" in first.metadata:
+            give_second_names(self.path)
+
+    def amend(self, facts: Mapping[str, Any]) -> None:
+        """Add to the metadata of finished videos.
+
+        Raises:
+            FileNotWritten: the disk is full.
+        """
+        self.say(**facts)
+        for recorder in self.recorders:
+            amend_metadata(Path(str(recorder.path)), facts)
+
+    def remove(self) -> None:
+        """Remove finished videos.
+
+        Raises:
+            DirectoryNotWritable: they cannot be removed.
+        """
+        for path in self._files():
+            try:
+                path.unlink(missing_ok=True)
+            except OSError as error:
+                raise DirectoryNotWritable(path.parent, error) from error
+
+    def _files(self) -> list[Path]:
+        """Return all files, in the order in which they may go.
+
+        The first camera's metadata, written last, is the sign that all are there.
+        """
+        return [
+            file
+            for recorder in reversed(self.recorders)
+            if recorder.path is not None and recorder.metadata_path is not None
+            for file in (
+                Path(recorder.metadata_path),
+                Path(recorder.path),
+                frame_hash_path(Path(recorder.path)),
+            )
+        ]
 
     def _each(self, capture: Callable[[VideoRecorder], None]) -> None:
         for recorder in self.recorders:
@@ -117,26 +176,53 @@ class LiveVideos:
                     raise
                 recorder.give_up(str(error))
 
-    def _end_one(
-        self,
-        recorder: VideoRecorder,
-        facts: Mapping[str, Any],
-        on_closed: Callable[[VideoRecorder], object],
-    ) -> None:
-        if recorder.closed:
-            return
-        recorder.metadata.update(facts)
-        try:
-            recorder.close()
-        except Error as error:
-            if not self._tolerates(error):
-                raise
-        finally:
-            if recorder.closed:
-                on_closed(recorder)
 
+def live_videos(
+    run: MonitoredRun,
+    path: Path,
+    *,
+    second_name: Mapping[str, str],
+    on_picture_error: Callable[[Exception], object] = lambda _: None,
+) -> LiveVideos:
+    """Return what draws videos of the running episode, of each camera.
 
-def _name_further_videos(first: VideoRecorder, others: Sequence[VideoRecorder]) -> None:
-    names = [Path(v.path).name for v in others if v.finished and v.path is not None]
-    if names:
-        first.metadata["further_videos"] = names
+    Args:
+        run: of which they are.
+        path: of the first camera's, without its ending.
+        second_name: as `MonitoredRun.second_name`.
+        on_picture_error: as of `LiveVideos`.
+    """
+    options, subject = run.options, run.subject
+    sources = {"": subject.pictures, **subject.further_pictures}
+    recorders = [
+        VideoRecorder(
+            pictures,
+            base_path=path.with_name(f"{path.name}.{name}" if name else path.name),
+            metadata=run.live_facts(),
+            fps=options.fps,
+            max_fps=options.max_fps,
+            frame_hashes=True,
+            clock=subject.clock,
+            declared=subject.declared,
+            facts=pictures.facts,
+            strict=options.strict,
+            caption=run.caption if options.annotate else None,
+        )
+        for name, pictures in sources.items()
+    ]
+    first, *others = recorders
+    if first.path is not None:
+        first.metadata.update(second_name)
+        first_name = Path(first.path).name
+        for other in others:
+            other.metadata["first_video"] = first_name
+            for second in second_name.values():
+                name = Path(str(other.path)).name
+                other.metadata["also_named"] = second_name_of(
+                    name, second, first=first_name
+                )
+    return LiveVideos(
+        recorders,
+        tolerates=functools.partial(run.tolerates, "video"),
+        on_picture_error=on_picture_error,
+    )

@@ -1,41 +1,40 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What all recordings of one run share: episodes and clips, deferred and live."""
+"""What all recordings of one run share: its journal, its logs, and its facts."""
 
 from __future__ import annotations
 
-import functools
 import itertools
 import logging
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
-
-import numpy as np
-from numpy.typing import NDArray
+from typing import TYPE_CHECKING, Any, Literal
 
 from ..annotation import Caption
-from ..errors import Error
-from ..formats.monitor_directory import ClipPart, Infix
-from ..formats.span_writer import SpanLogs
-from ..formats.spans import is_in_flight
-from ..formats.video_names import second_name_of
+from ..atomic_files import file_sha256
+from ..errors import FileNotWritten
+from ..formats.journal import JournalEntry, JournalWriter
+from ..formats.monitor_directory import journal_name
+from ..formats.span_writer import OpenLog, SpanLogs
 from ..machine import machine_fingerprint
-from ..provenance import versions
-from .live_videos import LiveVideos
+from ..provenance import look_around, versions
+from ..results.run import Run
+from . import tracking
+from .finishers import Finisher
 from .opening import OpenDirectory
-from .options import LIVE, RecorderOptions
-from .run_journal import RunJournal, What
+from .options import LIVE, WARN, RecorderOptions
 from .stats_recorder import StatsRecorder
-from .step_arrays import StepArray
-from .subject import EpisodePictures, Subject, check_refusal
+from .subject import Subject, check_refusal
 from .tracking import Trackers
 from .video_recorder import VideoRecorder
 
 if TYPE_CHECKING:
     from ..simulation.capture import EpisodeStart
+    from .states import RowLayout
 
 logger = logging.getLogger(__name__)
+
+What = Literal["video", "trajectory", "statistics", "journal", "model", "tracker"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,91 +61,33 @@ class BegunEpisode:
     reset_clock: float | None = None
 
 
-class Finisher(Protocol):
-    """Turns ended recordings into trajectories and videos, beside the simulation."""
-
-    def expect(self) -> None:
-        """Get ready: a recording will come that has a video. Never waits."""
-
-    def submit(self, recording: Path) -> None:
-        """Take over an ended trajectory, or a clip by its first part. Never waits."""
-
-    def wait(self, on_progress: Callable[[Any], None]) -> None:
-        """Return when all that was taken over is done."""
-
-    def stop(self) -> None:
-        """Stop at once; the rest stays pending. Idempotent."""
-
-    @property
-    def failures(self) -> Mapping[str, str]:
-        """Why videos could not be rendered, by the base names of the videos."""
-
-
-class LaterFinisher:
-    """Draws nothing; makes the trajectories when the monitor closes.
-
-    It is a `Finisher` for runs whose videos are rendered another time, or never.
-    """
-
-    def __init__(self) -> None:
-        self.failures: Mapping[str, str] = {}
-        self._waiting: list[Path] = []
-
-    def expect(self) -> None:
-        """Do nothing."""
-
-    def submit(self, recording: Path) -> None:
-        """Keep a trajectory in mind; clips stay as they are."""
-        if ClipPart.parse(recording.name) is None:
-            self._waiting.append(recording)
-
-    def wait(self, on_progress: Callable[[Any], None]) -> None:
-        """Make the trajectories.
-
-        Raises:
-            Error: of the last that could not be made; the others are there.
-        """
-        # Not at the top: it loads h5py, which the simulation has no use for.
-        from ..formats.trajectory_file import finish_trajectory
-
-        failure: Error | None = None
-        waiting, self._waiting = self._waiting, []
-        for recording in waiting:
-            try:
-                if is_in_flight(recording):
-                    finish_trajectory(recording)
-            except Error as error:
-                failure = error
-                self._waiting.append(recording)
-        if failure is not None:
-            raise failure
-
-    def stop(self) -> None:
-        """Do nothing."""
-
-
 class MonitoredRun:
     """What all recordings of one run share, and what files say of them.
+
+    It writes the run's journal. With `on_error="raise"` a fault is an error that the
+    caller raises; with "warn" it is one warning and a line in the manifest, and the
+    simulation goes on.
 
     Args:
         place: the open directory.
         subject: what is recorded.
         options: what was asked for.
         stats: counts steps and rewards.
-        journal: of the run.
         finisher: takes over recordings that have ended.
-        trackers: are told of finished videos.
-        selection: `selection` of a video that is chosen after its episode's end; empty
+        selection: what is said of a video that is chosen after its episode's end; empty
             where it is chosen before.
 
     Attributes:
-        subject, options, stats, journal, finisher, trackers, selection: as given.
+        subject, options, stats, finisher, selection: as given.
         directory: the monitor directory.
         infix: what its files have in the middle.
         clock: returns the time, in seconds since the epoch.
+        events: what the journal says so far, also what the disk was too full for.
+        trackers: are told of episodes and finished videos.
         logs: of the episodes' rows.
         clip_logs: of the clips'.
-        action, row_words: what the next recording may use again of the last one.
+        layouts, paces: of the last recording in each of these.
+        no_video: stands for the video of an episode that gets none.
     """
 
     def __init__(
@@ -156,39 +97,160 @@ class MonitoredRun:
         subject: Subject,
         options: RecorderOptions,
         stats: StatsRecorder,
-        journal: RunJournal,
         finisher: Finisher,
-        trackers: Trackers,
         selection: Mapping[str, Any],
     ) -> None:
-        self.directory: Path = place.path
-        self.infix: Infix = place.infix
-        self.subject = subject
-        self.options = options
+        self.directory, self.infix = place.path, place.infix
+        self.subject, self.options, self.stats = subject, options, stats
         self.clock = options.clock
-        self.stats = stats
-        self.journal = journal
-        self.finisher = finisher
-        self.trackers = trackers
-        self.selection = selection
+        self.finisher, self.selection = finisher, selection
+        self.events = Run(place.run)
+        self._journal_path = self.directory / journal_name(self.infix)
+        self._journal = JournalWriter(self._journal_path, run=place.run)
+        self._faults: set[tuple[int | None, What, str]] = set()
+        self._policy = _policy_facts(options)
+        self._statements = options.statements
+        self._surroundings = None if options.statements else look_around()
+        self._environment_facts = {
+            "infix": str(self.infix),
+            "env_id": subject.env_id,
+            "environment": subject.environment,
+            "versions": dict(versions()),
+            "machine": dict(machine_fingerprint()),
+        }
+        self.trackers = Trackers(
+            tracking.Run(
+                directory=self.directory,
+                infix=str(self.infix),
+                env_id=subject.env_id,
+                env_index=subject.env_index,
+            ),
+            options.all_trackers,
+            on_fault=lambda name, error, number: self.note_fault(
+                "tracker", f"{name}: {error}", episode_id=number
+            ),
+        )
         numbers = itertools.count()
         self.logs, self.clip_logs = (
             SpanLogs(
-                place.path,
-                place.infix,
+                self.directory,
+                self.infix,
                 numbers=numbers,
                 tail_bytes=options.tail_bytes,
             )
             for _ in range(2)
         )
-        # Of the last recording, which the next one's are usually like: the memory of
-        # actions, and the words of a row with those of the state before them.
-        self.action: StepArray | None = None
-        self.row_words: tuple[object, object, NDArray[np.intp]] | None = None
-        self._no_video = VideoRecorder(subject.pictures, enabled=False)
+        self.layouts: dict[SpanLogs, RowLayout] = {}
+        self.paces: dict[SpanLogs, Mapping[str, Any]] = {}
+        # Recordings whose ends are not in their lists yet: the disk was full.
+        self._late: list[Path] = []
+        self.no_video = VideoRecorder(subject.pictures, enabled=False)
         self._episode: BegunEpisode | None = None
         # Why videos are drawn live, as far as it was said.
         self._said: set[str] = set()
+
+    # --- the journal -----------------------------------------------------------------
+
+    def add(self, entry: JournalEntry) -> None:
+        """Write down a completed episode.
+
+        Raises:
+            FileNotWritten: the disk is full.
+        """
+        self.events.add(entry)
+        self._write(lambda: self._journal.append(entry))
+        self.note_surroundings()
+
+    def note(self, kind: str, facts: Any) -> None:
+        """Write down another event, one of `formats.journal.EVENTS`.
+
+        Raises:
+            FileNotWritten: the disk is full.
+        """
+        self.events.note(kind, facts)
+        self._write(lambda: self._journal.note(kind, facts))
+
+    def note_surroundings(self, *, wait: bool = False) -> None:
+        """Write down what the run is made with, once that is known.
+
+        Args:
+            wait: wait for it a little.
+        """
+        if self.events.surroundings is None:
+            found = self._found(wait=wait)
+            if found is not None:
+                self.note("surroundings", found)
+
+    def tolerates(
+        self, what: What, error: BaseException, *, of_episode: bool = True
+    ) -> bool:
+        """Note a fault, and tell whether the simulation may go on.
+
+        Args:
+            what: could not be recorded.
+            error: why.
+            of_episode: False where it is not the running episode's.
+        """
+        has_episode = of_episode and self._episode is not None
+        episode_id = self.episode.episode_id if has_episode else None
+        is_warned = self.options.on_error == WARN
+        if is_warned and self.note_fault(what, str(error), episode_id=episode_id):
+            of = "" if episode_id is None else f" of episode {episode_id}"
+            logger.warning("Not recorded whole: %s%s. %s", what, of, error)
+        return is_warned
+
+    def note_fault(self, what: What, reason: str, *, episode_id: int | None) -> bool:
+        """Write a fault down; return whether it is a new one."""
+        fault = (episode_id, what, reason)
+        if fault in self._faults:
+            return False
+        self._faults.add(fault)
+        facts = {"episode_id": episode_id, "what": what, "reason": reason}
+        self.note("fault", facts)
+        return True
+
+    def submit(self, recording: Path, log: OpenLog | None) -> None:
+        """Let a recording be finished, now or when its log says that it has ended."""
+        if log is not None and log.is_behind:
+            self._late.append(recording)
+        else:
+            self.finisher.submit(recording)
+
+    def close_logs(self) -> None:
+        """Write all rows, and what else the logs lack.
+
+        Raises:
+            FileNotWritten: the disk is full; the next call tries again.
+        """
+        self.logs.close()
+        self.clip_logs.close()
+        while self._late:
+            self.finisher.submit(self._late.pop(0))
+
+    def leave(self) -> None:
+        """Let go of journal and logs as they are; idempotent."""
+        for logs in (self.logs, self.clip_logs):
+            logs.release()
+        self._journal.close()
+
+    def _found(self, *, wait: bool) -> Mapping[str, Any] | None:
+        if (stated := self._statements) is not None:
+            is_time = wait or self.events.count >= stated.surroundings_after
+            return stated.surroundings if is_time else None
+        found = (
+            None if self._surroundings is None else self._surroundings.found(wait=wait)
+        )
+        return None if found is None else {**found, **self._policy}
+
+    def _write(self, write: Callable[[], None]) -> None:
+        try:
+            write()
+        except OSError as error:
+            named = FileNotWritten(self._journal_path, error.strerror or error)
+            if not self.tolerates("journal", named):
+                raise named from error
+
+    # --- facts -----------------------------------------------------------------------
 
     @property
     def episode(self) -> BegunEpisode:
@@ -197,13 +259,9 @@ class MonitoredRun:
         return self._episode
 
     def begin(self, episode: BegunEpisode) -> None:
-        """Take note of an episode that begins."""
+        """Take note of an episode that begins: faults are its own from here on."""
         self._episode = episode
-        self.journal.begin(episode.episode_id)
-
-    def tolerates(self, what: What, error: BaseException) -> bool:
-        """Note what of the running episode is lost; tell whether to go on."""
-        return self.journal.tolerates(what, error)
+        self.events.begin(episode.episode_id, chosen=False)
 
     def caption(self) -> Caption:
         """Return what is written on the frame of this moment."""
@@ -235,18 +293,18 @@ class MonitoredRun:
         return False
 
     def promise(
-        self, path: Path, recording: str, *, second_name: Mapping[str, str]
+        self, name: str, recording: str, *, second_name: Mapping[str, str]
     ) -> dict[str, Any]:
         """Return what a trajectory, or a clip, says of its video.
 
         Args:
-            path: where it will be, without the ending.
+            name: of its file, without the ending.
             recording: when it is drawn, `DEFERRED` or `LIVE`.
             second_name: as of `second_name`.
         """
         options, subject = self.options, self.subject
         promise: dict[str, Any] = {
-            "name": f"{path.name}.mp4",
+            "name": f"{name}.mp4",
             "quality": options.quality,
             "fps": None if options.fps is None else str(options.fps),
             "max_fps": None if options.max_fps is None else str(options.max_fps),
@@ -282,16 +340,12 @@ class MonitoredRun:
         """
         episode = self.episode
         return {
+            **self._environment_facts,
             "episode_id": episode.episode_id,
-            "infix": str(self.infix),
-            "env_id": self.subject.env_id,
             "type": episode.type,
             "start_time": episode.start_time,
             "seed": episode.seed,
             "options": episode.options,
-            "environment": self.subject.environment,
-            "versions": dict(versions()),
-            "machine": dict(machine_fingerprint()),
             "model": None if start is None else start.model,
             "scene": None if start is None else start.scene,
             "refusal": None if start is None else start.refusal,
@@ -299,73 +353,19 @@ class MonitoredRun:
 
     def live_facts(self) -> dict[str, Any]:
         """Return what the metadata of a live video says of the running episode."""
+        known = self.recording_facts(None)
+        keys = ("episode_id", "type", "env_id", "seed", "options")
         reason = self.subject.rendering.reason
-        episode = self.episode
         return {
-            "episode_id": episode.episode_id,
-            **({} if reason is None else {"recording_reason": reason}),
-            "type": episode.type,
-            "env_id": self.subject.env_id,
-            "seed": episode.seed,
-            "options": episode.options,
+            **{key: known[key] for key in (*keys, "versions", "machine")},
             "recording": LIVE,
-            "versions": dict(versions()),
-            "machine": dict(machine_fingerprint()),
+            **({} if reason is None else {"recording_reason": reason}),
             **({"selection": self.selection} if self.selection else {}),
         }
 
-    def live_videos(
-        self,
-        path: Path,
-        *,
-        second_name: Mapping[str, str],
-        on_picture_error: Callable[[Exception], object] = lambda _: None,
-    ) -> LiveVideos:
-        """Return what draws videos while the simulation runs, of each camera.
 
-        Args:
-            path: of the first camera's, without its ending.
-            second_name: as of `second_name`.
-            on_picture_error: as of `LiveVideos`.
-        """
-        recorders = [self._live_recorder(path, self.subject.pictures)]
-        if recorders[0].path is not None:
-            recorders[0].metadata.update(second_name)
-            for name, pictures in self.subject.further_pictures.items():
-                other_path = path.with_name(f"{path.name}.{name}")
-                other = self._live_recorder(other_path, pictures)
-                other.metadata["first_video"] = Path(recorders[0].path).name
-                for second in second_name.values():
-                    other.metadata["also_named"] = second_name_of(
-                        Path(str(other.path)).name,
-                        second,
-                        first=Path(recorders[0].path).name,
-                    )
-                recorders.append(other)
-        return LiveVideos(
-            recorders,
-            tolerates=functools.partial(self.tolerates, "video"),
-            on_picture_error=on_picture_error,
-        )
-
-    def no_video(self) -> VideoRecorder:
-        """Return what stands for the video of an episode that gets none."""
-        return self._no_video
-
-    def _live_recorder(
-        self, base_path: Path, pictures: EpisodePictures
-    ) -> VideoRecorder:
-        options = self.options
-        return VideoRecorder(
-            pictures,
-            base_path=base_path,
-            metadata=self.live_facts(),
-            fps=options.fps,
-            max_fps=options.max_fps,
-            frame_hashes=True,
-            clock=self.subject.clock,
-            declared=self.subject.declared,
-            facts=pictures.facts,
-            strict=options.strict,
-            caption=self.caption if options.annotate else None,
-        )
+def _policy_facts(options: RecorderOptions) -> dict[str, Any]:
+    if options.policy_file is None:
+        return {"policy": None}
+    path = Path(options.policy_file).absolute()
+    return {"policy": {"file": str(path), "sha256": file_sha256(path)}}

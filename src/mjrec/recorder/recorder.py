@@ -9,7 +9,6 @@ import os
 import weakref
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,7 +17,6 @@ from ..formats.journal import JournalEntry
 from ..formats.manifest import GYM_VERSION
 from ..formats.monitor_directory import (
     episode_of,
-    journal_name,
     stats_prefix,
     video_prefix,
 )
@@ -29,41 +27,24 @@ from ..results.manifest_writing import write_manifest_and_stats
 from .clips import Clips
 from .ending_reasons import CLOSE, RESET, ending
 from .episode_choice import EpisodeChoice
-from .episode_recording import EpisodeRecording
 from .fast_path import FastPath
+from .finishers import Finisher, LaterFinisher
 from .keep_rules import Standing
 from .kept_videos import KeptVideos
-from .monitored_run import BegunEpisode, Finisher, LaterFinisher, MonitoredRun
+from .monitored_run import BegunEpisode, MonitoredRun
 from .opening import open_directory
 from .options import LIVE, RecorderOptions, type_of_mode
-from .recording import DeferredVideo
-from .run_journal import RunJournal
+from .recording import EpisodeRecording
+from .states import DeferredVideo
 from .stats_recorder import StatsRecorder, reward_to_float
 from .subject import Subject, check_pictures
-from .tracking import FinishedEpisode, Run, Trackers
+from .tracking import FinishedEpisode
 from .video_recorder import VideoRecorder
 
 if TYPE_CHECKING:
     from ..simulation.capture import Capture
 
 logger = logging.getLogger(__name__)
-
-
-@dataclass
-class _End:
-    """How the running episode has ended: decided once, and then written down.
-
-    Attributes:
-        facts: `complete`, and what ended it.
-        standing: whether its video is kept.
-        episode: the episode, where it is complete.
-        is_journaled: the journal has it, or could not be written.
-    """
-
-    facts: Mapping[str, Any]
-    standing: Standing
-    episode: FinishedEpisode | None
-    is_journaled: bool = False
 
 
 class Recorder:
@@ -110,17 +91,11 @@ class Recorder:
         _recorders.add(self)
         # Why the running episode ends early, once the environment has raised.
         self._ending: dict[str, Any] | None = None
-        # What the last step said.
-        self._flags = {"terminated": False, "truncated": False}
-        self._success: bool | None = None
         self._recording: EpisodeRecording | None = None
-        self._end: _End | None = None
         self.closed = False
-        # What the next step may be recorded with; None where it needs a closer look.
         self.fast: FastPath | None = None
         self.evaluation_facts: Callable[[], Mapping[str, Any] | None] = lambda: None
 
-        self._clock = options.clock
         selection = self._choice.selection
         keep = None if selection is None else selection.facts()
         self._place = open_directory(
@@ -153,35 +128,13 @@ class Recorder:
             allow_early_reset=options.allow_early_reset,
         )
         self.stats_recorder.type = type_of_mode(options.mode)
-        self.stats_recorder.clock = self._clock
-        self._journal = RunJournal(
-            self.directory / journal_name(infix),
-            facts=self._place.run,
-            options=options,
-        )
-        self._trackers = Trackers(
-            Run(
-                directory=self.directory,
-                infix=str(infix),
-                env_id=subject.env_id,
-                env_index=subject.env_index,
-            ),
-            options.all_trackers,
-            on_fault=lambda name, error, number: self._journal.note_fault(
-                "tracker", f"{name}: {error}", episode_id=number
-            ),
-        )
-        self._finisher = (
-            LaterFinisher() if finisher is None else finisher(self.directory)
-        )
+        self.stats_recorder.clock = options.clock
         self.run = MonitoredRun(
             self._place,
             subject=subject,
             options=options,
             stats=self.stats_recorder,
-            journal=self._journal,
-            finisher=self._finisher,
-            trackers=self._trackers,
+            finisher=LaterFinisher() if finisher is None else finisher(self.directory),
             selection=(
                 {} if selection is None else {"rule": selection.name, "decided": False}
             ),
@@ -251,7 +204,7 @@ class Recorder:
         """
         self.check_process()
         self.fast = None
-        now = self._clock()
+        now = self.run.clock()
         self.stats_recorder.before_reset(after_error=self._ending is not None, now=now)
         if not self._is_unbegun():
             self._take_last_frame()
@@ -281,9 +234,8 @@ class Recorder:
             if self._recording is not None:
                 self._recording.discard()
         else:
-            self._end_episode(otherwise=RESET)
-        self._ending = self._end = None
-        self._flags = {"terminated": False, "truncated": False}
+            self._cut_episode(RESET)
+        self._ending = None
         self.stats_recorder.after_reset()
         self.run.begin(
             BegunEpisode(
@@ -298,19 +250,23 @@ class Recorder:
         )
         self._next_episode_id += 1
         # That of the episode before is over, whatever the schedule raises.
-        self._recording = EpisodeRecording(self.run, on_picture_error=self.note_error)
+        recording = EpisodeRecording(self.run, on_picture_error=self.note_error)
+        self._recording = recording
         try:
-            self._begin_episode(self._recording, observation)
+            self._begin_episode(recording, observation)
         except Exception as error:
             if not self.run.tolerates("video", error):
                 raise
             # Where it is only the first frame, states are recorded all the same.
-            self._recording.give_up(str(error))
+            if recording.live is not None:
+                recording.live.give_up(str(error))
+        if self._clips is None:
+            self.fast = recording.fast_path()
         if self._options.write_upon_reset:
             try:
                 self._write_results()
             except FileNotWritten as error:
-                if not self._journal.tolerates("statistics", error, of_episode=False):
+                if not self.run.tolerates("statistics", error, of_episode=False):
                     raise
 
     def note_event(self, kind: str, facts: Any) -> None:
@@ -319,7 +275,7 @@ class Recorder:
         Raises:
             FileNotWritten: the disk is full.
         """
-        self._journal.note(kind, facts)
+        self.run.note(kind, facts)
 
     def note_error(self, error: BaseException) -> None:
         """Note that the environment's step or reset has raised, or its user has.
@@ -343,8 +299,8 @@ class Recorder:
         self.stats_recorder.before_step()
         if self._clips is not None:
             self._clips.before_step()
-        if self._recording is not None:
-            self._recording.before_step(action)
+        if self._recording is not None and self._recording.states is not None:
+            self._recording.states.before_step(action)
 
     def step(
         self,
@@ -374,15 +330,20 @@ class Recorder:
         fast, self.fast = self.fast if done else None, None
         self._ending = None
         recording, clips = self._recording, self._clips
+        states = None if recording is None else recording.states
         failures = _Failures()
         is_counted = False
         try:
             # First of all: what is counted has a row, if it can have one.
             if fast is not None and picture:
                 is_counted = fast.step(reward, **flags)
-            if recording is not None and not is_counted:
-                recording.step(
-                    reward, **flags, observation=observation, has_picture=picture
+            if states is not None and not is_counted:
+                states.step(
+                    reward,
+                    **flags,
+                    observation=observation,
+                    is_last=done,
+                    has_picture=picture,
                 )
         except Error as error:
             failures.note(error)
@@ -390,28 +351,25 @@ class Recorder:
             # A signal's handler has raised: this step is not recorded.
             self.note_error(error)
             raise
-        self._flags, self._success = flags, success
         if is_counted:
             self.stats_recorder.done = True
             self.stats_recorder.save_complete()
         else:
             self.stats_recorder.count(reward, done)
-        if done:
-            # Before all that is drawn, so that no failing video can lose the episode.
-            with failures:
-                self._journal_end(CLOSE)
-        if recording is not None:
-            with failures:
-                recording.take_pictures(is_last=done, is_there=picture)
-        if clips is not None:
-            with failures:
-                clips.step(reward, **flags, has_picture=picture)
-        if done:
-            with failures:
-                self._end_episode()
-            self._tell_of_episode()
-        elif clips is None and recording is not None:
-            self.fast = recording.fast_path()
+        if not done:
+            self._take_pictures(failures, clips, reward, flags, picture)
+            if clips is None and recording is not None:
+                self.fast = recording.fast_path()
+        else:
+            episode = self._finished_episode(flags, success)
+            self._end_episode(
+                {"complete": True, **flags},
+                episode,
+                failures,
+                take=lambda: self._take_pictures(
+                    failures, clips, reward, flags, picture
+                ),
+            )
         failures.raise_first()
 
     def finish(self, on_progress: Callable[[Any], None] = lambda _: None) -> None:
@@ -432,9 +390,9 @@ class Recorder:
         with self._leaving_if_interrupted():
             self._end_recordings()
         try:
-            self._finisher.wait(on_progress)
+            self.run.finisher.wait(on_progress)
         except Error as error:
-            if not self._journal.tolerates("trajectory", error, of_episode=False):
+            if not self.run.tolerates("trajectory", error, of_episode=False):
                 raise
 
     def close(self) -> None:
@@ -453,10 +411,10 @@ class Recorder:
             return
         failures = _Failures()
         with self._leaving_if_interrupted():
-            self._finisher.stop()
+            self.run.finisher.stop()
             with failures:
                 self._end_recordings()
-            self._trackers.end()
+            self.run.trackers.end()
             pending = self._write_last_results()
         self._leave()
         self._say_what_is_left(pending)
@@ -465,7 +423,7 @@ class Recorder:
 
     def failures(self) -> Mapping[str, str]:
         """Return why videos could not be rendered, by their names."""
-        return self._finisher.failures
+        return self.run.finisher.failures
 
     def check_process(self) -> None:
         """Raise `Error` in a process forked from the one that made the recorder."""
@@ -487,7 +445,7 @@ class Recorder:
         if self._clips is not None:
             self._clips.reset(is_chosen=wanted)
         chosen = wanted and self._kept is None
-        self._journal.run.begin(episode.episode_id, chosen=chosen)
+        self.run.events.begin(episode.episode_id, chosen=chosen)
         # With clips the episode has no video of its own.
         wanted = wanted and self._clips is None
         recording.begin(
@@ -502,99 +460,136 @@ class Recorder:
     def _take_last_frame(self) -> None:
         """Take the frame of the running episode's last step, if it was left out."""
         is_running = self.stats_recorder.done is False and self._ending is None
-        if is_running and self._recording is not None:
-            self._recording.take_last()
+        recording = self._recording
+        if is_running and recording is not None and not recording.is_over:
+            recording.take_last()
 
-    def _end_episode(self, *, otherwise: str = CLOSE) -> None:
-        """Finish what is recorded of the running episode. Idempotent.
+    def _take_pictures(
+        self,
+        failures: _Failures,
+        clips: Clips | None,
+        reward: float,
+        flags: dict[str, bool],
+        picture: bool,
+    ) -> None:
+        """Take the frames of a step that are drawn live, and those of a clip."""
+        live = None if self._recording is None else self._recording.live
+        if live is not None:
+            with failures:
+                live.take(last=any(flags.values()), is_there=picture)
+        if clips is not None:
+            with failures:
+                clips.step(reward, **flags, has_picture=picture)
+
+    def _cut_episode(self, reason: str) -> None:
+        """End the running episode, if there is one, before it is complete.
 
         Args:
-            otherwise: why, where it is not over and nothing was raised.
+            reason: why, where nothing was raised.
+        """
+        if self._recording is not None and not self._recording.is_over:
+            failures = _Failures()
+            facts = {"complete": False, **(self._ending or {"reason": reason})}
+            self._end_episode(facts, None, failures)
+            failures.raise_first()
+
+    def _end_episode(
+        self,
+        facts: Mapping[str, Any],
+        episode: FinishedEpisode | None,
+        failures: _Failures,
+        take: Callable[[], None] = lambda: None,
+    ) -> None:
+        """End what is recorded of an episode, and hand it on or hold it.
+
+        Args:
+            facts: of its end.
+            episode: the episode; None where it is not complete.
+            failures: of all that is done here.
+            take: takes its last frames.
         """
         recording, kept = self._recording, self._kept
-        if recording is None or recording.is_over:
+        if recording is None:
             return
-        end = self._decided_end(otherwise)
-        failures = _Failures()
-        with failures:
-            self._journal_end(otherwise)
-        with failures:
-            chosen = {} if kept is None else kept.chosen_facts()
-            ended = self._end_time(end, otherwise)
-            recording.end(end.facts, end.standing, chosen, end_time=ended)
-            if kept is not None and end.standing is Standing.CANDIDATE:
-                kept.hold(recording)
-            else:
-                recording.hand_on()
-        with failures:
-            self._settle(None if kept is None else kept.settle)
-        failures.raise_first()
-
-    def _decided_end(self, otherwise: str) -> _End:
-        """Return how the running episode has ended, which is decided once."""
-        if self._end is None:
-            # Somebody else may have said that it is done.
-            is_complete = self.stats_recorder.done and any(self._flags.values())
-            episode = self._finished_episode() if is_complete else None
-            facts: dict[str, Any] = {"complete": True, **self._flags}
-            if episode is None:
-                facts = {"complete": False, **(self._ending or {"reason": otherwise})}
-            standing = Standing.CHOSEN
+        # Once, also where it is interrupted: recovery completes what is left of it.
+        recording.is_over = True
+        if not self._choice.is_scheduled:
             # What a schedule has said is final.
-            if self._kept is not None and self._choice.is_scheduled:
-                standing = self._kept.judge(self.run.episode.episode_id, episode)
-            self._end = _End(facts, standing, episode)
-        return self._end
+            kept = None
+        standing = Standing.CHOSEN
+        if kept is not None:
+            standing = kept.judge(recording.episode_id, episode)
+        try:
+            # Before all that is drawn, so that no failing video can lose the episode.
+            with failures:
+                self._journal_end(recording, facts, episode, standing)
+            take()
+            if standing is Standing.DROPPED and not recording.stays:
+                with failures:
+                    recording.discard()
+            else:
+                if kept is not None and standing is Standing.CHOSEN and recording.live:
+                    recording.live.say(selection=kept.chosen_facts())
+                with failures:
+                    recording.end(facts, end_time=self._end_time(facts, episode))
+                with failures:
+                    if kept is None:
+                        recording.hand_on()
+                    else:
+                        kept.hold(recording)
+            with failures:
+                self._settle(None if kept is None else kept.settle)
+        except BaseException:
+            recording.leave()
+            # It may go on to the last row there, and the next one is another.
+            self.run.logs.release()
+            raise
+        if episode is not None:
+            has_video = recording.video.enabled and standing is not Standing.DROPPED
+            self.run.trackers.episode(episode, has_video=has_video)
 
-    def _end_time(self, end: _End, otherwise: str) -> float:
-        if end.episode is not None:
-            return end.episode.end_time
-        return self._reset_time if otherwise == RESET else self._clock()
+    def _end_time(
+        self, facts: Mapping[str, Any], episode: FinishedEpisode | None
+    ) -> float:
+        if episode is not None:
+            return episode.end_time
+        return self._reset_time if facts.get("reason") == RESET else self.run.clock()
 
-    def _finished_episode(self) -> FinishedEpisode:
+    def _finished_episode(
+        self, flags: dict[str, bool], success: bool | None
+    ) -> FinishedEpisode:
         stats, episode = self.stats_recorder, self.run.episode
         return FinishedEpisode(
             episode_id=episode.episode_id,
             length=stats.episode_lengths[-1],
             reward=stats.episode_rewards[-1],
             type=stats.episode_types[-1],
-            success=self._success,
+            success=success,
             seed=episode.seed,
             options=episode.options,
             start_time=episode.start_time,
             end_time=stats.timestamps[-1],
             total_steps=stats.total_steps,
-            **self._flags,
+            **flags,
         )
 
-    def _journal_end(self, otherwise: str) -> None:
-        """Write down an episode that has ended; once, unless that was interrupted."""
-        end, recording = self._decided_end(otherwise), self._recording
-        if end.is_journaled or recording is None:
-            return
-        is_chosen = self._choice.is_scheduled and end.standing is Standing.CHOSEN
-        is_out = end.standing is Standing.DROPPED
+    def _journal_end(
+        self,
+        recording: EpisodeRecording,
+        facts: Mapping[str, Any],
+        episode: FinishedEpisode | None,
+        standing: Standing,
+    ) -> None:
+        is_chosen = self._choice.is_scheduled and standing is Standing.CHOSEN
+        is_out = standing is Standing.DROPPED
         choice = {"chosen": is_chosen, "recording": None if is_out else recording.mode}
-        failures = _Failures()
-        with failures:
-            if end.episode is not None:
-                of_evaluation = {"evaluation": self.evaluation_facts()}
-                facts = {**vars(end.episode), **choice, **of_evaluation}
-                del facts["total_steps"]
-                self._journal.add(JournalEntry(**facts))
-            else:
-                reason = {"reason": end.facts.get("reason")}
-                number = {"episode_id": recording.episode_id}
-                self._journal.note("cut", {**number, **reason, **choice})
-        end.is_journaled = True
-        failures.raise_first()
-
-    def _tell_of_episode(self) -> None:
-        end, video = self._end, self.video_recorder
-        if end is not None and end.episode is not None:
-            is_out = end.standing is Standing.DROPPED
-            has_video = video is not None and video.enabled and not is_out
-            self._trackers.episode(end.episode, has_video=has_video)
+        if episode is None:
+            number = {"episode_id": recording.episode_id}
+            self.run.note("cut", {**number, "reason": facts.get("reason"), **choice})
+        else:
+            known = {**vars(episode), **choice, "evaluation": self.evaluation_facts()}
+            del known["total_steps"]
+            self.run.add(JournalEntry(**known))
 
     def _end_recordings(self) -> None:
         """End whatever runs; what fails stops nothing else. Idempotent."""
@@ -606,7 +601,7 @@ class Recorder:
         with failures:
             self._take_last_frame()
         with failures:
-            self._end_episode()
+            self._cut_episode(CLOSE)
         with failures:
             self._settle(None if self._kept is None else self._kept.decide)
         for states in self._states:
@@ -614,16 +609,15 @@ class Recorder:
             # end with the process.
             with failures:
                 self._finish_models(states)
-        for logs in (self.run.logs, self.run.clip_logs):
-            with failures:
-                self._settle(logs.close)
+        with failures:
+            self._settle(self.run.close_logs)
         failures.raise_first()
 
     def _finish_models(self, states: Capture) -> None:
         try:
             states.finish()
         except Error as error:
-            if not self._journal.tolerates("model", error, of_episode=False):
+            if not self.run.tolerates("model", error, of_episode=False):
                 raise
 
     def _settle(self, do: Callable[[], None] | None) -> None:
@@ -654,13 +648,11 @@ class Recorder:
     def _leave(self) -> None:
         """Let go of all files as they are, as the end of this process would."""
         self.closed = self.stats_recorder.closed = True
-        self._finisher.stop()
+        self.run.finisher.stop()
         for each in (self._recording, self._clips):
             if each is not None:
                 each.leave()
-        for logs in (self.run.logs, self.run.clip_logs):
-            logs.release()
-        self._journal.close()
+        self.run.leave()
         self._place.lock.release()
 
     def _say_what_is_left(self, pending: int) -> None:
@@ -680,10 +672,10 @@ class Recorder:
 
     def _write_last_results(self) -> int:
         """Write what the run amounts to; return how many videos are pending."""
-        self._journal.note_surroundings(wait=True)
+        self.run.note_surroundings(wait=True)
         if self._kept is not None:
-            self._journal.note("keep", self._kept.details())
-        self._journal.note("closed", {"next_episode_id": self._next_episode_id})
+            self.run.note("keep", self._kept.details())
+        self.run.note("closed", {"next_episode_id": self._next_episode_id})
         for name, why in self.failures().items():
             # Most were written down by the process that has failed.
             video = self.directory / self._video_of(name)
@@ -693,7 +685,7 @@ class Recorder:
 
     def _video_of(self, name: str) -> str:
         """Return the name of the video of a recording, or of a video."""
-        for video, clip in self._journal.run.clips.items():
+        for video, clip in self.run.events.clips.items():
             if clip.get("clip") == name:
                 return video
         number = episode_of(name)
@@ -705,7 +697,7 @@ class Recorder:
         listing = write_manifest_and_stats(
             self.directory,
             self._place.infix,
-            run=self._journal.run,
+            run=self.run.events,
             stats=self.stats_recorder.stats(),
             is_own=True,
         )

@@ -34,14 +34,14 @@ from typing import TYPE_CHECKING, Any
 from ..child_python import Child, wait_for_news
 from ..errors import Error
 from ..formats.monitor_directory import infix_of
+from ..machine import check_workers
 from ..messages import log_message
 from ..parent import Parent
 from ..patience import Patience, patience_s
 from .jobs import Progress, VideoJob, key_of
-from .pool import check_workers
 
 if TYPE_CHECKING:
-    from .finish import Finisher
+    from .finisher import Finisher
 
 # Not `__name__`, which is `__main__` in the process.
 logger = logging.getLogger("mjrec.rendering.background")
@@ -191,6 +191,9 @@ class Background:
             # What it has told of failures belongs into the manifest.
             with contextlib.suppress(EOFError):
                 self._take_from(child)
+            if not self.waiting:
+                # There is nothing that it would have to clean up.
+                child.kill()
             child.end()
 
     def _was_forked(self) -> bool:
@@ -277,7 +280,7 @@ class _Stopped(BaseException):
 def main() -> None:
     """Finish the recordings that the simulation's process names, until it ends."""
     # Not at the top: the simulation's process needs none of it.
-    from .finish import Finisher
+    from .finisher import Finisher
 
     parser = argparse.ArgumentParser()
     parser.add_argument("directory", type=Path)
@@ -344,10 +347,12 @@ class _Work:
         while True:
             self._take_in_all()
             if not finisher:
-                finisher.rest()
                 self._take_in(self._parent.receive())
             elif finisher.is_ready() or self._is_waited_for:
                 job, result = finisher.do_next()
+                if not finisher:
+                    # Before the parent knows: it may end this process then.
+                    finisher.rest()
                 self._parent.send(progress=vars(finisher.progress))
                 failures = {**result.failures, **result.blank}
                 self._parent.send(done=job.recording, failures=failures)

@@ -10,7 +10,6 @@ rate, and the trajectory, where there is one, the episode.
 
 from __future__ import annotations
 
-import struct
 import time
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -21,7 +20,7 @@ from ..formats.asciicast import AsciicastWriter, unfinished_recording
 from ..formats.journal import KILLED
 from ..formats.locks import is_locked
 from ..formats.monitor_directory import episode_of
-from ..formats.unfinished_video import UnfinishedVideo, read_note
+from ..formats.unfinished_video import UnfinishedVideo, note_path, read_note
 from ..formats.video_metadata import (
     StepRuns,
     further_live_videos,
@@ -41,7 +40,7 @@ _SAID_BY_TRAJECTORY = ("type", "env_id", "seed", "options", "versions")
 
 
 def finish_video(
-    note_file: Path, known: Mapping[str, Any], *, deadline: float
+    path: Path, known: Mapping[str, Any], *, deadline: float
 ) -> Iterator[tuple[str, str]]:
     """Give a live video its name and its metadata, as far as it goes.
 
@@ -49,8 +48,8 @@ def finish_video(
     video broke, and why.
 
     Args:
-        note_file: the note beside it. That of an episode's first video comes after
-            those of its further cameras, which its metadata names.
+        path: the video. An episode's first comes after those of its further cameras,
+            which its metadata names.
         known: what is known of the end of its episode, with `complete` where it ended,
             and of its `length` and `reward`.
         deadline: until when to wait for its encoder, by `time.monotonic`.
@@ -62,47 +61,34 @@ def finish_video(
         Error: its encoder is still at it, or the files cannot be written.
     """
     try:
-        video = read_note(note_file)
+        video = read_note(path)
     except UnreadableFile:
         # A note is written before there is a video.
-        note_file.unlink(missing_ok=True)
+        note_path(path).unlink(missing_ok=True)
         return
     _wait_for_encoder(video, deadline)
-    if not metadata_path(video.path).exists():
+    if not metadata_path(path).exists():
         if _FIRST_STEP in video.metadata:
             # A clip crosses episodes: what is known of one says nothing of its end.
             known = {}
-        ending = known if "complete" in known else {**known, **_CUT}
-        without_video = {**video.metadata, **ending, "empty": True, "recovered": True}
         try:
-            if _holds_frames(video):
-                metadata = _metadata(video, video.finish(), known)
-                write_metadata(video.path, metadata)
-                yield video.path.name, _counted(metadata["frame_count"], metadata)
-            # The hash comes first: of the last one the encoder may have had nothing.
-            elif (lost := _hashed_frames(video)) > 1:
-                why = f"it holds none of {lost} frames"
-                broken = {"broken": True, "broken_reason": f"{_BROKEN}: {why}"}
-                write_metadata(video.path, {**without_video, **broken})
-                yield video.path.name, f"broken ({why})"
-            else:
-                # It was killed before its encoder had been given a frame.
-                write_metadata(video.path, without_video)
-                yield metadata_path(video.path).name, "there was no frame yet"
+            metadata = _metadata(video, video.finish(), known)
+            done = path.name, _counted(metadata["frame_count"], metadata)
         except EncoderError as error:
-            why = (error.stderr.strip().splitlines() or [str(error)])[-1]
-            broken = {"broken": True, "broken_reason": f"{_BROKEN}: {why}"}
-            write_metadata(video.path, {**without_video, **broken})
-            if video.hashes is not None:
-                video.hashes.unlink(missing_ok=True)
-            kept = f"its data is in {video.temporary.name}"
-            yield video.path.name, f"broken ({why}); {kept}"
-            return
-    video.temporary.unlink(missing_ok=True)
-    if video.hashes is not None:
-        video.hashes.unlink(missing_ok=True)
-    # The note last, which says what they were.
-    note_file.unlink(missing_ok=True)
+            ending = known if "complete" in known else {**known, **_CUT}
+            metadata = {**video.metadata, **ending, "empty": True, "recovered": True}
+            done = metadata_path(path).name, "there was no frame yet"
+            # The hash comes first: of the last one the encoder may have had nothing.
+            if video.hashed_frames > 1:
+                why = (error.stderr.strip().splitlines() or [str(error)])[-1]
+                metadata |= {"broken": True, "broken_reason": f"{_BROKEN}: {why}"}
+                write_metadata(path, metadata)
+                kept = f"its data is in {video.temporary.name}"
+                yield path.name, f"broken ({why}); {kept}"
+                return
+        write_metadata(path, metadata)
+        yield done
+    video.forget()
 
 
 def _counted(count: int, metadata: Mapping[str, Any]) -> str:
@@ -118,36 +104,6 @@ def _wait_for_encoder(video: UnfinishedVideo, deadline: float) -> None:
                 f"wait longer: mjrec recover --timeout 60 {video.path.parent}"
             )
         time.sleep(_MOMENT)
-
-
-def _holds_frames(video: UnfinishedVideo) -> bool:
-    """Tell whether the file holds anything besides what every mp4 begins with."""
-    path = video.temporary if video.temporary.exists() else video.path
-    # A link may lead anywhere.
-    if path.is_symlink() or not path.is_file():
-        return False
-    end = path.stat().st_size
-    with path.open("rb") as file:
-        position = 0
-        while position + 8 <= end:
-            file.seek(position)
-            size, kind = struct.unpack(">I4s", file.read(8))
-            if kind not in (b"ftyp", b"moov", b"free", b"mdat"):
-                return True
-            # 0 is to the end, as in one that is not finished, and 1 very large.
-            held = end - position if size == 0 else size
-            if kind == b"mdat" and held != 8:
-                return True
-            position += max(size, 8)
-    return False
-
-
-def _hashed_frames(video: UnfinishedVideo) -> int:
-    """Return how many frames have a hash, which the encoder was given or was to be."""
-    if video.hashes is None or video.hashes.is_symlink() or not video.hashes.is_file():
-        return 0
-    with video.hashes.open("rb") as lines:
-        return sum(not line.startswith(b"#") for line in lines)
 
 
 def _metadata(

@@ -16,9 +16,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from ..engines.jobs import Job, JobOutcome, Run, Work
+from ..engines.jobs import JobOutcome, Run, Work
 from ..simulation.model_trust import TRUST_VARIABLE, note_models, stored_models
-from .finish import Finisher, note_failure
+from .finisher import Finisher, note_failure
 from .jobs import Progress, RenderedVideos, VideoJob
 from .recordings import may_be_left
 
@@ -63,7 +63,7 @@ def do_on_engine(
     )
     with Run(engine, work) as run:
         for name, job in by_name.items():
-            run.submit(Job(key=name, arguments=job.as_json()))
+            run.submit(name, **job.as_json())
         for done in run.results():
             # Without patience there is always one.
             assert done is not None

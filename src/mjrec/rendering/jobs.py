@@ -8,7 +8,6 @@ once: the second finds nothing left to do, or puts the same file in its place.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
@@ -18,6 +17,7 @@ from typing import Any, Self
 from ..formats.monitor_directory import (
     ClipPart,
     Infix,
+    VideoName,
     clip_lock_name,
     clip_part_name,
     episode_of,
@@ -28,8 +28,6 @@ from ..formats.monitor_directory import (
 )
 from ..rates import to_rate
 from .views import Variant, View
-
-_CLIP_VIDEO = re.compile(r".*\.video[0-9]{6,18}\.step(?P<step>[0-9]{6,18})\.mp4")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -100,9 +98,9 @@ def key_of(name: str) -> RecordingKey | None:
     infix, number = Infix.parse(infix_of(name) or ""), episode_of(name)
     if infix is None or number is None:
         return None
-    clip = _CLIP_VIDEO.fullmatch(name)
-    if clip is not None:
-        return RecordingKey(infix, int(clip["step"]), is_clip=True)
+    video = VideoName.parse(name)
+    if video is not None and video.first_step is not None:
+        return RecordingKey(infix, video.first_step, is_clip=True)
     return RecordingKey(infix, number)
 
 

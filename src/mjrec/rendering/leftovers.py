@@ -1,219 +1,137 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What killed processes have left in a directory, monitor by monitor.
+"""What a monitor that is not open has left to be put in order.
 
-Only names and locks are looked at, and the episodes of journals counted: it is done at
-each `resume`, in the process of the simulation.
+Only names, locks, lists of spans and the journal are looked at: it is done at each
+`resume`, in the process of the simulation.
 """
 
 from __future__ import annotations
 
-import functools
 import re
-from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Literal, NamedTuple
 
 from ..errors import UnreadableFile
 from ..formats.locks import is_locked
 from ..formats.monitor_directory import (
-    Infix,
-    infix_of,
+    VideoName,
+    final_name,
+    is_note,
     iter_monitor_files,
-    lock_name,
-    names_in,
+    unfinished_files,
 )
-from ..formats.spans import SPANS, Recording, SpanList, read_list
+from ..formats.spans import SPANS, read_list
 from ..formats.unfinished_video import note_path
 from ..formats.video_metadata import is_broken, metadata_path
 from ..results.journal_or_stats import MonitorResults
-from ..results.monitor_files import MonitorFiles
+from ..results.monitor_files import MonitorFiles, monitors_of
 
-# A note is rewritten as every file is: an unfinished one has both endings.
-_PART = re.compile(
-    r"\.(?P<final>openaigym\..+?)(?P<note>\.note(\.part)?)?(?P<hex>\.[0-9a-f]{8})?\.part"
-)
-_MODEL_PART = re.compile(r"\.openaigym\.model\..+\.[0-9a-f]{8}\.part")
-_VIDEO = re.compile(
-    r"(?P<stem>openaigym\.video\..+)\.(?P<kind>mp4|framehash|meta\.json|json)"
-)
-_TEXT = re.compile(r"openaigym\.video\..+\.video\d{6,}\.json")
+_SHARED_LOCK = re.compile(r"\.openaigym\.(recover|render\.\d+)\.lock")
 
 
-@dataclass(frozen=True)
-class Leftovers:
-    """The files of one monitor, hidden ones too, and what is left to do about them.
+class Leftover(NamedTuple):
+    """One thing to do.
 
     Attributes:
-        directory: where they are.
-        infix: the monitor's.
-        paths: the files, sorted by name.
-        lists: its lists of spans.
-        damaged_lists: those that cannot be read, and why.
+        kind: a list of spans with ended episodes, or without any use; the note of a
+            live video; the frames of a text recording; an unfinished file that no
+            process will finish, or the lock of a dead one; results that may be older
+            than the rest.
+        path: of that file; of the results the directory.
     """
 
-    directory: Path
-    infix: Infix
-    paths: tuple[Path, ...]
-    lists: dict[Path, SpanList] = field(init=False, default_factory=dict)
-    damaged_lists: dict[Path, str] = field(init=False, default_factory=dict)
-
-    def __post_init__(self) -> None:
-        for path in self.paths:
-            if path.suffix == SPANS:
-                try:
-                    spans = self.lists[path] = read_list(path)
-                    if spans.is_headless:
-                        raise UnreadableFile(path, "it does not say what its rows are")
-                except UnreadableFile as error:
-                    self.lists.pop(path, None)
-                    self.damaged_lists[path] = str(error)
-
-    @functools.cached_property
-    def files(self) -> MonitorFiles:
-        """The files as results are read from them, with those that logs will become."""
-        logs = [each.path for each in self.in_flight if each.path.suffix == ".h5"]
-        return MonitorFiles(str(self.infix), (*self.paths, *logs))
-
-    @property
-    def lock(self) -> Path:
-        """What the monitor claimed its infix with; it may not be there."""
-        return self.directory / lock_name(self.infix)
-
-    @property
-    def is_open(self) -> bool:
-        """Whether a living process holds the monitor's lock."""
-        return is_locked(self.lock)
-
-    @functools.cached_property
-    def in_flight(self) -> list[Recording]:
-        """The recordings that only logs have."""
-        return [each for spans in self.lists.values() for each in spans.in_flight()]
-
-    @property
-    def idle_lists(self) -> list[Path]:
-        """Lists of spans that are not needed any more."""
-        return [path for path, spans in self.lists.items() if not spans.in_flight()]
-
-    @property
-    def unfinished_logs(self) -> list[Path]:
-        """The files of episodes in flight that are to get their final form."""
-        return [each.path for each in self.in_flight if each.path.suffix == ".h5"]
-
-    @property
-    def unfinished_files(self) -> dict[Path, str]:
-        """Hidden files that no process is at, each with what is to be done about it.
-
-        ============================================== ========
-        the note of a live video                       "video"
-        ... of one whose metadata says it is broken    (stays)
-        its mp4 and its frame hashes                   (with the note)
-        the frames of a text recording                 "text"
-        every other unfinished file                    "remove"
-        ============================================== ========
-        """
-        found: dict[Path, str] = {}
-        for path in self.paths:
-            match = _PART.fullmatch(path.name)
-            if match is None:
-                continue
-            final, video = match["final"], _VIDEO.fullmatch(match["final"])
-            is_note = match["note"] and not match["hex"]
-            if is_note and not is_broken(metadata_path(path.with_name(final))):
-                found[path] = "video"
-            elif is_note or (video is not None and self._is_held(video)):
-                continue
-            elif _TEXT.fullmatch(final):
-                found[path] = "text"
-            elif video is None or not self._has_note(video):
-                found[path] = "remove"
-        return found
-
-    @property
-    def lacks_results(self) -> bool:
-        """Whether statistics or manifest are missing, or may be older than the rest.
-
-        A monitor that has closed wrote both, and removed its lock.
-        """
-        files = self.files
-        if self.lock in self.paths:
-            return True
-        if files.manifest is None:
-            # Gym's own never had these, and its manifests cannot be made again.
-            return bool(files.journal or files.trajectories)
-        try:
-            results = MonitorResults(files)
-            is_damaged = results.manifest is None
-            return files.journal is not None and (is_damaged or results.is_behind)
-        except UnreadableFile:
-            return True
-
-    @property
-    def has_work(self) -> bool:
-        """Whether anything is to be put in order, of a monitor that is not open."""
-        return bool(
-            self.unfinished_files
-            or self.unfinished_logs
-            or self.idle_lists
-            or self.damaged_lists
-            or self.lacks_results
-        )
-
-    def _is_held(self, video: re.Match[str]) -> bool:
-        """Tell whether a living process may be at a video, or at any clip.
-
-        A clip's video may be called as an episode's.
-        """
-        stem = video["stem"]
-        begins = (f".{stem}.lock", f".{stem}.mp4.", f".openaigym.clip.{self.infix}.")
-        return any(is_locked(p) for p in self.paths if p.name.startswith(begins))
-
-    def _has_note(self, video: re.Match[str]) -> bool:
-        is_noted = video["kind"] in ("mp4", "framehash")
-        note = note_path(self.directory / f"{video['stem']}.mp4")
-        return is_noted and note in self.paths
+    kind: Literal["spans", "video", "text", "stale", "results"]
+    path: Path
 
 
-def leftovers_in(directory: Path) -> list[Leftovers]:
-    """Return the files of all monitors, those that are open too."""
-    grouped: dict[Infix, list[Path]] = {}
-    for path in iter_monitor_files(directory, hidden=True):
-        infix = _infix_of(path.name)
-        if infix is not None:
-            grouped.setdefault(infix, []).append(path)
-    return [
-        Leftovers(directory, infix, tuple(grouped[infix]))
-        for infix in sorted(grouped, key=lambda infix: (infix.monitor_id, infix.uid))
+def leftovers_of(directory: Path, files: MonitorFiles) -> list[Leftover]:
+    """Return what is left to do of a monitor, in the order in which it is to be done.
+
+    Args:
+        directory: where it recorded.
+        files: of the monitor.
+    """
+    found = [Leftover("spans", path) for path in files.paths if _has_work(path)]
+    found += [
+        Leftover(kind, path)
+        for kind in ("video", "text", "stale")
+        for path in files.paths
+        if _kind_of_part(path, files) == kind
     ]
+    if _lacks_results(files):
+        found.append(Leftover("results", directory))
+    return found
 
 
-def leftovers_of(directory: Path, infix: Infix) -> Leftovers:
-    """Return the files of one monitor as they are now."""
-    # Many names are compared, of whole directories, once for each dead monitor.
-    own = f".{infix}."
-    paths = [
-        path
-        for name in names_in(directory)
-        if own in name
-        and _infix_of(name) == infix
-        and (path := directory / name).is_file()
-    ]
-    return Leftovers(directory, infix, tuple(sorted(paths)))
+def stale_shared_files(directory: Path) -> list[Path]:
+    """Return what is left behind of files that belong to all monitors of a directory.
 
-
-def model_leftovers(directory: Path) -> list[Path]:
-    """Return the unfinished files of models that no process will finish.
-
-    They belong to all monitors of a directory, so there are none while one is open.
+    That is unfinished files of models, unless a monitor is open, and locks.
     """
     # In this order: a process that is at one of them has held a lock since before.
-    parts = [
-        path
-        for path in iter_monitor_files(directory, hidden=True)
-        if _MODEL_PART.fullmatch(path.name)
-    ]
-    is_open = parts and any(each.is_open for each in leftovers_in(directory))
-    return [] if is_open else parts
+    hidden = [p for p in iter_monitor_files(directory, hidden=True) if p.name[0] == "."]
+    models = [path for path in hidden if path.name.startswith(".openaigym.model.")]
+    if models and any(files.is_open for files in monitors_of(directory)):
+        models = []
+    locks = [path for path in hidden if _SHARED_LOCK.fullmatch(path.name)]
+    return models + [path for path in locks if not is_locked(path)]
 
 
-def _infix_of(name: str) -> Infix | None:
-    part = _PART.fullmatch(name)
-    return Infix.parse(infix_of(part["final"] if part else name) or "")
+def _has_work(path: Path) -> bool:
+    """Tell whether a file is a list of spans that is to be finished or removed."""
+    if path.suffix != SPANS:
+        return False
+    try:
+        spans = read_list(path)
+    except UnreadableFile:
+        return True
+    in_flight = spans.in_flight()
+    is_idle = not in_flight
+    return is_idle or any(each.path.suffix == ".h5" for each in in_flight)
+
+
+def _kind_of_part(path: Path, files: MonitorFiles) -> str | None:
+    """Return what is to be done about a hidden file; None where nothing is."""
+    if path.suffix == ".lock" and path != files.lock:
+        return None if is_locked(path) else "stale"
+    final = final_name(path.name)
+    if final is None:
+        return None
+    video = path.with_name(final)
+    if is_note(path.name):
+        # What is left of a broken one stays, for those who want to try more.
+        return None if is_broken(metadata_path(video)) else "video"
+    name = VideoName.parse(final)
+    if name is None:
+        return "stale"
+    mp4 = path.with_name(name.video)
+    if note_path(mp4).exists() and final.endswith((".mp4", ".framehash")):
+        return None
+    # A clip's video may be called as an episode's.
+    clips = f".openaigym.clip.{files.infix}."
+    locks = [p for p in files.paths if p.name.startswith(clips)]
+    if any(map(is_locked, [*unfinished_files(mp4), *locks, _lock_of(mp4)])):
+        return None
+    return "text" if name.is_episodes and name.ending == "json" else "stale"
+
+
+def _lock_of(video: Path) -> Path:
+    return video.with_name(f".{video.stem}.lock")
+
+
+def _lacks_results(files: MonitorFiles) -> bool:
+    """Tell whether statistics or manifest are missing, or may be older than the rest.
+
+    A monitor that has closed wrote both, and removed its lock.
+    """
+    if files.lock is not None:
+        return True
+    if files.manifest is None:
+        # Gym's own never had these, and its manifests cannot be made again.
+        return bool(files.journal or files.trajectories)
+    try:
+        results = MonitorResults(files)
+        is_damaged = results.manifest is None
+        return files.journal is not None and (is_damaged or results.is_behind)
+    except UnreadableFile:
+        return True

@@ -17,6 +17,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
 
@@ -25,10 +26,8 @@ import numpy as np
 from ..child_python import Child, wait_for_news
 from ..errors import (
     ClosedError,
-    DirectoryNotWritable,
     Error,
     GLError,
-    InvalidArgument,
 )
 from ..formats.locks import Lock, try_lock
 from ..formats.monitor_directory import render_lock_name
@@ -40,7 +39,7 @@ from ..gl.backends import (
     environment_for,
     rendering_is_off,
 )
-from ..machine import usable_cpus
+from ..machine import check_workers, usable_cpus
 from ..messages import log_message, unpacked
 from ..patience import Patience
 from ..simulation.model_trust import ALL_MODELS, TRUST_VARIABLE
@@ -68,9 +67,9 @@ class WorkerPool:
     midst of a job is ended, and started again for the next.
 
     They use the backend that `MUJOCO_GL` names. Where it names none, or turns rendering
-    off (which is for the simulation), it is the first that works, as of `mjrec.use_gl`.
-    They begin with EGL then, and look at a frame of theirs before they draw others'; a
-    process that tries the backends one by one comes only where that fails.
+    off (which is for the simulation), each begins with EGL and looks at a frame of its
+    own before it draws others'; only where that fails, the first backend that works is
+    looked for, as of `mjrec.use_gl`.
 
     For one thread at a time.
 
@@ -109,8 +108,10 @@ class WorkerPool:
         self._fixed = check_workers(workers)
         count = self._fixed or usable_cpus()
         self._environ = _environment(os.environ, alone=count == 1)
+        # The user's backend, or one that was found to work, needs no trial.
+        self._is_chosen = "MUJOCO_GL" in self._environ
         if trust_models:
-            self._environ = {**self._environ, TRUST_VARIABLE: ALL_MODELS}
+            self._environ[TRUST_VARIABLE] = ALL_MODELS
         self._directory = directory
         # The CPUs of the directory that this process holds.
         self._held: dict[int, Lock] = {}
@@ -119,12 +120,7 @@ class WorkerPool:
         self._patience = Patience()
         self.gl_facts: dict[str, Any] = {}
         self._has_drawn = False
-        # Whether the backend is the user's, or has drawn what it should.
-        self._is_tried = "MUJOCO_GL" in self._environ
-        # What is drawn: of which call, what, and the numbers of its frames.
-        self._call = 0
-        self._drawing: Mapping[str, Any] = {}
-        self._indices: Sequence[int] = ()
+        self._job: _Job | None = None
         self._closed = False
         self._process_id = os.getpid()
 
@@ -133,7 +129,6 @@ class WorkerPool:
 
         Raises:
             DirectoryNotWritable: there can be no lock in the directory.
-            GLError: no backend works here.
             Error: one cannot be started.
         """
         self._check_usable()
@@ -192,13 +187,12 @@ class WorkerPool:
         As `frames`. Frames that an earlier call has not given yet are given up.
         """
         self._check_usable()
-        self._call += 1
         for worker in self._workers:
             worker.leave()
-        self._drawing, self._indices = dict(drawing), indices
         while not (limit := self._free()):
             time.sleep(_SECONDS_BETWEEN_TRIES)
-        drawn = self._drawn(self._call, self._workers[:limit])
+        self._job = _Job(dict(drawing), indices, self._workers[:limit])
+        drawn = self._drawn(self._job)
         first = list(itertools.islice(drawn, 1))
         return itertools.chain(first, drawn)
 
@@ -215,8 +209,8 @@ class WorkerPool:
     def __exit__(self, *error: object) -> None:
         self.close()
 
-    def _check_usable(self, call: int | None = None) -> None:
-        if call not in (None, self._call):
+    def _check_usable(self, job: _Job | None = None) -> None:
+        if job is not None and job is not self._job:
             raise ClosedError("A later call has taken the workers over.")
         if self._closed:
             raise ClosedError("The pool of workers is closed.")
@@ -233,12 +227,7 @@ class WorkerPool:
         for number in range(len(self._workers)):
             if number not in self._held:
                 path = self._directory / render_lock_name(number)
-                try:
-                    lock = try_lock(path, f"{os.getpid()}\n")
-                except OSError as error:
-                    raise DirectoryNotWritable(
-                        self._directory, error.strerror
-                    ) from error
+                lock = try_lock(path)
                 if lock is not None:
                     self._held[number] = lock
         return len(self._held)
@@ -246,27 +235,27 @@ class WorkerPool:
     def _start(self, worker: _Worker) -> None:
         if worker.child is not None:
             return
-        if "MUJOCO_GL" not in self._environ:
-            self._environ = environment_for(BACKENDS[0], self._environ)
+        environ = self._environ
+        if not self._is_chosen:
+            environ = environment_for(BACKENDS[0], environ)
         try:
             # No directory of others is kept from being removed or unmounted.
             worker.child = Child(
-                _MODULE, environ=self._environ, cwd="/", fork=self._main_of_fork()
+                _MODULE, environ=environ, cwd="/", fork=self._main_of_fork(environ)
             )
         except OSError as error:
             raise Error(
                 f"No process that draws could be started: {sys.executable!r}: {error}."
             ) from error
-        # One that tries it is enough: the first frame of all is the first worker's.
-        if worker is self._workers[0] and not self._is_tried:
-            worker.child.send(tries=True)
+        worker.is_tried = self._is_chosen
+        worker.child.send(tries=not self._is_chosen)
 
-    def _main_of_fork(self) -> Callable[[], object] | None:
+    def _main_of_fork(self, environ: Mapping[str, str]) -> Callable[[], object] | None:
         if not self._forks or threading.active_count() > 1:
             return None
         before = dict(os.environ)
         # Read when mujoco is imported.
-        os.environ.update(self._environ)
+        os.environ.update(environ)
         try:
             # Not at the top: other processes that have a pool draw nothing.
             from .worker import main
@@ -280,83 +269,76 @@ class WorkerPool:
             os.environ.update(before)
         return main
 
-    def _try_backends(self) -> None:
-        """Let all workers begin anew with the first backend that works.
+    def _choose_backend(self) -> None:
+        """Look for the first backend that works; what was imported for EGL is no use.
 
         Raises:
             GLError: there is none.
         """
-        for worker in self._workers:
-            worker.end()
-            worker.give_back()
-        self._environ = environment_for(backend_for_children(), self._environ)
-        self._is_tried, self._forks = True, False
-        for worker in self._workers:
-            if worker.owes:
-                self._order(worker)
+        if not self._is_chosen:
+            self._environ = environment_for(backend_for_children(), self._environ)
+            self._is_chosen, self._forks = True, False
 
-    def _order(self, worker: _Worker) -> None:
-        """Tell a worker what to draw, and start it if need be."""
-        self._start(worker)
-        assert worker.child is not None
-        indices = [int(self._indices[position]) for position in worker.owes]
-        self._patience.renew()
-        worker.child.send(drawing=self._drawing, indices=indices)
-
-    def _drawn(self, call: int, workers: Sequence[_Worker]) -> Iterator[Frame]:
-        count = len(self._indices)
+    def _drawn(self, job: _Job) -> Iterator[Frame]:
+        count, workers = len(job.indices), job.workers
         try:
             for first, worker in enumerate(workers):
                 worker.owes = range(first, count, len(workers))
                 if worker.owes:
-                    self._order(worker)
+                    self._order(worker, job)
             for position in range(count):
                 worker = workers[position % len(workers)]
                 while not worker.arrived:
                     if worker.error is not None:
                         raise worker.error
-                    self._wait_for_news(workers)
-                    self._check_usable(call)
+                    self._wait_for_news(job)
+                    self._check_usable(job)
                 frame = worker.arrived.popleft()
                 self._patience.renew()
                 # Before the caller has it: it may be busy with it for long.
-                self._listen(workers, 0)
+                self._listen(job, 0)
                 yield frame
-                self._check_usable(call)
+                self._check_usable(job)
         finally:
-            if self._call == call:
+            if self._job is job:
                 for worker in workers:
                     worker.leave()
 
-    def _wait_for_news(self, workers: Sequence[_Worker]) -> None:
+    def _order(self, worker: _Worker, job: _Job) -> None:
+        """Tell a worker what to draw, and start it if need be."""
+        self._start(worker)
+        assert worker.child is not None
+        indices = [int(job.indices[position]) for position in worker.owes]
+        self._patience.renew()
+        worker.child.send(drawing=job.drawing, indices=indices)
+
+    def _wait_for_news(self, job: _Job) -> None:
         """Wait until a worker says something; end those that have not for too long."""
-        hungry = [worker for worker in workers if worker.may_send]
+        hungry = [worker for worker in job.workers if worker.may_send]
         for worker in hungry:
             if worker.child is None:
-                self._order(worker)
-        self._patience.wait(lambda seconds: self._listen(hungry, seconds))
+                self._order(worker, job)
+        self._patience.wait(lambda seconds: self._listen(job, seconds))
         if self._patience.is_over:
             # All that sent more have no room for it, or owe nothing.
             for worker in hungry:
-                self._end_hanging(worker)
+                self._end_hanging(worker, job)
             self._patience.renew()
 
-    def _listen(self, workers: Sequence[_Worker], seconds: float) -> bool:
+    def _listen(self, job: _Job, seconds: float) -> bool:
         """Take in what the workers send, waiting so long for it; tell if they did."""
         by_child = {
             worker.child: worker
-            for worker in workers
+            for worker in job.workers
             if worker.child is not None and worker.may_send
         }
         heard = [by_child[child] for child in wait_for_news(by_child, seconds)]
         for worker in heard:
-            if worker.child is None:
-                # With the backend of another one.
-                continue
+            assert worker.child is not None
             try:
                 self._take_in(worker, worker.child)
             except EOFError:
-                self._lose(worker, "died", f"it {worker.child.last_words()}")
+                self._lose(worker, job, "died", f"it {worker.child.last_words()}")
             except BaseException:
                 # Ctrl-C, in the midst of a message: what follows makes no sense.
                 worker.end()
@@ -377,17 +359,17 @@ class WorkerPool:
             elif log_message(said):
                 continue
             elif "untried" in said:
-                logger.info("Workers cannot draw with %s: %s", BACKENDS[0], said)
-                self._try_backends()
-                return
+                logger.info("A worker cannot draw with EGL: %s", said["untried"])
+                # It ends, and another one takes its place.
+                self._choose_backend()
             elif "error" in said:
                 worker.error = unpacked(said["error"])
             else:
-                self._is_tried = self._is_tried or worker is self._workers[0]
+                worker.is_tried = True
                 worker.shape = (*said["size"], 3)
                 self.gl_facts = said["gl"]
 
-    def _end_hanging(self, worker: _Worker) -> None:
+    def _end_hanging(self, worker: _Worker, job: _Job) -> None:
         assert worker.child is not None
         seconds = self._patience.seconds
         logger.error(
@@ -402,26 +384,42 @@ class WorkerPool:
             "in the log"
         )
         # Where nothing was ever drawn, it is not for the sake of this frame.
-        self._lose(worker, "hung", how, kind=Error if self._has_drawn else GLError)
+        kind = Error if self._has_drawn else GLError
+        self._lose(worker, job, "hung", how, kind=kind)
 
     def _lose(
-        self, worker: _Worker, what: str, how: str, *, kind: type[Error] = Error
+        self,
+        worker: _Worker,
+        job: _Job,
+        what: str,
+        how: str,
+        *,
+        kind: type[Error] = Error,
     ) -> None:
         """End a worker's process; the second that is lost at a frame is an error."""
         worker.end()
-        if not self._is_tried:
-            self._try_backends()
+        if not worker.is_tried:
+            self._choose_backend()
             return
         position = worker.owes.start
         if worker.lost_at == position:
-            source = self._drawing.get("trajectory", "the given states")
+            source = job.drawing.get("trajectory", "the given states")
             worker.error = kind(
-                f"A worker {what} while drawing frame {self._indices[position]} of "
+                f"A worker {what} while drawing frame {job.indices[position]} of "
                 f"{source}, which was the second try: {how}"
             )
         else:
             logger.warning("A drawing worker %s and is replaced: %s", what, how)
         worker.lost_at = position
+
+
+@dataclass(frozen=True)
+class _Job:
+    """What is drawn, which frames of it, and by which workers."""
+
+    drawing: Mapping[str, Any]
+    indices: Sequence[int]
+    workers: Sequence[_Worker]
 
 
 class _Worker:
@@ -434,6 +432,7 @@ class _Worker:
         owes: the positions of those that are to come.
         error: what there is instead of the next one.
         lost_at: the position at which a process was lost.
+        is_tried: its backend is the user's, or has drawn what it should.
     """
 
     def __init__(self) -> None:
@@ -443,19 +442,13 @@ class _Worker:
         self.owes = range(0)
         self.error: Error | None = None
         self.lost_at: int | None = None
+        self.is_tried = False
 
     @property
     def may_send(self) -> bool:
         """Whether there is something to come, and room for it."""
         is_full = len(self.arrived) >= _MOST_BUFFERED
         return bool(self.owes) and self.error is None and not is_full
-
-    def give_back(self) -> None:
-        """Owe again what has arrived and was not taken, and forget what went wrong."""
-        self.error = self.lost_at = None
-        first = self.owes.start - self.owes.step * len(self.arrived)
-        self.owes = range(first, self.owes.stop, self.owes.step)
-        self.arrived.clear()
 
     def leave(self) -> None:
         """Forget the job; a process that has more to send of it is ended."""
@@ -470,21 +463,6 @@ class _Worker:
         child, self.child = self.child, None
         if child is not None:
             child.end()
-
-
-def check_workers(workers: int | None) -> int | None:
-    """Return `workers` if it is a number of processes, or None.
-
-    Raises:
-        InvalidArgument: it is something else.
-    """
-    whole = isinstance(workers, int) and not isinstance(workers, bool)
-    if workers is not None and not (whole and workers >= 1):
-        raise InvalidArgument(
-            "workers must be a positive whole number, or None for one on each CPU that "
-            f"can be used, got {workers!r}."
-        )
-    return workers
 
 
 def _environment(environ: Mapping[str, str], *, alone: bool) -> dict[str, str]:

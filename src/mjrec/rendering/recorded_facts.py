@@ -46,7 +46,7 @@ from ..formats.trajectory_file import open_trajectory
 from ..formats.video_names import further_parts, is_second_name, with_part
 from ..frames import QUALITIES
 from ..rates import stride_for, to_rate
-from ..simulation.foreign_trajectories import open_vetted_trajectory
+from ..simulation.foreign_files import open_vetted_trajectory
 from .views import PlainCamera, plain_camera
 
 logger = logging.getLogger(__name__)

@@ -9,8 +9,6 @@ its video is there.
 
 from __future__ import annotations
 
-import os
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
@@ -20,14 +18,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import DirectoryNotWritable, UnreadableFile
+from ..errors import UnreadableFile
 from ..formats.frame_hashes import frame_hash_path
 from ..formats.locks import Lock, is_locked, try_lock
 from ..formats.monitor_directory import (
     ClipPart,
     iter_monitor_files,
     lock_name,
-    names_in,
+    unfinished_files,
 )
 from ..formats.spans import FINISHED, recordings_in_flight
 from ..formats.trajectory import added_up
@@ -44,8 +42,6 @@ from .recorded_facts import (
     video_facts,
     video_path,
 )
-
-_UNFINISHED = re.compile(r"[0-9a-f]{8}\.part", re.ASCII)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -239,10 +235,7 @@ def claim(directory: Path, key: RecordingKey) -> Lock | None:
     Raises:
         DirectoryNotWritable: there can be no lock in the directory.
     """
-    try:
-        return try_lock(directory / key.lock_name, f"{os.getpid()}\n")
-    except OSError as error:
-        raise DirectoryNotWritable(directory, error.strerror) from error
+    return try_lock(directory / key.lock_name)
 
 
 def remove_unfinished(video: Path) -> None:
@@ -250,12 +243,6 @@ def remove_unfinished(video: Path) -> None:
 
     To be called by the process that holds the recording's lock: no other is at it.
     """
-    finals = (video, frame_hash_path(video), metadata_path(video))
-    begins = tuple(f".{final.name}." for final in finals)
-    # Many names, of whole directories, are compared once for each video.
-    for name in names_in(video.parent):
-        if name.startswith(begins) and any(
-            name.startswith(begin) and _UNFINISHED.fullmatch(name, len(begin))
-            for begin in begins
-        ):
-            video.with_name(name).unlink(missing_ok=True)
+    for final in (video, frame_hash_path(video), metadata_path(video)):
+        for part in unfinished_files(final):
+            part.unlink(missing_ok=True)

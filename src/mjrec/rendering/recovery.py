@@ -12,8 +12,10 @@ from pathlib import Path
 
 from ..errors import DirectoryNotWritable, InvalidArgument
 from ..formats.locks import is_locked, wait_for_lock
+from ..formats.monitor_directory import Infix
 from ..formats.second_names import give_all_second_names
-from .leftovers import Leftovers, leftovers_in, model_leftovers
+from ..results.monitor_files import monitors_of
+from .leftovers import leftovers_of, stale_shared_files
 
 # One recovery of a directory at a time.
 _LOCK = ".openaigym.recover.lock"
@@ -110,29 +112,23 @@ def recover(
         raise InvalidArgument(f"There is no directory {path} to recover.")
     dead, open_monitors = _dead_and_open(path)
     # A recovering process holds the locks of the dead, who look alive meanwhile.
-    if not (dead or model_leftovers(path) or is_locked(path / _LOCK)):
+    if not (dead or stale_shared_files(path) or is_locked(path / _LOCK)):
         return Recovery(path, open_monitors=open_monitors)
     # Not at the top: it loads HDF5, which a simulation that goes on where a closed
     # monitor left off has no use for.
-    from .cut_episodes import Report, put_in_order
+    from .dead_monitor import Report, finish_dead_monitor
 
     report = Report(deadline=deadline)
-    try:
-        if not os.access(path, os.W_OK | os.X_OK):
-            raise PermissionError(0, "permission denied")
-        lock = wait_for_lock(path / _LOCK, f"{os.getpid()}\n")
-    except OSError as error:
-        raise DirectoryNotWritable(path, error.strerror) from error
-    try:
+    if not os.access(path, os.W_OK | os.X_OK):
+        raise DirectoryNotWritable(path, "permission denied")
+    with wait_for_lock(path / _LOCK):
         # Once more, because another process may have done it meanwhile.
         dead, open_monitors = _dead_and_open(path)
-        for leftovers in dead:
-            put_in_order(leftovers, report)
-        for part in model_leftovers(path):
-            report.remove(part)
+        for infix in dead:
+            finish_dead_monitor(path, infix, report)
+        for stale in stale_shared_files(path):
+            report.remove(stale)
         give_all_second_names(path)
-    finally:
-        lock.release()
     files, failures = (
         tuple(RecoveredFile(name, what) for name, what in each)
         for each in (report.files, report.failures)
@@ -140,16 +136,19 @@ def recover(
     return Recovery(path, files, failures, open_monitors)
 
 
-def _dead_and_open(directory: Path) -> tuple[list[Leftovers], tuple[str, ...]]:
+def _dead_and_open(directory: Path) -> tuple[list[Infix], tuple[str, ...]]:
     """Return the monitors to be put in order, and the infixes of those open."""
-    dead: list[Leftovers] = []
+    dead: list[Infix] = []
     still_open: list[str] = []
-    for leftovers in leftovers_in(directory):
+    for files in monitors_of(directory):
+        infix = Infix.parse(files.infix)
         try:
-            if leftovers.is_open:
-                still_open.append(str(leftovers.infix))
-            elif leftovers.has_work:
-                dead.append(leftovers)
+            if infix is None:
+                continue
+            if files.is_open:
+                still_open.append(files.infix)
+            elif leftovers_of(directory, files):
+                dead.append(infix)
         except OSError as error:
             raise DirectoryNotWritable(directory, error.strerror) from error
     return dead, tuple(still_open)

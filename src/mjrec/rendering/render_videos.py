@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import hashlib
-import itertools
 import json
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -19,14 +18,13 @@ from ..errors import InvalidArgument
 from ..formats.monitor_directory import iter_monitor_files, where_recordings_are
 from ..formats.spans import is_in_flight
 from ..formats.video_names import camera_part, name_part
-from ..machine import usable_cpus
+from ..machine import check_workers, usable_cpus
 from ..simulation.model_trust import trusting_models
 from .engine_jobs import do_on_engine
-from .finish import bring_up_to_date, do_jobs
+from .finish import finish
+from .finisher import do_jobs
 from .jobs import Progress, RecordingKey, RenderedVideos, VideoJob, key_of
-from .pool import check_workers
 from .recordings import parts_of, recordings
-from .recovery import recover
 from .views import Variant, View
 
 _SHOWN = 20
@@ -159,39 +157,30 @@ def iter_rendered_videos(
         check_annotation()
     given = given_engine(engine, workers)
     directory, keys = _recordings_of(target, episode)
-    is_pending = variant == Variant() and out is None
-    if is_pending:
-        jobs = [VideoJob.finishing(directory, key, strict=strict) for key in keys]
+    on_progress = on_progress or (lambda _: None)
+    if variant == Variant() and out is None:
         if not keys and not target.is_dir():
             raise InvalidArgument(
                 f"No video of {target.name} is pending: no recording has such a name. "
                 "To render it again, say what is to be other (camera, size, max_fps, "
                 "quality, fps, annotate) or where to write it (out, --out)."
             )
+        results = finish(
+            directory,
+            None if target.is_dir() and episode is None else keys,
+            workers=workers,
+            engine=given,
+            strict=strict,
+            on_progress=on_progress,
+        )
     else:
-        workers = workers or usable_cpus()
         jobs = _variant_jobs(target, keys, variant, out, strict=strict)
-    on_progress = on_progress or (lambda _: None)
-    if given is None:
-        results = do_jobs(jobs, directory, workers=workers, on_progress=on_progress)
-    else:
-        results = do_on_engine(given, jobs, on_progress=on_progress)
-    if is_pending:
-        results = itertools.chain(results, _afterwards(directory, target, episode))
+        if given is None:
+            workers = workers or usable_cpus()
+            results = do_jobs(jobs, directory, workers=workers, on_progress=on_progress)
+        else:
+            results = do_on_engine(given, jobs, on_progress=on_progress)
     return _trusting(results) if trust_models else results
-
-
-def _afterwards(
-    directory: Path, target: Path, episode: int | None
-) -> Iterator[RenderedVideos]:
-    """Bring the directory up to date, and yield what stands in the way.
-
-    Of a whole directory, what killed monitors left is put in order too.
-    """
-    bring_up_to_date(directory)
-    if target.is_dir() and episode is None:
-        for file in recover(directory).failures:
-            yield RenderedVideos(directory=directory, failures={file.name: file.what})
 
 
 def _trusting(results: Iterator[RenderedVideos]) -> Iterator[RenderedVideos]:

@@ -3,7 +3,8 @@
 
 Its parent sends::
 
-    {"tries": true}                         it looks first at a frame of its own
+    {"tries": true}                         it makes its context and, if true, looks at
+                                            a frame of its own
     {"drawing": {...}, "indices": [1, 3, 5]}
 
 `drawing` is what `open_drawing` takes; `indices` are the frames. It sends the bytes of
@@ -22,18 +23,14 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import ArrayLike
-
-from ..errors import InvalidArgument
+from ..errors import Error, InvalidArgument
 from ..frames import Frame, grid_frame, grid_shape
 from ..messages import carried
 from ..parent import Parent
-from ..simulation.cameras import Camera, camera_from_members, is_tracking
 from ..simulation.gl_probe import draw_test_scene
 from ..simulation.recorded_scene import GivenStates, RecordedScene
 from ..simulation.renderer import Canvas, SceneRenderer
@@ -47,45 +44,38 @@ _NICE = 10
 class Drawing:
     """Frames of a scene, known by their numbers, from 0.
 
-    Each is the same whatever was drawn before. MuJoCo's visualiser remembers: an
-    infinite plane is drawn around the place where the cameras stood in the frame
-    before, and a camera that tracks a body goes a part of the way to it in each frame.
-    So the cameras are brought to where they would be.
+    Each is the same whatever was drawn before: the cameras are brought to where they
+    would be if all before had been drawn.
 
     Args:
         scene: what is drawn.
         cameras: whose frames they are, in a grid where there are several. All draw
-            with one context.
-        acquired: what `close` frees.
+            with one canvas.
     """
 
     def __init__(
-        self,
-        scene: RecordedScene | GivenStates,
-        cameras: Iterable[_CameraReplay],
-        acquired: contextlib.ExitStack,
+        self, scene: RecordedScene | GivenStates, cameras: Sequence[SceneRenderer]
     ) -> None:
         self._scene = scene
-        self._cameras = list(cameras)
-        self._acquired = acquired
+        self._cameras = cameras
         # The frame whose cameras the renderers have in mind.
         self._last: int | None = None
-        self._context_is_old = False
+        self._canvas_is_old = False
 
     @property
     def size(self) -> tuple[int, int]:
         """`(height, width)` of the frames."""
-        height, width = self._cameras[0].renderer.size
+        height, width = self._cameras[0].size
         rows, columns = grid_shape(len(self._cameras))
         return rows * height, columns * width
 
     @property
     def gl_facts(self) -> dict[str, Any]:
         """Who draws, and on which device: `gl_context.current_gl_facts`."""
-        return self._cameras[0].renderer.gl_facts
+        return self._cameras[0].gl_facts
 
-    def draw(self, index: int, *, out: Frame | None = None) -> Frame:
-        """Return a frame, in `out` if that is given.
+    def draw(self, index: int) -> Frame:
+        """Return a frame.
 
         Raises:
             InvalidArgument: there is no such frame.
@@ -101,27 +91,16 @@ class Drawing:
         if last is None or index != last + 1:
             self._prepare(index, last)
         self._bring_to(index)
-        if self._context_is_old:
-            self._cameras[0].renderer.model_changed()
-            self._context_is_old = False
-        frame = self._render(out)
+        if self._canvas_is_old:
+            self._cameras[0].model_changed()
+            self._canvas_is_old = False
+        frames = [camera.render(self._scene.data) for camera in self._cameras]
         self._last = index
-        return frame
+        return frames[0] if len(frames) == 1 else grid_frame(frames)
 
     def close(self) -> None:
-        """Free what was acquired for this drawing. Idempotent."""
-        self._acquired.close()
-
-    def _render(self, out: Frame | None) -> Frame:
-        if len(self._cameras) == 1:
-            return self._cameras[0].renderer.render(self._scene.data, out=out)
-        grid = grid_frame(
-            [camera.renderer.render(self._scene.data) for camera in self._cameras]
-        )
-        if out is None:
-            return grid
-        np.copyto(out, grid)
-        return out
+        """Close the files of the scene. Idempotent."""
+        self._scene.close()
 
     def _prepare(self, index: int, last: int | None) -> None:
         """Bring the cameras to where they are before a frame."""
@@ -134,33 +113,10 @@ class Drawing:
         for earlier in range(start, index):
             self._bring_to(earlier)
             for camera in self._cameras:
-                camera.renderer.look(self._scene.data)
+                camera.look(self._scene.data)
 
     def _bring_to(self, index: int) -> None:
-        self._context_is_old |= self._scene.bring_to(index)
-
-
-class _CameraReplay:
-    """One camera's renderer, brought to any frame as if all before had been drawn.
-
-    Args:
-        renderer: of its frames.
-        camera: what it draws with; None where the recording moves that.
-        before: where the two cameras of its scene stand before the first frame.
-    """
-
-    def __init__(self, renderer: SceneRenderer, camera: Any, before: ArrayLike) -> None:
-        self.renderer = renderer
-        self.is_following = is_tracking(camera)
-        self._before = before
-        self._camera = camera
-        self._start = camera.lookat.copy() if self.is_following else None
-
-    def begin(self) -> None:
-        """Go to before the first frame."""
-        self.renderer.camera_positions = self._before
-        if self.is_following:
-            self._camera.lookat[:] = self._start
+        self._canvas_is_old |= self._scene.bring_to(index)
 
 
 def trajectory_drawing(
@@ -186,84 +142,56 @@ def trajectory_drawing(
             driver cannot draw.
         GLError: nothing can be drawn here.
     """
-    with contextlib.ExitStack() as opened:
-        reader = opened.enter_context(open_for_rendering(path, is_vetted=True))
+    reader = open_for_rendering(path, is_vetted=True)
+    try:
         check_has_frames(reader)
-        facts = reader.facts
         scene = RecordedScene(reader)
-        model, recorded = scene.model, scene.view
-        look: dict[str, Any] = {
+        recorded = scene.view
+        quality = (reader.facts.get("video") or {}).get("quality", "full")
+        shared: dict[str, Any] = {
+            "scene_option": recorded.option,
+            "max_geom": recorded.max_geom,
+            "fresh": recorded.fresh,
             "height": recorded.height if view.height is None else view.height,
             "width": recorded.width if view.width is None else view.width,
-            "quality": view.quality
-            or (facts.get("video") or {}).get("quality", "full"),
+            "quality": view.quality or quality,
+            "canvas": canvas or Canvas(),
         }
-        shared = canvas or opened.enter_context(contextlib.closing(Canvas()))
-
-        def replay(asked: PlainCamera | None) -> _CameraReplay:
-            # Of a camera as recorded it is known how the frames have moved it.
-            camera = None if asked is None else _camera(model, asked)
-            renderer = SceneRenderer(
-                model,
-                camera=recorded.camera if camera is None else camera,
-                scene_option=recorded.option,
-                max_geom=recorded.max_geom,
-                fresh=recorded.fresh,
-                canvas=shared,
-                **look,
-            )
-            before = scene.previous_cameras if asked is None else np.zeros((2, 3))
-            return _CameraReplay(renderer, camera, before)
-
+        # Of a camera as recorded it is known how the frames have moved it.
+        as_recorded = {
+            "camera": recorded.camera,
+            "begins_at": scene.previous_cameras,
+            "is_moved": True,
+        }
         wanted = [view.camera] if cameras is None else cameras
-        return Drawing(scene, [replay(asked) for asked in wanted], opened.pop_all())
-
-
-def states_drawing(
-    directory: Path, spec: int, view: View, *, canvas: Canvas
-) -> Drawing:
-    """Return the frames of given states, with all that is computed from them.
-
-    Args:
-        directory: where `save_states` wrote them.
-        spec: which components a state has.
-        view: how they are to be drawn, with nothing left open.
-        canvas: what to draw with.
-
-    Raises:
-        UnknownName, InvalidArgument, GLError: as `trajectory_drawing`.
-    """
-    scene = GivenStates(directory, spec)
-    camera = _camera(scene.model, view.camera)
-    look: dict[str, Any] = {
-        "height": view.height,
-        "width": view.width,
-        "quality": view.quality,
-    }
-    renderer = SceneRenderer(scene.model, camera=camera, canvas=canvas, **look)
-    replay = _CameraReplay(renderer, camera, np.zeros((2, 3)))
-    return Drawing(scene, [replay], contextlib.ExitStack())
+        own = (as_recorded if c is None else {"camera": c} for c in wanted)
+        renderers = [SceneRenderer(scene.model, **shared, **each) for each in own]
+        return Drawing(scene, renderers)
+    except BaseException:
+        reader.close()
+        raise
 
 
 def open_drawing(drawing: Mapping[str, Any], canvas: Canvas) -> Drawing:
     """Return what is described, for a worker, in plain JSON.
 
     Args:
-        drawing: `trajectory` (a path), or `states` (a directory) and `spec`; and
-            `view`; and, of a trajectory, `cameras`.
+        drawing: `trajectory` (a path), or `states` (a directory of `save_states`) and
+            `spec`; and `view`; and, of a trajectory, `cameras`.
         canvas: what to draw with.
+
+    Raises:
+        Error: as of `trajectory_drawing`.
     """
     log_mujoco_warnings()
     view = View(**drawing["view"])
     if "trajectory" in drawing:
         path, cameras = Path(drawing["trajectory"]), drawing.get("cameras")
         return trajectory_drawing(path, view, cameras=cameras, canvas=canvas)
-    states = Path(drawing["states"])
-    return states_drawing(states, drawing["spec"], view, canvas=canvas)
-
-
-def _camera(model: Any, camera: Any) -> Camera:
-    return camera_from_members(model, camera) if isinstance(camera, dict) else camera
+    scene = GivenStates(Path(drawing["states"]), drawing["spec"])
+    # Nothing is left open.
+    look: dict[str, Any] = vars(view)
+    return Drawing(scene, [SceneRenderer(scene.model, canvas=canvas, **look)])
 
 
 def main() -> None:
@@ -275,27 +203,29 @@ def main() -> None:
     canvas = Canvas()
     while True:
         order = parent.receive()
-        if "tries" in order:
+        if "tries" not in order:
             try:
-                draw_test_scene()
+                _draw(order, canvas, parent)
+            except Exception as error:
+                parent.send(error=carried(error))
+        elif order["tries"]:
+            try:
+                draw_test_scene(canvas=canvas)
             except Exception as error:
                 parent.send(untried=str(error))
                 # Not `sys.exit`, which would wait for the driver.
                 os._exit(1)
-            continue
-        try:
-            _draw(order, canvas, parent)
-        except Exception as error:
-            parent.send(error=carried(error))
+        else:
+            # What is in the way is said when there is something to draw.
+            with contextlib.suppress(Error):
+                canvas.open()
 
 
 def _draw(order: Mapping[str, Any], canvas: Canvas, parent: Parent) -> None:
     with contextlib.closing(open_drawing(order["drawing"], canvas)) as drawing:
         parent.send(size=drawing.size, gl=drawing.gl_facts)
-        frame = np.empty((*drawing.size, 3), np.uint8)
         for index in order["indices"]:
-            drawing.draw(index, out=frame)
-            parent.send(frame.data)
+            parent.send(drawing.draw(index).data)
 
 
 if __name__ == "__main__":

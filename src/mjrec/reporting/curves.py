@@ -23,13 +23,14 @@ from .contents import ReportTask
 from .page_text import counted, decimals_for, interval_text, number
 
 _Floats: TypeAlias = NDArray[np.float64]
+_Ticks: TypeAlias = Sequence[tuple[float, str]]
 
 # The classes that tell lines apart, each with a dash pattern of its own as well.
 SERIES: Final = 6
 
-# Of SVG's units, which are CSS pixels where there is room: a phone's width.
-_WIDTH: Final = 340
-_HEIGHT: Final = 210
+# Width and height in SVG's units, which are CSS pixels where there is room: a phone's.
+_SMALL: Final = (340, 210)
+_WIDE: Final = (520, 260)
 _TOP: Final = 24
 _BELOW: Final = 38
 
@@ -59,24 +60,18 @@ def learning_curve(task: ReportTask, *, key: str) -> str:
         returns = returns[np.argsort(times, kind="stable")]
     count, window = len(returns), max(5, len(returns) // 20)
     middle, low, mean, high = _running(returns, window)
+    has_dots = count <= _MOST_DOTS
     # What is not drawn needs no room.
-    seen = returns if count <= _MOST_DOTS else np.append(low, high)
-    panel = _Panel(
-        left=46,
-        right=_WIDTH - 14,
-        x=_span([0, count - 1], margin=0.01),
-        y=_span(seen),
-    )
-    panel.grid()
-    if count <= _MOST_DOTS:
+    y = _span(returns if has_dots else np.append(low, high))
+    panel = _Panel(46, _SMALL[0] - 14, x=_span([0, count - 1], margin=0.01), y=y)
+    if has_dots:
         panel.dots(np.arange(count), returns, opacity=0.4)
     panel.band(middle, low, high, "accent")
     panel.line(middle, mean, "accent")
-    panel.label_y("Return")
     ticks = [x for x in panel.ticks_x if 0 <= x < count and x == round(x)]
-    panel.label_x("Episode", [(tick, _short(tick)) for tick in ticks])
+    panel.label("Return", "Episode", [(tick, _short(tick)) for tick in ticks])
     return _svg(
-        [panel],
+        panel.elements,
         title=f"Returns of {task.name} over episodes",
         description=f"{_in_words(task.summary)} Mean of {window} episodes in a row, "
         "and the range of the middle 80 % of them.",
@@ -100,11 +95,8 @@ def evaluation_curve(task: ReportTask, *, key: str) -> str:
     mean, interval = task.summary.mean, task.summary.mean_interval
     ends = [interval.low, interval.high] if interval else []
     reach = _span(np.append(returns, ends))
-    dots = _Panel(left=46, right=212, x=(-0.6, len(seeds) - 0.4), y=reach)
-    shares = _Panel(left=228, right=318, x=(0, 1), y=reach)
-    dots.grid()
-    shares.grid(labels=False)
-    across = [-0.6, len(seeds) - 0.4]
+    across = -0.6, len(seeds) - 0.4
+    dots = _Panel(46, 212, x=across, y=reach)
     if interval is not None:
         dots.band(across, [interval.low] * 2, [interval.high] * 2, "accent")
     if mean is not None:
@@ -114,16 +106,20 @@ def evaluation_curve(task: ReportTask, *, key: str) -> str:
     else:
         chosen = _spread(len(returns), _MOST_DOTS)
         dots.dots(place[chosen], returns[chosen], opacity=0.35)
+    longest = max((len(str(seed)) for seed in seeds), default=1)
+    named = _spread(len(seeds), 6 if longest < 4 else 2)
+    dots.label("Return", "Seed", [(i, str(seeds[i])) for i in named])
+    shares = _Panel(228, 318, x=(0, 1), y=reach, y_labels=False)
     # The corners of steps: shares of the episodes, and what they reach.
     heights = np.sort(returns)[::-1][_spread(len(returns), _MOST_POINTS)]
     edges = np.linspace(0, 1, len(heights) + 1)
     shares.line(np.repeat(edges, 2)[1:-1], np.repeat(heights, 2), "accent")
-    dots.label_y("Return")
-    dots.label_x("Seed", _seed_labels(seeds))
-    shares.label_x("Share reaching it", [(0, "0"), (0.5, "50 %"), (1, "100 %")])
-    title = f"Returns of {task.name} by seed"
+    shares.label("", "Share reaching it", [(0, "0"), (0.5, "50 %"), (1, "100 %")])
     return _svg(
-        [dots, shares], title=title, description=_in_words(task.summary), key=key
+        dots.elements + shares.elements,
+        title=f"Returns of {task.name} by seed",
+        description=_in_words(task.summary),
+        key=key,
     )
 
 
@@ -138,32 +134,24 @@ def profile_curve(across: Mapping[str, AcrossTasks], *, key: str) -> str:
             left out, and count for i.
         key: makes the ids of this figure's elements unique on the page.
     """
-    width, height = 520, 260
     profiles = [each.profile for each in across.values()]
-    thresholds = [x for each in profiles if each for x in each.thresholds]
-    panel = _Panel(
-        left=52,
-        right=width - 14,
-        bottom=height - _BELOW,
-        x=_span(thresholds or [0, 1], margin=0),
-        y=(0, 1),
-    )
-    panel.grid(ticks=[(share, f"{share:.0%}") for share in (0, 0.25, 0.5, 0.75, 1)])
+    x = _span([x for p in profiles if p for x in p.thresholds] or [0, 1], margin=0)
+    percents = [(share, f"{share:.0%}") for share in (0, 0.25, 0.5, 0.75, 1)]
+    panel = _Panel(52, _WIDE[0] - 14, _WIDE[1], x=x, y=(0, 1), ticks=percents)
     for index, profile in enumerate(profiles):
         if profile is not None:
-            x, series = profile.thresholds, index % SERIES
+            thresholds, series = profile.thresholds, index % SERIES
             role = f"series-{series}"
-            panel.band(x, profile.low, profile.high, role, opacity=0.14)
-            panel.line(x, profile.shares, role, dash=series)
-    panel.label_y("Share of scores above")
-    panel.label_x("Score", [(tick, f"{tick:g}") for tick in panel.ticks_x])
+            panel.band(thresholds, profile.low, profile.high, role, opacity=0.14)
+            panel.line(thresholds, profile.shares, role, dash=series)
+    ticks = [(tick, f"{tick:g}") for tick in panel.ticks_x]
+    panel.label("Share of scores above", "Score", ticks)
     return _svg(
-        [panel],
+        panel.elements,
         title="Performance profile",
         description=" ".join(_scores_in_words(*each) for each in across.items()),
         key=key,
-        width=width,
-        height=height,
+        size=_WIDE,
     )
 
 
@@ -213,11 +201,6 @@ def _draw_seeds(
         panel.line([seed - 0.34, seed + 0.34], [of_seed.mean()] * 2, "ink", width=1.5)
 
 
-def _seed_labels(seeds: NDArray[np.int64]) -> list[tuple[float, str]]:
-    longest = max((len(str(seed)) for seed in seeds), default=1)
-    return [(i, str(seeds[i])) for i in _spread(len(seeds), 6 if longest < 4 else 2)]
-
-
 # --- What is said -----------------------------------------------------------------
 
 
@@ -252,53 +235,45 @@ def _short(value: float) -> str:
 
 
 class _Panel:
-    """A part of a figure with scales of its own.
+    """A part of a figure with scales of its own, and lines at the ticks of y.
 
     Args:
         left: edge of the panel, in pixels from the figure's left.
         right: likewise.
-        bottom: likewise, from the figure's top.
+        height: of the figure.
         x: from where to where its scale goes.
         y: likewise.
+        ticks: of y, with what they are called.
+        y_labels: whether that is written.
     """
 
     def __init__(
         self,
-        *,
         left: float,
         right: float,
-        bottom: float = _HEIGHT - _BELOW,
+        height: int = _SMALL[1],
+        *,
         x: tuple[float, float],
         y: tuple[float, float],
+        ticks: _Ticks | None = None,
+        y_labels: bool = True,
     ) -> None:
         self.elements: list[str] = []
+        self.ticks_x = _ticks(x)
         self._x, self._y = x, y
-        self._left, self._right, self._bottom = left, right, bottom
-        self.ticks_x, self.ticks_y = _ticks(x), _ticks(y)
+        self._left, self._right, self._bottom = left, right, height - _BELOW
+        for value, label in ticks or [(tick, _short(tick)) for tick in _ticks(y)]:
+            ((_, pixel),) = self._pixels([x[0]], [value])
+            self._path(f"M{left:g} {pixel:g}H{right:g}", "s-grid")
+            self._text(left - 7, pixel + 4, label if y_labels else "", anchor="end")
 
-    def grid(
-        self,
-        *,
-        labels: bool = True,
-        ticks: Sequence[tuple[float, str]] | None = None,
-    ) -> None:
-        """Draw lines at the ticks of y, with what they stand for."""
-        for value, label in ticks or [(tick, _short(tick)) for tick in self.ticks_y]:
-            ((_, y),) = self._pixels([self._x[0]], [value])
-            self._path(f"M{self._left:g} {y:g}H{self._right:g}", "s-grid")
-            if labels:
-                self._text(self._left - 7, y + 4, label, anchor="end")
-
-    def label_x(self, name: str, ticks: Sequence[tuple[float, str]]) -> None:
-        """Write what is below the panel."""
+    def label(self, up: str, right: str, ticks: _Ticks) -> None:
+        """Write what is below the panel, and above it what goes up."""
         for value, label in ticks:
             ((x, _),) = self._pixels([value], [self._y[0]])
             self._text(x, self._bottom + 16, label)
-        self._text((self._left + self._right) / 2, self._bottom + 33, name)
-
-    def label_y(self, name: str) -> None:
-        """Write what goes up, above the panel, where it can be read upright."""
-        self._text(4, 13, name, anchor="start")
+        self._text((self._left + self._right) / 2, self._bottom + 33, right)
+        self._text(4, 13, up, anchor="start")
 
     def line(
         self, x: ArrayLike, y: ArrayLike, role: str, *, width: float = 2, dash: int = 0
@@ -331,10 +306,9 @@ class _Panel:
             self.elements.append(f'<path class="{role}" d="{data}" {fill} {look}/>')
 
     def _text(self, x: float, y: float, text: str, *, anchor: str = "middle") -> None:
-        self.elements.append(
-            f'<text class="f-faint" x="{x:g}" y="{y:g}" text-anchor="{anchor}">'
-            f"{escape(text)}</text>"
-        )
+        if text:
+            place = f'x="{x:g}" y="{y:g}" text-anchor="{anchor}"'
+            self.elements.append(f'<text class="f-faint" {place}>{escape(text)}</text>')
 
     def _pixels(self, x: ArrayLike, y: ArrayLike) -> list[list[float]]:
         low, high = np.transpose([self._x, self._y])
@@ -354,20 +328,19 @@ def _joined(points: Sequence[Sequence[float]]) -> str:
 
 
 def _svg(
-    panels: Sequence[_Panel],
+    elements: Sequence[str],
     *,
     title: str,
     description: str,
     key: str,
-    width: int = _WIDTH,
-    height: int = _HEIGHT,
+    size: tuple[int, int] = _SMALL,
 ) -> str:
+    width, height = size
     return (
         f'<svg class="curve" viewBox="0 0 {width} {height}" width="{width}" '
         f'height="{height}" role="img" aria-labelledby="{key}-title {key}-desc">'
         f'<title id="{key}-title">{escape(title)}</title>'
-        f'<desc id="{key}-desc">{escape(description)}</desc>'
-        f"{''.join(element for panel in panels for element in panel.elements)}</svg>"
+        f'<desc id="{key}-desc">{escape(description)}</desc>{"".join(elements)}</svg>'
     )
 
 

@@ -7,7 +7,6 @@ among the problems, and the rest is shown.
 
 from __future__ import annotations
 
-import contextlib
 import logging
 import os
 import shlex
@@ -53,6 +52,8 @@ from .provenance import (
 )
 from .recorded_videos import recorded_videos
 
+_package_logger = logging.getLogger(__package__.partition(".")[0])
+
 Directories = str | os.PathLike[str] | Iterable[str | os.PathLike[str]]
 
 _UNKNOWN_ENVIRONMENT: Final = "unknown environment"
@@ -88,7 +89,7 @@ def gather(
     given = [_read_verdict(Path(path)) for path in verifications]
     found = _find_recordings(directories)
     contents = ReportContents()
-    with _noting_warnings(contents.problems):
+    with _Noting(contents.problems):
         for directory in found:
             if is_evaluation(directory):
                 _add_evaluation(contents, directory)
@@ -133,26 +134,26 @@ def _recordings_in(directory: Path) -> list[Path]:
             "record` wrote into (--out), or that a Monitor did."
         )
     try:
-        if _has_recordings(directory):
-            return [directory]
         # A link may lead anywhere, also to what is in the folder itself.
-        below = [
-            each
-            for each in sorted(directory.iterdir())
-            if each.is_dir() and not each.is_symlink() and _has_recordings(each)
-        ]
+        inside = (each for each in sorted(directory.iterdir()) if _is_folder(each))
+        has_own = _has_recordings(directory)
+        found = [directory] if has_own else [*filter(_has_recordings, inside)]
     except OSError as error:
         raise InvalidArgument(
             f"{directory} cannot be looked into: {error.strerror}. Name one that this "
             "user may read."
         ) from error
-    if not below:
+    if not found:
         raise InvalidArgument(
             f"{directory} holds no recordings, and neither do the folders directly in "
             f"it. `mjrec record ENV --out {shlex.quote(str(directory))}` makes some; "
             "`mjrec evaluate` makes some of many episodes."
         )
-    return below
+    return found
+
+
+def _is_folder(path: Path) -> bool:
+    return path.is_dir() and not path.is_symlink()
 
 
 def _has_recordings(directory: Path) -> bool:
@@ -301,9 +302,8 @@ def _add_evaluation(contents: ReportContents, directory: Path) -> None:
     except UnreadableFile as error:
         problem = f"{error} What its monitors recorded is shown instead."
         contents.problems.append(problem)
-        for folder in sorted(directory.iterdir()):
-            if folder.is_dir() and not folder.is_symlink():
-                _add_monitors(contents, folder, _places_of_task(folder))
+        for folder in filter(_is_folder, sorted(directory.iterdir())):
+            _add_monitors(contents, folder, _places_of_task(folder))
         return
     if not any(task.is_evaluation for task in contents.tasks):
         contents.bootstrap = results.bootstrap
@@ -410,20 +410,19 @@ def _title(tasks: Iterable[ReportTask], found: Iterable[Path]) -> str:
     return f"{what}: {len(names)} tasks" if names else what
 
 
-@contextlib.contextmanager
-def _noting_warnings(problems: list[str]) -> Iterator[None]:
-    """Note what the readers of files warn of in this thread: what they leave out."""
-    thread = threading.get_ident()
+class _Noting(logging.Handler):
+    """Notes what the readers of files warn of in this thread: what they leave out."""
 
-    class Noting(logging.Handler):
-        def emit(self, record: logging.LogRecord) -> None:
-            if record.thread == thread:
-                problems.append(record.getMessage())
+    def __init__(self, problems: list[str]) -> None:
+        super().__init__(logging.WARNING)
+        self._problems, self._thread = problems, threading.get_ident()
 
-    handler = Noting(logging.WARNING)
-    logger = logging.getLogger(__package__.partition(".")[0])
-    logger.addHandler(handler)
-    try:
-        yield
-    finally:
-        logger.removeHandler(handler)
+    def emit(self, record: logging.LogRecord) -> None:
+        if record.thread == self._thread:
+            self._problems.append(record.getMessage())
+
+    def __enter__(self) -> None:
+        _package_logger.addHandler(self)
+
+    def __exit__(self, *_: object) -> None:
+        _package_logger.removeHandler(self)

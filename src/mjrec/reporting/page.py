@@ -13,7 +13,6 @@ import base64
 import hashlib
 import math
 import platform
-import re
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -25,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import MissingDependency
-from ..evaluation.statistics import PERCENTILE_BOOTSTRAP, Interval
+from ..evaluation.statistics import PERCENTILE_BOOTSTRAP, Bootstrap, Interval
 from ..evaluation.summaries import TaskSummary
 from .contents import FAILED, ReportContents, ReportTask, ReportVideo
 from .curves import SERIES, evaluation_curve, learning_curve, profile_curve
@@ -39,6 +38,7 @@ from .page_text import (
     page_json,
     spelled_out,
 )
+from .provenance import SELECTION
 
 _LONGEST_NAME: Final = 120
 _LONGEST_REASON: Final = 300
@@ -61,9 +61,6 @@ _OUTCOMES: Final = (
     "failed",
 )
 _SUCCESS: Final = {1: ", success", 0: ", no success", -1: ""}
-_SELECTION: Final = "selection"
-_CHOICE: Final = r"(?:best|median|worst|failures)(?::\d+)?"
-_CHOICES: Final = re.compile(rf"\b({_CHOICE}),(?={_CHOICE}\b)")
 
 _Pairs = Sequence[tuple[str, str]]
 
@@ -84,7 +81,10 @@ def page_of(contents: ReportContents) -> str:
     cards = _cards(contents)
     shown = {id(card.video) for card in cards}
     common, differing = _provenance(contents.tasks)
-    usual_method = _usual_method(contents)
+    how = contents.bootstrap
+    methods = [_method(task.summary, how) for task in contents.tasks]
+    usual = Counter(filter(None, methods)).most_common(1)
+    intervals = usual[0][0] if usual else None
     count = sum(len(task.episodes) for task in contents.tasks)
     page: str = environment.get_template("report.html.j2").render(
         contents=contents,
@@ -98,17 +98,15 @@ def page_of(contents: ReportContents) -> str:
         subtitle=_subtitle(contents),
         most_problems=_MOST_PROBLEMS,
         bars=[_bar(task.summary) for task in contents.tasks],
-        intervals=_method_in_words(usual_method, contents),
-        notes=list(_notes(contents, usual_method)),
-        percent=f"{contents.bootstrap.confidence * 100:.4g}\N{NO-BREAK SPACE}%",
+        intervals=intervals,
+        notes=_notes(contents.tasks, methods, intervals),
+        percent=f"{how.confidence * 100:.4g}\N{NO-BREAK SPACE}%",
         across=[
             {
                 "name": name,
                 "series": index % SERIES,
                 "scores": each,
-                "method": None
-                if each.interval_method == usual_method
-                else _method_in_words(each.interval_method, contents),
+                "method": _in_words(each.interval_method, how),
             }
             for index, (name, each) in enumerate(contents.across.items())
         ],
@@ -168,7 +166,6 @@ def _environment() -> Any:
         command=lambda text: escape(spelled_out(text, _LONGEST_COMMAND)),
         # However long it is: a `data:` URL is all of a video.
         address=lambda path: escape(address(path)),
-        readable=_readable,
         number=number,
         interval=interval_text,
         share=lambda value: (
@@ -204,63 +201,49 @@ def _bar(summary: TaskSummary) -> dict[str, Any] | None:
         return None
     if mean is None or minimum is None or maximum is None:
         return None
-
-    def place(value: float) -> float:
-        return min(100.0, max(0.0, 100 * (value - scale[0]) / (scale[1] - scale[0])))
-
     interval = summary.mean_interval or Interval(mean, mean)
-    low, high = place(minimum), place(maximum)
-    from_, to = place(interval.low), place(interval.high)
+    values = (minimum, maximum, interval.low, interval.high, mean)
+    places = [100 * (value - scale[0]) / (scale[1] - scale[0]) for value in values]
+    low, high, from_, to, middle = (min(100.0, max(0.0, place)) for place in places)
     return {
         "low": f"{low:.2f}",
         "spread": f"{high - low:.2f}",
         "from": f"{from_:.2f}",
         "interval": f"{max(to - from_, 0.8):.2f}",
-        "mean": f"{place(mean):.2f}",
+        "mean": f"{middle:.2f}",
         "words": f"on a scale from {number(scale[0], 0)} to {number(scale[1], 0)}",
     }
 
 
-def _usual_method(contents: ReportContents) -> str | None:
-    """Return how most tasks' intervals were made; None where there are none."""
-    methods = [_method(task.summary) for task in contents.tasks]
-    counts = Counter(method for method in methods if method is not None)
-    return max(counts, key=counts.__getitem__, default=None)
-
-
-def _method(summary: TaskSummary) -> str | None:
+def _method(summary: TaskSummary, how: Bootstrap) -> str | None:
+    """Return how a task's intervals were made; None where there are none."""
     if summary.mean_interval is None and summary.iqm_interval is None:
         return None
-    return summary.interval_method or PERCENTILE_BOOTSTRAP
+    return _in_words(summary.interval_method or PERCENTILE_BOOTSTRAP, how)
 
 
-def _method_in_words(method: str | None, contents: ReportContents) -> str | None:
-    """Return how intervals were made, with what that method depends on."""
+def _in_words(method: str | None, how: Bootstrap) -> str | None:
     if method != PERCENTILE_BOOTSTRAP:
         return method
-    how = contents.bootstrap
     resamples = counted(how.resamples, "resample")
     return f"{method} over episodes, {resamples}, seed {how.seed}"
 
 
 def _notes(
-    contents: ReportContents, usual_method: str | None
-) -> Iterator[tuple[str, list[str]]]:
-    """Yield why figures are missing or made in another way, and for which tasks."""
-    for task in contents.tasks:
+    tasks: Iterable[ReportTask], methods: Iterable[str | None], usual: str | None
+) -> dict[str, list[str]]:
+    """Return why figures are missing or made in another way, and for which tasks."""
+    notes: dict[str, list[str]] = {}
+    for task, method in zip(tasks, methods, strict=True):
         if count := task.summary.not_finite:
             of = counted(task.summary.episodes, "return")
             what = "is no finite number" if count == 1 else "are no finite numbers"
             words = f"No figures of the returns: {number(count, 0)} of {of} {what}"
-            yield words, [task.name]
-    others: dict[str, list[str]] = {}
-    for task in contents.tasks:
-        method = _method(task.summary)
-        if method is not None and method != usual_method:
-            others.setdefault(method, []).append(task.name)
-    for method, names in others.items():
-        how = _method_in_words(method, contents)
-        yield f"Intervals by another method, {how}", names
+            notes.setdefault(words, []).append(task.name)
+        if method not in (None, usual):
+            words = f"Intervals by another method, {method}"
+            notes.setdefault(words, []).append(task.name)
+    return notes
 
 
 # --- Figures ----------------------------------------------------------------------
@@ -360,18 +343,9 @@ def _card(
 
 def _selection(tasks: Iterable[ReportTask]) -> list[str]:
     """Return the rules by which episodes got a video, as the provenance states them."""
-    rules = (
-        _readable(value)
-        for task in tasks
-        for label, value in task.provenance
-        if _SELECTION in label.casefold()
-    )
+    said = (pair for task in tasks for pair in task.provenance)
+    rules = (value for label, value in said if label == SELECTION)
     return list(dict.fromkeys(rules))[:10]
-
-
-def _readable(rule: str) -> str:
-    """Return what is said of a rule of selection, with its parts apart."""
-    return _CHOICES.sub(r"\1, ", rule)
 
 
 # --- The table of episodes --------------------------------------------------------
@@ -470,7 +444,7 @@ def _where_all_are(tasks: Iterable[ReportTask]) -> list[str]:
 
 def _provenance(tasks: Sequence[ReportTask]) -> tuple[_Pairs, list[tuple[str, _Pairs]]]:
     """Return what is so for all tasks, and what else is so for some of them."""
-    said = [[_pair(*pair) for pair in task.provenance] for task in tasks]
+    said = [list(task.provenance) for task in tasks]
     everywhere = set.intersection(*map(set, said)) if said else set()
     differing = [
         (task.name, [pair for pair in pairs if pair not in everywhere])
@@ -478,7 +452,3 @@ def _provenance(tasks: Sequence[ReportTask]) -> tuple[_Pairs, list[tuple[str, _P
     ]
     common = [pair for pair in said[0] if pair in everywhere] if said else []
     return common, [(name, pairs) for name, pairs in differing if pairs]
-
-
-def _pair(label: str, value: str) -> tuple[str, str]:
-    return label, _readable(value) if _SELECTION in label.casefold() else value

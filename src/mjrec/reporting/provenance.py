@@ -14,8 +14,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import Error, UnreadableFile
-from ..evaluation.kept_episodes import keep_rule
+from ..errors import UnreadableFile
 from ..evaluation.plan import SEEDED
 from ..evaluation.results_files import ReadResults
 from ..formats.manifest import GYM_VERSION
@@ -23,21 +22,13 @@ from ..results.journal_or_stats import MonitorResults
 
 Pairs = Iterable[tuple[str, str]]
 
+SELECTION: Final = "Selection of videos"
+
 # In the order of the page.
 _LABELS: Final = (
-    "Environment",
-    "Arguments of the environment",
-    "Monitors",
-    "Policy",
-    "Protocol",
-    "Seeds",
-    "Episodes of each seed",
-    "Most steps of an episode",
-    "Selection of videos",
-    "Versions",
-    "OpenGL of the videos",
-    "Recorded on",
-    "Recorded",
+    *("Environment", "Arguments of the environment", "Monitors", "Policy", "Protocol"),
+    *("Seeds", "Episodes of each seed", "Most steps of an episode", SELECTION),
+    *("Versions", "OpenGL of the videos", "Recorded on", "Recorded"),
 )
 # In this order, by the names of the packages.
 _PACKAGES: Final = {
@@ -81,7 +72,7 @@ class Provenance:
     def pairs(self) -> list[tuple[str, str]]:
         """Return label and values, in the order of the page."""
         return [
-            (label, ("; " if label != "Monitors" else ", ").join(_some(values)))
+            (label, _some(values, "; " if label != "Monitors" else ", "))
             for label, values in self._values.items()
             if values
         ]
@@ -89,7 +80,7 @@ class Provenance:
 
 def machine_of(monitor: MonitorResults) -> tuple[str, str]:
     """Return what a monitor says of the machine that it recorded on."""
-    surroundings = _surroundings(monitor)
+    surroundings = _mapping(_details(monitor).get("surroundings"))
     cpu = _mapping(surroundings.get("cpu")).get("model")
     return "Recorded on", _joined(cpu, surroundings.get("system"))
 
@@ -99,11 +90,11 @@ def pairs_of_monitor(monitor: MonitorResults) -> Pairs:
     details = _details(monitor)
     yield machine_of(monitor)
     yield "Monitors", monitor.files.infix
-    policy = _mapping(_surroundings(monitor).get("policy"))
+    policy = _mapping(_mapping(details.get("surroundings")).get("policy"))
     sha256 = policy.get("sha256")
     if isinstance(policy.get("file"), str):
         yield "Policy", _joined(policy["file"], f"sha256 {sha256}" if sha256 else None)
-    yield "Selection of videos", _schedule(details)
+    yield SELECTION, _schedule(details)
     yield "Versions", _versions(details.get("versions"))
     gym = (monitor.env_info or {}).get("gym_version")
     if isinstance(gym, str) and gym != GYM_VERSION:
@@ -120,12 +111,18 @@ def pairs_of_results(results: ReadResults, task: str) -> Iterator[tuple[str, str
     seeded = "seeded: episode i of seed s starts from SeedSequence([s, i])"
     suite = "suite: one random stream for each task and seed"
     yield "Protocol", seeded if plan.protocol == SEEDED else suite
-    yield "Seeds", ", ".join(_some(map(str, plan.seeds)))
+    yield "Seeds", _some(map(str, plan.seeds), ", ")
     yield "Episodes of each seed", str(plan.episodes)
     limit = "the environment's own limit, 1000 where it has none"
     yield "Most steps of an episode", str(plan.max_steps or limit)
-    yield "Selection of videos", _rule(plan.keep)
+    chosen = f"{spaced(plan.keep)}; chosen after all episodes of the task had ended"
+    yield SELECTION, _RULES.get(plan.keep, chosen)
     yield "Versions", _versions(results.versions)
+
+
+def spaced(rule: str) -> str:
+    """Return what a rule of selection says, with its parts apart."""
+    return ", ".join(part.strip() for part in rule.split(","))
 
 
 def recorded_when(rows: NDArray[np.void]) -> str:
@@ -151,24 +148,18 @@ def _details(monitor: MonitorResults) -> Mapping[str, Any]:
         return {}
 
 
-def _surroundings(monitor: MonitorResults) -> Mapping[str, Any]:
-    return _mapping(_details(monitor).get("surroundings"))
-
-
-def _some(values: Iterable[str]) -> list[str]:
+def _some(values: Iterable[str], between: str) -> str:
     listed = list(values)
     more = len(listed) - _MOST_LISTED
-    return listed if more <= 0 else [*listed[:_MOST_LISTED], f"and {more} more"]
+    if more > 0:
+        listed[_MOST_LISTED:] = [f"and {more} more"]
+    return between.join(listed)
 
 
 def _versions(versions: Any) -> str:
     said = _mapping(versions)
-    named = {
-        shown: said[package]
-        for package, shown in _PACKAGES.items()
-        if isinstance(said.get(package), str)
-    }
-    return ", ".join(f"{name} {version}" for name, version in named.items())
+    known = [(shown, said.get(package)) for package, shown in _PACKAGES.items()]
+    return ", ".join(f"{name} {of}" for name, of in known if isinstance(of, str))
 
 
 def _schedule(details: Mapping[str, Any]) -> str:
@@ -176,19 +167,9 @@ def _schedule(details: Mapping[str, Any]) -> str:
     if not isinstance(name, str):
         return "" if details else "as its schedule chose; gym did not write it down"
     if name.startswith(_KEPT):
-        rule = name.removeprefix(_KEPT)
+        rule = spaced(name.removeprefix(_KEPT))
         return f"{rule}; chosen after all episodes had ended"
     return _SCHEDULES.get(name, f"as {name} chose, before each began")
-
-
-def _rule(keep: str) -> str:
-    if keep in _RULES:
-        return _RULES[keep]
-    try:
-        keep_rule(keep)
-    except Error:
-        return keep
-    return f"{keep}; chosen after all episodes of the task had ended"
 
 
 def _joined(*texts: Any) -> str:

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import itertools
 import os
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
@@ -80,8 +79,8 @@ def iter_episodes(directory: str | os.PathLike[str]) -> Iterator[Episode]:
 
     Gym's files do not say which video shows which episode where an environment was
     reset twice in a row; such a monitor's episodes have None as their video. So do
-    episodes whose number is lost with their line of the journal; their `episode_id`
-    is the lowest that they can have had.
+    episodes whose line of the journal is lost; their `episode_id` is the lowest that
+    they can have had.
 
     Raises:
         UnreadableFile: there is no such directory (at once), or a file in it is
@@ -109,54 +108,35 @@ def episodes_of(results: MonitorResults) -> Iterator[Episode]:
     if saved is None or count >= len(saved.timestamps):
         for entry in entries:
             yield _of_journal(results, entry)
-    elif journal is None and not results.details:
-        yield from _of_gym(results, saved)
-    else:
-        yield from _of_both(results, saved, entries)
+        return
+    # Both are written from the same numbers, which JSON gives back exactly.
+    by_end = {(entry.end_time, entry.length): entry for entry in entries}
+    number = results.details.get("first_episode_id", 0)
+    is_certain = not by_end and _is_every_one(results, saved, number)
+    ends = zip(saved.timestamps, saved.episode_lengths, strict=True)
+    for index, end in enumerate(ends):
+        known = by_end.get(end)
+        if known is None:
+            yield _of_stats(results, saved, index, number, is_certain=is_certain)
+        else:
+            yield _of_journal(results, known)
+            number = known.episode_id
+        number += 1
+
+
+def _is_every_one(results: MonitorResults, stats: StatsFile, first: int) -> bool:
+    """Tell whether every episode that began was completed, so that numbers follow."""
+    count, following = len(stats.timestamps), results.details.get("next_episode_id")
+    if results.details:
+        return following is not None and following - first == count
+    # Gym noted a type at each reset, and numbered the videos by resets. One more than
+    # episodes is the last one, which did not end; two more are resets in a row.
+    return len(stats.episode_types or ()) <= count + 1
 
 
 def _of_journal(results: MonitorResults, entry: JournalEntry) -> Episode:
     facts = {k: v for k, v in vars(entry).items() if k not in ("chosen", "recording")}
     return Episode(**facts, **_files(results, entry.episode_id))
-
-
-def _of_both(
-    results: MonitorResults, stats: StatsFile, entries: Iterable[JournalEntry]
-) -> Iterator[Episode]:
-    """Yield the episodes of a statistics file of which a journal lacks some.
-
-    The neighbours in the journal often leave just as many numbers as are missing.
-    """
-    # Both are written from the same numbers, which JSON gives back exactly.
-    by_end = {(entry.end_time, entry.length): entry for entry in entries}
-    ends = zip(stats.timestamps, stats.episode_lengths, strict=True)
-    matches = [by_end.pop(end, None) for end in ends]
-    following = results.details.get("next_episode_id")
-    low = results.details.get("first_episode_id", 0)
-    for is_missing, group in itertools.groupby(
-        range(len(matches)), key=lambda index: matches[index] is None
-    ):
-        indices = list(group)
-        if not is_missing:
-            for index in indices:
-                entry = matches[index]
-                assert entry is not None
-                yield _of_journal(results, entry)
-                low = entry.episode_id + 1
-            continue
-        after = next(iter(matches[indices[-1] + 1 :]), None)
-        high = following if after is None else after.episode_id
-        is_certain = high is not None and high - low == len(indices)
-        for number, index in enumerate(indices, start=low):
-            yield _of_stats(results, stats, index, number, is_certain=is_certain)
-
-
-def _of_gym(results: MonitorResults, stats: StatsFile) -> Iterator[Episode]:
-    # Gym noted a type at each reset, and numbered the videos by resets. One more than
-    # episodes is the last one, which did not end; two more are resets in a row.
-    is_certain = len(stats.episode_types or ()) <= len(stats.timestamps) + 1
-    for index in range(len(stats.timestamps)):
-        yield _of_stats(results, stats, index, index, is_certain=is_certain)
 
 
 def _of_stats(

@@ -8,14 +8,13 @@ some of its videos, by one that puts a dead monitor in order.
 from __future__ import annotations
 
 import contextlib
-import os
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from .. import json_text
-from ..errors import DirectoryNotWritable, UnreadableFile
+from ..errors import UnreadableFile
 from ..formats.locks import is_locked, wait_for_lock
 from ..formats.manifest import (
     GYM_VERSION,
@@ -167,14 +166,8 @@ def manifest_lock(directory: Path, infix: Infix) -> Iterator[None]:
     Raises:
         DirectoryNotWritable: there can be no lock in the directory.
     """
-    try:
-        lock = wait_for_lock(directory / manifest_lock_name(infix), f"{os.getpid()}\n")
-    except OSError as error:
-        raise DirectoryNotWritable(directory, error.strerror) from error
-    try:
+    with wait_for_lock(directory / manifest_lock_name(infix)):
         yield
-    finally:
-        lock.release()
 
 
 def _as_read(manifest: Manifest) -> Manifest:
@@ -183,7 +176,7 @@ def _as_read(manifest: Manifest) -> Manifest:
 
 
 def _manifest(directory: Path, infix: Infix, run: Run, *, stats_name: str) -> Manifest:
-    finished, broken = _videos(directory, infix, run)
+    finished, broken = finished_and_broken(directory, infix, run)
     pending = _pending(directory, infix, run)
     keep, name, chosen = _keep(run), run.facts.get("schedule"), set(run.chosen)
     if keep is not None:
@@ -230,8 +223,8 @@ def _keep(run: Run) -> dict[str, Any] | None:
     }
 
 
-def _videos(
-    directory: Path, infix: Infix, run: Run
+def finished_and_broken(
+    directory: Path, infix: Infix | str, run: Run
 ) -> tuple[list[tuple[str, str]], list[str]]:
     """Return finished videos, each with its metadata, and the metadata of broken ones.
 

@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from ..formats.manifest import GYM_VERSION, StatsFile, read_stats_file
-from ..formats.video_metadata import is_broken
 from .journal_or_stats import MonitorResults
+from .manifest_writing import finished_and_broken
 from .monitor_files import monitors_of
 
 logger = logging.getLogger(__name__)
@@ -213,14 +213,12 @@ def _videos(directory: Path, monitors: Sequence[_Kept]) -> list[tuple[str, str]]
 
 
 def _names_of_videos(results: MonitorResults) -> list[tuple[str, str]]:
-    """Return what the manifest lists, and what was finished after it was written."""
-    manifest, files = results.manifest, results.files
-    listed = [] if manifest is None else list(manifest.videos)
-    if manifest is None or results.is_behind:
-        # A video gets its name when it is whole, and its metadata after that.
-        listed += [
-            (files.videos[number].name, files.metadata[number].name)
-            for number in sorted(files.videos.keys() & files.metadata.keys())
-            if not is_broken(files.metadata[number])
-        ]
-    return list(dict.fromkeys(listed))
+    """Return what the manifest lists; where it is older, what is there."""
+    manifest, journal = results.manifest, results.files.journal
+    if manifest is not None and not results.is_behind:
+        return list(dict.fromkeys(manifest.videos))
+    if journal is None:
+        return []
+    infix = results.files.infix
+    finished, _ = finished_and_broken(journal.parent, infix, results.run)
+    return finished

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import logging
 import os
-import re
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -14,42 +13,46 @@ from ..formats.journal import MOST_EPISODES
 from ..formats.locks import is_locked
 from ..formats.monitor_directory import (
     Infix,
+    VideoName,
     episode_of,
     infix_of,
     is_manifest,
     iter_monitor_files,
+    names_in,
 )
 from ..formats.second_names import is_called_like_second
 from ..formats.spans import recordings_in_flight
 
 logger = logging.getLogger(__name__)
 
-# Videos of further cameras have the camera's name before the ending.
-_VIDEO = re.compile(r".*\.video(?P<episode>\d{6,})\.(?P<kind>meta\.json|mp4|avi|json)")
-
 
 class MonitorFiles:
-    """The files of one monitor, as far as results are read from them.
+    """The files of one monitor.
 
     Args:
         infix: what their names have in common.
         paths: the files.
+        in_flight: the files that recordings in flight will become.
 
     Attributes:
         infix: as given.
+        paths: as given.
         manifest: its manifest, where there is one; likewise:
         stats: its statistics file.
         journal: its journal.
         lock: what it claimed its infix with; it is left where the monitor was killed.
         videos: its videos, by the numbers of their episodes.
         metadata: their metadata, likewise.
-        trajectories: the recorded states, likewise; also what is not finished yet.
+        trajectories: the recorded states, likewise; also what is in flight.
         last_episode_id: the highest number of an episode in a name, also of a file
             that was never finished; -1 where there is none.
     """
 
-    def __init__(self, infix: str, paths: Iterable[Path]) -> None:
+    def __init__(
+        self, infix: str, paths: Iterable[Path], in_flight: Iterable[Path] = ()
+    ) -> None:
         self.infix = infix
+        self.paths = tuple(paths)
         self.manifest: Path | None = None
         self.stats: Path | None = None
         self.journal: Path | None = None
@@ -58,48 +61,77 @@ class MonitorFiles:
         self.metadata: dict[int, Path] = {}
         self.trajectories: dict[int, Path] = {}
         self.last_episode_id = -1
-        for path in paths:
+        for path in (*self.paths, *in_flight):
             self._sort_in(path)
+
+    @property
+    def is_open(self) -> bool:
+        """Whether a living process holds the monitor's lock.
+
+        Raises:
+            OSError: the lock cannot be opened.
+        """
+        # Locks that are no monitor's are called alike.
+        is_monitor = Infix.parse(self.infix) is not None
+        return is_monitor and self.lock is not None and is_locked(self.lock)
 
     def _sort_in(self, path: Path) -> None:
         number = episode_of(path.name)
         # A name may hold any number of digits, and be anybody's.
         if number is not None and number < MOST_EPISODES:
             self.last_episode_id = max(self.last_episode_id, number)
-        video = _VIDEO.fullmatch(path.name)
-        if is_manifest(path.name):
+        video = VideoName.parse(path.name)
+        if path.name == f".openaigym.{self.infix}.lock":
+            self.lock = path
+        elif path.name.startswith("."):
+            return
+        elif is_manifest(path.name):
             self.manifest = path
         elif path.name.endswith(".stats.json"):
             self.stats = path
         elif path.suffix == ".jsonl":
             self.journal = path
-        elif path.name == f".openaigym.{self.infix}.lock":
-            self.lock = path
-        elif video is not None:
-            kind = self.metadata if video["kind"] == "meta.json" else self.videos
-            kind[int(video["episode"])] = path
+        elif video is not None and video.is_episodes:
+            if video.ending in ("mp4", "avi", "json"):
+                self.videos[video.episode_id] = path
+            elif video.ending == "meta.json":
+                self.metadata[video.episode_id] = path
         elif path.suffix == ".h5" and number is not None:
             self.trajectories[number] = path
 
 
 def monitors_of(directory: Path) -> list[MonitorFiles]:
-    """Return the files of each monitor, in the order of the infixes.
+    """Return the files of each monitor, hidden ones too, in the order of the infixes.
 
-    Files that recordings in flight will become are among them, and monitors of which
-    there is a lock or an unfinished file only.
+    Files that recordings in flight will become are among their trajectories, and
+    monitors of which there is a lock or an unfinished file only among them.
     """
-    grouped: dict[str, list[Path]] = {}
-    for path in iter_monitor_files(directory, hidden=True):
-        infix = infix_of(path.name)
-        if infix is not None:
-            grouped.setdefault(infix, []).append(path)
-    for recording in recordings_in_flight(directory):
-        infix = infix_of(recording.path.name)
-        if infix is not None:
-            grouped.setdefault(infix, []).append(recording.path)
+    files, in_flight = (
+        _by_infix(iter_monitor_files(directory, hidden=True)),
+        _by_infix(recording.path for recording in recordings_in_flight(directory)),
+    )
     return [
-        MonitorFiles(infix, grouped[infix]) for infix in sorted(grouped, key=_order)
+        MonitorFiles(infix, files.get(infix, ()), in_flight.get(infix, ()))
+        for infix in sorted({*files, *in_flight}, key=_order)
     ]
+
+
+def files_of(directory: Path, infix: Infix) -> MonitorFiles:
+    """Return the files of one monitor as they are now, hidden ones too."""
+    # Many names are compared, of whole directories, once for each dead monitor.
+    own = f".{infix}."
+    names = [n for n in names_in(directory) if own in n and infix_of(n) == str(infix)]
+    paths = [path for n in sorted(names) if (path := directory / n).is_file()]
+    in_flight = [each.path for each in recordings_in_flight(directory, infix)]
+    return MonitorFiles(str(infix), paths, in_flight)
+
+
+def _by_infix(paths: Iterable[Path]) -> dict[str, list[Path]]:
+    grouped: dict[str, list[Path]] = {}
+    for path in paths:
+        if (infix := infix_of(path.name)) is not None:
+            grouped.setdefault(infix, []).append(path)
+    return grouped
 
 
 def _order(infix: str) -> tuple[int, int, int, str]:

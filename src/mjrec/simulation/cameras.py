@@ -54,24 +54,34 @@ def camera_names(model: Any) -> list[str]:
     return [name for name in names if name]
 
 
-def resolve_camera(model: Any, camera: Camera) -> mujoco.MjvCamera:
+def resolve_camera(model: Any, camera: Camera | Mapping[str, Any]) -> mujoco.MjvCamera:
     """Return the camera that is meant, ready for `mjv_updateScene`.
 
     Args:
         model: the model that the camera belongs to.
         camera: the name or number of one of the model's cameras, -1 for the free
-            camera in the place that the model gives it, or an `MjvCamera`, which is
-            given back as it is.
+            camera in the place that the model gives it, the public members of an
+            `MjvCamera` by their names (those left out are MuJoCo's default), or an
+            `MjvCamera`, which is given back as it is.
 
     Raises:
-        UnknownName: the model has no camera of that name.
-        InvalidArgument: it has no camera of that number, or `camera` is none of these.
+        UnknownName: the model has no camera of that name, or there is no such member.
+        InvalidArgument: it has no camera of that number, or `camera` is none of these,
+            or its members follow something that the model lacks.
     """
     model = raw_model(model)
     if isinstance(camera, mujoco.MjvCamera):
         return camera
-    index = _camera_index(model, camera)
     resolved = mujoco.MjvCamera()
+    if isinstance(camera, Mapping):
+        for name, value in camera.items():
+            if name.startswith("_") or not hasattr(resolved, name):
+                known = [known for known in dir(resolved) if not known.startswith("_")]
+                raise UnknownName("member of mujoco.MjvCamera", name, known)
+            setattr(resolved, name, value)
+        check_camera(model, resolved)
+        return resolved
+    index = _camera_index(model, camera)
     if index == FREE_CAMERA:
         mujoco.mjv_defaultFreeCamera(model, resolved)
     else:
@@ -80,47 +90,29 @@ def resolve_camera(model: Any, camera: Camera) -> mujoco.MjvCamera:
     return resolved
 
 
-def camera_from_members(
-    model: mujoco.MjModel, members: Mapping[str, Any]
-) -> mujoco.MjvCamera:
-    """Return a camera with these members; those left out are MuJoCo's default.
-
-    Args:
-        model: the model that the camera is for.
-        members: values of the public members of `mujoco.MjvCamera` by their names.
-
-    Raises:
-        UnknownName: there is no such member.
-        InvalidArgument: it follows, or is fixed to, something that the model lacks.
-    """
-    camera = mujoco.MjvCamera()
-    for name, value in members.items():
-        if name.startswith("_") or not hasattr(camera, name):
-            known = [known for known in dir(camera) if not known.startswith("_")]
-            raise UnknownName("member of mujoco.MjvCamera", name, known)
-        setattr(camera, name, value)
-    check_camera(model, camera)
-    return camera
-
-
 def check_camera(model: mujoco.MjModel, camera: mujoco.MjvCamera) -> None:
     """Check that what a camera follows, or is fixed to, is in the model.
 
     Raises:
         InvalidArgument: it is not, or there is no such kind of camera.
     """
-    kind, count = int(camera.type), 0
+    fixed, tracking = (
+        mujoco.mjtCamera.mjCAMERA_FIXED,
+        mujoco.mjtCamera.mjCAMERA_TRACKING,
+    )
+    numbered = {
+        int(fixed): ("fixedcamid", model.ncam),
+        int(tracking): ("trackbodyid", model.nbody),
+    }
+    kind = int(camera.type)
     if kind == int(mujoco.mjtCamera.mjCAMERA_FREE):
         return
-    if kind == int(mujoco.mjtCamera.mjCAMERA_FIXED):
-        what, number, count = "fixedcamid", camera.fixedcamid, model.ncam
-    elif kind == int(mujoco.mjtCamera.mjCAMERA_TRACKING):
-        what, number, count = "trackbodyid", camera.trackbodyid, model.nbody
-    else:
+    if kind not in numbered:
         raise InvalidArgument(
             f"A camera's type is free (0), tracking (1) or fixed (2), got {kind}."
         )
-    if not 0 <= number < count:
+    what, count = numbered[kind]
+    if not 0 <= (number := getattr(camera, what)) < count:
         raise InvalidArgument(
             f"A camera's {what} is {number}, and this model has {count} of these: 0 to "
             f"{count - 1}."
@@ -146,15 +138,14 @@ def tracking_camera(model: Any) -> str | int | None:
     """
     model = raw_model(model)
     modes = model.cam_mode.tolist()
+    bodies = model.cam_bodyid.tolist()
     candidates = [index for index, mode in enumerate(modes) if mode == _TRACKCOM]
     candidates += [
         index
         for index, mode in enumerate(modes)
-        if mode == _TRACK and _travels(model, model.cam_bodyid[index])
+        if mode == _TRACK and _travels(model, bodies[index])
     ]
-    if not candidates:
-        return None
-    return model.camera(candidates[0]).name or candidates[0]
+    return _name_of(model, candidates[0]) if candidates else None
 
 
 def default_camera(model: Any) -> str | int:
@@ -170,7 +161,7 @@ def default_camera(model: Any) -> str | int:
     if tracking is not None:
         return tracking
     model = raw_model(model)
-    return (model.camera(0).name or 0) if model.ncam else FREE_CAMERA
+    return _name_of(model, 0) if model.ncam else FREE_CAMERA
 
 
 def camera_label(model: mujoco.MjModel, camera: Any) -> str | int | dict[str, Any]:
@@ -193,7 +184,11 @@ def camera_label(model: mujoco.MjModel, camera: Any) -> str | int | dict[str, An
                 "elevation": float(camera.elevation),
             }
         camera = camera.fixedcamid
-    number = int(camera)
+    return _name_of(model, int(camera))
+
+
+def _name_of(model: mujoco.MjModel, number: int) -> str | int:
+    """Return a camera's name, or its number where it has none."""
     return number if number < 0 else model.camera(number).name or number
 
 

@@ -17,19 +17,14 @@ from numpy.typing import NDArray
 
 from ..errors import ClosedError, PicturesDiffer
 from .cameras import is_tracking, raw_data, raw_model
-from .captured_arrays import (
-    STATE_SPEC,
-    needs_constraints,
-    snapshot_dtype,
-    state_dtype,
-    state_words,
-)
-from .change_detection import Looks
+from .captured_arrays import needs_constraints, snapshot_dtype
 from .fields import VIEW_PREFIXES, is_settable
+from .looks import Looks
 from .model_sources import AuthoredModel
 from .model_store import ModelStore
 from .self_check import scene_difference
 from .snapshot import SnapshotSource
+from .states import STATE_SPEC, state_dtype, state_words
 from .view import SceneView
 
 T = TypeVar("T")
@@ -327,8 +322,8 @@ class _StoredModel:
 
     Attributes:
         scene: where each frame leaves its two cameras; None before the first.
-        options: the visual options with which a snapshot was found to suffice.
-        fields: those that were other than in the stored model then.
+        sound: with which visual options (as bytes), and with which fields other than
+            stored, a snapshot was found to suffice.
     """
 
     def __init__(self, model: mujoco.MjModel, facts: dict[str, Any]) -> None:
@@ -337,8 +332,7 @@ class _StoredModel:
         self.looks = Looks(model)
         self.state = state_dtype(model)
         self.scene: mujoco.MjvScene | None = None
-        self.options: set[bytes] = set()
-        self.fields: set[str] = set()
+        self.sound: set[bytes | str] = set()
 
 
 class _Frames:
@@ -392,9 +386,7 @@ class _Frames:
         That is checked of the first frame, and again of the first one that has a
         visual option, or a changed field of the model, that none before it had.
         """
-        stored = self._stored
-        is_known = stored.looks.option_bytes() in stored.options
-        return is_known and stored.fields.issuperset(fields)
+        return self._stored.sound.issuperset(self._looks(fields))
 
     def objection(self, fields: Iterable[str], row: Any) -> str | None:
         """Say why frames of this moment cannot be drawn from snapshots.
@@ -417,8 +409,7 @@ class _Frames:
         found = scene_difference(stored.model, self.data, row, self.view)
         if found is not None:
             return f"drawn from its snapshot the scene is another one: {found}"
-        stored.options.add(stored.looks.option_bytes())
-        stored.fields.update(fields)
+        stored.sound.update(self._looks(fields))
         return None
 
     def drawn(
@@ -437,6 +428,9 @@ class _Frames:
         mujoco.mjv_updateCamera(model, self.data, self._camera, self.scene)
         self._stored.scene = self.scene
         return changed
+
+    def _looks(self, fields: Iterable[str]) -> list[bytes | str]:
+        return [self._stored.looks.option_bytes(), *fields]
 
     def _follow_camera(self) -> None:
         # Moved as frames move it; the environment's own stays where it is.

@@ -1,18 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a row of a recording holds of a simulation, and where that lies in memory.
+"""Which arrays of a simulation a snapshot holds: what a frame is drawn from.
 
-A row has two parts. The state is `mjSTATE_INTEGRATION`, everything that the next step
-depends on. MuJoCo gives it as one vector, whose parts are numbered by bits; the bits
-were renumbered between releases, so that what is kept goes by names.
-
-The snapshot is what a frame is drawn from: some twenty of the hundred and more arrays
-of `MjData`. They do not follow from the state alone: after a step they belong to the
-state before its last substep, and environments move things just before they draw.
+They are some twenty of the hundred and more arrays of `MjData`, and do not follow from
+the state (`states`) alone: after a step they belong to the state before its last
+substep, and environments move things just before they draw.
 """
 
 from __future__ import annotations
 
-import functools
 from typing import Any
 
 import mujoco
@@ -20,17 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..formats.trajectory import packed
-from .raw_memory import WORDS, address_of, can_be_gathered, raw_memory, words_of
+from .raw_memory import address_of
 
-STATE_SPEC = int(mujoco.mjtState.mjSTATE_INTEGRATION)
-
-_PREFIX = "mjSTATE_"
 _JOINT_WRAP = int(mujoco.mjtWrap.mjWRAP_JOINT)
-
-# Components whose array in `MjData` has another name.
-_STATE_ARRAYS = {"warmstart": "qacc_warmstart", "plugin": "plugin_state"}
-# The time is no array but a number of the struct, which lies close to this one.
-_NEIGHBOUR, _REACH = "energy", 16
 
 # Not an array of `MjData`: the colours that tendons have in the frame. They are
 # restored into the model's array of this name.
@@ -43,109 +30,22 @@ ALWAYS = (
     *("ten_wrapadr", "ten_wrapnum", "ten_length", "wrap_obj", "wrap_xpos"),
 )
 _FOR_SKINS = ("xpos", "xquat")
-_BODIES = ("xpos", "xmat", "xipos", "ximat")
-
-# What a flag that is off by default needs besides.
-_FOR_FLAGS: dict[str, tuple[str, ...]] = {
-    "mjVIS_JOINT": ("xanchor", "xaxis", "xmat"),
-    "mjVIS_ACTUATOR": ("ctrl", "xanchor", "xaxis", "xmat"),
-    "mjVIS_ACTIVATION": ("act",),
-    "mjVIS_CONSTRAINT": ("eq_active", "xpos", "xmat"),
-    "mjVIS_INERTIA": ("xipos", "ximat"),
-    "mjVIS_SCLINERTIA": ("xipos", "ximat"),
-    "mjVIS_PERTFORCE": ("xfrc_applied", "xipos"),
-    "mjVIS_SELECT": _BODIES,
-    "mjVIS_AUTOCONNECT": ("xanchor", "xipos"),
-    "mjVIS_BODYBVH": ("xipos", "ximat", "bvh_active"),
-    # Until mujoco 3.3 on their own.
-    "mjVIS_FLEXBVH": ("bvh_aabb_dyn", "bvh_active", "xpos", "xmat"),
-    "mjVIS_MESHBVH": ("bvh_aabb_dyn", "bvh_active", "xpos", "xmat"),
-}
-_FRAMES_OF_BODIES = ("mjFRAME_BODY", "mjFRAME_WORLD")
+# What flags, frames and labels that are off by default may need besides.
+_FOR_OPTIONS = (
+    *("xpos", "xmat", "xipos", "ximat", "xanchor", "xaxis", "ctrl", "act"),
+    *("eq_active", "xfrc_applied", "bvh_active", "bvh_aabb_dyn"),
+)
 
 # Nothing else is put into data from a file.
 SNAPSHOT_ARRAYS = frozenset(
-    (*ALWAYS, *_FOR_SKINS, *_BODIES, *sum(_FOR_FLAGS.values(), ()))
-) | {"sensordata", "plastic"}
+    (*ALWAYS, *_FOR_SKINS, *_FOR_OPTIONS, "sensordata", "plastic")
+)
 
 # Read from the constraints of a step, which cannot be put into fresh data.
 _CONSTRAINT_FLAGS = ("mjVIS_CONTACTPOINT", "mjVIS_CONTACTFORCE", "mjVIS_CONTACTSPLIT")
 
 # Sensors whose reading is drawn: as rays.
 _DRAWN_SENSORS = ("mjSENS_RANGEFINDER", "mjSENS_GEOMFROMTO")
-
-
-def _elementary_bits() -> dict[str, int]:
-    """Return the bits inside `STATE_SPEC` by their names, in MuJoCo's order.
-
-    Combinations of several bits (`mjSTATE_PHYSICS`) are left out.
-    """
-    values = {
-        name.removeprefix(_PREFIX).lower(): int(value)
-        for name, value in mujoco.mjtState.__members__.items()
-        # mjNSTATE is a number of bits, not one of them.
-        if name.startswith(_PREFIX)
-    }
-    bits = {n: v for n, v in values.items() if v & STATE_SPEC and v.bit_count() == 1}
-    return dict(sorted(bits.items(), key=lambda item: item[1]))
-
-
-STATE_BITS = _elementary_bits()
-
-
-def state_dtype(model: mujoco.MjModel) -> np.dtype[Any]:
-    """Return what the state of `model` consists of, in the order of its vector.
-
-    Components that this model has none of (`act` without activations) are left out.
-    """
-    sizes = {name: mujoco.mj_stateSize(model, bit) for name, bit in STATE_BITS.items()}
-    return packed((name, ("<f8", (size,))) for name, size in sizes.items() if size)
-
-
-def read_state(model: mujoco.MjModel, data: mujoco.MjData) -> NDArray[np.float64]:
-    """Return the state of `data`."""
-    state = np.empty(mujoco.mj_stateSize(model, STATE_SPEC))
-    mujoco.mj_getState(model, data, state, STATE_SPEC)
-    return state
-
-
-def state_words(model: mujoco.MjModel, data: mujoco.MjData) -> NDArray[np.intp] | None:
-    """Return which of `memory.WORDS` are the state of `data`, which is kept alive.
-
-    That they hold what `mj_getState` gives is tried, not taken from a header.
-
-    Returns:
-        None where a component is kept as another type than it is given as
-        (`eq_active`), or is new in MuJoCo.
-    """
-    arrays = []
-    for part in state_dtype(model).names or ():
-        name = _STATE_ARRAYS.get(part, part)
-        array = _time(data) if name == "time" else getattr(data, name, None)
-        if array is None or array.dtype != np.float64:
-            return None
-        arrays.append(array)
-    if not can_be_gathered(arrays):
-        return None
-    words = words_of(arrays)
-    is_state = WORDS.take(words).tobytes() == read_state(model, data).tobytes()
-    return words if is_state else None
-
-
-def _time(data: mujoco.MjData) -> NDArray[np.float64]:
-    raw = raw_memory(address_of(getattr(data, _NEIGHBOUR)) + _time_offset(), 8)
-    return np.frombuffer(memoryview(raw), np.float64)
-
-
-@functools.cache
-def _time_offset() -> int:
-    """Return where the time lies, from its neighbour on, by setting it."""
-    data = mujoco.MjData(mujoco.MjModel.from_xml_string("<mujoco/>"))
-    start = address_of(getattr(data, _NEIGHBOUR)) - _REACH
-    near = np.frombuffer(memoryview(raw_memory(start, 3 * _REACH)), np.float64)
-    data.time = 1 / 3
-    offset: int = 8 * near.tolist().index(data.time)
-    return offset - _REACH
 
 
 def snapshot_dtype(
@@ -172,8 +72,8 @@ def snapshot_dtype(
     # Not `np.isin`, whose first call loads numpy's masked arrays (100 ms).
     if not _drawn_sensors().isdisjoint(model.sensor_type.tolist()):
         names.add("sensordata")
-    if option is not None:
-        names.update(_for_option(option))
+    if option is not None and _shows_more(option):
+        names.update(_FOR_OPTIONS)
     held = [name for name in names if array_kind(data, name) is not None]
     # In the order of the memory, which is read faster so.
     held.sort(key=lambda name: address_of(getattr(data, name)))
@@ -234,13 +134,14 @@ def drawn_readings(model: mujoco.MjModel) -> NDArray[np.bool_]:
     return drawn
 
 
-def _for_option(option: mujoco.MjvOption) -> set[str]:
-    flags = [needed for flag, needed in _FOR_FLAGS.items() if _flag(option, flag)]
-    names = {name for needed in flags for name in needed}
-    frames = [int(getattr(mujoco.mjtFrame, name)) for name in _FRAMES_OF_BODIES]
-    if option.frame in frames or option.label != int(mujoco.mjtLabel.mjLABEL_NONE):
-        names.update(_BODIES)
-    return names
+def _shows_more(option: mujoco.MjvOption) -> bool:
+    """Tell whether an option shows anything that MuJoCo's default does not."""
+    default = mujoco.MjvOption()
+    return bool(
+        (option.flags > default.flags).any()
+        or option.frame != default.frame
+        or option.label != default.label
+    )
 
 
 def _flag(option: mujoco.MjvOption, name: str) -> bool:

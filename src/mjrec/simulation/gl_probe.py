@@ -97,11 +97,15 @@ def check_picture(picture: np.ndarray) -> None:
 
 
 def draw_test_scene(
-    side: int = _SMALL,
+    side: int = _SMALL, canvas: Any = None
 ) -> tuple[Callable[[], np.ndarray], dict[str, Any]]:
     """Draw the test scene and look at the frame.
 
     At MuJoCo's default quality; where a small frame is enough, without shadows.
+
+    Args:
+        side: of the frame, in pixels.
+        canvas: what to draw with, as of `SceneRenderer`.
 
     Returns:
         What draws it again, and what metadata says of who draws.
@@ -120,7 +124,9 @@ def draw_test_scene(
         model.vis.quality.shadowsize = model.vis.quality.offsamples = 0
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
-    renderer = SceneRenderer(model, height=side, width=side, camera="front")
+    renderer = SceneRenderer(
+        model, height=side, width=side, camera="front", canvas=canvas
+    )
     check_picture(renderer.render(data))
     return lambda: renderer.render(data), renderer.gl_facts
 

@@ -10,11 +10,6 @@
                            compiled sources: what an environment set by hand
 
 The same content makes the same bytes. Compiling reads nothing but these files.
-
-A line of MJCF can ask for anything: a body replicated a thousand million times, a
-texture of ten gigabytes, an object that takes days to compile. So a zip is read and
-compiled in a sandbox, which is this module as a program. Half a second is what that
-costs; it is needed only where the compiled model cannot be used.
 """
 
 from __future__ import annotations
@@ -25,7 +20,6 @@ import logging
 import os
 import posixpath
 import re
-import sys
 import tempfile
 import zipfile
 from collections.abc import Iterable, Mapping
@@ -39,7 +33,6 @@ import numpy as np
 from ..errors import UnreadableFile
 from ..formats.regular_files import open_regular
 from ..json_text import loads
-from ..sandbox import LIMITS, Sandbox, enter
 from .fields import apply_fields, differing_fields
 
 logger = logging.getLogger(__name__)
@@ -59,13 +52,6 @@ _XML_ELEMENTS = ("include", "model")
 _MOST_UP = 4
 _EMPTY = PurePosixPath(*["x"] * 8 * _MOST_UP)
 
-_COMPILED = "model.mjb"
-_LONGEST_REASON = 2000
-# The largest robots and rooms of the field compile in seconds.
-_SECONDS = 300.0
-# Python, MuJoCo and what they need for threads, and then some room.
-_BASE_MEMORY = 6 << 30
-_MEMORY_FACTOR = 8
 # What MuJoCo raises where memory does not suffice, as a RuntimeError.
 _MUJOCO_GAVE_UP = "Caught an unknown exception!"
 
@@ -123,42 +109,6 @@ def write_authored(path: Path, authored: AuthoredModel, model: mujoco.MjModel) -
             archive.writestr(member, members[name])
 
 
-def compile_sources(
-    path: Path, *, compiled_size: int, seconds: float = _SECONDS
-) -> mujoco.MjModel:
-    """Return the model that `write_authored` was given, compiled by this MuJoCo.
-
-    Args:
-        path: of the zip.
-        compiled_size: of the model when it was recorded, by which it is judged how
-            much memory compiling may take.
-        seconds: how long it may take.
-
-    Raises:
-        UnreadableFile: it is damaged or dangerous, this MuJoCo refuses it, or it needs
-            more time or memory than that.
-    """
-    memory = _BASE_MEMORY + _MEMORY_FACTOR * compiled_size
-    limits = {**LIMITS, "RLIMIT_AS": memory, "RLIMIT_DATA": memory}
-    request = {"path": str(path.absolute())}
-    with tempfile.TemporaryDirectory(prefix="mjrec-model-") as directory:
-        place = Path(directory)
-        with Sandbox(__name__, request, place=place, limits=limits) as sandbox:
-            for said in sandbox.said(seconds):
-                if said is None:
-                    reason = f"compiling it takes longer than {seconds:g} seconds"
-                    raise UnreadableFile(path, reason)
-                if "reason" in said:
-                    raise UnreadableFile(path, str(said["reason"]))
-                if "compiled" in said:
-                    return mujoco.MjModel.from_binary_path(str(place / _COMPILED))
-            raise UnreadableFile(
-                path,
-                f"the process that compiled it {sandbox.last_words()} (it may "
-                f"use {memory / 2**30:.1f} GiB of memory)",
-            )
-
-
 def read_authored(path: Path) -> mujoco.MjModel:
     """Return the model that `write_authored` was given, compiled by this MuJoCo.
 
@@ -197,18 +147,6 @@ def with_embedded_files(model: mujoco.MjModel) -> mujoco.MjModel:
     if not hasattr(mujoco, "mj_embedAssets") or not (model.tex_adr < 0).any():
         return model
     return mujoco.mj_embedAssets(model)
-
-
-def main() -> int:
-    """Compile the zip that the parent names."""
-    request, say = enter()
-    try:
-        mujoco.mj_saveModel(read_authored(Path(request["path"])), _COMPILED)
-    except UnreadableFile as error:
-        say(reason=error.reason[:_LONGEST_REASON])
-        return 1
-    say(compiled=True)
-    return 0
 
 
 def _compile(authored: AuthoredModel) -> mujoco.MjModel:
@@ -326,7 +264,3 @@ def _existing(
     if not found:
         raise ValueError(f"there is no {reference!r}")
     return found
-
-
-if __name__ == "__main__":
-    sys.exit(main())

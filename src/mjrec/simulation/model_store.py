@@ -33,12 +33,7 @@ from ..formats.json_fields import unreadable
 from ..formats.monitor_directory import FILE_PREFIX
 from ..formats.regular_files import open_regular
 from ..worker_thread import WorkerThread
-from .model_sources import (
-    AuthoredModel,
-    compile_sources,
-    with_embedded_files,
-    write_authored,
-)
+from .model_sources import AuthoredModel, with_embedded_files, write_authored
 from .model_trust import (
     TRUST_VARIABLE,
     directory_digest,
@@ -57,7 +52,7 @@ _CHUNK = 1 << 20
 # Nothing that was recorded comes near; a file that claims more is made to hurt.
 _LARGEST = 1 << 31
 
-_NAME = re.compile(r"openaigym\.model\.(?P<digits>[0-9a-f]{16})\.(mjb\.gz|zip)")
+_NAME = re.compile(r"openaigym\.model\.[0-9a-f]{16}\.(mjb\.gz|zip)")
 
 
 class _Job(NamedTuple):
@@ -173,20 +168,16 @@ def load_model(
         UntrustedModel: there is only a stranger's compiled model.
     """
     compiled, source = (_path(directory, facts.get(key)) for key in ("mjb", "xml"))
-    digest = facts.get("sha256")
-    objection: UnreadableFile
-    if compiled is None or facts.get("mujoco") != mujoco.__version__:
-        objection = _not_loadable(directory, facts)
-    elif not (trust_models or is_stored(digest) or is_trusted(digest)):
-        objection = _untrusted(compiled, "is not there")
-    else:
-        try:
-            return _load_compiled(compiled, facts)
-        except UnreadableFile as error:
-            objection = error
-    if source is None:
-        raise objection
+    try:
+        return _load_compiled(directory, compiled, facts, trust_models)
+    except UnreadableFile as error:
+        if source is None:
+            raise
+        objection = error
     logger.info("%s It is compiled from %s.", objection, source.name)
+    # Here, because it loads h5py, for which who records has no use.
+    from .foreign_files import compile_sources
+
     try:
         return compile_sources(source, compiled_size=_recorded_size(source, facts))
     except UnreadableFile as error:
@@ -240,12 +231,18 @@ def _path(directory: Path, name: object) -> Path | None:
     return directory / name if (directory / name).exists() else None
 
 
-def _load_compiled(path: Path, facts: Mapping[str, Any]) -> mujoco.MjModel:
+def _load_compiled(
+    directory: Path, path: Path | None, facts: Mapping[str, Any], trust_models: bool
+) -> mujoco.MjModel:
+    digest = facts.get("sha256")
+    if path is None or facts.get("mujoco") != mujoco.__version__:
+        raise _not_loadable(directory, facts)
+    if not (trust_models or is_stored(digest) or is_trusted(digest)):
+        raise _untrusted(path, "is not there")
     content = _read_gzip(path, _recorded_size(path, facts))
     # MuJoCo trusts the sizes and addresses in such a file.
-    digest = hashlib.sha256(content).hexdigest()
-    name = _NAME.fullmatch(path.name)
-    if digest != facts.get("sha256") or name is None or name["digits"] != digest[:16]:
+    found = hashlib.sha256(content).hexdigest()
+    if found != digest or f".{found[:16]}." not in path.name:
         raise UnreadableFile(path, "its content is not what was recorded")
     try:
         return _loaded(content)

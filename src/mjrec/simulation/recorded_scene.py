@@ -84,6 +84,10 @@ class RecordedScene:
             raise UnreadableFile(self._reader.path, error) from error
         return any(map(is_kept_by_context, changed))
 
+    def close(self) -> None:
+        """Close the trajectory. Idempotent."""
+        self._reader.close()
+
     def _restart(self) -> None:
         self._changes: Iterator[ModelChange] = self._reader.iter_model_changes()
         self._next = next(self._changes, None)
@@ -199,6 +203,9 @@ class GivenStates:
         mujoco.mj_setState(self.model, self.data, state, self._spec)
         mujoco.mj_forward(self.model, self.data)
         return False
+
+    def close(self) -> None:
+        """Do nothing: the files are the caller's."""
 
 
 def _positions(previous: Any) -> NDArray[np.float64]:

@@ -3,20 +3,29 @@
 
 from __future__ import annotations
 
+import contextlib
 import copy
 import hashlib
-import weakref
+import os
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import mujoco
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from ..errors import InvalidArgument
-from ..frames import Frame, check_frame, check_quality, check_size
-from .cameras import FREE_CAMERA, Camera, resolve_camera
+from ..errors import ClosedError, InvalidArgument
+from ..frames import Frame, check_quality, check_size
+from .cameras import FREE_CAMERA, Camera, is_tracking, resolve_camera
 from .fields import holder_of
-from .gl_context import GLContext, gl_error, raw_opengl
+from .gl_context import (
+    context_kept,
+    current_gl_facts,
+    gl_error,
+    new_context,
+    raw_opengl,
+    refuse_fork_of_gl,
+)
 
 _EVERYTHING = int(mujoco.mjtCatBit.mjCAT_ALL)
 _DRAFT_SHADOW_MAP = 1024
@@ -55,17 +64,28 @@ class Canvas:
 
     It stays as it is from one `prepare` to the next where those three do, and nothing
     has changed that the context keeps of the model.
+
+    Attributes:
+        gl_facts: what metadata says of who draws, as `current_gl_facts`.
     """
 
     def __init__(self) -> None:
-        self._context: GLContext | None = None
+        self.gl_facts: dict[str, Any] = {}
+        self._context: Any = None
+        self._drawing: mujoco.MjrContext | None = None
+        self._closed = False
+        self._process_id = os.getpid()
         self._kind: object = None
         self._kept = b""
 
-    @property
-    def gl_facts(self) -> dict[str, Any]:
-        """What metadata says of who draws, as `gl_context.current_gl_facts`."""
-        return {} if self._context is None else self._context.facts
+    def open(self) -> None:
+        """Make the context now, so that the first frame comes sooner. Idempotent.
+
+        Raises:
+            GLError: as of `new_context`.
+        """
+        with self._current():
+            pass
 
     def prepare(
         self, model: mujoco.MjModel, *, height: int, width: int, quality: str
@@ -74,7 +94,7 @@ class Canvas:
 
         Raises:
             InvalidArgument: a size that the driver cannot draw.
-            ClosedError, GLError: as of `GLContext`.
+            GLError: as of `new_context`.
         """
         # Not by what a recording says of its model, which may be a stranger's.
         buffer = np.empty(mujoco.mj_sizeModel(model), np.uint8)
@@ -95,7 +115,7 @@ class Canvas:
             model: the same, or loaded from the same file.
 
         Raises:
-            InvalidArgument, ClosedError, GLError: as `prepare`.
+            InvalidArgument, GLError: as `prepare`.
         """
         kept = _kept_of(model)
         if kept != self._kept:
@@ -103,34 +123,51 @@ class Canvas:
             self._load(model)
             self._kept = kept
 
-    def draw(self, scene: mujoco.MjvScene, out: Frame | None = None) -> Frame:
-        """Return the frame of `scene`, the top row first, in `out` if that is given.
+    def draw(self, scene: mujoco.MjvScene) -> Frame:
+        """Return the frame of `scene`, the top row first.
 
         Raises:
-            ClosedError, GLError: as of `GLContext`.
+            ClosedError: after `close`.
+            GLError: in a forked child.
         """
-        assert self._context is not None
-        with self._context.current():
-            drawing = self._context.drawing
-            mujoco.mjr_render(self._rectangle, scene, drawing)
-            mujoco.mjr_readPixels(self._bottom_up, None, self._rectangle, drawing)
-        frame = np.empty_like(self._bottom_up) if out is None else out
-        np.copyto(frame, self._bottom_up[::-1])
-        return frame
+        with self._current():
+            mujoco.mjr_render(self._rectangle, scene, self._drawing)
+            mujoco.mjr_readPixels(self._bottom_up, None, self._rectangle, self._drawing)
+        return np.ascontiguousarray(self._bottom_up[::-1])
 
     def close(self) -> None:
-        """Free the context. Idempotent."""
-        if self._context is not None:
-            self._context.free()
+        """Free what lies in the context, then the context. Idempotent."""
+        self._closed = True
+        context, self._context = self._context, None
+        # At exit somebody else may have shut EGL down already, and all is gone. What a
+        # forked child has is its parent's.
+        if context is not None and os.getpid() == self._process_id:
+            with context_kept(), contextlib.suppress(Exception):
+                context.make_current()
+                self._free_drawing()
+                context.free()
+
+    # Forgotten, MuJoCo's context would be freed in whichever context is current then,
+    # and take what lies there under the same numbers.
+    __del__ = close
+
+    @contextlib.contextmanager
+    def _current(self) -> Iterator[None]:
+        if self._closed:
+            raise ClosedError("The renderer is closed.")
+        refuse_fork_of_gl()
+        with context_kept():
+            if self._context is None:
+                self._context = new_context()
+                self.gl_facts = current_gl_facts()
+            else:
+                self._context.make_current()
+            yield
 
     def _load(self, model: mujoco.MjModel) -> None:
         """Give the context what it keeps of a model."""
         height, width = self._rectangle.height, self._rectangle.width
-        if self._context is None:
-            self._context = GLContext()
-            # Its own hook may come after EGL was shut down; the context has another.
-            weakref.finalize(self, self._context.free).atexit = False
-        with self._context.current():
+        with self._current():
             # The longest side that the driver can draw.
             limits = np.zeros(1, np.int32)
             raw_opengl().glGetIntegerv(_MAX_RENDERBUFFER_SIZE, limits)
@@ -141,20 +178,23 @@ class Canvas:
                     f"driver ({self.gl_facts['gl_renderer']}) can draw: "
                     f"{limit}x{limit}."
                 )
-            if self._context.drawing is not None:
-                self._context.drawing.free()
-                self._context.drawing = None
+            self._free_drawing()
             # Only the context needs these settings, and it keeps no reference.
             for_context = _with_settings(model, height, width, self._quality)
             try:
-                drawing = mujoco.MjrContext(
+                self._drawing = mujoco.MjrContext(
                     for_context, int(mujoco.mjtFontScale.mjFONTSCALE_150)
                 )
             except mujoco.FatalError as error:
                 what = f"A {width}x{height} frame cannot be drawn"
                 raise gl_error(what, error, remedy="Ask for a smaller one.") from error
-            self._context.drawing = drawing
-            mujoco.mjr_setBuffer(int(mujoco.mjtFramebuffer.mjFB_OFFSCREEN), drawing)
+            offscreen = int(mujoco.mjtFramebuffer.mjFB_OFFSCREEN)
+            mujoco.mjr_setBuffer(offscreen, self._drawing)
+
+    def _free_drawing(self) -> None:
+        if self._drawing is not None:
+            self._drawing.free()
+            self._drawing = None
 
 
 class SceneRenderer:
@@ -167,8 +207,10 @@ class SceneRenderer:
     textures, meshes, sizes of planes, textures of materials, fog and rendering quality
     show after `model_changed`.
 
-    An infinite plane is drawn around the place where the cameras stood in the frame
-    before. `camera_positions` and `look` give frames in any order the same planes.
+    MuJoCo's visualiser remembers the frame before: an infinite plane is drawn around
+    the place where the cameras stood in it, and a camera that tracks a body goes a part
+    of the way to it in each frame. `begin` and `look` bring the renderer to any frame
+    as if all before had been drawn.
 
     ::
 
@@ -179,8 +221,8 @@ class SceneRenderer:
         model: the model.
         height: in pixels; may be larger than the model's offscreen buffer.
         width: likewise.
-        camera: the name or number of a camera of the model, -1 for the free camera, or
-            an `MjvCamera`, which is read anew for every frame.
+        camera: as `resolve_camera` takes it; an `MjvCamera` is read anew for every
+            frame.
         scene_option: read anew for every frame; MuJoCo's default, if None, which is
             not dm_control's: that draws no range finders.
         max_geom: how many geoms a scene may have; the rest is not drawn. Environments'
@@ -190,9 +232,13 @@ class SceneRenderer:
         fresh: draw each frame as if it were the first, as dm_control does.
         canvas: what to draw with, which others of this model, size and quality may draw
             with in turn; one of its own, if None.
+        begins_at: where the two cameras of its scene stand before the first frame,
+            `(2, 3)`.
+        is_moved: the camera is brought to its place before each frame from outside.
 
     Attributes:
         size: `(height, width)` of the frames.
+        is_following: each frame moves the camera.
 
     Raises:
         UnknownName: the model has no such camera, or there is no such quality.
@@ -208,20 +254,26 @@ class SceneRenderer:
         *,
         height: int,
         width: int,
-        camera: Camera = FREE_CAMERA,
+        camera: Camera | Mapping[str, Any] = FREE_CAMERA,
         scene_option: mujoco.MjvOption | None = None,
         max_geom: int = 10000,
         quality: str = "full",
         fresh: bool = False,
         canvas: Canvas | None = None,
+        begins_at: ArrayLike = ((0, 0, 0), (0, 0, 0)),
+        is_moved: bool = False,
     ) -> None:
         self.size = height, width = check_size(height, width)
         check_quality(quality)
-        resolve_camera(model, camera)
+        placed = resolve_camera(model, camera)
+        self.is_following = not is_moved and is_tracking(placed)
         self._model = model
-        self._camera = camera
+        # The place of the free camera and the number of a name may change.
+        self._camera = placed if isinstance(camera, Mapping) else camera
         self._scene_option = scene_option or mujoco.MjvOption()
         self._fresh = fresh
+        self._begins_at = np.asarray(begins_at)
+        self._begins_looking_at = placed.lookat.copy()
         self._scene = mujoco.MjvScene(model, maxgeom=max_geom)
         self._owns_canvas = canvas is None
         self._canvas = canvas or Canvas()
@@ -232,27 +284,20 @@ class SceneRenderer:
         """What metadata says of who draws, as `gl_context.current_gl_facts`."""
         return self._canvas.gl_facts
 
-    @property
-    def camera_positions(self) -> NDArray[np.float32]:
-        """Where the two cameras stood in the last frame, `(2, 3)`, in metres.
-
-        All zeros before the first. Set it to draw the next frame as if another one
-        had been drawn before.
-        """
-        return np.array([camera.pos for camera in self._scene.camera])
-
-    @camera_positions.setter
-    def camera_positions(self, positions: ArrayLike) -> None:
-        pairs = zip(self._scene.camera, np.asarray(positions), strict=True)
-        for camera, position in pairs:
-            camera.pos = position
+    def begin(self) -> None:
+        """Go to before the first frame."""
+        self._put_cameras(self._begins_at)
+        if self.is_following:
+            resolve_camera(self._model, self._camera).lookat[:] = (
+                self._begins_looking_at
+            )
 
     def look(self, data: mujoco.MjData) -> None:
         """Leave in the scene what a frame of `data` would, without drawing one."""
         camera = resolve_camera(self._model, self._camera)
         mujoco.mjv_updateCamera(self._model, data, camera, self._scene)
 
-    def render(self, data: mujoco.MjData, *, out: Frame | None = None) -> Frame:
+    def render(self, data: mujoco.MjData) -> Frame:
         """Return the frame of `data`, a new `(height, width, 3) uint8` array.
 
         The first row is the top one.
@@ -260,24 +305,19 @@ class SceneRenderer:
         Args:
             data: of the model. Its derived quantities are drawn as they are: after
                 `mj_step` they belong to the state before the last substep.
-            out: an array to draw into and return, instead of a new one.
 
         Raises:
-            InvalidFrame: `out` is no frame of this size.
             ClosedError: after `close`.
             GLError: in a forked child.
         """
-        if out is not None:
-            check_frame(out, size=self.size)
         if self._fresh:
-            self.camera_positions = np.zeros((2, 3))
-        # The model's free camera and the number of a name may have changed.
+            self._put_cameras(np.zeros((2, 3)))
         camera = resolve_camera(self._model, self._camera)
         mujoco.mjv_updateScene(
             *(self._model, data, self._scene_option, None, camera),
             *(_EVERYTHING, self._scene),
         )
-        return self._canvas.draw(self._scene, out)
+        return self._canvas.draw(self._scene)
 
     def model_changed(self) -> None:
         """Bring the canvas up to date with the model.
@@ -300,6 +340,10 @@ class SceneRenderer:
 
     def __exit__(self, *error: object) -> None:
         self.close()
+
+    def _put_cameras(self, positions: np.ndarray) -> None:
+        for camera, position in zip(self._scene.camera, positions, strict=True):
+            camera.pos = position
 
 
 def _kept_of(model: mujoco.MjModel) -> bytes:

@@ -7,16 +7,14 @@ back, and they have to be the same.
 
 One scene does not tell of plugins: MuJoCo calls a plugin's `visualize` for each scene,
 and what that draws may come from its own memory and show only at times (a touch grid
-draws nothing until something touches it). So they are asked for by name.
+draws nothing until something touches it). So models with plugins are recorded live.
 """
 
 from __future__ import annotations
 
 import copy
-import ctypes
 import functools
-from collections.abc import Iterable, Iterator
-from pathlib import Path
+from collections.abc import Iterator
 from typing import Any
 
 import mujoco
@@ -29,7 +27,7 @@ from .view import SceneView
 _EVERYTHING = int(mujoco.mjtCatBit.mjCAT_ALL)
 
 # Not set by `mjv_updateScene` in every geom, or only later, when it is drawn.
-_NOT_SET = ("camdist", "modelrbound", "transparent", "label")
+_NOT_SET = ("camdist", "modelrbound", "transparent")
 
 
 def scene_difference(
@@ -51,9 +49,8 @@ def scene_difference(
     Returns:
         What differs, in words; None where the scenes are the same.
     """
-    plugin = drawing_plugin(model)
-    if plugin is not None:
-        return f"the plugin {plugin} draws by itself, from what it alone knows"
+    if model.nplugin:
+        return "its plugins may draw by themselves, from what they alone know"
     # Where tendons have colours of their own these are set in the model.
     sets_model = TENDON_RGBA in (row.dtype.names or ())
     restored_model = copy.copy(model) if sets_model else model
@@ -82,33 +79,31 @@ def differences(
     live: mujoco.MjvScene, again: mujoco.MjvScene, option: mujoco.MjvOption
 ) -> Iterator[str]:
     """Yield in words what of `again` is not, to the last bit, as in `live`."""
-    if live.ngeom != again.ngeom:
-        yield f"{again.ngeom} geoms instead of {live.ngeom}"
-    if live.nlight != again.nlight:
-        yield f"{again.nlight} lights instead of {live.nlight}"
-    labelled = option.label != int(mujoco.mjtLabel.mjLABEL_NONE)
-    without = tuple(n for n in _NOT_SET if not (labelled and n == "label"))
-    geoms = slice(min(live.ngeom, again.ngeom))
-    lights = slice(min(live.nlight, again.nlight))
-    yield from _different("geom", live.geoms[geoms], again.geoms[geoms], without)
-    yield from _different("light", live.lights[lights], again.lights[lights])
-    yield from _different("camera", live.camera, again.camera)
+    found = dict(_parts(again, option))
+    for what, value in _parts(live, option):
+        if found.get(what) != value:
+            yield what
+
+
+def _parts(
+    scene: mujoco.MjvScene, option: mujoco.MjvOption
+) -> Iterator[tuple[str, Any]]:
+    """Yield what a scene consists of, by what it is called."""
+    is_labelled = option.label != int(mujoco.mjtLabel.mjLABEL_NONE)
+    not_set = _NOT_SET if is_labelled else (*_NOT_SET, "label")
+    yield "the number of geoms", scene.ngeom
+    yield "the number of lights", scene.nlight
+    for what, structs in (
+        ("geom", scene.geoms[: scene.ngeom]),
+        ("light", scene.lights[: scene.nlight]),
+        ("camera", scene.camera),
+    ):
+        for index, struct in enumerate(structs):
+            for name in _members(struct.__class__):
+                if what != "geom" or name not in not_set:
+                    yield f"{name} of {what} {index}", _value(struct, name)
     for name in _shapes():
-        if _value(live, name) != _value(again, name):
-            yield f"the scene's {name}"
-
-
-def _different(
-    what: str,
-    live: Iterable[Any],
-    again: Iterable[Any],
-    without: tuple[str, ...] = (),
-) -> Iterator[str]:
-    for index, (one, other) in enumerate(zip(live, again, strict=True)):
-        names = [n for n in _members(one.__class__) if n not in without]
-        differing = [n for n in names if _value(one, n) != _value(other, n)]
-        if differing:
-            yield f"{', '.join(differing)} of {what} {index} of the scene"
+        yield name, _value(scene, name)
 
 
 def _value(struct: Any, name: str) -> Any:
@@ -130,45 +125,3 @@ def _shapes() -> tuple[str, ...]:
     names = (name for name in dir(scene) if name.startswith(("skin", "flex")))
     values = {name: getattr(scene, name) for name in names}
     return tuple(n for n, v in values.items() if getattr(v, "dtype", None) == "<f4")
-
-
-class _Plugin(ctypes.Structure):
-    """The beginning of `mjpPlugin` (mjplugin.h), the same from mujoco 3.3 to 4.0."""
-
-    _functions = (
-        *("nstate", "nsensordata", "init", "destroy", "copy", "reset"),
-        *("compute", "advance", "visualize"),
-    )
-    _fields_ = (
-        ("name", ctypes.c_char_p),
-        ("nattribute", ctypes.c_int),
-        ("attributes", ctypes.POINTER(ctypes.c_char_p)),
-        ("capabilityflags", ctypes.c_int),
-        ("needstage", ctypes.c_int),
-        *((name, ctypes.c_void_p) for name in _functions),
-    )
-
-
-def drawing_plugin(model: mujoco.MjModel) -> str | None:
-    """Return the name of a plugin of `model` that draws; None where there is none.
-
-    A plugin that cannot be looked at counts as one that draws.
-    """
-    for instance in range(model.nplugin):
-        try:
-            plugin = _library().mjp_getPluginAtSlot(int(model.plugin[instance]))[0]
-        except (OSError, AttributeError, ValueError):
-            return f"number {instance}, which cannot be looked at,"
-        if plugin.visualize:
-            return str((plugin.name or b"").decode(errors="replace"))
-    return None
-
-
-@functools.cache
-def _library() -> Any:
-    # Loaded already; this only finds it again.
-    path = next(Path(mujoco.__file__).parent.glob("libmujoco.*"), None)
-    library = ctypes.CDLL(None if path is None else str(path))
-    library.mjp_getPluginAtSlot.restype = ctypes.POINTER(_Plugin)
-    library.mjp_getPluginAtSlot.argtypes = [ctypes.c_int]
-    return library

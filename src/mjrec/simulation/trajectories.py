@@ -19,7 +19,7 @@ from ..errors import InvalidArgument, UnknownName, UnreadableFile
 from ..formats.monitor_directory import infix_of, iter_monitor_files
 from ..formats.spans import recordings_in_flight
 from ..formats.trajectory import TrajectoryReader
-from .foreign_trajectories import open_vetted_trajectory
+from .foreign_files import open_vetted_trajectory
 
 if TYPE_CHECKING:
     import mujoco
@@ -235,7 +235,7 @@ class Trajectory:
                 data's model.
         """
         # Here, because reading needs no simulator.
-        from .replay import set_state
+        from .states import set_state
 
         row = self.states[self._step(step)]
         set_state(data.model, data, self._columns, row)

@@ -3,10 +3,12 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable
 from pathlib import Path
 
 from ..errors import DirectoryNotWritable, FileNotWritten
+from ..formats.appending import append_whole, open_for_appending
 
 
 class AppendOnlyFile:
@@ -30,7 +32,7 @@ class AppendOnlyFile:
         for path in names:
             make_directory(path.parent)
             try:
-                self._file = path.open("xb", buffering=0)
+                self._file = os.fdopen(open_for_appending(path, new=True), "ab", 0)
             except FileExistsError:
                 continue
             except OSError as error:
@@ -45,15 +47,10 @@ class AppendOnlyFile:
         Raises:
             FileNotWritten: it has no room; the file is as it was before.
         """
-        end = self._file.tell()
         try:
-            written = self._file.write(piece)
+            append_whole(self._file.fileno(), piece)
         except OSError as error:
             raise FileNotWritten(self.path, error.strerror) from error
-        if written != len(piece):
-            self._file.truncate(end)
-            self._file.seek(end)
-            raise FileNotWritten(self.path, "the disk is full")
 
     def close(self) -> None:
         """Close the file."""

@@ -13,7 +13,7 @@ from sound_files import finished
 from trajectories_by_hand import write_log
 
 import mjrec
-import mjrec.simulation.foreign_trajectories as foreign_trajectories
+import mjrec.simulation.foreign_files as foreign_files
 from mjrec.rendering.recorded_facts import open_for_rendering
 from mjrec.simulation.model_trust import directory_digest, note_models
 
@@ -23,12 +23,12 @@ def started(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """The modules that were started in a sandbox."""
     modules: list[str] = []
 
-    class Counted(foreign_trajectories.Sandbox):
+    class Counted(foreign_files.Sandbox):
         def __init__(self, module: str, *arguments: object, **options: object) -> None:
             modules.append(module)
             super().__init__(module, *arguments, **options)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(foreign_trajectories, "Sandbox", Counted)
+    monkeypatch.setattr(foreign_files, "Sandbox", Counted)
     return modules
 
 

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from mjrec import Error, LocalEngine
-from mjrec.commands.engine_options import NO_ENGINE, EngineOptions
+from mjrec.commands.options import NO_ENGINE, EngineOptions
 
 
 def test_without_an_option_there_is_no_engine() -> None:

@@ -9,7 +9,6 @@ import mujoco
 import numpy as np
 import pytest
 
-from mjrec.simulation.change_detection import Looks
 from mjrec.simulation.fields import (
     array_names,
     holder_of,
@@ -17,6 +16,7 @@ from mjrec.simulation.fields import (
     read_member,
     struct_names,
 )
+from mjrec.simulation.looks import Looks
 from mjrec.simulation.view import SceneView
 
 # With a texture, a mesh and a height field.

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from mjrec.formats.trajectory import columns_of
-from mjrec.simulation.captured_arrays import read_state, state_dtype, state_words
 from mjrec.simulation.raw_memory import WORDS
+from mjrec.simulation.states import read_state, state_dtype, state_words
 
 # Something of every component but plugins'.
 FULL = """

@@ -1,19 +1,72 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the options of an engine say, on any command's line."""
+"""What options say that several commands have."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
+from typing import Annotated, Any, TypeAlias
 
 import tyro
 
 from ..engines.choice import engine_from
 from ..errors import InvalidArgument
+from ..frames import check_size
+from ..json_text import has_nan, loads
 from .help_text import flowing_help
 
+AsJson: TypeAlias = Annotated[bool, tyro.conf.arg(name="json")]
+
 _LOCAL = "local"
+
+
+def size_of(text: str | None) -> tuple[int | None, int | None]:
+    """Return `(height, width)` of WIDTHxHEIGHT; twice None for None.
+
+    Raises:
+        InvalidArgument: it is no size.
+    """
+    if text is None:
+        return None, None
+    match = re.fullmatch(r"(\d+)x(\d+)", text.strip(), re.ASCII | re.IGNORECASE)
+    if match is None:
+        raise InvalidArgument(
+            f"--size must be WIDTHxHEIGHT in pixels, such as 640x480, got {text!r}."
+        )
+    return check_size(int(match[2]), int(match[1]))
+
+
+def number_or_name(text: str) -> str | int:
+    """Return the number, if `text` is a whole number, else `text`."""
+    return int(text) if re.fullmatch(r"-?\d+", text, re.ASCII) else text
+
+
+def camera_of(text: str | None) -> str | int | None:
+    """Return the number or the name of a camera; None for None."""
+    return None if text is None else number_or_name(text)
+
+
+def kwargs_of(text: str, option: str = "--env-kwargs") -> dict[str, Any]:
+    """Return the arguments that an option names.
+
+    Raises:
+        InvalidArgument: it is no JSON object, or has a key twice, or NaN.
+    """
+    wrong = f"{option} must be a JSON object"
+    try:
+        kwargs = loads(text)
+    except ValueError as error:
+        raise InvalidArgument(f"{wrong}, got {text!r}: {error}.") from None
+    if not isinstance(kwargs, dict):
+        raise InvalidArgument(f"{wrong}, got {text!r}.")
+    for name, value in kwargs.items():
+        if has_nan(value):
+            raise InvalidArgument(
+                f"{wrong}, and {name!r} holds NaN, which JSON has no number for."
+            )
+    return kwargs
 
 
 @flowing_help
@@ -90,3 +143,6 @@ def _options_of(given: Sequence[str]) -> dict[str, str]:
 
 # What is asked for where nothing is said.
 NO_ENGINE = EngineOptions()
+Engine: TypeAlias = Annotated[
+    tyro.conf.OmitArgPrefixes[EngineOptions], tyro.conf.arg(name="engine")
+]

@@ -1,0 +1,74 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What takes over recordings that have ended."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, Protocol
+
+from ..errors import Error
+from ..formats.monitor_directory import ClipPart
+from ..formats.spans import is_in_flight
+
+
+class Finisher(Protocol):
+    """Turns ended recordings into trajectories and videos, beside the simulation."""
+
+    def expect(self) -> None:
+        """Get ready: a recording will come that has a video. Never waits."""
+
+    def submit(self, recording: Path) -> None:
+        """Take over an ended trajectory, or a clip by its first part. Never waits."""
+
+    def wait(self, on_progress: Callable[[Any], None]) -> None:
+        """Return when all that was taken over is done."""
+
+    def stop(self) -> None:
+        """Stop at once; the rest stays pending. Idempotent."""
+
+    @property
+    def failures(self) -> Mapping[str, str]:
+        """Why videos could not be rendered, by the base names of the videos."""
+
+
+class LaterFinisher:
+    """Draws nothing; makes the trajectories when the monitor closes.
+
+    It is a `Finisher` for runs whose videos are rendered another time, or never.
+    """
+
+    def __init__(self) -> None:
+        self.failures: Mapping[str, str] = {}
+        self._waiting: list[Path] = []
+
+    def expect(self) -> None:
+        """Do nothing."""
+
+    def submit(self, recording: Path) -> None:
+        """Keep a trajectory in mind; clips stay as they are."""
+        self._waiting.append(recording)
+
+    def wait(self, on_progress: Callable[[Any], None]) -> None:
+        """Make the trajectories.
+
+        Raises:
+            Error: of the last that could not be made; the others are there.
+        """
+        # Not at the top: it loads h5py, which the simulation has no use for.
+        from ..formats.trajectory_file import finish_trajectory
+
+        failure: Error | None = None
+        waiting, self._waiting = self._waiting, []
+        for recording in waiting:
+            try:
+                if ClipPart.parse(recording.name) is None and is_in_flight(recording):
+                    finish_trajectory(recording)
+            except Error as error:
+                failure = error
+                self._waiting.append(recording)
+        if failure is not None:
+            raise failure
+
+    def stop(self) -> None:
+        """Do nothing."""

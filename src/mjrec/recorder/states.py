@@ -1,0 +1,597 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The states of an episode, or of a clip's part that is of one: a row a step."""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import logging
+from collections.abc import Callable, Mapping
+from fractions import Fraction
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import FileNotWritten, PicturesDiffer
+from ..formats.span_writer import SpanLogs, SpanWriter
+from ..formats.trajectory import ModelChange, row_dtype
+from ..rates import rate_from_timestep, stride_for
+from ..simulation.raw_memory import words_of
+from .fast_path import FastPath, gathering
+from .monitored_run import MonitoredRun, What
+from .step_arrays import StepArray, action_array, step_array
+
+if TYPE_CHECKING:
+    from ..simulation.capture import Capture, EpisodeStart
+
+logger = logging.getLogger(__name__)
+
+
+class RowLayout(NamedTuple):
+    """What rows consist of. The next recording's are usually the same.
+
+    Attributes:
+        state, snapshot: what is taken of the simulation.
+        action: memory for actions.
+        observation: dtype and shape of an observation.
+        start_words: where state and snapshot lie in memory, if they can be gathered.
+        dtype: of a row.
+        words: where all of a row but its head lies, if it can be gathered.
+    """
+
+    state: np.dtype[Any] | None
+    snapshot: np.dtype[Any] | None
+    action: StepArray | None
+    observation: np.dtype[Any] | None
+    start_words: NDArray[np.intp] | None
+    dtype: np.dtype[Any]
+    words: NDArray[np.intp] | None
+
+
+class StateRecorder:
+    """Records the states of an episode, or of a part of one: a row a step.
+
+    Its first row is that of the reset. Until it is known what an action is and how long
+    a step takes, which the first step tells, that row waits in memory. Frames are steps
+    0, n, 2n ... where n is the smallest stride that keeps `max_fps`, and always the
+    last one.
+
+    What goes wrong ends here. Where no picture can be made any more, the frames end
+    and the states go on. Where nothing can be written any more, the recording ends
+    there: an error, unless `on_error` has it that the simulation goes on.
+
+    Args:
+        run: of which it is.
+        name: of the file that it becomes, without suffix.
+        logs: where its rows go.
+        what: is lost where they cannot be written.
+        facts: what is known at its beginning.
+        capture: takes states; None where there is no simulation that can be seen.
+        start: what `capture.begin_episode` returned.
+        max_fps: the most frames per second that are wanted; None for every step.
+        observation: of the reset; None where observations are not recorded.
+        has_actions: actions are recorded.
+        is_alone: it may be deleted alone: it gets a log of its own.
+
+    Attributes:
+        is_stopped: nothing more is recorded, after an error.
+        broken_reason: why there are no frames any more; None while there are.
+    """
+
+    def __init__(
+        self,
+        run: MonitoredRun,
+        name: str,
+        *,
+        logs: SpanLogs,
+        what: What,
+        facts: Mapping[str, Any],
+        capture: Capture | None,
+        start: EpisodeStart | None,
+        max_fps: float | Fraction | None = None,
+        observation: Any = None,
+        has_actions: bool = True,
+        is_alone: bool = False,
+    ) -> None:
+        self.is_stopped = False
+        self.broken_reason: str | None = None
+        self._run = run
+        self._name = name
+        self._logs = logs
+        self._what = what
+        self._facts = facts
+        self._capture = capture
+        self._start = start
+        self._max_fps = max_fps
+        self._has_actions = has_actions
+        self._is_alone = is_alone
+        self._state = None if start is None else start.state
+        self._snapshot = None if start is None else start.snapshot
+        self._takes_frames = self._snapshot is not None
+        self._layout: RowLayout | None = None
+        self._span: SpanWriter | None = None
+        self._fast: FastPath | None = None
+        self._irregular: set[str] = set()
+        # From which step on actions were given as what.
+        self._action_dtypes: list[list[Any]] = []
+        self._observation = None if observation is None else step_array(observation)
+        self._first_observation = None
+        if self._observation is not None:
+            self._observation.set(observation)
+            self._first_observation = self._observation.values.copy()
+        self._first_state = np.full(_words(self._state), np.nan)
+        self._first_snapshot = np.empty(_words(self._snapshot), np.uint64)
+        self._first_change: Mapping[str, NDArray[Any]] | None = None
+        self._first_time = run.subject.clock()
+        if capture is not None:
+            capture.capture_state(self._first_state)
+            if self._takes_frames:
+                self._first_change = capture.capture_snapshot(self._first_snapshot)
+        self._pace = run.paces.get(logs)
+        self._action: StepArray | None = None
+        last = run.layouts.get(logs)
+        if has_actions and last is not None:
+            self._use_action(last.action)
+        if self._pace is not None and (not has_actions or self._action is not None):
+            # Most likely all is as it was. Where it cannot be written, the first step
+            # says so.
+            with contextlib.suppress(FileNotWritten):
+                self._begin(self._pace)
+
+    @property
+    def path(self) -> Path:
+        """The file that it becomes."""
+        return self._logs.path_of(self._name)
+
+    @property
+    def is_there(self) -> bool:
+        """Whether the log has something of it."""
+        return self._span is not None
+
+    @property
+    def steps(self) -> int:
+        """How many steps were recorded."""
+        return 0 if self._span is None else self._span.steps
+
+    @property
+    def frame_count(self) -> int:
+        """How many snapshots were taken."""
+        return 0 if self._span is None else self._span.frame_count
+
+    @property
+    def size(self) -> int:
+        """The bytes of its rows."""
+        return 0 if self._span is None else self._span.size
+
+    def before_step(self, action: Any) -> None:
+        """Note the action of the coming step, which the environment may overwrite."""
+        if self.is_stopped or not self._has_actions:
+            return
+        if self._action is not None and self._action.set(action):
+            return
+        if self.steps == 0:
+            # Unlike those of the episode before: the rows will be others.
+            self._take_back()
+            self._use_action(action_array(action))
+            if self._action is not None and self._action.set(action):
+                return
+        self._note_irregular("actions")
+        where = {"episode_id": self._run.episode.episode_id, "step": self.steps}
+        given = {"dtype": action.dtype.name} if hasattr(action, "dtype") else {}
+        self._run.note("action", {**where, **given, "value": action})
+
+    def step(
+        self,
+        reward: float,
+        *,
+        terminated: bool,
+        truncated: bool,
+        observation: Any = None,
+        is_last: bool = False,
+        has_picture: bool = True,
+    ) -> None:
+        """Record what the environment is like after a step.
+
+        Where there is no state to be had, the step is in the log without one.
+
+        Args:
+            reward: of the step.
+            terminated: the task ended the episode.
+            truncated: a limit from outside the task ended it.
+            observation: after the step; only where observations are recorded.
+            is_last: it is the last one, and gets a frame.
+            has_picture: False where the environment has reset itself already: its
+                state is the next episode's.
+
+        Raises:
+            FileNotWritten: the disk is full, and that is not tolerated. The step was
+                not recorded, and all before it is kept.
+        """
+
+        def take_row() -> None:
+            if self._observation is not None and not self._observation.set(observation):
+                self._note_irregular("observations")
+            span = self._settled()
+            number, slot = span.steps + 1, span.make_room()
+            is_frame = False
+            try:
+                self._write_state(span, slot, has_picture=has_picture)
+                if has_picture and (is_last or number % self._stride == 0):
+                    is_frame = self._write_snapshot(span, slot, number)
+            finally:
+                # Whatever was raised: a missing step would be the end of the log.
+                self._write_arrays(span, slot)
+                span.commit(
+                    number,
+                    reward,
+                    is_frame=is_frame,
+                    terminated=terminated,
+                    truncated=truncated,
+                )
+
+        self._try(take_row)
+
+    def take_frame(self) -> None:
+        """Take the snapshot of this moment, unless there is one of it already.
+
+        Raises:
+            FileNotWritten: the disk is full, and that is not tolerated.
+        """
+
+        def take() -> None:
+            span = self._span
+            if span is not None and span.last_frame != span.steps:
+                slot = span.make_room()
+                if self._write_snapshot(span, slot, span.steps):
+                    span.commit(span.steps, is_step=False, is_frame=True)
+
+        self._try(take)
+
+    def fast_path(self) -> FastPath | None:
+        """Return what usual steps can be recorded with; None where there are none."""
+        if self.is_stopped or not self._takes_frames or self._observation is not None:
+            return None
+        if self._fast is None and self._span is not None:
+            self._fast = self._new_fast_path(self._span)
+        return self._fast
+
+    def end_frames(self, reason: str) -> None:
+        """Take no more snapshots, and say why."""
+        self._takes_frames = False
+        self._break(reason)
+        logger.warning(
+            "The frames of %s end early, at step %d: %s", self._name, self.steps, reason
+        )
+
+    def note(self, **facts: Any) -> None:
+        """Add to its facts; on a full disk they wait for what is said next."""
+        self._facts = {**self._facts, **facts}
+        with contextlib.suppress(FileNotWritten):
+            self.amend(facts)
+
+    def amend(self, facts: Mapping[str, Any]) -> None:
+        """Add to its facts, also after its end.
+
+        Raises:
+            FileNotWritten: the disk is full.
+        """
+        if self._span is not None:
+            self._span.note(facts)
+
+    def end(self, facts: Mapping[str, Any]) -> None:
+        """Write what is known of its end.
+
+        Raises:
+            FileNotWritten: the disk is full, and that is not tolerated; it is said as
+                soon as there is room.
+        """
+        # It holds the log's memory.
+        self._fast = None
+        try:
+            if self._span is None and not self.is_stopped:
+                # No step was taken; there is the reset.
+                self._begin(_pace(self._run.subject.declared(), None, self._max_fps))
+            if self._span is not None:
+                self._span.end(facts)
+        except FileNotWritten as error:
+            self._break(str(error))
+            if not self._run.tolerates(self._what, error):
+                raise
+
+    def submit(self, recording: Path | None = None) -> None:
+        """Hand it on to what finishes it, after its end.
+
+        Args:
+            recording: of which it is the last part, if it is one.
+        """
+        # Else the disk was too full for a single row: there is nothing to promise.
+        if self._span is not None or recording is not None:
+            log = None if self._span is None else self._span.log
+            self._run.submit(recording or self.path, log)
+
+    def drop(self) -> None:
+        """Give up its rows, also after its end.
+
+        Raises:
+            FileNotWritten: the disk is full.
+        """
+        if self._span is not None:
+            self._span.drop()
+
+    def _take_back(self) -> None:
+        """Give up the row of the reset; the first step will write it anew."""
+        self._fast = None
+        if self._span is not None:
+            self._span.drop()
+            self._span = None
+
+    def _try(self, take: Callable[[], None]) -> None:
+        if self.is_stopped:
+            return
+        try:
+            take()
+        except PicturesDiffer as error:
+            self.end_frames(str(error))
+        except FileNotWritten as error:
+            self.is_stopped = True
+            self._break(str(error))
+            if not self._run.tolerates(self._what, error):
+                raise
+
+    def _break(self, reason: str) -> None:
+        self.broken_reason = reason
+        self.note(broken_reason=reason)
+
+    def _new_fast_path(self, span: SpanWriter) -> FastPath | None:
+        layout, start, action = self._layout, self._start, self._action
+        if layout is None or layout.words is None or start is None or action is None:
+            return None
+        return gathering(
+            self._run.stats,
+            span,
+            layout.words,
+            set_action=action.set,
+            is_current=start.is_current,
+            is_on_pace=lambda: self._measured_pace() == self._pace,
+            stride=self._stride,
+        )
+
+    def _settled(self) -> SpanWriter:
+        """Return where the coming row goes, after what the first step has told."""
+        if self._span is not None and self.steps:
+            return self._span
+        pace = self._measured_pace()
+        if self._span is None:
+            self._begin(pace)
+        elif pace != self._pace:
+            self._run.paces[self._logs] = self._pace = pace
+            self._fast = None
+            self.note(**pace)
+        assert self._span is not None
+        return self._span
+
+    @property
+    def _stride(self) -> int:
+        return 1 if self._pace is None else int(self._pace["stride"])
+
+    def _begin(self, pace: Mapping[str, Any]) -> None:
+        """Write the row of the reset."""
+        self._run.paces[self._logs] = self._pace = pace
+        layout = self._layout = self._new_layout()
+        facts = {**self._facts, **self._parts(), **pace}
+        action = self._action
+        if action is not None and action.given is not None:
+            self._action_dtypes = [[0, _dtype_name(action.given)]]
+            facts["action_dtypes"] = self._action_dtypes
+        span = self._logs.begin(self._name, facts, layout.dtype, alone=self._is_alone)
+        try:
+            own = None if self._start is None else self._start.model_fields
+            for fields in (own, self._first_change):
+                if fields:
+                    span.log.add_change(ModelChange(step=0, fields=fields))
+            columns, slot = span.log.columns, span.make_room()
+            first: dict[str, Any] = {
+                "state": self._first_state,
+                "snapshot": self._first_snapshot,
+                "action": 0,
+                "observation": self._first_observation,
+            }
+            for part, column in columns.items():
+                if part in first:
+                    column[slot] = first[part]
+            span.commit(0, is_frame=self._takes_frames)
+            self._span = span
+        except BaseException:
+            # Without its first frame it would promise a video of nothing.
+            span.drop()
+            raise
+
+    def _new_layout(self) -> RowLayout:
+        """Return what the rows consist of; that of the last recording, if it fits."""
+        start, action = self._start, self._action
+        kinds = (
+            self._state,
+            self._snapshot,
+            action,
+            None if self._observation is None else self._observation.kind,
+            None if start is None else start.words,
+        )
+        last = self._run.layouts.get(self._logs)
+        if last is not None and all(map(_is_same, last, kinds)):
+            return last
+        state, snapshot, _, observation, start_words = kinds
+        words = None
+        # Of another size the last word would have what stands behind it in memory.
+        if start_words is not None and action is not None and action.size % 8 == 0:
+            words = np.concatenate([start_words, words_of([action.values])])
+        dtype = row_dtype(
+            state=state,
+            snapshot=snapshot,
+            action=None if action is None else action.kind,
+            observation=observation,
+        )
+        if last is not None and last.dtype == dtype:
+            dtype = last.dtype
+        layout = self._run.layouts[self._logs] = RowLayout(*kinds, dtype, words)
+        return layout
+
+    def _write_state(self, span: SpanWriter, slot: int, *, has_picture: bool) -> None:
+        if "state" not in span.log.columns:
+            return
+        state = span.log.columns["state"][slot]
+        state[...] = np.nan
+        if not has_picture or self._capture is None:
+            return
+        try:
+            self._capture.capture_state(state)
+        except PicturesDiffer:
+            # It is another simulation from here on.
+            self._capture = None
+            raise
+
+    def _write_snapshot(self, span: SpanWriter, slot: int, number: int) -> bool:
+        """Write the snapshot of this moment, and what has changed; tell whether so."""
+        capture = self._capture
+        if capture is None:
+            return False
+        if self._takes_frames:
+            snapshot = span.log.columns["snapshot"][slot]
+            changed = capture.capture_snapshot(snapshot)
+        else:
+            changed = capture.changed_fields()
+        if changed:
+            span.log.add_change(ModelChange(step=number, fields=changed))
+        return self._takes_frames
+
+    def _write_arrays(self, span: SpanWriter, slot: int) -> None:
+        columns = span.log.columns
+        if self._action is not None:
+            columns["action"][slot] = self._action.values
+        if self._observation is not None:
+            columns["observation"][slot] = self._observation.values
+
+    def _parts(self) -> dict[str, Any]:
+        """Return what dictionaries were made into one vector from."""
+        arrays = {"action": self._action, "observation": self._observation}
+        return {
+            f"{name}_parts": [
+                [part, list(shape)] for part, shape in array.parts.items()
+            ]
+            for name, array in arrays.items()
+            if array is not None and array.parts is not None
+        }
+
+    def _use_action(self, array: StepArray | None) -> None:
+        self._action = array
+        if array is not None:
+            array.on_other_dtype = self._note_action_dtype
+
+    def _note_action_dtype(self) -> None:
+        if self._span is not None and self._action is not None:
+            given = self._action.given
+            assert given is not None
+            before = [each for each in self._action_dtypes if each[0] < self.steps]
+            self._action_dtypes = [*before, [self.steps, _dtype_name(given)]]
+            self.note(action_dtypes=self._action_dtypes)
+
+    def _note_irregular(self, what: str) -> None:
+        if what not in self._irregular:
+            self._irregular.add(what)
+            self.note(**{f"irregular_{what}_from": self.steps})
+            logger.warning(
+                "%s: from step %d on the %s are not like those before and are recorded "
+                "as zeros.",
+                self.path.name,
+                self.steps,
+                what,
+            )
+
+    def _measured_pace(self) -> Mapping[str, Any]:
+        """Return the time of a step, measured over the first one, and the stride."""
+        began, now = self._first_time, self._run.subject.clock()
+        if began is None or now is None or now <= began:
+            return _pace(self._run.subject.declared(), None, self._max_fps)
+        return _measured(now - began, self._max_fps)
+
+
+def _pace(
+    rate: Fraction, timestep: Fraction | None, max_fps: float | Fraction | None
+) -> Mapping[str, Any]:
+    return {
+        "rate": str(rate),
+        "timestep": None if timestep is None else str(timestep),
+        "stride": stride_for(rate, max_fps),
+    }
+
+
+def _is_same(one: object, other: object) -> bool:
+    # Two dtypes are compared member by member, and nearly always they are one.
+    return one is other or (isinstance(one, np.dtype) and one == other)
+
+
+# NumPy composes the name anew each time.
+_dtype_name = functools.lru_cache(maxsize=16)(lambda dtype: str(dtype.name))
+
+
+# Of the same few steps in each episode; fractions take Python long.
+@functools.lru_cache(maxsize=64)
+def _measured(seconds: float, max_fps: float | Fraction | None) -> Mapping[str, Any]:
+    rate = rate_from_timestep(seconds)
+    return _pace(rate, 1 / rate, max_fps)
+
+
+def _words(kind: np.dtype[Any] | None) -> int:
+    return 0 if kind is None else kind.itemsize // 8
+
+
+class DeferredVideo:
+    """Stands where a `VideoRecorder` stands when pictures are drawn live.
+
+    Its frames are recorded snapshots. The files come when they are rendered, which the
+    monitor's `close` waits for.
+
+    Args:
+        directory: of the video.
+        name: of the video, without extension.
+        states: of the episode.
+
+    Attributes:
+        path: the video, once it is rendered.
+        metadata_path: its metadata, likewise.
+        enabled: True.
+    """
+
+    enabled = True
+    ansi_mode = False
+
+    def __init__(self, directory: Path, name: str, states: StateRecorder) -> None:
+        self.path = f"{directory}/{name}.mp4"
+        self.metadata_path = f"{directory}/{name}.meta.json"
+        self._states = states
+
+    @property
+    def broken(self) -> bool:
+        """Whether no more frames could be taken; those before are rendered."""
+        return self._states.broken_reason is not None
+
+    @property
+    def functional(self) -> bool:
+        """Whether frames are (or were) recorded: not broken."""
+        return not self.broken
+
+    @property
+    def frame_count(self) -> int:
+        """The number of frames recorded so far."""
+        return self._states.frame_count
+
+    @property
+    def empty(self) -> bool:
+        """Whether there is no frame."""
+        return self.frame_count == 0
+
+    @property
+    def finished(self) -> bool:
+        """Whether the video has been rendered and is there, whole."""
+        return Path(self.path).exists() and Path(self.metadata_path).exists()

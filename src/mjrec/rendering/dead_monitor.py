@@ -1,0 +1,399 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Finishing what a monitor left that was killed, or closed without waiting.
+
+Recordings in flight become trajectories, live videos get their names, the journal gets
+the lines that it lacks, and statistics and manifest follow from it. Meanwhile the
+monitor's lock is held, as the monitor did: to all others it is open.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import logging
+import time
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from ..errors import Error, FileNotWritten, UnreadableFile
+from ..formats.journal import (
+    KILLED,
+    JournalEntry,
+    JournalReader,
+    JournalWriter,
+    entry_of,
+)
+from ..formats.locks import try_lock
+from ..formats.monitor_directory import (
+    Infix,
+    VideoName,
+    episode_of,
+    final_name,
+    journal_name,
+    lock_name,
+    manifest_name,
+)
+from ..formats.spans import drop_recording, read_list, remove_list
+from ..formats.trajectory_file import (
+    find_trajectory,
+    finish_trajectory,
+    open_trajectory,
+)
+from ..formats.video_metadata import is_done
+from ..results.journal_or_stats import MonitorResults, locked_run
+from ..results.manifest_writing import manifest_lock, write_manifest_and_stats
+from ..results.monitor_files import MonitorFiles, files_of
+from .cut_videos import finish_text, finish_video
+from .jobs import key_of
+from .leftovers import Leftover, leftovers_of
+from .recorded_facts import open_for_rendering, video_path
+from .recordings import claim, parts_of
+
+logger = logging.getLogger(__name__)
+
+_MOMENT = 0.05
+
+_Line = tuple[str, Mapping[str, Any]]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Report:
+    """What was done, and what failed.
+
+    Attributes:
+        deadline: until when to wait for others, by `time.monotonic`.
+        files: names, and what was done.
+        failures: names, and why it could not be.
+    """
+
+    deadline: float
+    files: list[tuple[str, str]] = field(default_factory=list)
+    failures: list[tuple[str, str]] = field(default_factory=list)
+
+    def note(self, name: str, what: str) -> None:
+        """Note what was done about a file."""
+        self.files.append((name, what))
+
+    @contextlib.contextmanager
+    def attempt(self, name: str) -> Iterator[None]:
+        """Note what fails inside the block, and go on."""
+        try:
+            yield
+        except (Error, OSError) as error:
+            self.failures.append((name, str(error)))
+        except Exception as error:
+            logger.exception("%s cannot be recovered.", name)
+            self.failures.append((name, f"{type(error).__name__}: {error}"))
+
+    def remove(self, stale: Path) -> None:
+        """Remove an unfinished file, or a lock that no process holds."""
+        with self.attempt(stale.name):
+            if stale.suffix != ".lock":
+                stale.unlink(missing_ok=True)
+                self.note(stale.name, "unfinished, removed")
+            elif (lock := try_lock(stale)) is not None:
+                lock.release()
+                self.note(stale.name, "left behind, removed")
+
+
+def finish_dead_monitor(directory: Path, infix: Infix, report: Report) -> None:
+    """Do all that is left to do of one monitor but drawing, unless it is open.
+
+    Args:
+        directory: where it recorded.
+        infix: the monitor's.
+        report: takes what was done.
+    """
+    path = directory / lock_name(infix)
+    with report.attempt(path.name):
+        was_killed = path.exists()
+        monitor = _DeadMonitor(directory, infix, report)
+        # Before there is a lock, which is what a killed monitor leaves.
+        is_behind = bool(monitor.left("results"))
+        lock = try_lock(path)
+        if lock is None:
+            return
+        if was_killed:
+            report.note(path.name, "its monitor was killed")
+        try:
+            monitor.finish(is_behind=is_behind)
+        except BaseException:
+            # What it says of the environment may not be written anywhere else.
+            lock.let_go()
+            raise
+        lock.release()
+        # A process that rendered meanwhile took the monitor for open.
+        if (directory / manifest_name(infix)).exists():
+            write_manifest_and_stats(directory, infix)
+
+
+class _DeadMonitor:
+    """A monitor that is not open."""
+
+    def __init__(self, directory: Path, infix: Infix, report: Report) -> None:
+        self._directory = directory
+        self._infix = infix
+        self._report = report
+
+    def left(self, kind: str) -> list[Leftover]:
+        """Return what is left to do now, of one kind."""
+        left = leftovers_of(self._directory, self._files())
+        return [each for each in left if each.kind == kind]
+
+    def finish(self, *, is_behind: bool) -> None:
+        """Do it, with the monitor's lock held.
+
+        Args:
+            is_behind: its results may be older than the rest.
+        """
+        report = self._report
+        for leftover in self.left("spans"):
+            with report.attempt(leftover.path.name):
+                self._finish_spans(leftover.path)
+        # Of logs a manifest says nothing that is not so of trajectories.
+        before = len(report.files)
+        # The first video's metadata names those of further cameras.
+        for video in sorted(self.left("video"), key=_is_first):
+            path = video.path.with_name(final_name(video.path.name) or "")
+            with report.attempt(path.name):
+                known = self._known(episode_of(path.name))
+                self._note_all(finish_video(path, known, deadline=report.deadline))
+        for text in self.left("text"):
+            path = text.path.with_name(final_name(text.path.name) or "")
+            number = episode_of(path.name)
+            with report.attempt(path.name):
+                facts, known = self._facts(number), self._known(number)
+                self._note_all(finish_text(text.path, path, facts, known))
+        for stale in self.left("stale"):
+            with self._claimed(stale.path) as is_ours:
+                if is_ours:
+                    report.remove(stale.path)
+        has_news = is_behind or len(report.files) > before
+        now = self._files()
+        if has_news and any(not path.name.startswith(".") for path in now.paths):
+            self._complete_journal(now)
+            self._write_results()
+
+    def _files(self) -> MonitorFiles:
+        return files_of(self._directory, self._infix)
+
+    def _note_all(self, done: Iterable[tuple[str, str]]) -> None:
+        for name, what in done:
+            self._report.note(name, what)
+
+    def _finish_spans(self, path: Path) -> None:
+        """Make trajectories of the episodes of a list; remove it where it is idle.
+
+        Raises:
+            UnreadableFile: it cannot be read; it stays with its rows.
+        """
+        spans = read_list(path)
+        if spans.is_headless:
+            raise UnreadableFile(path, "it does not say what its rows are")
+        for recording in spans.in_flight():
+            log = recording.path
+            if log.suffix == ".h5":
+                with self._report.attempt(log.name), self._claimed(log) as is_ours:
+                    if is_ours and not log.exists():
+                        self._report.note(log.name, _finish_log(log))
+        if path.exists() and not read_list(path).in_flight():
+            remove_list(path)
+            self._report.note(path.name, "nothing in flight, removed")
+
+    @contextlib.contextmanager
+    def _claimed(self, path: Path) -> Iterator[bool]:
+        """Hold the lock of a file's recording; False where another process keeps it."""
+        key = key_of(final_name(path.name) or path.name)
+        if key is None:
+            yield True
+            return
+        # A renderer that outlived its monitor is about to end.
+        while (lock := claim(self._directory, key)) is None:
+            if time.monotonic() >= self._report.deadline:
+                break
+            time.sleep(_MOMENT)
+        with contextlib.nullcontext() if lock is None else lock:
+            yield lock is not None
+
+    # What is known of episodes
+
+    @functools.cached_property
+    def _entries(self) -> dict[int, JournalEntry | None]:
+        """Episodes with files of which the journal has a line; None where it was cut.
+
+        Of the others there may be millions.
+        """
+        files, entries = self._files(), dict[int, JournalEntry | None]()
+        # One that cannot be read is reported when the statistics are made.
+        with contextlib.suppress(UnreadableFile):
+            if files.journal is not None:
+                numbers = _numbers(files)
+
+                def note(kind: str, facts: Any) -> None:
+                    if kind == "cut" and isinstance(facts, Mapping):
+                        entries.setdefault(facts.get("episode_id", -1))
+
+                for entry in JournalReader(files.journal, on_event=note):
+                    if entry.episode_id in numbers:
+                        entries[entry.episode_id] = entry
+        return entries
+
+    def _facts(self, number: int | None) -> Mapping[str, Any]:
+        """Return what an episode's trajectory says; nothing without, or of damaged."""
+        with contextlib.suppress(UnreadableFile):
+            if number is None:
+                return {}
+            path = find_trajectory(self._directory, self._infix, number)
+            if path is not None:
+                return _facts_of(path)
+        return {}
+
+    def _known(self, number: int | None) -> dict[str, Any]:
+        """Return what metadata says of an episode's end, as far as its files say it."""
+        facts = self._facts(number)
+        entry = None if number is None else self._entries.get(number)
+        known = {key: facts[key] for key in ("length", "reward") if key in facts}
+        if "complete" in facts and facts.get("reason") != KILLED:
+            keys = ("complete", "terminated", "truncated", "reason", "exception")
+            known |= {key: facts[key] for key in keys if key in facts}
+        if entry is not None:
+            said = ("length", "reward", "terminated", "truncated")
+            known |= {"complete": True, **{key: getattr(entry, key) for key in said}}
+        return known
+
+    # Journal, statistics, manifest
+
+    def _missing_episodes(self, now: MonitorFiles) -> Iterator[_Line]:
+        """Yield what the journal lacks of episodes with a trajectory or a video."""
+        is_choosing = bool(MonitorResults(now).run.facts.get("keep"))
+        for number in sorted(_numbers(now) - self._entries.keys()):
+            facts = self._facts(number)
+            is_filmed = number in now.videos or number in now.metadata
+            video = facts.get("video") or ({"recording": "live"} if is_filmed else {})
+            line = {
+                "episode_id": number,
+                "chosen": bool(video) and not is_choosing,
+                "recording": video.get("recording"),
+            }
+            try:
+                entry_of({**facts, **line})
+                is_complete = facts.get("complete") is True
+            except ValueError:
+                is_complete = False
+            if is_complete:
+                yield "episode", {**facts, **line}
+            else:
+                yield "cut", {**line, "reason": facts.get("reason", KILLED)}
+
+    def _missing_clips(self, now: MonitorFiles) -> Iterator[_Line]:
+        """Yield the clips, deferred and live; those that the journal has say the same.
+
+        One that cannot be read is left out; rendering the directory reports it.
+        """
+        spans = [path for path in now.paths if path.suffix == ".spans"]
+        keys = set()
+        for path in spans:
+            with contextlib.suppress(UnreadableFile):
+                keys |= {key_of(each.name) for each in read_list(path).in_flight()}
+        for key in keys:
+            if key is None or not key.is_clip:
+                continue
+            with contextlib.suppress(UnreadableFile, IndexError):
+                parts = parts_of(self._directory, key)
+                facts, last = _facts_of(parts[0]), _facts_of(parts[-1])
+                yield (
+                    "clip",
+                    {
+                        "episode_id": facts.get("episode_id") or 0,
+                        "last_episode_id": last.get("episode_id") or 0,
+                        "clip": parts[0].name,
+                        "video": video_path(parts[0], facts).name,
+                    },
+                )
+        for path in now.paths:
+            name = VideoName.parse(path.name)
+            if name is None or name.first_step is None or name.view:
+                continue
+            if name.ending == "meta.json":
+                yield "clip", {"episode_id": name.episode_id, "video": name.video}
+
+    def _complete_journal(self, now: MonitorFiles) -> None:
+        """Write down what the monitor did not live to write down."""
+        lines = [*self._missing_episodes(now), *self._missing_clips(now)]
+        path = self._directory / journal_name(self._infix)
+        writer = JournalWriter(path, run=self._run_facts(now))
+        try:
+            with manifest_lock(self._directory, self._infix):
+                for kind, facts in (*lines, ("recovered", {})):
+                    if kind == "episode":
+                        writer.append(entry_of(facts))
+                    else:
+                        writer.note(kind, facts)
+        except OSError as error:
+            raise FileNotWritten(path, error.strerror or error) from error
+        finally:
+            writer.close()
+        added = sum(kind == "episode" for kind, _ in lines)
+        if added:
+            self._report.note(path.name, f"{_counted(added, 'episode')} added")
+
+    def _run_facts(self, now: MonitorFiles) -> Mapping[str, Any]:
+        """Return what the first line says of a journal that is gone, or never was."""
+        with contextlib.suppress(OSError, ValueError):
+            if run := locked_run(self._directory / lock_name(self._infix)):
+                return run
+        results = MonitorResults(now)
+        details = results.details
+        return {
+            "env_info": results.env_info,
+            "schedule": (details.get("schedule") or {}).get("name"),
+            **{k: details[k] for k in ("keep", "first_episode_id") if k in details},
+            "versions": details.get("versions", {}),
+        }
+
+    def _write_results(self) -> None:
+        written = write_manifest_and_stats(self._directory, self._infix, is_own=True)
+        assert written is not None
+        manifest, note = written.manifest, self._report.note
+        if written.stats is not None and written.is_new_stats:
+            note(manifest.stats, _counted(len(written.stats.timestamps), "episode"))
+        if written.is_new_manifest:
+            pending = len(written.pending)
+            rest = f", {pending} pending: mjrec render" if pending else ""
+            what = f"{_counted(len(manifest.videos), 'video')}{rest}"
+            note(manifest_name(self._infix), what)
+
+
+def _finish_log(path: Path) -> str:
+    """Give a recording in flight its final form; return what was done."""
+    with open_trajectory(path) as reader:
+        facts, steps = reader.facts, _counted(reader.step_count, "step")
+    if not facts.get("kept", True) and is_done(video_path(path, facts)):
+        # Its renderer died between the two.
+        drop_recording(path)
+        return "its video is there, removed"
+    finish_trajectory(path)
+    is_cut = "complete" not in facts and _facts_of(path).get("reason") == KILLED
+    return f"{steps}, incomplete: killed" if is_cut else steps
+
+
+def _is_first(note: Leftover) -> bool:
+    name = VideoName.parse(final_name(note.path.name) or "")
+    return name is not None and not name.view
+
+
+def _numbers(files: MonitorFiles) -> set[int]:
+    """Return the numbers of the episodes with a trajectory or a video, in any state."""
+    named = {number for p in files.paths if (number := episode_of(p.name)) is not None}
+    return named | files.trajectories.keys()
+
+
+def _facts_of(path: Path) -> Mapping[str, Any]:
+    with open_for_rendering(path) as reader:
+        return reader.facts
+
+
+def _counted(count: int, what: str) -> str:
+    return f"{count} {what}" if count == 1 else f"{count} {what}s"

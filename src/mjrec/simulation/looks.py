@@ -1,0 +1,239 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What has changed in a model and in how it is shown, found by comparing memory.
+
+Comparing some five hundred arrays one by one takes longer than a simulation step. They
+all lie in one allocation, and the structs `opt`, `vis` and `stat` one behind the other
+in `mjModel` itself, so that comparing a few long pieces tells that nothing has changed,
+which is usual. Only a piece that differs is looked at by name.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterable
+from typing import Any
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from .fields import array_names, member_names, read_fields, struct_names
+from .raw_memory import address_of, raw_memory
+from .view import SceneView
+
+# What each frame is drawn from; whole groups, because a few long pieces are compared
+# faster than what the visualiser is known to read. Other arrays are compared at resets.
+_DRAWN = (
+    *("geom_", "site_", "mat_", "light_", "cam_", "tendon_", "actuator_cranklength"),
+    *("skin_matid", "skin_group", "skin_rgba", "skin_inflate"),
+    *("flex_matid", "flex_group", "flex_rgba", "flex_radius"),
+)
+
+# How far a camera and an option reach before their first and behind their last array.
+# Nothing beyond is looked at: it belongs to somebody else, and may change any time.
+_REACH = {mujoco.MjvCamera: (16, 32), mujoco.MjvOption: (8, 8)}
+
+_Arrays = list[tuple[str, NDArray[Any]]]
+
+
+class Looks:
+    """Remembers a model and a view, and tells which of their fields have changed.
+
+    At a reset any field of the model counts, in between what each frame is drawn from:
+    not textures and meshes, which have to be uploaded to the graphics card. The model
+    is only read, and kept alive.
+
+    Args:
+        model: the model, as it is stored now.
+
+    Attributes:
+        seen: what is watched, in pieces, as it was when last looked at. The list is
+            another one after `follow`; its pieces are changed in place.
+        present: the same pieces as they are: where the lists are equal, nothing of
+            what is watched has changed.
+    """
+
+    def __init__(self, model: mujoco.MjModel) -> None:
+        self._model = model
+        self._watched: list[_Piece] = [_structs_of(model)]
+        self._others: list[_Piece] = []
+        for is_watched, arrays in _pieces(model):
+            pieces = self._watched if is_watched else self._others
+            pieces.append(_ArrayPiece(arrays, is_watched=is_watched))
+        self._view: list[_Piece] = []
+        self._structs: dict[str, Any] = {}
+        self.seen: list[bytearray] = []
+        self.present: list[Any] = []
+
+    def is_of(self, model: mujoco.MjModel) -> bool:
+        """Tell whether `model` is the model remembered, in whatever wrapper."""
+        # The address is of no other model while this one is kept alive.
+        return bool(model._address == self._model._address)
+
+    def follow(self, view: SceneView) -> None:
+        """Watch the camera and the option of a view from here on, as they are now."""
+        structs = {"camera": view.camera, "option": view.option}
+        if all(self._structs.get(name) is struct for name, struct in structs.items()):
+            for piece in self._view:
+                piece.look()
+            return
+        self._structs = structs
+        self._view = [_struct_of_view(*item) for item in structs.items()]
+        watched = [*self._watched, *self._view]
+        self.seen = [piece.seen for piece in watched]
+        self.present = [piece.raw for piece in watched]
+
+    def view_bytes(self) -> bytes:
+        """Return the camera and the option as bytes."""
+        return b"".join(bytes(piece.raw) for piece in self._view)
+
+    def option_bytes(self) -> bytes:
+        """Return the option as bytes."""
+        return bytes(self._view[1].raw)
+
+    def since_stored(self) -> dict[str, NDArray[Any]]:
+        """Return the model's fields that are other than when this was made.
+
+        What is there now counts as seen.
+        """
+        names: list[str] = []
+        for piece in (*self._watched, *self._others):
+            names += piece.look_from_stored()
+        return read_fields(self._model, names)
+
+    def changed(self, *, anything: bool = False) -> dict[str, NDArray[Any]] | None:
+        """Return the watched fields that are other than when last looked at.
+
+        Args:
+            anything: look at textures, meshes and the like, too.
+
+        Returns:
+            Copies by their names; None, in a microsecond, where all are the same.
+        """
+        if not anything and self.seen == self.present:
+            return None
+        pieces = [*self._watched, *self._view, *(self._others if anything else ())]
+        names = (name for piece in pieces for name in piece.look())
+        return read_fields(self._model, names, **self._structs) or None
+
+
+class _Piece:
+    """A piece of memory, as it was at first (`stored`) and when it was last `seen`.
+
+    Of what is not watched at each step, which may be large, one copy is kept until
+    something changes.
+    """
+
+    def __init__(self, address: int, size: int, *, is_watched: bool = True) -> None:
+        self.raw = raw_memory(address, size)
+        self.stored = bytearray(self.raw)
+        self.seen = bytearray(self.raw) if is_watched else self.stored
+
+    def look(self) -> list[str]:
+        """Return the names of what has changed since the last look."""
+        if self.seen == self.raw:
+            return []
+        names = self.differing(self.seen)
+        self.see()
+        return names
+
+    def look_from_stored(self) -> list[str]:
+        """Return the names of what is other than at first."""
+        names = [] if self.stored == self.raw else self.differing(self.stored)
+        if self.seen != self.raw:
+            self.see()
+        return names
+
+    def see(self) -> None:
+        """Remember what is there, in place: `Looks` has given `seen` away."""
+        if self.seen is self.stored:
+            self.seen = bytearray(self.raw)
+        else:
+            self.seen[:] = self.raw
+
+    def differing(self, before: bytearray) -> list[str]:
+        """Return the names of what is other than in a copy of the memory."""
+        raise NotImplementedError
+
+
+class _ArrayPiece(_Piece):
+    """Arrays that lie one behind the other."""
+
+    def __init__(self, arrays: _Arrays, *, is_watched: bool) -> None:
+        first = address_of(arrays[0][1])
+        super().__init__(first, _extent(arrays), is_watched=is_watched)
+        self._names = [name for name, _ in arrays]
+        self._starts = [address_of(array) - first for _, array in arrays]
+
+    def differing(self, before: bytearray) -> list[str]:
+        now, then = (np.frombuffer(memory, np.uint8) for memory in (self.raw, before))
+        positions = np.flatnonzero(now != then)
+        owners = np.searchsorted(self._starts, positions, side="right") - 1
+        # Not `np.unique`, whose first call loads numpy's masked arrays (100 ms).
+        return [self._names[index] for index in sorted({*owners.tolist()})]
+
+
+class _StructPiece(_Piece):
+    """Structs, whose members are looked at one by one where any byte has changed.
+
+    Args:
+        names: of the members, as `read_fields` takes them.
+        holders: its other arguments.
+    """
+
+    def __init__(
+        self, address: int, size: int, names: Iterable[str], **holders: Any
+    ) -> None:
+        super().__init__(address, size)
+        self._names, self._holders = [*names], holders
+        self._stored_values = self._seen_values = self._values()
+
+    def see(self) -> None:
+        super().see()
+        self._seen_values = self._values()
+
+    def differing(self, before: bytearray) -> list[str]:
+        is_stored = before is self.stored
+        then = self._stored_values if is_stored else self._seen_values
+        now = self._values()
+        return [name for name in self._names if then[name] != now[name]]
+
+    def _values(self) -> dict[str, bytes]:
+        fields = read_fields(names=self._names, **self._holders)
+        return {name: value.tobytes() for name, value in fields.items()}
+
+
+def _pieces(model: mujoco.MjModel) -> list[tuple[bool, _Arrays]]:
+    """Return pieces of memory that together hold all arrays, and what is watched."""
+    named = [(name, getattr(model, name)) for name in array_names()]
+    arrays = [(name, array) for name, array in named if array.nbytes]
+    arrays.sort(key=lambda item: address_of(item[1]))
+    # Should other memory lie between them, each is a piece of its own.
+    are_together = _extent(arrays) <= int(model.nbuffer)
+    groups = itertools.groupby(
+        arrays, lambda item: (item[0].startswith(_DRAWN), are_together or item[0])
+    )
+    return [(is_watched, list(group)) for (is_watched, _), group in groups]
+
+
+def _extent(arrays: _Arrays) -> int:
+    last = arrays[-1][1]
+    return address_of(last) + last.nbytes - address_of(arrays[0][1])
+
+
+def _structs_of(model: mujoco.MjModel) -> _StructPiece:
+    # They lie behind the sizes; the last member of the last of them is an array.
+    size = address_of(model.stat.center) + model.stat.center.nbytes - model._address
+    return _StructPiece(model._address, size, struct_names(), model=model)
+
+
+def _struct_of_view(name: str, struct: Any) -> _StructPiece:
+    before, behind = _REACH[type(struct)]
+    members = [*member_names(struct)]
+    values = [(member, getattr(struct, member)) for member in members]
+    arrays = [item for item in values if isinstance(item[1], np.ndarray)]
+    arrays.sort(key=lambda item: address_of(item[1]))
+    first, extent = address_of(arrays[0][1]), _extent(arrays)
+    names = [f"{name}.{member}" for member in members]
+    size = before + extent + -extent % 4 + behind
+    return _StructPiece(first - before, size, names, model=None, **{name: struct})

@@ -1,0 +1,207 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The state of a simulation: as a recorded row, in memory, set again, preserved.
+
+It is `mjSTATE_INTEGRATION`, everything that the next step depends on. MuJoCo gives it
+as one vector, whose parts are numbered by bits; the bits were renumbered between
+releases, so that what is kept goes by names.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import InvalidArgument
+from ..formats.trajectory import columns_of, packed
+from .raw_memory import WORDS, address_of, can_be_gathered, raw_memory, words_of
+
+STATE_SPEC = int(mujoco.mjtState.mjSTATE_INTEGRATION)
+
+_PREFIX = "mjSTATE_"
+
+# Components whose array in `MjData` has another name.
+_STATE_ARRAYS = {"warmstart": "qacc_warmstart", "plugin": "plugin_state"}
+# The time is no array but a number of the struct, which lies close to this one.
+_NEIGHBOUR, _REACH = "energy", 16
+
+# What an environment moves or colours to show a goal or a touch.
+_SHOWING = (
+    *("site_pos", "site_quat", "site_size", "site_rgba"),
+    *("geom_pos", "geom_quat", "geom_size", "geom_rgba"),
+    *("body_pos", "body_quat", "mat_rgba"),
+)
+
+
+def _elementary_bits() -> dict[str, int]:
+    """Return the bits inside `STATE_SPEC` by their names, in MuJoCo's order.
+
+    Combinations of several bits (`mjSTATE_PHYSICS`) are left out.
+    """
+    values = {
+        name.removeprefix(_PREFIX).lower(): int(value)
+        for name, value in mujoco.mjtState.__members__.items()
+        # mjNSTATE is a number of bits, not one of them.
+        if name.startswith(_PREFIX)
+    }
+    bits = {n: v for n, v in values.items() if v & STATE_SPEC and v.bit_count() == 1}
+    return dict(sorted(bits.items(), key=lambda item: item[1]))
+
+
+STATE_BITS = _elementary_bits()
+
+
+def state_dtype(model: mujoco.MjModel) -> np.dtype[Any]:
+    """Return what the state of `model` consists of, in the order of its vector.
+
+    Components that this model has none of (`act` without activations) are left out.
+    """
+    sizes = {name: mujoco.mj_stateSize(model, bit) for name, bit in STATE_BITS.items()}
+    return packed((name, ("<f8", (size,))) for name, size in sizes.items() if size)
+
+
+def read_state(model: mujoco.MjModel, data: mujoco.MjData) -> NDArray[np.float64]:
+    """Return the state of `data`."""
+    state = np.empty(mujoco.mj_stateSize(model, STATE_SPEC))
+    mujoco.mj_getState(model, data, state, STATE_SPEC)
+    return state
+
+
+def state_words(model: mujoco.MjModel, data: mujoco.MjData) -> NDArray[np.intp] | None:
+    """Return which of `memory.WORDS` are the state of `data`, which is kept alive.
+
+    That they hold what `mj_getState` gives is tried, not taken from a header.
+
+    Returns:
+        None where a component is kept as another type than it is given as
+        (`eq_active`), or is new in MuJoCo.
+    """
+    arrays = []
+    for part in state_dtype(model).names or ():
+        name = _STATE_ARRAYS.get(part, part)
+        array = _time(data) if name == "time" else getattr(data, name, None)
+        if array is None or array.dtype != np.float64:
+            return None
+        arrays.append(array)
+    if not can_be_gathered(arrays):
+        return None
+    words = words_of(arrays)
+    is_state = WORDS.take(words).tobytes() == read_state(model, data).tobytes()
+    return words if is_state else None
+
+
+def _time(data: mujoco.MjData) -> NDArray[np.float64]:
+    raw = raw_memory(address_of(getattr(data, _NEIGHBOUR)) + _time_offset(), 8)
+    return np.frombuffer(memoryview(raw), np.float64)
+
+
+@functools.cache
+def _time_offset() -> int:
+    """Return where the time lies, from its neighbour on, by setting it."""
+    data = mujoco.MjData(mujoco.MjModel.from_xml_string("<mujoco/>"))
+    start = address_of(getattr(data, _NEIGHBOUR)) - _REACH
+    near = np.frombuffer(memoryview(raw_memory(start, 3 * _REACH)), np.float64)
+    data.time = 1 / 3
+    offset: int = 8 * near.tolist().index(data.time)
+    return offset - _REACH
+
+
+def state_columns(
+    model: mujoco.MjModel, parts: Mapping[str, slice]
+) -> NDArray[np.intp]:
+    """Return where in a recorded row the numbers of this MuJoCo's state stand.
+
+    Raises:
+        InvalidArgument: a component is unknown to this MuJoCo, or this model has
+            another number of it.
+    """
+    own = columns_of(state_dtype(model))
+    if _lengths(parts) == _lengths(own):
+        return np.concatenate([np.r_[parts[name]] for name in own])
+    unknown = sorted(parts.keys() - STATE_BITS.keys())
+    if unknown:
+        raise InvalidArgument(
+            f"The state holds {', '.join(unknown)}, which MuJoCo {mujoco.__version__} "
+            "does not know; use the MuJoCo version that recorded it, or a later one."
+        )
+    recorded, here = _lengths(parts), _lengths(own)
+    differences = [
+        f"{name}: {recorded.get(name, 0)}, and this model has {here.get(name, 0)}"
+        for name in STATE_BITS
+        if recorded.get(name, 0) != here.get(name, 0)
+    ]
+    raise InvalidArgument(
+        "The state is not one of this model. How many numbers it holds: "
+        f"{'; '.join(differences)}. Use the model that it was recorded with "
+        "(`trajectory.model()`)."
+    )
+
+
+def _lengths(parts: Mapping[str, slice]) -> dict[str, int]:
+    return {name: part.stop - part.start for name, part in parts.items()}
+
+
+def set_state(
+    model: mujoco.MjModel,
+    data: mujoco.MjData,
+    parts: Mapping[str, slice],
+    row: NDArray[np.float64],
+) -> None:
+    """Put a recorded state into `data`, whichever MuJoCo it was recorded by.
+
+    What follows from the state (positions of bodies, contacts) is not computed.
+    Nothing is set where anything does not fit.
+
+    Args:
+        model: the model of `data`.
+        data: what is set.
+        parts: where the parts of the state are in `row`.
+        row: the state, `(n,) float64`.
+
+    Raises:
+        InvalidArgument: the row is not a state of this model.
+    """
+    columns = state_columns(model, parts)
+    values = np.asarray(row, np.float64)
+    if values.ndim != 1 or len(values) < len(columns):
+        raise InvalidArgument(
+            f"A state of this model is {len(columns)} numbers, got an array of shape "
+            f"{values.shape}."
+        )
+    mujoco.mj_setState(model, data, values[columns], STATE_SPEC)
+
+
+class PreservedState:
+    """Puts a simulation back as it was before a block.
+
+    All of the data is put back, and of the model what places, sizes and colours sites,
+    geoms and bodies. The arrays stay where they are in memory.
+    """
+
+    def __init__(self) -> None:
+        self._model: mujoco.MjModel | None = None
+        self._scratch: mujoco.MjData | None = None
+
+    @contextlib.contextmanager
+    def around(self, model: mujoco.MjModel, data: mujoco.MjData) -> Iterator[None]:
+        """Preserve `model` and `data` over the block, also if it raises.
+
+        Not reentrant.
+        """
+        if self._model is not model:
+            # Making one costs as much as a hundred copies.
+            self._scratch, self._model = mujoco.MjData(model), model
+        fields = [getattr(model, name) for name in _SHOWING]
+        before = [field.copy() for field in fields]
+        mujoco.mj_copyData(self._scratch, model, data)
+        try:
+            yield
+        finally:
+            mujoco.mj_copyData(data, model, self._scratch)
+            for field, values in zip(fields, before, strict=True):
+                field[...] = values
