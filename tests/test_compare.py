@@ -386,13 +386,13 @@ def test_an_excuse_reaches_its_own_item_only(packed: Path, given: Path) -> None:
     """A wrapper of one recording excuses rewards there, and no files."""
     set_reward(the(given, "*episode000000.h5"), 2, 9.0)
     notes = Notes()
-    notes.add("recording 0.u", "wrappers", "mine.DoubleReward is not here")
+    notes.add("episode 0 of 0.u", "wrappers", "mine.DoubleReward is not here")
     made = shutil.copytree(packed, given.with_name("made"))
     notes.write(made)
     verification = compared(given, made)
     assert verification.verdict is Verdict.PARTLY
     [excuse] = verification.excuses
-    assert (excuse.name, excuse.items) == ("wrappers", ("recording 0.u",))
+    assert (excuse.name, excuse.items) == ("wrappers", ("episode 0 of 0.u",))
     (given / "data" / "README.md").write_text("All is well.")
     assert compared(given, made).verdict is Verdict.FAIL
 

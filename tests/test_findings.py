@@ -21,6 +21,7 @@ OF_FILES = finding(topic=Topic.FILES)
     [
         ((MADE, NOTED), (), Level.PIXELS, Verdict.PASS),
         ((MADE, BELIEVED), (), Level.PIXELS, Verdict.PARTLY),
+        ((MADE,), (), Level.PHYSICS, Verdict.PARTLY),
         ((MADE, WITHIN), (excuse(),), Level.PIXELS, Verdict.PARTLY),
         ((MADE, WITHIN), (excuse(allowed=True),), Level.PIXELS, Verdict.PASS),
         ((MADE, BELIEVED), (excuse(allowed=True),), Level.PIXELS, Verdict.PARTLY),

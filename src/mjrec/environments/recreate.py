@@ -218,11 +218,21 @@ def recreate(
         return _wrapped(env, said)
 
 
-def is_installed_name(name: str) -> bool:
-    """Tell whether a name is that of an environment that can be made here by it."""
-    if name.startswith("dm_control/"):
-        return _suite_name(name) is not None
-    return _entry_point(name) is not None
+def checked_options(options: Any) -> dict[str, Any] | None:
+    """Return the options of a reset, which are plain values.
+
+    Raises:
+        NotRecreated: they are more than that.
+    """
+    if options is None:
+        return None
+    if not isinstance(options, Mapping) or not all(
+        _is_plain_item(*item) for item in options.items()
+    ):
+        raise NotRecreated(
+            f"the options of a reset ({options!r:.100}) are more than plain values"
+        )
+    return dict(options)
 
 
 def _gymnasium(
@@ -245,9 +255,8 @@ def _gymnasium(
             "be made again"
         )
     for name, value in kwargs.items():
-        if name == "render_mode" and value in _RENDER_MODES:
-            continue
-        if name in _MAKE or not _is_plain_item(name, value):
+        is_shown = name != "render_mode" or value in _RENDER_MODES
+        if name in _MAKE or not is_shown or not _is_plain_item(name, value):
             raise NotRecreated(
                 f"its argument {name!r:.80} ({value!r:.80}) is more than a plain "
                 "value within bounds, or names a file"

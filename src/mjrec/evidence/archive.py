@@ -18,7 +18,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import IO, Any
 
-from ..errors import Error, FileNotWritten, UnreadableArchive
+from ..errors import FileNotWritten, UnreadableArchive
 from ..formats.monitor_directory import iter_monitor_files
 from ..formats.regular_files import open_regular
 from .layout import PAYLOAD, RECORDINGS
@@ -61,7 +61,7 @@ def bring_in(path: Path, into: Path) -> Mapping[str, Any]:
 
     Raises:
         UnreadableArchive: it is none of these, or damaged, or made to do harm.
-        Error: there is too little room.
+        FileNotWritten: there is too little room.
     """
     try:
         if path.is_dir():
@@ -180,9 +180,10 @@ def _unpack(path: Path, into: Path) -> None:
 def _check_room(size: int, into: Path, path: Path) -> None:
     free = shutil.disk_usage(into).free
     if size + _ROOM > free:
-        raise Error(
-            f"Unpacking {path} takes {size} bytes, and {free} are free in "
-            f"{into.parent}. Choose another disk with the variable TMPDIR."
+        raise FileNotWritten(
+            into.parent,
+            f"unpacking {path} takes {size} bytes, and {free} are free",
+            then="choose another disk with the variable TMPDIR",
         )
 
 

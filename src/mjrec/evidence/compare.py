@@ -11,7 +11,9 @@ from __future__ import annotations
 import dataclasses
 import filecmp
 import gzip
+import hashlib
 import re
+import zipfile
 import zlib
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -20,10 +22,11 @@ from typing import Any, Final, TypeAlias
 
 import numpy as np
 
+from .. import json_text
 from ..atomic_files import file_sha256
 from ..errors import Error, UnreadableFile
 from ..formats.frame_hashes import frame_hash_path
-from ..formats.json_fields import read_object
+from ..formats.json_fields import json_object, read_object
 from ..formats.monitor_directory import episode_of, infix_of
 from ..formats.trajectory_hdf5 import open_hdf5
 from .claims import claimed_excuses
@@ -89,6 +92,8 @@ _MODEL: Final = re.compile(r"openaigym\.model\.[0-9a-f]{16}")
 # Four numbers; the last is the version. A model of 1 GiB is beyond any.
 _MODEL_HEAD: Final = 16
 _LARGEST_MODEL: Final = 1 << 30
+# In the zip file of its sources.
+_CONTENTS: Final = "contents.json"
 
 _Found: TypeAlias = Iterator[Same | Difference]
 
@@ -266,6 +271,8 @@ class Comparison:
                 yield from compare_frame_hashes(given, made, file)
             case "model":
                 yield from _compare_models(given, made, file)
+            case "sources":
+                yield from _compare_sources(given, made, file)
             case "manifest":
                 yield from self._compare_manifests(given, made, file, rules)
             case "statistics" | "metadata" | "text":
@@ -463,7 +470,7 @@ def _model(file: str) -> str:
 def _renamed_models(given: Path, made: Path) -> dict[str, str]:
     """Return the models that have another name made again, of the same sources."""
     sources = [
-        {file_sha256(path): _model(path.name) for path in folder.rglob("*.model.*.zip")}
+        {_sources(path): _model(path.name) for path in folder.rglob("*.model.*.zip")}
         for folder in (given, made)
     ]
     return {
@@ -471,6 +478,42 @@ def _renamed_models(given: Path, made: Path) -> dict[str, str]:
         for digest, name in sources[0].items()
         if sources[1].get(digest, name) != name
     }
+
+
+def _sources(path: Path) -> str:
+    """Return the hash of a model's sources, whatever their main file is called.
+
+    Some environments write it under a name that is random.
+    """
+    digest = hashlib.sha256()
+    try:
+        with zipfile.ZipFile(path) as sources:
+            if sum(each.file_size for each in sources.infolist()) > _LARGEST_MODEL:
+                raise ValueError("its sources are larger than any")
+            contents = json_object(sources.read(_CONTENTS))
+            main = f"source/{contents.get('main')}"
+            digest.update(json_text.dumps({**contents, "main": ""}).encode())
+            names = [name for name in sources.namelist() if name != _CONTENTS]
+            for name in [main, *sorted(set(names) - {main})]:
+                content = sources.read(name)
+                said = "" if name == main else name
+                digest.update(f"{said!r}: {len(content)}\n".encode())
+                digest.update(content)
+    except (KeyError, OSError, ValueError, zipfile.BadZipFile, zlib.error) as error:
+        raise UnreadableFile(path, error) from error
+    return digest.hexdigest()
+
+
+def _compare_sources(given: Path, made: Path, file: str) -> _Found:
+    is_equal = _sources(given) == _sources(made)
+    yield Difference(
+        topic=Topic.IDENTITY,
+        file=file,
+        # The name of the main file is a statement.
+        aspect=Aspect.STATEMENT if is_equal else Aspect.EXACT,
+        given="these sources",
+        made="others",
+    )
 
 
 def _compare_models(given: Path, made: Path, file: str) -> _Found:

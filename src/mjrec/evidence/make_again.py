@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..environments.recreate import NotRecreated, Recreated, recreate
+from ..environments.recreate import NotRecreated, Recreated, checked_options, recreate
 from ..environments.stand_ins import RecordedSteps
 from ..formats.journal import KILLED
 from ..recorder.ending_reasons import EXCEPTION, INTERRUPT
@@ -192,8 +192,8 @@ class _Playing:
             if self._recreated.is_dm_env:
                 self._monitor.reset()
             else:
-                options = episode.options
-                self._monitor.reset(seed=seed, options=options and dict(options))
+                options = checked_options(episode.options)
+                self._monitor.reset(seed=seed, options=options)
         if episode.end_time is not None:
             self._now = episode.end_time
 

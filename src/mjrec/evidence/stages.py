@@ -6,8 +6,9 @@
 - `compare` sees the two runs.
 
 What one says to `verify`, which has started it: `count` (of how much is done),
-`finding`, `excuses`, `facts`, and at the end `done`, or `failure` with the reason, or
-`refused` where what was given is nothing that can be verified.
+`finding`, `excuses`, `facts`, and at the end `done`, or `failure` with the reason;
+`refused` where what was given is nothing that can be verified, `error` where this
+machine has too little room.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from typing import Any, Final
 
 from numpy.typing import NDArray
 
-from ..errors import Error, UnreadableArchive
+from ..errors import Error, FileNotWritten, UnreadableArchive
 from ..sandbox import enter
 from .findings import Level
 from .inputs import ARRAYS_FILE, Inputs
@@ -56,6 +57,9 @@ def main() -> int:
         stage(request, say)
     except UnreadableArchive as error:
         say(refused=str(error.reason))
+        return 1
+    except FileNotWritten as error:
+        say(error=str(error))
         return 1
     except MemoryError:
         say(failure="it needs more memory than it may use")

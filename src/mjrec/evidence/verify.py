@@ -17,6 +17,7 @@ from typing import Any
 
 from ..errors import (
     DirectoryNotWritable,
+    Error,
     InvalidArgument,
     UnknownName,
     UnreadableArchive,
@@ -211,6 +212,8 @@ class _Verifying:
         match said:
             case {"refused": reason}:
                 raise UnreadableArchive(self._path, reason)
+            case {"error": text}:
+                raise Error(text)
             case {"finding": finding}:
                 self.findings.append(Finding.from_json(finding))
             case {"excuses": excuses}:
