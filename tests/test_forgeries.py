@@ -10,7 +10,6 @@ from __future__ import annotations
 import json
 import re
 import shutil
-import zlib
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -27,6 +26,8 @@ import lying_environments as lying
 import mjrec
 from forged_runs import ForgedRun
 from mjrec.evidence.findings import Outcome, Verdict, Verification
+from mjrec.formats.trajectory_file import open_trajectory
+from mjrec.formats.trajectory_hdf5 import write_hdf5
 from mjrec.formats.video_writer import VideoWriter
 
 FAIL, PARTLY, PASS = Verdict.FAIL, Verdict.PARTLY, Verdict.PASS
@@ -133,29 +134,6 @@ def cut(run: ForgedRun, episode: int, steps: int, **facts: Any) -> None:
         run.film(episode)
 
 
-def cut_by_reset(run: ForgedRun) -> None:
-    """As an early reset does: the episode is no part of the statistics."""
-    cut(run, 1, 2)
-
-    def edit(lines: list[Any]) -> None:
-        index = next(n for n, line in enumerate(lines) if line.get("episode_id") == 1)
-        known = {k: lines[index][k] for k in ("episode_id", "chosen", "recording")}
-        lines[index] = {"cut": {**known, "reason": "reset"}}
-
-    run.edit_journal(edit)
-    facts = {**run.content(1).facts, "complete": False, "reason": "reset"}
-    for name in ("terminated", "truncated"):
-        del facts[name]
-    run.edit_rows(1, all_facts=facts)
-
-    def change(said: dict[str, Any]) -> None:
-        said.update(complete=False, reason="reset")
-        for name in ("terminated", "truncated"):
-            said.pop(name, None)
-
-    run.edit_json("*000001.meta.json", change)
-
-
 def hide_the_fall(run: ForgedRun) -> None:
     run.film(1, run.frames(1)[:-2])
 
@@ -234,10 +212,10 @@ def copy_the_recording(run: ForgedRun) -> None:
                 content = content.replace(b".0.u.", b".0.v.")
             path.with_name(path.name.replace(".0.u.", ".0.v.")).write_bytes(content)
     for path in run.directory.glob("*.0.v.*.h5"):
-        with h5py.File(path, "r+") as file:
-            text = bytes(file.attrs["facts"]).replace(b"0.u", b"0.v")
-            file.attrs["facts"] = np.bytes_(text)
-            file.attrs["crc32"] = np.int64(zlib.crc32(text))
+        with open_trajectory(path) as reader:
+            text = json.dumps(dict(reader.facts)).replace("0.u", "0.v")
+            reader.facts = json.loads(text)
+            write_hdf5(reader, path)
 
 
 # Lies about videos.
@@ -723,12 +701,6 @@ FORGERIES = (
         "cut before the fall, called a limit",
         lambda run: cut(run, 1, 2, truncated=True),
     ),
-    Forgery(
-        "cut before the fall, called an early reset",
-        cut_by_reset,
-        "reset",
-        verdict=PARTLY,
-    ),
     Forgery("a state of an ulp", edit_a_state, r"qpos|qvel|states"),
     Forgery("an action edited", edit_an_action, "", quick=True),
     Forgery("another seed", name_another_seed, "", quick=True),
@@ -754,7 +726,7 @@ FORGERIES = (
         packing={"anonymous": True},
     ),
     Forgery("the worst left out, the others renumbered", leave_the_worst_out),
-    Forgery("the first left out", leave_the_first_out, verdict=PARTLY),
+    Forgery("the first left out", leave_the_first_out, "begins with episode 1"),
     Forgery("one recording shown as two", copy_the_recording, "same", verdict=PARTLY),
     Forgery("fall called a limit of time", swap_the_ending, "terminated|truncated"),
     Forgery("actions called float64", call_it_double, of=honest.cheetah),
