@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from ..environments.recreate import NotRecreated, Recreated, checked_options, recreate
 from ..environments.stand_ins import RecordedSteps
 from ..formats.journal import KILLED
-from ..recorder.ending_reasons import EXCEPTION, INTERRUPT
+from ..recorder.ending_reasons import EXCEPTION, INTERRUPT, RESET
 from .evaluation_choice import choose_for_evaluation
 from .inputs import EpisodeInputs, RecordingInputs
 from .notes import Notes, read_notes
@@ -35,6 +35,13 @@ from .recorder_again import monitor_again
 _MOST_BELIEVED_STEPS = 100_000_000
 _STEPS_BETWEEN_COUNTS = 1000
 _MODES = {"e": "evaluation"}
+# What cuts an episode off from outside, and how that is called as an excuse.
+_EVENTS = {
+    KILLED: "kill",
+    RESET: "early reset",
+    EXCEPTION: "exception",
+    INTERRUPT: "exception",
+}
 
 
 def play_recording(
@@ -310,6 +317,12 @@ class _Playing:
 
     def _cut_off(self, episode: EpisodeInputs) -> None:
         """Let happen what an episode was cut off by."""
+        if episode.cut in _EVENTS:
+            self._note(
+                episode,
+                _EVENTS[episode.cut],
+                "it was cut off from outside: after which step is believed",
+            )
         if episode.cut not in (EXCEPTION, INTERRUPT):
             return
         said = episode.exception or {}
