@@ -20,12 +20,11 @@ import numpy as np
 from trajectory_contents import TrajectoryContent, content_of
 
 import mjrec
-from mjrec.atomic_files import file_sha256
 from mjrec.formats.ffmpeg import ffmpeg_executable
 from mjrec.formats.trajectory import PARTS, TrajectoryReader, added_up, row_dtype
 from mjrec.formats.trajectory_file import open_trajectory
 from mjrec.formats.trajectory_hdf5 import write_hdf5
-from mjrec.formats.video_file import count_frames
+from mjrec.formats.video_file import content_facts
 from mjrec.formats.video_writer import VideoWriter
 
 # Where facts of an episode stand in each kind of file.
@@ -219,13 +218,10 @@ class ForgedRun:
 
     def _note(self, path: Path, said: Mapping[str, Any]) -> None:
         """Write the metadata of a video with the hashes of the file."""
-        _, decoded = count_frames(
-            path,
-            height=said["padded_height"],
-            width=said["padded_width"],
-            pixel_format="yuv420p",
-        )
-        hashes = {"file_sha256": file_sha256(path), "decoded_sha256": decoded}
+        size = {side: said[f"padded_{side}"] for side in ("height", "width")}
+        facts = content_facts(path, **size, pixel_format="yuv420p")
+        # How many frames there are was said.
+        hashes = {key: facts[key] for key in ("file_sha256", "decoded_sha256")}
         path.with_suffix(".meta.json").write_text(json.dumps({**said, **hashes}))
 
     # Edits of which episodes there are.

@@ -21,10 +21,10 @@ import gymnasium
 import numpy as np
 import pytest
 import yaml
-from forged_episodes import record_gymnasium
 from packed_runs import record_pendulum, the, unpacked
 from recordings import frames_of, manifest_of, metadata_of, videos_in
 
+import honest_runs
 import mjrec
 from mjrec.evidence.layout import STATISTICS_COLUMNS
 from mjrec.evidence.pack import pack_folder
@@ -300,7 +300,9 @@ def test_the_readme_leads_a_stranger(infix: str, bag: Path) -> None:
 def test_the_readme_says_what_environments_were_made_with(tmp_path: Path) -> None:
     """Which makes another environment of one with a name that everybody knows."""
     env = gymnasium.make("HalfCheetah-v5", forward_reward_weight=100.0)
-    directory = record_gymnasium(tmp_path / "run", env, episodes=1, steps=2)
+    directory = tmp_path / "run"
+    kept: dict[str, Any] = {"video_callable": False, "trajectory_callable": True}
+    honest_runs.play(mjrec.Monitor(env, directory, **kept), 1, most=2)
     folder = unpacked(mjrec.pack(directory, tmp_path / "a.zip"), tmp_path / "x")
     said = "- Environment: HalfCheetah-v5, made with forward_reward_weight=100.0\n"
     assert said in (folder / "data/README.md").read_text()
@@ -516,8 +518,6 @@ def test_videos_are_drawn_smaller_for_a_limit(tmp_path: Path) -> None:
     assert "smaller than 320x240" in (folder / "data/README.md").read_text()
     assert told[-1].frames_done == told[-1].frames > 0
     assert told[-1].videos_done == 2
-    verification = mjrec.verify(small, level="stats")
-    assert verification.passed, verification.failures
     assert "packed_smaller" not in metadata_of(directory, 0)
 
 

@@ -6,6 +6,7 @@ from __future__ import annotations
 import gzip
 import json
 import os
+import re
 import select
 import shutil
 import signal
@@ -97,7 +98,7 @@ def test_bag_that_names_files_outside_is_found(name: str, bag: Path) -> None:
     """None of them is opened."""
     with (bag / "manifest-sha512.txt").open("a") as file:
         file.write(f"{'0' * 128}  {name}\n")
-    assert "manifest-sha512.txt" in failures(bag)
+    assert re.search("leads out|absolute|backslash|bagit.txt", failures(bag))
 
 
 @pytest.mark.parametrize(
