@@ -34,6 +34,14 @@ from .recorder_again import monitor_again
 # Steps that an archive only claims are counted one by one.
 _MOST_BELIEVED_STEPS = 100_000_000
 _STEPS_BETWEEN_COUNTS = 1000
+# What cuts an episode off from outside, and the excuse that it is. A run that is closed
+# in the middle of its last episode is a usual one.
+_EVENTS = {
+    RESET: "early reset",
+    EXCEPTION: "exception",
+    INTERRUPT: "fault",
+    KILLED: "kill",
+}
 _MODES = {"e": "evaluation"}
 # What cuts an episode off from outside, and how that is called as an excuse.
 _EVENTS = {
@@ -317,11 +325,17 @@ class _Playing:
 
     def _cut_off(self, episode: EpisodeInputs) -> None:
         """Let happen what an episode was cut off by."""
+<<<<<<< HEAD
         if episode.cut in _EVENTS:
             self._note(
                 episode,
                 _EVENTS[episode.cut],
                 "it was cut off from outside: after which step is believed",
+=======
+        if (excuse := _EVENTS.get(episode.cut or "")) is not None:
+            self._note(
+                episode, excuse, "it was cut off: that it ended there is believed"
+>>>>>>> evcmp
             )
         if episode.cut not in (EXCEPTION, INTERRUPT):
             return
