@@ -43,13 +43,6 @@ _EVENTS = {
     KILLED: "kill",
 }
 _MODES = {"e": "evaluation"}
-# What cuts an episode off from outside, and how that is called as an excuse.
-_EVENTS = {
-    KILLED: "kill",
-    RESET: "early reset",
-    EXCEPTION: "exception",
-    INTERRUPT: "exception",
-}
 
 
 def play_recording(
@@ -325,17 +318,9 @@ class _Playing:
 
     def _cut_off(self, episode: EpisodeInputs) -> None:
         """Let happen what an episode was cut off by."""
-<<<<<<< HEAD
-        if episode.cut in _EVENTS:
-            self._note(
-                episode,
-                _EVENTS[episode.cut],
-                "it was cut off from outside: after which step is believed",
-=======
         if (excuse := _EVENTS.get(episode.cut or "")) is not None:
             self._note(
                 episode, excuse, "it was cut off: that it ended there is believed"
->>>>>>> evcmp
             )
         if episode.cut not in (EXCEPTION, INTERRUPT):
             return
