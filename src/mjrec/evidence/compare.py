@@ -87,6 +87,9 @@ _TOPICS: Final = {
 }
 _OF_MANIFEST: Final = (Topic.SELECTION, Topic.IDENTITY)
 _NO_DIFFERENCES: Final = (Aspect.CLAIM, Aspect.STATEMENT)
+_NOTHING: Final = "nothing made it"
+# Excuses of what was not played.
+_UNPLAYED: Final = ("environment", "wrappers", "actions not kept")
 _MOST_FAILURES: Final = 100
 _MODEL: Final = re.compile(r"openaigym\.model\.[0-9a-f]{16}")
 # Four numbers; the last is the version. A model of 1 GiB is beyond any.
@@ -218,7 +221,7 @@ class Comparison:
             file=file,
             aspect=Aspect.MODEL if kind == "model" else Aspect.EXACT,
             given="this file" if is_given else "no such file",
-            made="one" if is_made else "nothing made it",
+            made="one" if is_made else _NOTHING,
         )
 
     def _compare_file(self, file: str) -> Iterator[Same | Difference | Finding]:
@@ -333,11 +336,15 @@ class Comparison:
             return
         with np.load(path, allow_pickle=False) as rewards:
             known = frozenset(rewards.files)
+            unplayed = {n.item for n in self._notes if n.excuse in _UNPLAYED}
             for given in sorted((self._given / RECORDINGS).glob("*.h5")):
-                name = f"{infix_of(given.name)}.{episode_of(given.name)}"
+                infix, number = infix_of(given.name), episode_of(given.name)
+                file, name = f"{RECORDINGS}/{given.name}", f"{infix}.{number}"
+                items = {f"recording {infix}", f"episode {number} of {infix}"}
                 if name not in known:
+                    if items.isdisjoint(unplayed):
+                        yield _not_made(file)
                     continue
-                file = f"{RECORDINGS}/{given.name}"
                 try:
                     yield from compare_rewards(given, rewards[name], file)
                 except Error as error:
@@ -536,6 +543,11 @@ def _compare_models(given: Path, made: Path, file: str) -> _Found:
 def _damaged(file: str, error: Error) -> Difference:
     topic = _TOPICS.get(_kind(file), Topic.FILES)
     return Difference(topic=topic, file=file, given=str(error), made="a whole file")
+
+
+def _not_made(file: str) -> Difference:
+    topic = _TOPICS.get(_kind(file), Topic.FILES)
+    return Difference(topic=topic, file=file, given="this file", made=_NOTHING)
 
 
 def _recompiled(file: str) -> Difference:

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from ..environments.recreate import NotRecreated, Recreated, checked_options, recreate
 from ..environments.stand_ins import RecordedSteps
 from ..formats.journal import KILLED
-from ..recorder.ending_reasons import EXCEPTION, INTERRUPT
+from ..recorder.ending_reasons import EXCEPTION, INTERRUPT, RESET
 from .evaluation_choice import choose_for_evaluation
 from .inputs import EpisodeInputs, RecordingInputs
 from .notes import Notes, read_notes
@@ -34,6 +34,14 @@ from .recorder_again import monitor_again
 # Steps that an archive only claims are counted one by one.
 _MOST_BELIEVED_STEPS = 100_000_000
 _STEPS_BETWEEN_COUNTS = 1000
+# What cuts an episode off from outside, and the excuse that it is. A run that is closed
+# in the middle of its last episode is a usual one.
+_EVENTS = {
+    RESET: "early reset",
+    EXCEPTION: "exception",
+    INTERRUPT: "fault",
+    KILLED: "kill",
+}
 _MODES = {"e": "evaluation"}
 
 
@@ -310,6 +318,10 @@ class _Playing:
 
     def _cut_off(self, episode: EpisodeInputs) -> None:
         """Let happen what an episode was cut off by."""
+        if (excuse := _EVENTS.get(episode.cut or "")) is not None:
+            self._note(
+                episode, excuse, "it was cut off: that it ended there is believed"
+            )
         if episode.cut not in (EXCEPTION, INTERRUPT):
             return
         said = episode.exception or {}
