@@ -61,8 +61,8 @@ class VectorMonitor(MonitorBase, gymnasium.vector.VectorWrapper):
     All others (`AsyncVectorEnv`, environments that are vectorised by themselves) are
     recorded by what goes into them and comes out: pictures are drawn live, through
     `render()`, and trajectories hold no states. Where such an environment resets
-    itself in the step that ends an episode (SAME_STEP), nobody outside sees the last
-    frame: the metadata says `final_frame: missing`. With a Monitor inside the
+    itself in the step that ends an episode (SAME_STEP), its last frame is not seen from
+    outside: the metadata says `final_frame: missing`. With a Monitor inside the
     environment functions, instead of this one, all is as for one environment.
 
     A reset in mid-episode is allowed unless `allow_early_reset=False`: sub-environments

@@ -82,7 +82,7 @@ def open_directory(
         resume: add to the recordings that are there. Episodes are numbered on from
             the highest number of the monitors with this `uid` that closed or died
             (without `uid`: of all of them); monitors that are still open do not count.
-            `JOIN` looks at nobody else's files, however many there are: the caller
+            `JOIN` looks at no other monitor's files, however many there are: the caller
             knows that they are of the same environment, and episodes are numbered
             from 0.
         uid: stands in the file names instead of the process id.
@@ -128,7 +128,7 @@ def made_directory(path: Path) -> Iterator[None]:
         yield
     except BaseException:
         for made in missing:
-            # Somebody else's files may have come into it meanwhile.
+            # Other files may have come into it meanwhile.
             with contextlib.suppress(OSError):
                 made.rmdir()
         raise
@@ -202,7 +202,7 @@ def _claim(
             directory, so that names are the same whichever process records.
         run: what is known of the run.
         looks: also for stray files with it. Without that, a manifest, a journal or a
-            lock say that it was somebody's: each monitor leaves one of them.
+            lock say that it was a monitor's: each monitor leaves one of them.
     """
     content = json_text.dumps({"pid": os.getpid(), "since": time.time(), "run": run})
     of_directory = itertools.count()
