@@ -176,7 +176,7 @@ class RecorderOptions:
                 )
         if len(set(map(id, self.all_trackers))) < len(self.all_trackers):
             raise InvalidArgument(
-                f"A tracker is there twice in {given!r}, and would get everything twice."
+                f"A tracker is there twice in {given!r}, and would get all twice."
             )
 
     def _check_policy_file(self) -> None:
