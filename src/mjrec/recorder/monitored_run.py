@@ -25,12 +25,12 @@ from .opening import OpenDirectory
 from .options import LIVE, WARN, RecorderOptions
 from .recorded_environment import RecordedEnvironment, check_refusal
 from .stats_recorder import StatsRecorder
+from .step_arrays import RowLayout
 from .tracking import Trackers
 from .video_recorder import VideoRecorder
 
 if TYPE_CHECKING:
     from ..simulation.capture import EpisodeStart
-    from .states import RowLayout
 
 logger = logging.getLogger(__name__)
 

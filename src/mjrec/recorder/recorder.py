@@ -21,8 +21,8 @@ from ..formats.monitor_directory import (
     stats_prefix,
     video_prefix,
 )
-from ..formats.render_failures import note_failure, reason_of
 from ..formats.spans import FINISHED, recordings_in_flight
+from ..formats.video_metadata import note_failure, reason_of
 from ..provenance import versions
 from ..results.manifest_writing import write_manifest_and_stats
 from .clips import Clips
