@@ -65,12 +65,9 @@ class Clips:
         """Begin a video, if it is its time."""
         taken = self._run.stats.total_steps
         if self._clip is None and self._trigger is not None:
-            try:
+            is_chosen: Any = False
+            with self._run.tolerating("video", Exception):
                 is_chosen = self._trigger(taken)
-            except Exception as error:
-                if not self._run.tolerates("video", error):
-                    raise
-                return
             if is_chosen:
                 self._start(taken)
 

@@ -3,9 +3,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -195,6 +196,17 @@ class MonitoredRun:
             of = "" if episode_id is None else f" of episode {episode_id}"
             logger.warning("Not recorded whole: %s%s. %s", what, of, error)
         return is_warned
+
+    @contextlib.contextmanager
+    def tolerating(
+        self, what: What, *kinds: type[Exception], of_episode: bool = True
+    ) -> Iterator[None]:
+        """Go on after an error of these kinds, where it is tolerated."""
+        try:
+            yield
+        except kinds as error:
+            if not self.tolerates(what, error, of_episode=of_episode):
+                raise
 
     def note_fault(self, what: What, reason: str, *, episode_id: int | None) -> bool:
         """Write a fault down; return whether it is a new one."""

@@ -11,7 +11,7 @@ import weakref
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from ..errors import DirectoryNotWritable, Error, FileNotWritten
 from ..formats.journal import JournalEntry
@@ -41,9 +41,6 @@ from .states import DeferredVideo
 from .stats_recorder import StatsRecorder, reward_to_float
 from .tracking import FinishedEpisode
 from .video_recorder import VideoRecorder
-
-if TYPE_CHECKING:
-    from ..simulation.capture import Capture
 
 logger = logging.getLogger(__name__)
 
@@ -248,11 +245,8 @@ class Recorder:
         if self._clips is None:
             self.fast = recording.fast_path()
         if self._options.write_upon_reset:
-            try:
+            with self.run.tolerating("statistics", FileNotWritten, of_episode=False):
                 self._write_results()
-            except FileNotWritten as error:
-                if not self.run.tolerates("statistics", error, of_episode=False):
-                    raise
 
     def note_event(self, kind: str, facts: Any) -> None:
         """Write an event of an evaluation into the journal; see `formats.journal`.
@@ -374,11 +368,8 @@ class Recorder:
             return
         with self._leaving_if_interrupted():
             self._end_recordings()
-        try:
+        with self.run.tolerating("trajectory", Error, of_episode=False):
             self.run.finisher.wait(on_progress)
-        except Error as error:
-            if not self.run.tolerates("trajectory", error, of_episode=False):
-                raise
 
     def close(self) -> None:
         """End the episode, write statistics and manifest, and let go. Idempotent.
@@ -522,8 +513,9 @@ class Recorder:
                         recording.hand_on()
                     else:
                         kept.hold(recording)
-            with failures:
-                self._settle(None if kept is None else kept.settle)
+            if kept is not None:
+                with failures, self._tolerating_lost():
+                    kept.settle()
         except BaseException:
             recording.leave()
             # It may go on to the last row there, and the next one is another.
@@ -580,32 +572,20 @@ class Recorder:
             self._take_last_frame()
         with failures:
             self._cut_episode(CLOSE)
-        with failures:
-            self._settle(None if self._kept is None else self._kept.decide)
+        if self._kept is not None:
+            with failures, self._tolerating_lost():
+                self._kept.decide()
         for states in self._states:
             # A trajectory without its model is worth nothing, and what stores it may
             # end with the process.
-            with failures:
-                self._finish_models(states)
-        with failures:
-            self._settle(self.run.close_logs)
+            with failures, self.run.tolerating("model", Error, of_episode=False):
+                states.finish()
+        with failures, self._tolerating_lost():
+            self.run.close_logs()
         failures.raise_first()
 
-    def _finish_models(self, states: Capture) -> None:
-        try:
-            states.finish()
-        except Error as error:
-            if not self.run.tolerates("model", error, of_episode=False):
-                raise
-
-    def _settle(self, do: Callable[[], None] | None) -> None:
-        """Do something about recordings that are not decided."""
-        try:
-            if do is not None:
-                do()
-        except (DirectoryNotWritable, FileNotWritten) as error:
-            if not self.run.tolerates("trajectory", error):
-                raise
+    def _tolerating_lost(self) -> AbstractContextManager[None]:
+        return self.run.tolerating("trajectory", DirectoryNotWritable, FileNotWritten)
 
     @contextlib.contextmanager
     def _leaving_if_interrupted(self) -> Iterator[None]:

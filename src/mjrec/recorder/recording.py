@@ -3,11 +3,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from ..errors import FileNotWritten
 from ..formats.monitor_directory import trajectory_prefix, video_prefix
 from .fast_path import FastPath, counting
 from .live_videos import LiveVideos, live_videos
@@ -124,7 +126,9 @@ class EpisodeRecording:
             self.live.discard()
             self.live = None
         if self.states is not None:
-            self.states.drop()
+            # On a full disk it is said later.
+            with contextlib.suppress(FileNotWritten):
+                self.states.drop()
             self.states = None
 
     def leave(self) -> None:

@@ -298,7 +298,9 @@ class StateRecorder:
         """Give up the row of the reset; the first step will write it anew."""
         self._fast = None
         if self._span is not None:
-            self._span.drop()
+            # On a full disk it is said later.
+            with contextlib.suppress(FileNotWritten):
+                self._span.drop()
             self._span = None
 
     def _try(self, take: Callable[[], None]) -> None:
