@@ -182,13 +182,14 @@ class Wandering(Executor):
     def submit(
         self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any
     ) -> Future[Any]:
-        [message] = json.loads(json.dumps(args))
+        place, job = json.loads(json.dumps(args))
         if self.worker is None:
-            self.worker = EvaluationWorker(message["work"]["settings"])
+            work = json.loads(Path(place, "work.json").read_bytes())
+            self.worker = EvaluationWorker(work["settings"])
         future: Future[Any] = Future()
         with pytest.MonkeyPatch.context() as patch:
-            patch.setenv("XDG_STATE_HOME", str(self.homes / message["key"]))
-            future.set_result({"value": self.worker(message["arguments"])})
+            patch.setenv("XDG_STATE_HOME", str(self.homes / job["key"]))
+            future.set_result({"value": self.worker(job["arguments"])})
         return future
 
 
@@ -586,6 +587,9 @@ def test_nothing_is_run_when_all_is_done(reference: Path, tmp_path: Path) -> Non
         ({"episodes": 1}, "episodes was 2 and is now 1"),
         ({"num_seeds": 1}, r"seeds was \(0, 1\) and is now \(0,\)"),
         ({"keep": "all"}, "keep was 'none'"),
+        # Though they are the defaults.
+        ({"keep": "best,median,worst"}, "keep was 'none' and is now 'best,median"),
+        ({"episodes": 10, "keep": None, "protocol": "suite"}, "episodes was 2"),
         ({"protocol": "suite"}, "protocol"),
         ({"env_kwargs": {"reset_noise_scale": 0.1}}, "env_kwargs"),
     ],
@@ -724,6 +728,9 @@ def test_what_cannot_be_drawn_has_results_without_videos(
     assert not evaluation.failed
     assert len(evaluation.videos) == is_drawn
     assert not evaluation.pending
+    # Nor is any announced.
+    assert len(evaluation.selection["CartPole-v1"]) == is_drawn
+    assert len(read_results(tmp_path / "e").columns["CartPole-v1"].videos) == is_drawn
     said = [r.message for r in caplog.records if "no videos, only results" in r.message]
     assert len(said) == (not is_drawn)
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import signal
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing
 from pathlib import Path
@@ -31,7 +30,6 @@ from mjrec.evaluation.worker import EvaluationWorker
 from mjrec.formats.trajectory_file import open_trajectory
 from mjrec.recorder.options import RecorderOptions
 from mjrec.sessions import Session, record_session
-from mjrec.signals import Terminated
 
 PENDULUM = "InvertedPendulum-v5"
 ID = "MjrecEvaluated-v0"
@@ -74,7 +72,7 @@ def run_chunk(
     settings: dict[str, Any] = {"directory": str(directory)}
     if policy is not None:
         plan = dataclasses.replace(plan, policy="mine", is_object=True)
-        settings["policy"] = str(directory / "policy")
+        settings["payload"] = str(directory / "policy")
         directory.mkdir(exist_ok=True)
         (directory / "policy").write_bytes(cloudpickle.dumps(policy))
     task = plan.tasks[0].name
@@ -180,7 +178,7 @@ def raising() -> Any:
 
 
 def told_to_end() -> Any:
-    raise Terminated(signal.SIGTERM)
+    raise KeyboardInterrupt
 
 
 def leaving() -> Any:
@@ -227,7 +225,7 @@ def test_a_random_stream_goes_on_where_it_was(
     before = Stumbling(wrong)
     whole = run_chunk(tmp_path / "whole", plan, policy=before)
     stopped = Stumbling({**wrong, 2: told_to_end})
-    with pytest.raises(Terminated):
+    with pytest.raises(KeyboardInterrupt):
         run_chunk(tmp_path / "cut", plan, policy=stopped)
     results = run_chunk(tmp_path / "cut", plan, policy=before)
     folders = [tmp_path / name / "task" / "chunk" for name in ("whole", "cut")]

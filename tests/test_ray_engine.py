@@ -47,16 +47,16 @@ def test_the_callers_ray_is_left_as_it_was(tmp_path: Path) -> None:
 def test_a_killed_worker_of_ray_counts_as_a_death(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """Its child closes what it is at, and the job is begun again."""
+    """Its child ends with it, and the job is begun again."""
     with own_ray(cpus=1):
-        work = odd_work(shared=tmp_path / "shared", closed=str(tmp_path / "closed"))
+        work = odd_work(shared=tmp_path / "shared", left=str(tmp_path / "left"))
         with Run(RayEngine(1), work) as run:
             submit(run, "a", do="hold", begun=str(tmp_path / "begun"))
             pid = wait_for(tmp_path / "begun", run)
             (tmp_path / "begun").unlink()
             os.kill(parent_of(pid), signal.SIGKILL)
             assert wait_for(tmp_path / "begun", run) != pid
-            wait_until(lambda: str(pid) in lines(tmp_path / "closed"))
+            wait_until(lambda: str(pid) in lines(tmp_path / "left"))
     assert "job a, which is begun again" in caplog.text
 
 
@@ -123,7 +123,7 @@ except GLError as error:
 HOLDING = f"""{BEGIN}
 from mjrec.signals import exiting_on_signals
 with exiting_on_signals():
-    work = odd_work(shared=place / "shared", closed=str(place / "closed"))
+    work = odd_work(shared=place / "shared", left=str(place / "left"))
     run = Run(RayEngine(1), work)
     submit(run, "a", do="hold", begun=str(place / "begun"))
     with run:
@@ -136,7 +136,7 @@ with exiting_on_signals():
     ("signum", "status"), [(signal.SIGTERM, 128 + 15), (signal.SIGKILL, -9)]
 )
 def test_a_driver_that_is_ended(tmp_path: Path, signum: int, status: int) -> None:
-    """Says so by its exit status, and leaves no process; the job closes its files."""
+    """Says so by its exit status, and leaves no process."""
     environ = {"PYTHONPATH": str(Path(__file__).parent), MARK: str(tmp_path)}
     with subprocess.Popen(
         [sys.executable, "-c", HOLDING, str(tmp_path)], env={**os.environ, **environ}
@@ -145,7 +145,7 @@ def test_a_driver_that_is_ended(tmp_path: Path, signum: int, status: int) -> Non
         driver.send_signal(signum)
     assert driver.returncode == status
     wait_until(lambda: not ray_processes(f"{MARK}={tmp_path}"), seconds=30)
-    assert lines(tmp_path / "closed") == lines(tmp_path / "begun")
+    assert lines(tmp_path / "left") == lines(tmp_path / "begun")
 
 
 def test_ray_is_optional() -> None:

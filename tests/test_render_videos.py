@@ -61,16 +61,18 @@ class Here(Executor):
     def submit(
         self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any
     ) -> Future[Any]:
-        [message] = json.loads(json.dumps(args))
-        if message["work"] not in self.works:
-            self.works.append(message["work"])
-        self.jobs.append(message)
-        return self._thread.submit(self._do, message)
+        place, job = json.loads(json.dumps(args))
+        work = json.loads(Path(place, "work.json").read_bytes())
+        if work not in self.works:
+            self.works.append(work)
+        Path(place, "begun").touch()
+        self.jobs.append(job)
+        return self._thread.submit(self._do, job)
 
-    def _do(self, message: Mapping[str, Any]) -> Mapping[str, Any]:
-        if any(name in message["key"] for name in self.dies):
-            return {"died": "was killed by SIGKILL."}
-        value = self._worker(message["arguments"])
+    def _do(self, job: Mapping[str, Any]) -> Mapping[str, Any]:
+        if any(name in job["key"] for name in self.dies):
+            return {"died": "was killed by SIGKILL.", "begun": True}
+        value = self._worker(job["arguments"])
         return {"value": json.loads(json.dumps(value))}
 
 
@@ -337,7 +339,6 @@ def test_workers_get_what_rendering_needs(
     [work] = engine.works
     assert work["environ"] == {"LP_NUM_THREADS": "1", "MJREC_TRUST_MODELS": "1"}
     assert work["settings"] == {"models": [digest]}
-    assert Path(work["place"]).is_relative_to(tmp_path)
     assert engine.jobs[0]["arguments"]["directory"] == str(tmp_path)
 
 

@@ -15,7 +15,7 @@ import pytest
 from slurm_cluster import slurm_cluster
 from waiting import wait_until
 
-from mjrec.engines.jobs import WORK_FOLDER, Job, Run, Work
+from mjrec.engines.jobs import WORK_FOLDER, Run, Work
 from mjrec.engines.slurm import SlurmEngine
 from mjrec.errors import Error
 
@@ -54,14 +54,13 @@ def engine(workers: int = 1, **options: Any) -> SlurmEngine:
 def work(place: Path) -> Work:
     return Work(
         entry="odd_jobs:make",
-        settings={"closed": str(place / "closed")},
+        settings={"left": str(place / "left")},
         shared_directory=place / "shared",
     )
 
 
-def hold(place: Path) -> Job:
-    arguments = {"do": "hold", "begun": str(place / "begun")}
-    return Job(key="held", arguments=arguments)
+def hold(run: Run, place: Path) -> None:
+    run.submit("held", do="hold", begun=str(place / "begun"))
 
 
 def wait_for(path: Path, run: Run) -> str:
@@ -85,17 +84,17 @@ def test_jobs_are_done_in_slurm_jobs(tmp_path: Path) -> None:
     """Which are submitted as one array, and have completed at the end."""
     with Run(engine(3), work(tmp_path)) as run:
         for number in range(50):
-            run.submit(Job(key=str(number), arguments={"do": "where"}))
+            run.submit(str(number), do="where")
         found = [outcome for outcome in run.results() if outcome is not None]
-        [path] = (tmp_path / "shared").rglob("submitted")
-        submitted = set(lines(path))
+        logs = (tmp_path / "shared").rglob("*_0_log.out")
+        submitted = {path.name.removesuffix("_0_log.out") for path in logs}
     assert len(found) == 50
     assert not [outcome.failure for outcome in found if outcome.failure]
     [array] = {number.partition("_")[0] for number in submitted}
     assert submitted == {f"{array}_{n}" for n in range(12)}
     states = asked("squeue", "--noheader", "--states=all", "-j", array, "--format=%T")
     assert set(states.split()) == {"COMPLETED"}
-    assert not (tmp_path / "shared").exists()
+    assert not list((tmp_path / "shared").iterdir())
 
 
 @pytest.mark.parametrize("how", ["preempted", "cancelled", "killed"])
@@ -104,7 +103,7 @@ def test_a_slurm_job_that_is_ended(
 ) -> None:
     """Files are closed where there is time; what it was at is done in another."""
     with Run(engine(partition="low"), work(tmp_path)) as run:
-        run.submit(hold(tmp_path))
+        hold(run, tmp_path)
         wait_for(tmp_path / "begun", run)
         first = slurm_job()
         (tmp_path / "begun").unlink()
@@ -118,7 +117,7 @@ def test_a_slurm_job_that_is_ended(
             lambda: wait_for(tmp_path / "begun", run) and slurm_job() not in (first, "")
         )
     assert "No Slurm job" not in caplog.text
-    assert lines(tmp_path / "closed")
+    assert lines(tmp_path / "left")
 
 
 def test_what_the_drivers_slurm_job_was_given_is_not_passed_on(
@@ -129,7 +128,7 @@ def test_what_the_drivers_slurm_job_was_given_is_not_passed_on(
     monkeypatch.setenv("SLURM_MEM_PER_GPU", "1")
     made = engine(setup=[f"env > {tmp_path / 'environ'}"])
     with Run(made, work(tmp_path)) as run:
-        run.submit(Job(key="a", arguments={"do": "echo"}))
+        run.submit("a", do="echo")
         assert next(run.results()) is not None
     given = dict(line.partition("=")[::2] for line in lines(tmp_path / "environ"))
     assert given["SLURM_CONF"] == os.environ["SLURM_CONF"]
@@ -141,7 +140,7 @@ def test_what_the_drivers_slurm_job_was_given_is_not_passed_on(
 def test_what_slurm_refuses(tmp_path: Path) -> None:
     """The error has its words."""
     with Run(engine(partition="none"), work(tmp_path)) as run:
-        run.submit(hold(tmp_path))
+        hold(run, tmp_path)
         with pytest.raises(Error, match=r"No job could be submitted: .*partition"):
             next(run.results())
 
@@ -153,7 +152,7 @@ import test_slurm_cluster
 from mjrec.engines.jobs import Run
 place = Path(sys.argv[1])
 run = Run(test_slurm_cluster.engine(2), test_slurm_cluster.work(place))
-run.submit(test_slurm_cluster.hold(place))
+test_slurm_cluster.hold(run, place)
 next(run.results())
 """
 
@@ -169,9 +168,9 @@ def test_the_next_driver_ends_what_a_killed_one_has_left(tmp_path: Path) -> None
         driver.kill()
     [pid] = lines(tmp_path / "begun")
     with Run(engine(), work(tmp_path)) as run:
-        run.submit(Job(key="a", arguments={"do": "echo"}))
+        run.submit("a", do="echo")
         assert next(run.results()) is not None
-        until(lambda: pid in lines(tmp_path / "closed"))
+        until(lambda: pid in lines(tmp_path / "left"))
     assert not (tmp_path / "shared" / WORK_FOLDER).exists()
 
 

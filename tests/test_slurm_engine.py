@@ -18,14 +18,22 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from engine_runs import lines, odd_work, outcomes, submit, values, wait_for
+from engine_runs import (
+    lines,
+    odd_work,
+    outcomes,
+    submit,
+    values,
+    wait_for,
+    wait_for_end,
+)
 from evaluated_files import recorded_in
 from marked_processes import MARK, marked
 from waiting import wait_until
 
 import mjrec
 from mjrec.engines.jobs import WORK_FOLDER, Run
-from mjrec.engines.slurm import DEFAULT_WORKERS, SlurmEngine
+from mjrec.engines.slurm import DEFAULT_WORKERS, SlurmEngine, slurm_options
 from mjrec.errors import Error, InvalidArgument, MissingDependency
 from mjrec.machine import usable_cpus
 from test_evaluating import contents
@@ -54,8 +62,8 @@ def begun(place: Path, workers: int = 1, **settings: Any) -> Run:
 
 def submitted(place: Path) -> list[str]:
     """Return the numbers of the Slurm jobs of the only run."""
-    [path] = (place / "shared" / WORK_FOLDER).glob("*/slurm/submitted")
-    return lines(path)
+    logs = (place / "shared" / WORK_FOLDER).glob("*/slurm/logs/*_0_log.err")
+    return [path.name.removesuffix("_0_log.err") for path in logs]
 
 
 @pytest.mark.thorough
@@ -81,10 +89,13 @@ def test_jobs_given_at_once_are_one_array(tmp_path: Path) -> None:
 
 
 @pytest.mark.thorough
-@pytest.mark.parametrize("signum", [signal.SIGTERM, signal.SIGKILL])
+@pytest.mark.parametrize("signum", [signal.SIGTERM, signal.SIGKILL, signal.SIGUSR2])
 def test_a_slurm_job_that_is_ended(signum: int, tmp_path: Path) -> None:
-    """What it was at is done in another, after its files were closed."""
-    with begun(tmp_path, closed=str(tmp_path / "closed")) as run:
+    """What it was at is done in another, or in itself, back in the queue.
+
+    By SIGUSR2, as before its time limit, it is put there.
+    """
+    with begun(tmp_path, left=str(tmp_path / "left")) as run:
         submit(run, "a", do="hold", begun=str(tmp_path / "begun"))
         first = wait_for(tmp_path / "begun", run)
         (tmp_path / "begun").unlink()
@@ -92,24 +103,7 @@ def test_a_slurm_job_that_is_ended(signum: int, tmp_path: Path) -> None:
         [process] = Path("/proc", job, "task", job, "children").read_text().split()
         os.kill(int(process), signum)
         assert wait_for(tmp_path / "begun", run) != first
-        wait_until(lambda: str(first) in lines(tmp_path / "closed"))
-
-
-@pytest.mark.thorough
-def test_a_slurm_job_at_its_time_limit_goes_on(tmp_path: Path) -> None:
-    """It is put back into the queue, and does what it has not done."""
-    with begun(tmp_path) as run:
-        submit(run, *"abcde", do="echo")
-        submit(run, "f", do="hold", begun=str(tmp_path / "begun"))
-        first = wait_for(tmp_path / "begun", run)
-        (tmp_path / "begun").unlink()
-        for job in submitted(tmp_path):
-            # Some have done all of theirs.
-            for path in Path("/proc").glob(f"{job}/task/{job}/children"):
-                for pid in path.read_text().split():
-                    os.kill(int(pid), signal.SIGUSR2)
-        assert wait_for(tmp_path / "begun", run) != first
-        assert run.unfinished >= 1
+        wait_until(lambda: str(first) in lines(tmp_path / "left"))
 
 
 def test_slurm_jobs_that_end_as_soon_as_they_begin(tmp_path: Path) -> None:
@@ -128,12 +122,12 @@ from engine_runs import odd_work, submit
 from mjrec.engines.jobs import Run
 from mjrec.engines.slurm import SlurmEngine
 place = Path(sys.argv[1])
-work = odd_work(shared=place / "shared", closed=str(place / "closed"))
-run = Run(SlurmEngine(2, cluster="local"), work)
-submit(run, "a", do="hold", begun=str(place / "begun"))
-submit(run, *map(str, range(20)), do="echo")
-for outcome in run.results(patience_s=0.05):
-    print(outcome.key if outcome else None, flush=True)
+work = odd_work(shared=place / "shared", left=str(place / "left"))
+with Run(SlurmEngine(2, cluster="local"), work) as run:
+    submit(run, "a", do="hold", begun=str(place / "begun"))
+    submit(run, *map(str, range(20)), do="echo")
+    for outcome in run.results(patience_s=0.05):
+        print(outcome.key if outcome else None, flush=True)
 """
 
 
@@ -156,15 +150,12 @@ def test_ctrl_c_in_a_terminal(tmp_path: Path) -> None:
     with driver(tmp_path) as process:
         os.killpg(process.pid, signal.SIGINT)
         process.communicate(timeout=60)
-    [pid] = lines(tmp_path / "begun")
-    wait_until(lambda: pid in lines(tmp_path / "closed"))
-    wait_until(lambda: not (tmp_path / "shared").exists())
+    wait_for_end(int(*lines(tmp_path / "begun")))
+    wait_until(lambda: not list((tmp_path / "shared").iterdir()))
 
 
 @pytest.mark.thorough
-def test_the_next_driver_ends_what_a_killed_one_has_left(
-    tmp_path: Path, mark: str
-) -> None:
+def test_the_next_driver_ends_what_a_killed_one_has_left(tmp_path: Path) -> None:
     """Whose Slurm jobs have gone on until then; a living one's do."""
     with driver(tmp_path) as process:
         process.kill()
@@ -172,7 +163,7 @@ def test_the_next_driver_ends_what_a_killed_one_has_left(
     with begun(tmp_path) as living:
         submit(living, "a", do="echo")
         assert len(values(living)) == 1
-        wait_until(lambda: pid in lines(tmp_path / "closed"))
+        wait_for_end(int(pid))
         with begun(tmp_path) as run:
             submit(run, "b", do="echo")
             assert len(values(run)) == 1
@@ -233,34 +224,44 @@ def test_options_as_texts() -> None:
         "sbatch.exclusive": "",
         "sbatch.nice": "100",
     }
-    asked = slurm_parameters(texts, workers=8, gpus=0.25)
-    assert asked["partition"] == "gpu"
-    assert asked["time"] == 30
-    assert asked["mem"] == "10240M"
-    assert asked["gpus_per_node"] == 1
-    assert asked["cpus_per_task"] == 4
-    assert asked["array_parallelism"] == 2
-    assert asked["setup"] == ["module load cuda"]
-    assert asked["additional_parameters"] == {"exclusive": True, "nice": "100"}
-    asked = slurm_parameters({"sbatch.gres": "gpu:a100:1"}, workers=8, gpus=1)
-    assert "gpus_per_node" not in asked
-    assert asked["additional_parameters"] == {"gres": "gpu:a100:1"}
+    script = sbatch_script(texts, workers=8, gpus=0.25)
+    for line in (
+        "--partition=gpu",
+        "--time=30",
+        "--mem=10GB",
+        "--gpus-per-node=1",
+        "--cpus-per-task=4",
+        "--array=0-2%2",
+        "--exclusive",
+        "--nice=100",
+    ):
+        assert f"#SBATCH {line}\n" in script
+    assert "\nmodule load cuda\n" in script
+    script = sbatch_script({"sbatch.gres": "gpu:a100:1"}, workers=8, gpus=1)
+    assert "#SBATCH --gres=gpu:a100:1\n" in script
+    assert "gpus-per-node" not in script
 
 
-def slurm_parameters(texts: dict[str, str], **options: Any) -> dict[str, Any]:
-    """Return what submitit is asked for, on a machine that has Slurm's commands."""
+def sbatch_script(texts: dict[str, str], **options: Any) -> str:
+    """Return what submitit would give to `sbatch`, for an array of three."""
+    import submitit
+
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("shutil.which", lambda name: f"/usr/bin/{name}")
-        made = SlurmEngine.from_texts(texts, **options)
-    return dict(made._cluster._parameters)
+        made = SlurmEngine(**options, **slurm_options(texts))
+        executor = submitit.AutoExecutor("logs", cluster="slurm")
+    executor.update_parameters(**made._parameters)
+    slurm = executor._executor
+    slurm.parameters["map_count"] = 3
+    return str(slurm._make_submission_file_text("command", "uid"))
 
 
 def test_texts_that_cannot_be() -> None:
     """A slip is told with what there is."""
     with pytest.raises(mjrec.UnknownName, match=r"'partitoin'.*partition.*sbatch.NAME"):
-        SlurmEngine.from_texts({"partitoin": "gpu"})
+        slurm_options({"partitoin": "gpu"})
     with pytest.raises(InvalidArgument, match="time_min of Slurm's is a number"):
-        SlurmEngine.from_texts({"time_min": "an hour"})
+        slurm_options({"time_min": "an hour"})
 
 
 def test_import_is_inert() -> None:

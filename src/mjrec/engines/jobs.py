@@ -17,6 +17,7 @@ import json
 import logging
 import os
 import queue
+import re
 import shutil
 import sys
 from collections.abc import Iterator, Mapping
@@ -36,6 +37,9 @@ logger = logging.getLogger(__name__)
 WORK_FOLDER = ".mjrec.work"
 
 TRIES = 3
+
+_OF_MUJOCO = "simulation.warnings"
+_NUMBERS = re.compile(r"[\d.]+")
 
 # Not by `tempfile`, which loads `random`: a script's neighbour may be called so.
 _TEMPORARY = Path(os.environ.get("TMPDIR") or "/tmp")
@@ -264,8 +268,10 @@ class Run:
     def _log(self, lines: Any) -> None:
         """Log here what children logged, each text once in a run."""
         for name, level, text in lines:
-            if (name, level, text) not in self._told:
-                self._told.add((name, level, text))
+            # What MuJoCo says of a moment or a joint is no other warning at the next.
+            kind = _NUMBERS.sub("", text) if name.endswith(_OF_MUJOCO) else text
+            if (name, level, kind) not in self._told:
+                self._told.add((name, level, kind))
                 logging.getLogger(name).log(level, "%s", text)
 
 
@@ -277,10 +283,9 @@ def _new_place(shared: Path | None) -> Path:
             place = _TEMPORARY / f"mjrec-work-{name}"
         else:
             place = shared.absolute() / WORK_FOLDER / name
-            place.parent.mkdir(parents=True, exist_ok=True)
             _end_earlier_runs(place.parent)
         # Only its owner says what is run.
-        place.mkdir(mode=0o700)
+        place.mkdir(mode=0o700, parents=True)
     except OSError as error:
         raise DirectoryNotWritable(shared or _TEMPORARY, error.strerror) from error
     return place

@@ -352,7 +352,7 @@ class SlurmEngine(Executor):
         return states
 
 
-# In a Slurm job: it was told to end.
+# In a Slurm job: it goes back into the queue.
 _is_ending = threading.Event()
 
 
@@ -372,8 +372,8 @@ class ArrayElement:
 
     def __call__(self, jobs: Mapping[int, Mapping[str, Any]]) -> None:
         """Do jobs, by their numbers, as far as they are not done."""
-        # submitit takes no notice of it.
-        signal.signal(signal.SIGTERM, lambda *_: _is_ending.set())
+        # submitit takes no notice of it. Children end with this process.
+        signal.signal(signal.SIGTERM, lambda *_: os._exit(1))
         run = str(self.place.parent)
 
         def do(number: int) -> None:

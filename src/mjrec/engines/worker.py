@@ -18,7 +18,6 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from ..atomic_files import write_text
 from ..child_python import Child, wait_for_news
 from ..gl.devices import CUDA_VISIBLE_DEVICES
 from ..parent import Parent
@@ -80,20 +79,20 @@ def end_idle_children(place: str) -> None:
 
 
 @contextlib.contextmanager
-def time_limit(seconds: float | None, mark: Path, text: str) -> Iterator[None]:
+def time_limit(seconds: float | None, file: Path, text: str) -> Iterator[None]:
     """End this child if what is done inside takes longer.
 
     By the process that started it, because what hangs may hold the interpreter.
 
     Args:
         seconds: so long; None is for ever.
-        mark: the file that says so then.
-        text: its content.
+        file: to which that process appends something then.
+        text: what it appends.
     """
     if seconds is None or parent is None:
         yield
         return
-    parent.send(limit=[seconds, str(mark), text])
+    parent.send(limit=[seconds, str(file), text])
     try:
         yield
     finally:
@@ -139,7 +138,8 @@ class _JobChild(Child):
         """Do a job; see `do_job`."""
         self.send(**job)
         log: list[Any] = []
-        limit: tuple[float, str, str] | None = None
+        limit: list[Any] | None = None
+        ends_at = 0.0
         while True:
             try:
                 message = self.receive()
@@ -148,10 +148,8 @@ class _JobChild(Child):
                 break
             if not isinstance(message, dict):
                 wait_for_news([self], _SECONDS_BETWEEN_LOOKS)
-                if limit and time.monotonic() > limit[0]:
-                    write_text(Path(limit[1]), limit[2])
+                if limit and time.monotonic() > ends_at:
                     self.kill()
-                    limit = None
                 if not self._work.exists():
                     how = "was cancelled"
                     break
@@ -162,10 +160,13 @@ class _JobChild(Child):
                 with contextlib.suppress(OSError):
                     self._work.with_name(BEGUN).touch()
             elif "limit" in message:
-                said = message["limit"]
-                limit = said and (time.monotonic() + said[0], *said[1:])
+                limit = message["limit"]
+                ends_at = time.monotonic() + (limit[0] if limit else 0)
             else:
                 return {**message, "log": log}
+        if limit and time.monotonic() > ends_at:
+            with Path(limit[1]).open("a") as file:
+                file.write(limit[2])
         self._listener.join(_SECONDS_BETWEEN_LOOKS)
         said = self._said.strip() or "(nothing)"
         died = f"{how}. The end of what it said: {said}"

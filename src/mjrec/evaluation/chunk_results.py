@@ -10,8 +10,9 @@ reset; its end is the journal's usual line, with `evaluation`, or a line `failed
     {"failed": {"seed": 7, "episode": 1, "episode_id": 1, "failure": "...",
      "length": 12, "start_time": 1790000000.0, "seconds": 0.2}}
 
-A monitor that closes says so in its journal. Where neither that nor an end follows a
-`begun`, the process died of the episode, or was killed at it.
+A monitor that closes says so in its journal, and a process that is ended by no fault of
+its own adds `{"begun": null}`. Where neither that nor an end follows a `begun`, the
+process died of the episode, or was killed at it.
 """
 
 from __future__ import annotations
@@ -46,6 +47,11 @@ class ChunkResults:
     results: dict[Unit, EpisodeResult] = field(default_factory=dict)
     deaths: Counter[Unit] = field(default_factory=Counter)
     is_drawn_live: bool = False
+
+    @property
+    def size(self) -> int:
+        """How much is done of it; episodes that killed their process count, too."""
+        return len(self.results) + self.deaths.total()
 
 
 def read_chunk(folder: Path, task: str) -> ChunkResults:
@@ -94,7 +100,8 @@ def _read(path: Path, task: str, found: ChunkResults) -> None:
         if kind == "closed":
             running.clear()
         elif kind == "begun":
-            running[:] = [_unit(facts)]
+            # Nothing is running where the process was ended by no fault of its own.
+            running[:] = [] if facts is None else [_unit(facts)]
         elif kind == "failed":
             running.clear()
             failed = _failed(facts, task, monitor)

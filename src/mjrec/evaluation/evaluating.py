@@ -9,8 +9,6 @@ the evaluation repeats nothing that is finished.
 from __future__ import annotations
 
 import contextlib
-import hashlib
-import inspect
 import logging
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -35,24 +33,27 @@ from ..gl.choice import choose
 from ..provenance import versions
 from ..rendering.engine_jobs import environ_for_drawing
 from ..results import clear_monitor_files
-from ..simulation.model_trust import stored_models
 from .dataclass_json import to_json
 from .episode_results import EpisodeResult
 from .evaluation import Evaluation, EvaluationProgress
-from .following import Runner, TaskRun, check_tasks
-from .kept_episodes import keep_rule
+from .following import (
+    Choice,
+    check_tasks,
+    choose_videos,
+    chunks_in,
+    draw_videos,
+    results_of,
+    run_chunks,
+)
+from .kept_episodes import NO_GL, keep_rule
 from .plan import SEEDED, EvaluationPlan
 from .plan_file import check_continues, read_plan, write_plan
 from .planning import check_score_ranges, plan_from
 from .policy_objects import SentPolicy, sent_policy
 from .result_tables import EpisodeFiles
-from .results_files import PLAN_NAME, RESULT_NAMES, ChosenEpisode, write_results
+from .results_files import PLAN_NAME, RESULT_NAMES, write_results
 from .statistics import Bootstrap
-from .summaries import (
-    default_score_range,
-    summarize_across,
-    summarize_results,
-)
+from .summaries import default_score_range, summarize_across, summarize_results
 
 logger = logging.getLogger(__name__)
 
@@ -65,6 +66,14 @@ _ONE_THREAD_EACH = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"
 
 _GL = "MUJOCO_GL"
 
+_DEFAULT_FPS = 60
+_DEFAULTS: Mapping[str, Any] = {
+    "episodes": 10,
+    "keep": "best,median,worst",
+    "protocol": SEEDED,
+    "quality": "full",
+}
+
 _Tell = Callable[[EvaluationProgress], object]
 
 
@@ -73,12 +82,12 @@ def evaluate(
     *,
     policy: Any = None,
     directory: str | os.PathLike[str],
-    episodes: int = 10,
+    episodes: int | None = None,
     seeds: Iterable[int] | None = None,
     num_seeds: int | None = None,
     workers: int | None = None,
-    keep: str = "best,median,worst",
-    protocol: str = SEEDED,
+    keep: str | None = None,
+    protocol: str | None = None,
     resume: bool = False,
     force: bool = False,
     max_steps: int | None = None,
@@ -86,8 +95,8 @@ def evaluate(
     camera: str | int | None = None,
     height: int | None = None,
     width: int | None = None,
-    max_fps: float | None = 60,
-    quality: str = "full",
+    max_fps: float | None = _DEFAULT_FPS,
+    quality: str | None = None,
     env_kwargs: Mapping[str, Any] | None = None,
     policy_kwargs: Mapping[str, Any] | None = None,
     score_ranges: Mapping[str, tuple[float, float]] | None = None,
@@ -119,7 +128,7 @@ def evaluate(
             `predict`, or a class that is built with each environment, which is
             pickled and sent to each worker.
         directory: of the evaluation; empty or new, unless `resume` or `force`.
-        episodes: how many of each task and seed.
+        episodes: how many of each task and seed; 10, if None.
         seeds: of the runs.
         num_seeds: how many, from 0 on, instead; 5 if neither is given.
         workers: how many processes run, and later draw; one for each usable CPU, if
@@ -127,10 +136,10 @@ def evaluate(
             it has.
         keep: which episodes of each task get a video: `best[:N]`, `median`,
             `worst[:N]` and `failures[:N]`, separated by commas; or `cubic`, `all` or
-            `none`. See `evaluation.kept_episodes`.
-        protocol: `"seeded"`: episode i of seed s starts from `SeedSequence([s, i])`.
-            `"suite"`: each task and seed has one random stream, seeded with s, that
-            goes on from episode to episode.
+            `none`. See `evaluation.kept_episodes`. None is `"best,median,worst"`.
+        protocol: `"seeded"`, or None: episode i of seed s starts from
+            `SeedSequence([s, i])`. `"suite"`: each task and seed has one random stream,
+            seeded with s, that goes on from episode to episode.
         resume: go on with the evaluation in the directory. What is not given is as it
             was. Other tasks, more seeds and more episodes may be asked for (with the
             protocol `"suite"` not episodes), everything else must be as it was, the
@@ -144,7 +153,7 @@ def evaluate(
         height: of the videos, in pixels; None is the environment's own.
         width: likewise.
         max_fps: the most frames per second of simulated time; None is every step.
-        quality: `"full"` or `"draft"`.
+        quality: `"full"`, or None; or `"draft"`.
         env_kwargs: more arguments for each environment.
         policy_kwargs: more arguments for the policy.
         score_ranges: the returns that count as 0 and as 1, by task, for what is said
@@ -170,27 +179,27 @@ def evaluate(
             before anything is run or written.
     """
     how = Bootstrap(confidence=confidence)
-    options: dict[str, Any] = {
-        "episodes": episodes,
-        "keep": keep,
-        "protocol": protocol,
-        "max_steps": max_steps,
-        "episode_timeout": episode_timeout,
-        "camera": camera,
-        "height": height,
-        "width": width,
-        "max_fps": max_fps,
-        "quality": quality,
-        "env_kwargs": env_kwargs or None,
-        "policy_kwargs": policy_kwargs or None,
-    }
     given = given_engine(engine, workers)
     local = LocalEngine(workers)
     place = Path(directory)
     begun = _begun(place, resume=resume, force=force)
-    if begun is not None:
-        options = _as_begun(options, begun)
-        policy = _policy_as_begun(begun) if policy is None else policy
+    options = _options(
+        begun,
+        episodes=episodes,
+        keep=keep,
+        protocol=protocol,
+        max_steps=max_steps,
+        episode_timeout=episode_timeout,
+        camera=camera,
+        height=height,
+        width=width,
+        max_fps=max_fps,
+        quality=quality,
+        env_kwargs=env_kwargs or None,
+        policy_kwargs=policy_kwargs or None,
+    )
+    if policy is None and begun is not None:
+        policy = _policy_as_begun(begun)
     if policy is None:
         raise PolicyError(
             "An evaluation needs a policy: random, zero, module:name, or an object."
@@ -202,29 +211,46 @@ def evaluate(
     ranges = check_score_ranges(score_ranges, [task.name for task in plan.tasks])
     if begun is not None:
         check_continues(place, begun, plan)
-    results: list[Evaluation] = []
-
-    def take(plan: EvaluationPlan, tasks: Sequence[TaskRun]) -> None:
-        """Write the results, before videos are drawn: that takes long."""
-        found = _evaluation_of(plan, tasks, place, ranges, how)
-        _write(found)
-        results.append(found)
-
+    tell = on_progress or (lambda _: None)
     with contextlib.ExitStack() as stack:
-        runner = _run(
-            given or local,
-            plan,
-            sent,
+        stack.callback(local.shutdown)
+        if given is not None and isinstance(engine, str):
+            stack.callback(given.shutdown)
+        if begun is not None:
+            stack.enter_context(_held(place))
+        executor = given or local
+        is_here = isinstance(executor, LocalEngine)
+        work = _work(plan, sent, place, chooses_gl=given is not None)
+        # What is quick is done here: nothing has to wait in a cluster's queue.
+        with Run(executor if is_here else local, work) as home:
+            plan, velocities = check_tasks(home, plan)
+            if begun is None:
+                _make(place)
+                stack.enter_context(_held(place))
+                _clear(place)
+            write_plan(place, plan)
+            chunks = chunks_in(place, plan)
+            # What takes long comes first, so that all workers end at about one time.
+            chunks.sort(key=lambda each: -velocities.get(each.task.name, 0))
+            if is_here:
+                progress = run_chunks(home, chunks, tell)
+        if not is_here:
+            with Run(executor, work) as run:
+                progress = run_chunks(run, chunks, tell)
+        results = results_of(plan, chunks)
+        choice = choose_videos(plan, chunks, results)
+        evaluation = _evaluation_of(plan, results, choice, place, ranges, how)
+        # Before videos are drawn, which takes long.
+        _write(evaluation)
+        videos, pending = draw_videos(
+            choice,
             place,
-            is_begun=begun is not None,
-            draws=given is not None,
-            on_results=take,
-            tell=on_progress or (lambda _: None),
-            stack=stack,
+            engine=given,
+            workers=local.workers,
+            progress=progress,
+            tell=tell,
         )
-        if given is None:
-            runner.draw(workers=local.workers)
-    return replace(results[-1], **_videos_of(runner))
+    return replace(evaluation, videos=videos, pending=pending)
 
 
 def _begun(directory: Path, *, resume: bool, force: bool) -> EvaluationPlan | None:
@@ -257,12 +283,18 @@ def _begun(directory: Path, *, resume: bool, force: bool) -> EvaluationPlan | No
     return None
 
 
-def _as_begun(options: Mapping[str, Any], begun: EvaluationPlan) -> dict[str, Any]:
-    """Return options, those that were not given as they were when it was begun."""
-    defaults = inspect.signature(evaluate).parameters
+def _options(begun: EvaluationPlan | None, **given: Any) -> dict[str, Any]:
+    """Return options; those that were not given are as when it was begun."""
+    if begun is None:
+        return {
+            name: _DEFAULTS.get(name) if value is None else value
+            for name, value in given.items()
+        }
+    if given["max_fps"] == _DEFAULT_FPS:
+        given["max_fps"] = None
     return {
-        name: getattr(begun, name) if value == defaults[name].default else value
-        for name, value in options.items()
+        name: getattr(begun, name) if value is None else value
+        for name, value in given.items()
     }
 
 
@@ -275,116 +307,27 @@ def _policy_as_begun(begun: EvaluationPlan) -> str:
     return begun.policy
 
 
-def _run(
-    engine: Executor,
-    plan: EvaluationPlan,
-    sent: SentPolicy,
-    directory: Path,
-    *,
-    is_begun: bool,
-    draws: bool,
-    on_results: Callable[[EvaluationPlan, Sequence[TaskRun]], object],
-    tell: _Tell,
-    stack: contextlib.ExitStack,
-) -> Runner:
-    """Run all tasks; the directory is held until `stack` ends.
-
-    Args:
-        engine: whose workers run them.
-        plan: what is evaluated.
-        sent: the policy.
-        directory: of the evaluation.
-        is_begun: whether it goes on with what is there.
-        draws: whether the workers draw, too.
-        on_results: called with the plan and the tasks, when all episodes are over.
-        tell: called with how far it is.
-        stack: see above.
-    """
-    if is_begun:
-        stack.enter_context(_held(directory))
-    folders = (
-        directory / task.folder / chunk.folder
-        for task in plan.tasks
-        for chunk in plan.chunks
+def _work(
+    plan: EvaluationPlan, sent: SentPolicy, directory: Path, *, chooses_gl: bool
+) -> Work:
+    return Work(
+        entry=_WORKER,
+        settings={
+            "directory": str(directory.absolute()),
+            # Each job brings its own chunk.
+            "plan": to_json(replace(plan, chunks=())),
+            # What works here may not work where an engine has its workers.
+            "chooses_gl": chooses_gl,
+        },
+        environ=_environ_of_workers(plan, is_elsewhere=chooses_gl),
+        shared_directory=directory.absolute(),
+        payload=sent.payload,
     )
-    environ = _environ_of_workers(plan, draws=draws)
-    is_here = isinstance(engine, LocalEngine)
-    with contextlib.ExitStack() as working:
-        policy = working.enter_context(_stored_policy(sent, directory))
-        work = Work(
-            entry=_WORKER,
-            settings={
-                "directory": str(directory.absolute()),
-                # Each job brings its own chunk.
-                "plan": to_json(replace(plan, chunks=())),
-                "policy": policy,
-                # What works here may not work where an engine has its workers.
-                "chooses_gl": draws,
-                # Of what was recorded before; their homes may be others.
-                "models": stored_models(folders) if is_begun and draws else [],
-            },
-            environ=environ,
-            shared_directory=directory.absolute(),
-        )
-        # What is quick is done here: nothing has to wait in a cluster's queue.
-        home = working.enter_context(Run(engine if is_here else LocalEngine(1), work))
-        unknown = [task for task in plan.tasks if task.step_limit is None]
-        checked = check_tasks(home, plan, unknown)
-        limits = {name: said["step_limit"] for name, said in checked.items()}
-        plan = replace(
-            plan,
-            tasks=tuple(
-                replace(task, step_limit=limits.get(task.name, task.step_limit))
-                for task in plan.tasks
-            ),
-        )
-        if not is_begun:
-            _make(directory)
-            stack.enter_context(_held(directory))
-            _clear(directory)
-        write_plan(directory, plan)
-        run = home if is_here else working.enter_context(Run(engine, work))
-        runner = Runner(
-            run,
-            plan,
-            directory,
-            draws=draws,
-            on_results=lambda tasks: on_results(plan, tasks),
-            tell=tell,
-        )
-        runner.run({name: said["velocities"] for name, said in checked.items()})
-        return runner
 
 
-@contextlib.contextmanager
-def _stored_policy(sent: SentPolicy, directory: Path) -> Iterator[str | None]:
-    """Store an object once for all workers, by its digest, while the run lasts."""
-    if sent.payload is None:
-        yield None
-        return
-    folder = directory.absolute() / WORK_FOLDER
-    missing = [each for each in (folder, *folder.parents) if not each.exists()]
-    path = folder / f"policy-{hashlib.sha256(sent.payload).hexdigest()[:16]}"
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        # Only its owner reads it.
-        path.touch(mode=0o600)
-        path.write_bytes(sent.payload)
-    except OSError as error:
-        raise DirectoryNotWritable(directory, error.strerror) from error
-    try:
-        yield str(path)
-    finally:
-        path.unlink(missing_ok=True)
-        with contextlib.suppress(OSError):
-            folder.rmdir()
-            for each in missing[1:]:
-                each.rmdir()
-
-
-def _environ_of_workers(plan: EvaluationPlan, *, draws: bool) -> dict[str, str]:
+def _environ_of_workers(plan: EvaluationPlan, *, is_elsewhere: bool) -> dict[str, str]:
     wanted = dict.fromkeys(_ONE_THREAD_EACH, "1")
-    if draws:
+    if is_elsewhere:
         return {
             **{name: os.environ.get(name, value) for name, value in wanted.items()},
             **environ_for_drawing(),
@@ -394,11 +337,7 @@ def _environ_of_workers(plan: EvaluationPlan, *, draws: bool) -> dict[str, str]:
         try:
             wanted[_GL] = choose().backend
         except GLError as error:
-            logger.warning(
-                "No video can be drawn here, and those that are chosen will stay "
-                "pending (--keep none wants none): %s",
-                error,
-            )
+            logger.warning(NO_GL, error)
     return {name: value for name, value in wanted.items() if name not in os.environ}
 
 
@@ -444,7 +383,8 @@ def _held(directory: Path) -> Iterator[None]:
 
 def _evaluation_of(
     plan: EvaluationPlan,
-    tasks: Sequence[TaskRun],
+    results: Sequence[EpisodeResult],
+    choice: Choice,
     directory: Path,
     ranges: Mapping[str, tuple[float, float]],
     bootstrap: Bootstrap,
@@ -454,35 +394,31 @@ def _evaluation_of(
         or default_score_range(task.name, task.step_limit)
         for task in plan.tasks
     }
-    summaries = [
-        summarize_results(
-            of.task.name,
-            of.results,
-            score_range=scales[of.task.name],
-            bootstrap=bootstrap,
-        )
-        for of in tasks
-    ]
-    returns = {
-        of.task.name: [
-            each.total_reward for each in of.results if each.total_reward is not None
-        ]
-        for of in tasks
-    }
+    by_task: dict[str, list[EpisodeResult]] = {name: [] for name in scales}
+    for result in results:
+        by_task[result.task].append(result)
     return Evaluation(
         directory=directory,
         plan=plan,
-        results=[result for of in tasks for result in of.results],
-        summaries=summaries,
-        across=summarize_across(returns, scales, bootstrap=bootstrap),
+        results=results,
+        summaries=[
+            summarize_results(
+                name, by_task[name], score_range=scales[name], bootstrap=bootstrap
+            )
+            for name in by_task
+        ],
+        across=summarize_across(
+            {
+                name: [
+                    each.total_reward for each in own if each.total_reward is not None
+                ]
+                for name, own in by_task.items()
+            },
+            scales,
+            bootstrap=bootstrap,
+        ),
         bootstrap=bootstrap,
-        selection={
-            of.task.name: [
-                ChosenEpisode(result.seed, result.episode, role)
-                for result, role in of.chosen
-            ]
-            for of in tasks
-        },
+        selection=choice.selection,
     )
 
 
@@ -507,18 +443,3 @@ def _write(evaluation: Evaluation) -> None:
         versions=versions(),
         files=files,
     )
-
-
-def _videos_of(runner: Runner) -> dict[str, Any]:
-    """Return the videos that are there, and why others are not, by their paths."""
-    videos, pending = [], {}
-    for video in (video for of in runner.tasks for video in of.videos):
-        if video.path.exists():
-            videos.append(video.path)
-        else:
-            why = runner.not_drawn.get(video.path, "Its frames were not recorded.")
-            pending[video.path] = f"{why} To try again: mjrec render {video.folder}"
-    for reason in dict.fromkeys(pending.values()):
-        names = [str(path) for path in pending if pending[path] == reason]
-        logger.warning("%s: %s", ", ".join(names), reason)
-    return {"videos": videos, "pending": pending}

@@ -47,6 +47,12 @@ RULES = (
     *("cubic", "all", "none"),
 )
 
+# What is logged, with the reason, where none of them can be drawn.
+NO_GL = (
+    "No video can be drawn here, and those that are chosen will stay pending "
+    "(--keep none wants none): %s"
+)
+
 _ALONE = ("cubic", "all", "none")
 _COUNTED = re.compile(r"(?P<kind>best|worst|failures)(:(?P<count>[1-9][0-9]{0,17}))?")
 

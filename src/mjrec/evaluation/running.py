@@ -12,17 +12,15 @@ from __future__ import annotations
 import contextlib
 import functools
 import logging
-import os
 import pickle
-import sys
-import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
 from ..engines.jobs import TRIES
+from ..engines.worker import time_limit
 from ..environments.episode_seeds import (
     EpisodeSeeds,
     episode_seeds,
@@ -33,11 +31,12 @@ from ..environments.named_environment import EnvironmentOptions, NamedEnvironmen
 from ..environments.names import working_directory_importable
 from ..environments.policies import Policy, load_policy, policy_file, policy_from
 from ..errors import Error, InvalidArgument, PolicyError
+from ..formats.monitor_directory import Infix, journal_name
+from ..json_text import dumps
 from ..monitors import Monitor
 from ..monitors.base import rendering_choice
 from ..recorder.options import LIVE
 from ..schedules import record_all
-from ..signals import Terminated
 from ..simulation.find_simulation import simulation_in
 from .chunk_results import read_chunk
 from .kept_episodes import keep_rule
@@ -88,6 +87,8 @@ class Evaluator:
         self._plan = plan
         self._policy = policy
         self._acting: Acting | None = None
+        # That of the running episode.
+        self.journal: Path | None = None
 
     @property
     def draws(self) -> bool:
@@ -122,6 +123,12 @@ class Evaluator:
         assert self._acting is not None
         return self._acting
 
+    def leave(self) -> None:
+        """Note that the running episode is not to blame for the end of this process."""
+        if self.journal is not None:
+            with self.journal.open("ab") as file:
+                file.write(b'{"begun": null}\n')
+
     def close(self) -> None:
         """Close the environment. Idempotent."""
         acting, self._acting = self._acting, None
@@ -147,6 +154,8 @@ class Evaluator:
             # It may be in the midst of a step.
             self.close()
             raise
+        finally:
+            self.journal = None
 
     def _make(self, task: str, seed: int) -> Acting:
         plan = self._plan
@@ -160,11 +169,6 @@ class Evaluator:
             kwargs=plan.env_kwargs,
         )
         named = environment_from_name(task, options)
-        if "mujoco" in sys.modules:
-            # Not at the top, because it loads MuJoCo, which not every task has.
-            from ..simulation.warnings import log_mujoco_warnings
-
-            log_mujoco_warnings()
         try:
             policy = self._make_policy(named.environment)
             choice = rendering_choice(None, named.scenes(), named.env_id)
@@ -265,6 +269,8 @@ class _ChunkRun:
         episode_id, start = monitor.episode_id, time.time()
         seed, number = unit
         monitor.recorder.note_event("begun", {"seed": seed, "episode": number})
+        journal = self._evaluator.journal
+        assert journal is not None
 
         def failed(why: str) -> dict[str, Any]:
             facts = _failed(unit, why, start_time=start, seconds=time.time() - start)
@@ -274,24 +280,19 @@ class _ChunkRun:
                 facts.update(episode_id=episode_id, length=length)
             return facts
 
-        def expire() -> None:
-            why = f"it took longer than {self._plan.episode_timeout:g} seconds"
-            monitor.recorder.note_event("failed", failed(why))
-            logger.warning("The episode %d of seed %d: %s.", number, seed, why)
-            os._exit(1)
-
+        limit = self._plan.episode_timeout
+        too_long = _failed(unit, f"it took longer than {limit or 0:g} seconds")
         acting = self._evaluator.acting(self._task, seed, continues=True)
         try:
-            with _time_limit(self._plan.episode_timeout, expire):
+            with time_limit(limit, journal, f"{dumps({'failed': too_long})}\n"):
                 self._play_recorded(acting, monitor, unit, begin)
-        except Terminated:
-            raise
         # A policy may call sys.exit(), or an environment's library.
         except (Exception, SystemExit) as error:
             # Errors of ours are of the recording, such as a full disk, unless they
             # speak of an action, or a reward, that is none.
             if isinstance(error, Error) and not isinstance(error, _OF_EPISODES):
                 raise
+            logger.warning("An episode failed. What was raised:", exc_info=True)
             monitor.recorder.note_error(error)
             monitor.recorder.note_event("failed", failed(_in_one_line(error)))
             self._renew()
@@ -348,6 +349,9 @@ class _ChunkRun:
             self._monitor = cast("_Monitor", monitor)
             self._monitor.leave_environment_open()
             self._open.enter_context(self._monitor)
+            infix = Infix.parse(self._monitor.infix)
+            assert infix is not None
+            self._evaluator.journal = self._folder / journal_name(infix)
         return self._monitor
 
     def _renew_unless_it_fits(self, seed: int, *, continues: bool) -> None:
@@ -356,7 +360,7 @@ class _ChunkRun:
 
     def _renew(self) -> None:
         """Close monitor and environment: the next episode gets others."""
-        self._monitor = None
+        self._monitor = self._evaluator.journal = None
         self._open.close()
         self._evaluator.close()
 
@@ -369,9 +373,7 @@ def _begin_in_stream(
     stream: int | None, named: NamedEnvironment, env: Any, seeds: EpisodeSeeds
 ) -> Any:
     """Begin an episode; `stream` seeds a new stream, None goes on with the last one."""
-    if stream is None:
-        return named.next_episode(env, seeds)
-    return named.begin_stream(env, stream, seeds)
+    return named.begin(env, seeds, stream)
 
 
 def _play(acting: Acting, env: Any, seeds: EpisodeSeeds, begin: _Begin) -> None:
@@ -384,20 +386,6 @@ def _play(acting: Acting, env: Any, seeds: EpisodeSeeds, begin: _Begin) -> None:
         while not done:
             observation, _, *ends = named.step(env, policy(observation))
             done = any(ends)
-
-
-@contextlib.contextmanager
-def _time_limit(seconds: float | None, expire: Callable[[], object]) -> Iterator[None]:
-    if seconds is None:
-        yield
-        return
-    timer = threading.Timer(seconds, expire)
-    timer.daemon = True
-    timer.start()
-    try:
-        yield
-    finally:
-        timer.cancel()
 
 
 def _warnings(environment: Any) -> dict[str, int]:

@@ -293,7 +293,6 @@ class SpanWriter:
         self.steps = self.frame_count = 0
         self.last_frame = -1
         self._name = name
-        self._first_row = log.rows.count
         known = log.facts
         own = {
             key: value
@@ -302,16 +301,11 @@ class SpanWriter:
             if key not in known or (known[key] is not value and known[key] != value)
         }
         without = [key for key in known if key not in facts]
-        line = {"begin": name, "row": self._first_row, "look": log.look_size}
+        line = {"begin": name, "row": log.rows.count, "look": log.look_size}
         line |= {"facts": own, **({"without": without} if without else {})}
         log.say_at_once(line)
         log.is_alone = alone
         log.begun += 1
-
-    @property
-    def size(self) -> int:
-        """The bytes of its rows."""
-        return (self.log.rows.count - self._first_row) * self.log.rows.row_size
 
     def make_room(self) -> int:
         """Return the slot that the next row is to be filled in.

@@ -207,7 +207,6 @@ def _keep(run: Run) -> dict[str, Any] | None:
         "decided": False,
         "chosen": sorted(run.chosen),
         "finished": None,
-        "most_bytes_held": None,
         **run.facts["keep"],
     }
 
