@@ -35,8 +35,10 @@ from ..formats.monitor_directory import (
     manifest_lock_name,
     manifest_name,
     stats_prefix,
+    tiled_name,
     trajectory_prefix,
     video_prefix,
+    with_part,
 )
 from ..formats.spans import FINISHED, is_in_flight
 from ..formats.video_metadata import (
@@ -47,7 +49,6 @@ from ..formats.video_metadata import (
     metadata_path,
     reason_of,
 )
-from ..formats.video_names import tiled_name, with_part
 from .journal_or_stats import MonitorResults
 from .monitor_files import MonitorFiles
 from .run import Run

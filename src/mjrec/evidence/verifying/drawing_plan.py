@@ -21,11 +21,11 @@ from ...formats.monitor_directory import (
     episode_of,
     infix_of,
     trajectory_prefix,
+    view_of,
 )
 from ...formats.spans import FINISHED, is_in_flight
 from ...formats.trajectory import TrajectoryReader
 from ...formats.video_metadata import StepRuns
-from ...formats.video_names import view_of
 from ...frames import grid_shape
 from ...rendering.recorded_facts import (
     ChosenFrames,

@@ -16,11 +16,17 @@ from ...errors import UnreadableFile
 from ...formats.frame_hashes import frame_hash_header, frame_hash_path
 from ...formats.json_fields import field, integer, read_object
 from ...formats.manifest import read_manifest
-from ...formats.monitor_directory import infix_of, is_manifest, iter_monitor_files
+from ...formats.monitor_directory import (
+    infix_of,
+    is_manifest,
+    is_second_name,
+    iter_monitor_files,
+    view_of,
+    without_part,
+)
 from ...formats.regular_files import open_regular
 from ...formats.trajectory_file import open_trajectory
 from ...formats.video_metadata import metadata_path
-from ...formats.video_names import is_second_name, view_of, without_part
 from ..verification import Check, Level
 from .digests import digest_of
 from .findings import Findings

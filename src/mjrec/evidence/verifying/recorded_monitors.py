@@ -13,9 +13,8 @@ from ...errors import UnreadableFile
 from ...formats.journal import JournalEntry, JournalReader
 from ...formats.json_fields import read_object
 from ...formats.manifest import Manifest, StatsFile, read_manifest, read_stats_file
-from ...formats.monitor_directory import episode_of
+from ...formats.monitor_directory import episode_of, view_of
 from ...formats.video_metadata import metadata_path
-from ...formats.video_names import view_of
 from ...results.monitor_files import MonitorFiles, monitors_of
 from ...results.run import Run
 
