@@ -10,6 +10,8 @@ other work they are what can be compared.
 
 from __future__ import annotations
 
+import contextlib
+import ctypes
 import os
 import statistics
 import subprocess
@@ -25,6 +27,7 @@ from gymnasium.envs import mujoco as environments
 import mjrec
 
 ROUNDS = 7
+_PR_SET_CHILD_SUBREAPER = 36
 STEPS = 1000
 QUALITY = '<visual><quality shadowsize="0" offsamples="0"/></visual>'
 VARIANTS = {
@@ -81,14 +84,24 @@ def seconds_of(how: str, backend: str | None) -> tuple[float, float]:
         stderr=subprocess.DEVNULL,
         check=True,
     )
+    # What drew was killed when all was done, and counts once it is waited for.
+    with contextlib.suppress(ChildProcessError):
+        while True:
+            os.waitpid(-1, 0)
     now = os.times()
     used = now.children_user + now.children_system
     used -= before.children_user + before.children_system
     return float(done.stdout.split()[-1]), used
 
 
+def _adopt_orphans() -> None:
+    """Be the parent of processes whose own has ended."""
+    ctypes.CDLL(None).prctl(_PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0)
+
+
 def main() -> None:
     """Print the medians of each variant, and what they are of RecordVideo's."""
+    _adopt_orphans()
     found: dict[str, list[tuple[float, float]]] = {name: [] for name in VARIANTS}
     for _ in range(ROUNDS):
         for name, variant in VARIANTS.items():

@@ -4,7 +4,8 @@
 On a machine with other work whole runs differ more from each other than a monitor
 costs. Here every step is timed, in rounds that take turns, and the quantiles of all
 steps tell what the others hide. Writing, and what begins and ends an episode, is in the
-times of the episodes.
+times of the episodes. Beside the monitor is what a prototype takes that only saves the
+state of each step (`prototype`).
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ import numpy as np
 
 import mjrec
 
+from .prototype import PrototypeRecorder
 from .setups import SUITE, is_there, random_actions, suite_environment
 
 STEPS = {"HalfCheetah-v5": 6000, "Humanoid-v5": 3000, f"{SUITE}cheetah-run": 6000}
@@ -75,6 +77,8 @@ def measure(env_id: str, count: int) -> None:
             "counted": _monitored(env_id, counted, lambda episode: False),
             "captured": _monitored(env_id, all_, lambda episode: True),
         }
+        if not env_id.startswith(SUITE):
+            variants["prototype"] = PrototypeRecorder(make(env_id))
         found: dict[str, tuple[list[int], list[int]]] = {
             name: ([], []) for name in variants
         }
@@ -84,14 +88,17 @@ def measure(env_id: str, count: int) -> None:
                     total += part
         variants["counted"].close(wait=False)
         variants["captured"].close(wait=False)
-    bare.close()
+    for name in variants.keys() - {"counted", "captured"}:
+        variants[name].close()
     for index, unit in enumerate(("step", "episode")):
         for quantile in QUANTILES:
             values = [np.percentile(found[name][index], quantile) for name in variants]
             print(
                 f"{env_id:22} {unit:8} {quantile:3}% "
                 + " ".join(f"{value / 1e3:10.1f}us" for value in values)
-                + f"   {values[0] / values[1]:.3f} {values[0] / values[2]:.3f} of bare"
+                + "   "
+                + " ".join(f"{values[0] / value:.3f}" for value in values[1:])
+                + " of bare"
             )
 
 
@@ -103,7 +110,8 @@ def _monitored(env_id: str, directory: str, schedule: Any) -> Any:
 
 def main() -> None:
     """Measure every environment."""
-    print(f"{'':37} {'bare':>12} {'counted':>12} {'captured':>12}")
+    columns = ("bare", "counted", "captured", "prototype")
+    print(f"{'':37}" + "".join(f"{column:>13}" for column in columns))
     for env_id, count in STEPS.items():
         if is_there(env_id):
             measure(env_id, count)

@@ -62,21 +62,21 @@ class Settings:
 
     Attributes:
         rounds: of all variants of a case.
-        steps: the length of the episode.
+        steps: the lengths of the episodes.
         size: height and width of the pictures.
         workers: mjrec's processes that draw.
         cases: what is measured.
     """
 
     rounds: int = 3
-    steps: int = 1000
+    steps: tuple[int, ...] = (500, 1000)
     size: tuple[int, int] = (480, 480)
     workers: int = 2
     cases: tuple[Case, ...] = CASES
 
 
 FULL = Settings()
-QUICK = Settings(rounds=1, steps=200)
+QUICK = Settings(rounds=1, steps=(200,))
 
 
 def measure(settings: Settings, say: Say) -> list[Result]:
@@ -84,7 +84,8 @@ def measure(settings: Settings, say: Say) -> list[Result]:
     return [
         result
         for case in settings.cases
-        for result in _measure_case(case, settings, say)
+        for steps in settings.steps
+        for result in _measure_case(case, steps, settings, say)
     ]
 
 
@@ -111,35 +112,35 @@ def make_video(setup: dict[str, Any], steps: int) -> dict[str, float]:
     return {"seconds": end - start, "stepping": stepped - start, "bytes": sizes[0]}
 
 
-def _measure_case(case: Case, settings: Settings, say: Say) -> list[Result]:
+def _measure_case(case: Case, steps: int, settings: Settings, say: Say) -> list[Result]:
     samples = take_turns(
         {
             (case.env_id, name): functools.partial(
-                call, make_video, setup=setup.as_json(), steps=settings.steps
+                call, make_video, setup=setup.as_json(), steps=steps
             )
-            for name, setup in _setups(case, settings).items()
+            for name, setup in _setups(case, steps, settings).items()
         },
         rounds=settings.rounds,
         say=say,
     )
     peer = samples.get((case.env_id, RECORD_VIDEO))
     reference = None if peer is None else Reference(RECORD_VIDEO, _seconds(peer))
-    results = [] if peer is None else [_result(case, RECORD_VIDEO, peer)]
+    results = [] if peer is None else [_result(case, steps, RECORD_VIDEO, peer)]
     for name, (_, promise) in case.variants.items():
         own = samples[case.env_id, name]
         results.append(
-            _result(case, name, own, reference, promise if reference else None)
+            _result(case, steps, name, own, reference, promise if reference else None)
         )
     return results
 
 
-def _setups(case: Case, settings: Settings) -> dict[str, Setup]:
+def _setups(case: Case, steps: int, settings: Settings) -> dict[str, Setup]:
     height, width = settings.size
     make = {
         **UNENDING.get(case.env_id, {}),
         "height": height,
         "width": width,
-        "max_episode_steps": settings.steps,
+        "max_episode_steps": steps,
     }
     setups = {
         name: Setup(
@@ -158,6 +159,7 @@ def _setups(case: Case, settings: Settings) -> dict[str, Setup]:
 
 def _result(
     case: Case,
+    steps: int,
     name: str,
     samples: list[dict[str, float]],
     reference: Reference | None = None,
@@ -165,7 +167,7 @@ def _result(
 ) -> Result:
     stepping = statistics.median(sample["stepping"] for sample in samples)
     return Result(
-        subject=case.env_id,
+        subject=f"{case.env_id}, {steps} steps",
         variant=name,
         unit="s",
         samples=_seconds(samples),

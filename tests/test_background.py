@@ -393,6 +393,24 @@ def test_workers_are_forks_and_one_that_dies_is_replaced(
     assert [len(frames_of(video)) for video in recorded.glob("*.mp4")] == [4, 4]
 
 
+def test_a_worker_beside_a_simulation_draws_with_one_thread(
+    recorded: Path,
+    others: set[int],
+    start: Start,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Mesa's rasteriser would start as many as there are CPUs, also in the only one."""
+    monkeypatch.delenv("LP_NUM_THREADS", raising=False)
+    background = start(recorded, in_flight(recorded)[0], workers=1)
+    [process] = children() - others
+    background.wait()
+    [worker] = children(process)
+    environ = Path(f"/proc/{worker}/environ").read_bytes().split(b"\0")
+    assert b"LP_NUM_THREADS=1" in environ
+    names = [file.read_text() for file in Path(f"/proc/{worker}/task").glob("*/comm")]
+    assert len([name for name in names if name.startswith("llvmpipe")]) <= 1
+
+
 # What it leaves alone
 
 

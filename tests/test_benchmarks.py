@@ -127,7 +127,7 @@ MEASURED: list[Any] = [
     ),
     pytest.param(
         time_to_video,
-        {**SMALL, "steps": 2, "workers": 1, "cases": time_to_video.CASES[1:]},
+        {**SMALL, "steps": (2,), "workers": 1, "cases": time_to_video.CASES[1:]},
         ["RecordVideo", "max_fps=30, full quality"],
         {"≤ 0.3"},
         marks=thorough,

@@ -184,6 +184,9 @@ def test_failed_episodes_and_nan_meet_no_requirement(
     out = capsys.readouterr().out
     assert ("1 of 2" in out) or ("no episode of B was completed" in out)
     assert ("No task could be compared." in out) is not has_figures
+    is_nan = returns[0] is not None
+    allowed = main(["compare", a, b, "--allow-nan"])
+    assert allowed == (0 if has_figures or is_nan else 1)
 
 
 def test_text_of_files_is_no_order_to_the_terminal(

@@ -57,10 +57,3 @@ def test_a_single_file_and_a_verdict(recordings: Path, tmp_path: Path) -> None:
     assert "said.json" in page.read_text()
     with pytest.raises(InvalidArgument, match="max_single_file_bytes"):
         report((recordings,), out=page, single_file=True, max_single_file_bytes=10)
-
-
-def test_a_directory_without_recordings(tmp_path: Path) -> None:
-    """It is named."""
-    with pytest.raises(InvalidArgument, match=str(tmp_path)):
-        report((tmp_path,), out=tmp_path / "report")
-    assert not (tmp_path / "report").exists()

@@ -414,7 +414,7 @@ def test_a_stream_is_seeded_once() -> None:
     theirs = gymnasium.make("InvertedPendulum-v5")
     expected = [theirs.reset(seed=4)[0], theirs.reset()[0]]
     env, seeds = named.environment, episode_seeds(4, 0)
-    found = [named.begin_stream(env, 4, seeds), named.next_episode(env, seeds)]
+    found = [named.begin(env, seeds, seed) for seed in (4, None)]
     assert np.array_equal(found, expected)
     theirs.close()
     env.close()

@@ -122,16 +122,6 @@ def test_a_task_is_made_with_its_own_limit() -> None:
     assert isinstance(endless, StepLimit)
 
 
-def test_the_last_step_of_a_suite_task_is_truncated() -> None:
-    """dm_control says discount 1 at its time limit."""
-    kwargs = {"task_kwargs": {"time_limit": 0.1}}
-    env = make_dm_control("ball_in_cup", "catch", EnvironmentOptions(kwargs=kwargs))
-    env.reset()
-    for _ in range(5):
-        step = env.step(np.zeros(2))
-    assert is_truncated(step)
-
-
 def test_the_run_seeds_what_is_drawn_when_a_task_is_made() -> None:
     """The springs of lqr are part of its model."""
 
@@ -285,10 +275,7 @@ def test_a_stream_is_what_the_suites_users_have(task: str) -> None:
     ours = named.environment
     for episode in range(3):
         seeds = episode_seeds(7, episode)
-        if episode:
-            first = named.next_episode(ours, seeds)
-        else:
-            first = named.begin_stream(ours, 7, seeds)
+        first = named.begin(ours, seeds, None if episode else 7)
         expected = theirs.reset().observation
         assert {k: v.tolist() for k, v in first.items()} == {
             k: v.tolist() for k, v in expected.items()
@@ -302,15 +289,6 @@ def test_a_stream_of_another_seed_is_begun_anew() -> None:
     fresh, used = (environment_from_name(name, options) for _ in range(2))
     used.environment.reset()
     seeds = episode_seeds(9, 0)
-    one = fresh.begin_stream(fresh.environment, 9, seeds)
-    other = used.begin_stream(used.environment, 9, seeds)
+    one = fresh.begin(fresh.environment, seeds, 9)
+    other = used.begin(used.environment, seeds, 9)
     assert one["orientation"].tolist() == other["orientation"].tolist()
-
-
-def test_the_limit_of_a_task_is_known() -> None:
-    """Its own, or the one that was asked for."""
-    name = "dm_control/pendulum-swingup"
-    own = environment_from_name(name, EnvironmentOptions(pictures=False))
-    options = EnvironmentOptions(max_steps=5, pictures=False)
-    assert own.step_limit == 1000
-    assert environment_from_name(name, options).step_limit == 5

@@ -29,30 +29,6 @@ def test_seeds_stay_what_they_were() -> None:
     )
 
 
-def test_every_seed_of_a_run_is_another() -> None:
-    """Neither streams nor episodes nor runs share a seed."""
-    seeds = [
-        value
-        for run in range(10)
-        for episode in range(100)
-        for value in dataclasses.astuple(episode_seeds(run, episode))
-    ]
-    assert len(set(seeds)) == len(seeds)
-
-
-def test_seeds_are_valid_for_every_generator() -> None:
-    """NumPy's old generator, its new one and Gymnasium's take them."""
-    for episode in range(1000):
-        values = dataclasses.astuple(episode_seeds(2**32 - 1, episode))
-        assert all(type(value) is int and 0 <= value < 2**31 for value in values)
-    np.random.RandomState(values[0])
-
-
-def test_numpy_integers_are_numbers() -> None:
-    """A seed out of an array means what the Python number means."""
-    assert episode_seeds(np.int64(3), np.uint8(4)) == episode_seeds(3, 4)
-
-
 @pytest.mark.parametrize("bad", [-1, 2**32, 1.0, True, None, "1"])
 def test_what_is_no_seed_is_refused(bad: object) -> None:
     """The message names the argument and says what it may be."""

@@ -4,6 +4,8 @@
 from __future__ import annotations
 
 import itertools
+import signal
+import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -19,41 +21,51 @@ from recordings import stats_of
 import mjrec
 from mjrec import Monitor
 
-CHEETAH, HOPPER, PENDULUM = "HalfCheetah-v5", "Hopper-v5", "InvertedPendulum-v5"
+CHEETAH, HOPPER = "HalfCheetah-v5", "Hopper-v5"
 INTEGRATION = mujoco.mjtState.mjSTATE_INTEGRATION
 
 Before = Callable[[int, Any], None]
 
 
-class Changed(gymnasium.Wrapper[Any, Any, Any, Any]):
-    """Does something after a step, and gives the rewards of the steps another type."""
+class Rewarding(gymnasium.Wrapper[Any, Any, Any, Any]):
+    """Gives the rewards of the steps another type."""
 
-    def __init__(
-        self,
-        env: Any,
-        *,
-        reward: Callable[[float], Any] = lambda reward: reward,
-        after: dict[int, Callable[[], None]] | None = None,
-    ) -> None:
+    def __init__(self, env: Any, reward: Callable[[float], Any]) -> None:
         super().__init__(env)
         self.reward = reward
-        self.after = after or {}
-        self.number = 0
 
     def step(self, action: Any) -> Any:
         observation, reward, *rest = self.env.step(action)
-        self.number += 1
-        self.after.get(self.number, lambda: None)()
         return (observation, self.reward(float(reward)), *rest)
 
 
-def make(env_id: str = CHEETAH, **options: Any) -> Any:
-    return gymnasium.make(env_id, width=48, height=32, **options)
+def make(env_id: str = CHEETAH, steps: int = 8) -> Any:
+    """Return an environment nearly all of whose steps are usual."""
+    return gymnasium.make(env_id, width=48, height=32, max_episode_steps=steps)
 
 
-def monitored(env: Any, directory: Path, **options: Any) -> Any:
+def dm_control_task(domain: str, task: str) -> Any:
+    """Return a dm_control task with Gymnasium's actions; its episodes have 8 steps."""
+    suite = pytest.importorskip("dm_control.suite", reason="dm_control not installed")
+    timestep = 0.02 if domain in ("reacher", "hopper") else 0.01
+    task_kwargs = {"random": 0, "time_limit": 8 * timestep}
+    return suite.load(domain, task, task_kwargs=task_kwargs)
+
+
+def monitored(env: Any, directory: Path, schedule: Any = None, **options: Any) -> Any:
     """Return a monitor of the environment that draws nothing yet."""
-    return Monitor(env, directory, lambda _: True, workers=0, **options)
+    if not isinstance(env, gymnasium.Env):
+        options |= {"env_id": "dm_control/some-task", "height": 32, "width": 48}
+    schedule = (lambda _: True) if schedule is None else schedule
+    return Monitor(env, directory, schedule, workers=0, **options)
+
+
+def begin(monitor: Any) -> None:
+    if isinstance(monitor, gymnasium.Env):
+        monitor.reset(seed=0)
+        monitor.action_space.seed(0)
+    else:
+        monitor.reset()
 
 
 def go(
@@ -66,23 +78,23 @@ def go(
             monitor._recorder.fast = None
         if before is not None:
             before(number, monitor)
-        results.append(monitor.step(monitor.action_space.sample()))
+        if isinstance(monitor, gymnasium.Env):
+            action = monitor.action_space.sample()
+        else:
+            spec = monitor.action_spec()
+            action = np.full(spec.shape, np.cos(number))
+            action = action.clip(spec.minimum, spec.maximum)
+        results.append(monitor.step(action))
     return results
 
 
-def begin(monitor: Any) -> None:
-    monitor.reset(seed=0)
-    monitor.action_space.seed(0)
-
-
 def recorded(
-    *given: Any, camera: Any = None, max_fps: Any = None, **steps: Any
+    env: Any, directory: Path, *, camera: Any = None, max_fps: Any = None, **steps: Any
 ) -> mjrec.Trajectory:
-    """Record the first steps of an episode and return its trajectory."""
-    env, directory, count = (*given, 8)[:3]
+    """Record an episode of eight steps and return its trajectory."""
     with monitored(env, directory, camera=camera, max_fps=max_fps) as monitor:
         begin(monitor)
-        go(monitor, count, **steps)
+        go(monitor, 8, **steps)
     [trajectory] = trajectories(directory)
     return trajectory
 
@@ -97,7 +109,7 @@ def state_of(env: Any) -> Any:
 @pytest.fixture
 def cheetah() -> Iterator[Any]:
     """An environment nearly all of whose steps are usual."""
-    env = make(max_episode_steps=8)
+    env = make()
     yield env
     env.close()
 
@@ -105,27 +117,42 @@ def cheetah() -> Iterator[Any]:
 # --- what is recorded ----------------------------------------------------------------
 
 
+def _dm_control(domain: str, task: str, camera: Any, *marks: Any) -> Any:
+    return pytest.param(
+        *(lambda: dm_control_task(domain, task), camera, None, [*range(9)]),
+        id=f"{domain} {camera!s:.4}",
+        marks=[pytest.mark.dm_control, *marks],
+    )
+
+
 @pytest.mark.parametrize(
-    ("env_id", "max_fps", "frames"),
+    ("new", "camera", "max_fps", "frames"),
     [
-        (HOPPER, None, [0, 1, 2, 3, 4, 5]),
-        # At most 10 of 25 steps a second are every third one, and the last of all.
-        (PENDULUM, 10, [0, 3, 5]),
+        (lambda: make(HOPPER), None, None, [*range(9)]),
+        # At most 50 of 125 steps a second are every third one, and the last of all.
+        (lambda: make(HOPPER), None, 50, [0, 3, 6, 8]),
+        _dm_control("cheetah", "run", None),
+        _dm_control("cheetah", "run", "side", pytest.mark.thorough),
+        _dm_control("cheetah", "run", mujoco.MjvCamera(), pytest.mark.thorough),
+        _dm_control("cartpole", "balance", None, pytest.mark.thorough),
+        _dm_control("reacher", "easy", 0, pytest.mark.thorough),
+        _dm_control("hopper", "stand", None, pytest.mark.thorough),
     ],
 )
 def test_usual_steps_are_recorded_as_others_are(
-    env_id: str, max_fps: Any, frames: list[int], tmp_path: Path
+    new: Any, camera: Any, max_fps: Any, frames: list[int], tmp_path: Path
 ) -> None:
     """States, actions, rewards, ends and frames are the same, bit for bit."""
     usual, other = (
         recorded(
-            *(make(env_id, max_episode_steps=5), tmp_path / str(is_usual), 5),
+            *(new(), tmp_path / str(is_usual)),
             usual=is_usual,
+            camera=camera,
             max_fps=max_fps,
         )
         for is_usual in (True, False)
     )
-    assert len(usual) == 5
+    assert len(usual) == 8
     assert usual.frame_steps.tolist() == frames
     assert_same(usual, other)
 
@@ -137,18 +164,20 @@ def test_states_are_those_of_the_environment(cheetah: Any, tmp_path: Path) -> No
         begin(monitor)
         states.append(state_of(cheetah))
         for _ in range(8):
-            monitor.step(monitor.action_space.sample())
+            go(monitor, 1)
             states.append(state_of(cheetah))
     [trajectory] = trajectories(tmp_path)
     np.testing.assert_array_equal(trajectory.states, states)
 
 
-@pytest.mark.parametrize("max_fps", [None, 8])
+@pytest.mark.parametrize(
+    ("max_fps", "schedule", "slow"), [(None, None, 1), (8, None, 1), (None, False, 0)]
+)
 def test_all_steps_but_the_first_of_the_run_are_usual(
-    max_fps: int | None, cheetah: Any, tmp_path: Path
+    max_fps: Any, schedule: Any, slow: int, cheetah: Any, tmp_path: Path
 ) -> None:
-    """With a frame or without; the first tells what actions are and how long it is."""
-    with monitored(cheetah, tmp_path, max_fps=max_fps) as monitor:
+    """Recorded or counted; the first tells what actions are, and how long it is."""
+    with monitored(cheetah, tmp_path, schedule, max_fps=max_fps) as monitor:
         seen = []
         for _ in range(2):
             begin(monitor)
@@ -156,7 +185,51 @@ def test_all_steps_but_the_first_of_the_run_are_usual(
                 seen.append(is_fast(monitor))
                 go(monitor, 1)
             assert not is_fast(monitor)
-    assert seen == [False, *15 * [True]]
+    assert seen == [*slow * [False], *(16 - slow) * [True]]
+
+
+def test_a_reset_that_another_one_replaces_leaves_nothing(
+    cheetah: Any, tmp_path: Path
+) -> None:
+    """Its row was written at once; so was that of one that no step followed."""
+    with monitored(cheetah, tmp_path) as monitor:
+        begin(monitor)
+        go(monitor, 8)
+        for seed in (3, 4, 5):
+            monitor.reset(seed=seed)
+    first, second = trajectories(tmp_path)
+    assert (len(first), len(second)) == (8, 0)
+    assert (second.seed, second.complete) == (5, False)
+
+
+def test_the_first_step_of_another_episode_may_be_unlike(tmp_path: Path) -> None:
+    """Another action and another pace: the reset is written anew, or they are noted."""
+
+    class Other(gymnasium.Wrapper[Any, Any, Any, Any]):
+        def reset(self, **options: Any) -> Any:
+            result = self.env.reset(**options)
+            self.unwrapped.model.opt.timestep = 0.01 / (monitor.episode_id + 1)  # type: ignore[attr-defined]
+            return result
+
+        def step(self, action: Any) -> Any:
+            return self.env.step(np.resize(action, 6))
+
+    with monitored(Other(make(steps=2)), tmp_path) as monitor:
+        for shape in (6, 6, (2, 3), 6):
+            monitor.reset(seed=0)
+            for value in (0.5, -0.5):
+                monitor.step(np.full(shape, value))
+    found = trajectories(tmp_path)
+    assert [each.actions.shape for each in found if each.actions is not None] == [
+        *((2, 6), (2, 6), (2, 2, 3), (2, 6))
+    ]
+    assert all(each.frame_steps.tolist() == [0, 1, 2] for each in found)
+    assert [each.facts["timestep"] for each in found] == [
+        "1/20",
+        "1/40",
+        "1/60",
+        "1/80",
+    ]
 
 
 # --- statistics ----------------------------------------------------------------------
@@ -165,7 +238,6 @@ def test_all_steps_but_the_first_of_the_run_are_usual(
 @pytest.mark.parametrize(
     "kind",
     [
-        float,
         int,
         np.float64,
         np.float32,
@@ -175,14 +247,13 @@ def test_all_steps_but_the_first_of_the_run_are_usual(
         # Another one in mid-episode.
         lambda reward: int(reward) if reward > 0 else np.float32(reward),
     ],
-    ids=["float", "int", "float64", "float32", "0-d", "1-d", "bool", "mixed"],
+    ids=["int", "float64", "float32", "0-d", "1-d", "bool", "mixed"],
 )
 def test_rewards_of_any_type_are_numbers(
     kind: Callable[[float], Any], tmp_path: Path
 ) -> None:
     """In the trajectory and, added up in their order, in the statistics."""
-    env = Changed(make(max_episode_steps=8), reward=kind)
-    with monitored(env, tmp_path) as monitor:
+    with monitored(Rewarding(make(), kind), tmp_path) as monitor:
         begin(monitor)
         stats, rewards = monitor.stats_recorder, []
         for number in range(1, 9):
@@ -192,8 +263,7 @@ def test_rewards_of_any_type_are_numbers(
             assert (stats.steps, stats.total_steps) == (number, number)
             assert (stats.rewards, type(stats.rewards)) == (sum(rewards), float)
         [total] = monitor.get_episode_rewards()
-    assert total == sum(rewards)
-    assert type(total) is float
+    assert (total, type(total)) == (sum(rewards), float)
     [trajectory] = trajectories(tmp_path)
     assert trajectory.rewards.tolist() == rewards
     assert stats_of(tmp_path)["episode_rewards"] == [total]
@@ -202,16 +272,13 @@ def test_rewards_of_any_type_are_numbers(
 def test_episodes_that_are_only_counted(tmp_path: Path) -> None:
     """Lengths, sums and ends are those of episodes whose states are recorded."""
     found = []
-    for name, schedule in (("counted", False), ("recorded", lambda _: True)):
-        env = make(HOPPER, max_episode_steps=30)
-        with Monitor(env, tmp_path / name, schedule, workers=0) as monitor:
+    for name, schedule in (("counted", False), ("recorded", None)):
+        with monitored(make(HOPPER, 30), tmp_path / name, schedule) as monitor:
             begin(monitor)
             for steps in range(1, 101):
-                assert is_fast(monitor) or steps == 1
                 [(_, _, terminated, truncated, _)] = go(monitor, 1)
                 assert monitor.get_total_steps() == steps
                 if terminated or truncated:
-                    assert not is_fast(monitor)
                     monitor.reset()
         stats = stats_of(tmp_path / name)
         found.append((stats["episode_lengths"], stats["episode_rewards"]))
@@ -222,7 +289,7 @@ def test_episodes_that_are_only_counted(tmp_path: Path) -> None:
 def test_a_reward_that_is_no_number_is_told(tmp_path: Path) -> None:
     """The step is not recorded, and the next one is."""
     rewards = iter([1.0, 1.0, "much", 1.0, 1.0])
-    env = Changed(make(), reward=lambda _: next(rewards))
+    env = Rewarding(make(), lambda _: next(rewards))
     with monitored(env, tmp_path) as monitor:
         begin(monitor)
         go(monitor, 2)
@@ -255,22 +322,25 @@ def test_a_changed_model_is_noticed_at_the_very_step(
     assert trajectory.frame_steps.tolist() == list(range(9))
 
 
-@pytest.mark.parametrize("is_own", [True, False])
-def test_a_camera_that_was_asked_for_may_move(is_own: bool, tmp_path: Path) -> None:
-    """One's own at any step; the free one with the model, for every frame anew."""
-    camera = mujoco.MjvCamera() if is_own else -1
-    env = make()
+@pytest.mark.parametrize(
+    "kind", ["own", "free", pytest.param("dm", marks=pytest.mark.dm_control)]
+)
+def test_a_camera_may_move(kind: str, tmp_path: Path) -> None:
+    """One's own at any step; a free one with the model, for every frame anew."""
+    camera: Any = {"own": mujoco.MjvCamera(), "free": -1, "dm": None}[kind]
+    env = dm_control_task("cheetah", "run") if kind == "dm" else make()
+    model = env.physics.model if kind == "dm" else env.unwrapped.model
 
     def turn(number: int, monitor: Any) -> None:
         if number in (3, 4, 7):
             assert is_fast(monitor)
-            if isinstance(camera, int):
-                env.unwrapped.model.vis.global_.azimuth += 30
-            else:
+            if kind == "own":
                 camera.azimuth += 10
+            else:
+                model.vis.global_.azimuth += 30
 
     recorded(env, tmp_path, camera=camera, before=turn)
-    moved = {"camera.azimuth"} | (set() if is_own else {"vis.global_.azimuth"})
+    moved = {"camera.azimuth"} | (set() if kind == "own" else {"vis.global_.azimuth"})
     assert changes_in(tmp_path) == dict.fromkeys((3, 4, 7), moved)
 
 
@@ -293,7 +363,7 @@ def test_actions_of_another_kind_are_recorded_as_they_are(
     kind: str, value: Any, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     """In mid-episode, with no word about it; and those after them too."""
-    env = make(max_episode_steps=8)
+    env = make()
     actions = [env.action_space.sample() for _ in range(8)]
     actions[3] = actions[5] = value
     with monitored(env, tmp_path) as monitor:
@@ -314,7 +384,7 @@ def test_an_action_that_the_environment_overwrites(tmp_path: Path) -> None:
             action[:] = 7
             return result
 
-    with monitored(Overwriting(make(max_episode_steps=8)), tmp_path) as monitor:
+    with monitored(Overwriting(make()), tmp_path) as monitor:
         begin(monitor)
         for k in range(8):
             monitor.step(np.full(6, 0.125 * k))
@@ -354,7 +424,7 @@ def interrupt_in(monitor: Any, event_number: int) -> bool:
 # Takes more than five seconds: an episode for each place of an interruption.
 @pytest.mark.parametrize(
     ("max_fps", "schedule"),
-    [(None, lambda _: True), (8, lambda _: True), (None, False)],
+    [(None, None), (8, None), (None, False)],
     ids=["frames", "few frames", "counted"],
 )
 def test_an_interrupted_step_is_recorded_or_is_not(
@@ -364,9 +434,7 @@ def test_an_interrupted_step_is_recorded_or_is_not(
     numbers = itertools.count(1)
     for number in numbers:
         directory = tmp_path / str(number)
-        env = make(max_episode_steps=8)
-        options = {"max_fps": max_fps, "workers": 0}
-        with Monitor(env, directory, schedule, **options) as monitor:
+        with monitored(make(), directory, schedule, max_fps=max_fps) as monitor:
             begin(monitor)
             go(monitor, 4)
             assert is_fast(monitor)
@@ -409,13 +477,54 @@ def test_steps_after_the_close_go_to_the_environment(
 
 def test_a_monitor_may_be_closed_within_a_step(tmp_path: Path) -> None:
     """As by a signal's handler that only closes it: the step returns as ever."""
-    env = Changed(make())
-    monitor = monitored(env, tmp_path)
+
+    def close_at(reward: float) -> float:
+        if monitor.get_total_steps() == 3:
+            monitor.close()
+        return reward
+
+    monitor = monitored(Rewarding(make(), close_at), tmp_path)
     begin(monitor)
-    env.after[4] = monitor.close
     go(monitor, 3)
     assert is_fast(monitor)
     [(observation, *_)] = go(monitor, 1)
     assert observation.shape == (17,)
     [trajectory] = trajectories(tmp_path)
     assert len(trajectory) == 3
+
+
+KILLED = """
+import os, signal, sys
+import gymnasium, mjrec
+from mjrec.recorder import fast_path
+
+class Head:
+    rows = 0
+    def pack_into(self, *values):
+        self.rows += 1
+        if self.rows < 7:
+            head.pack_into(*values)
+        else:
+            if sys.argv[2] == "filled":
+                head.pack_into(*values)
+            os.kill(os.getpid(), signal.SIGKILL)
+
+head, fast_path.ROW_HEAD = fast_path.ROW_HEAD, Head()
+env = gymnasium.make("InvertedPendulum-v5", max_episode_steps=3)
+env = mjrec.Monitor(env, sys.argv[1], lambda _: True, workers=0)
+while True:
+    env.reset(seed=0)
+    for _ in range(3):
+        env.step(env.action_space.sample() * 0)
+"""
+
+
+@pytest.mark.parametrize("moment", ["being filled", "filled"])
+def test_a_kill_at_a_row_loses_that_row(moment: str, tmp_path: Path) -> None:
+    """Between filling it and counting it, too: all rows before it are there."""
+    done = subprocess.run([sys.executable, "-c", KILLED, str(tmp_path), moment])
+    assert done.returncode == -signal.SIGKILL
+    mjrec.recover(tmp_path)
+    # The first step of all did not go the fast way.
+    assert [len(each) for each in trajectories(tmp_path)] == [3, 3, 1]
+    assert [each.complete for each in trajectories(tmp_path)] == [True, True, False]

@@ -250,6 +250,11 @@ def test_a_full_disk_while_an_episode_is_recorded(
     monitor.close()
     assert stats_of(out)["episode_lengths"] == [8, 8, 8]
     assert on_error == "raise" or (1, "trajectory") in faults_of(out)
+    # Of that without a row nothing is left, though there was room when it ended.
+    assert not list(out.glob("*episode000001*"))
+    assert [each["episode_id"] for each in manifest_of(out)["mjrec"]["pending"]] == [
+        *(0, 2)
+    ]
     [path] = out.glob("*episode000002.h5")
     assert len(mjrec.load_trajectory(path).rewards) == 8
 

@@ -7,7 +7,6 @@ import functools
 import json
 import subprocess
 import sys
-from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -73,14 +72,6 @@ def test_wrappers_that_show_what_is_inside_are_no_obstacle() -> None:
     env = wrappers.NormalizeReward(wrappers.Autoreset(env))
     assert gymnasium_scenes(env).obstacle is None
     assert gymnasium_scenes(make(render_mode=None)).obstacle is None
-
-
-def test_recorded_by_gymnasium_too(tmp_path: Path) -> None:
-    """RecordVideo gives single pictures as it gets them."""
-    pytest.importorskip("moviepy")
-    env = wrappers.RecordVideo(make(), str(tmp_path / "new"))
-    assert gymnasium_scenes(env).obstacle is None
-    env.close()
 
 
 @pytest.mark.parametrize(
@@ -205,18 +196,6 @@ def test_camera_is_kept_from_the_first_picture_on() -> None:
     scene.at_picture(lambda: None)
     assert pose(scene().camera) == first
     assert pose(scene_of(env)().camera) != first
-
-
-def test_camera_number_of_the_renderer_counts_in_its_moment() -> None:
-    """As OffScreenViewer.render settles it, at each picture."""
-    env = make("HalfCheetah-v5", camera_name="track")
-    env.reset(seed=1)
-    scene = scene_of(env)
-    view = scene()
-    assert (view.label, view.camera.fixedcamid) == ("track", 0)
-    env.unwrapped.mujoco_renderer.camera_id = -1
-    scene.at_picture(lambda: None)
-    assert view.camera.type == int(mujoco.mjtCamera.mjCAMERA_FREE)
 
 
 def test_another_renderer_has_another_camera() -> None:

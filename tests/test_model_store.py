@@ -16,6 +16,7 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
+from full_disk import file_size_limit
 from parts import parametrize
 from PIL import Image
 
@@ -158,13 +159,13 @@ def test_adding_does_not_write_on_the_callers_thread(
 
 def test_a_full_disk_is_one_error_and_can_be_tried_again(directory: Path) -> None:
     """The error names the file; what could not be written is kept until it can."""
-    shutil.rmtree(directory)
     store = ModelStore(directory)
-    facts = store.add(sphere())
-    for _ in range(2):
-        with pytest.raises(FileNotWritten, match=facts["mjb"]):
-            store.finish()
-    directory.mkdir()
+    with file_size_limit(100):
+        facts = store.add(sphere())
+        for _ in range(2):
+            with pytest.raises(FileNotWritten, match=facts["mjb"]):
+                store.finish()
+    assert list(directory.iterdir()) == []
     store.finish()
     assert load_model(directory, facts).ngeom == 1
     store.finish()

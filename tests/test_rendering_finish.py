@@ -35,6 +35,7 @@ from mjrec.formats.trajectory_file import open_trajectory
 from mjrec.rendering import finish as module
 from mjrec.rendering.finisher import Finisher
 from mjrec.rendering.jobs import RecordingKey, RenderedVideos, VideoJob
+from mjrec.rendering.pool import WorkerPool
 from mjrec.rendering.recorded_facts import open_for_rendering
 from mjrec.rendering.recordings import (
     claim,
@@ -169,7 +170,7 @@ def test_what_a_killed_renderer_left_goes_with_the_next_try(tmp_path: Path) -> N
 def test_one_whose_model_is_still_being_written_waits(tmp_path: Path) -> None:
     """And no other comes before it."""
     write_finished(tmp_path, 0, model={"mjb": "m.mjb.gz", "xml": None})
-    with contextlib.closing(Finisher(tmp_path, workers=1)) as finisher:
+    with contextlib.closing(Finisher(WorkerPool(1))) as finisher:
         finisher.add(VideoJob.finishing(tmp_path, KEY))
         assert not finisher.is_ready()
         (tmp_path / "m.mjb.gz").write_bytes(b"")

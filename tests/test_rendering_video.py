@@ -9,7 +9,7 @@ import json
 from collections.abc import Callable
 from fractions import Fraction
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import av
 import pytest
@@ -337,7 +337,7 @@ def test_all_videos_of_an_episode_are_counted_and_listed(
     manifest, seen = write_pending_manifest(tmp_path, 0), []
     job = VideoJob.finishing(tmp_path, KEY)
     with contextlib.closing(
-        Finisher(tmp_path, workers=1, on_progress=seen.append)
+        Finisher(cast(Any, painter), on_progress=seen.append)
     ) as finisher:
         assert finisher.add(job)
         assert (finisher.progress.videos, finisher.progress.frames) == (3, 15)

@@ -35,7 +35,7 @@ def sources(directory: Path, xml: str = "<mujoco/>") -> Path:
 
 def compiling(parent: int) -> list[int]:
     """Return the process that compiles; importing mujoco starts others."""
-    return [pid for pid in children(parent) if _COMPILER in command_of(pid)]
+    return [pid for pid in children(parent) if f"-m\0{_COMPILER}" in command_of(pid)]
 
 
 def command_of(pid: int) -> str:

@@ -4,8 +4,6 @@
 from __future__ import annotations
 
 import functools
-import subprocess
-import sys
 import weakref
 from pathlib import Path
 from typing import Any
@@ -19,21 +17,6 @@ import mjrec
 from mjrec.environments.scenes import has_own_method
 from mjrec.environments.wrapping import around_dm_env, around_gymnasium
 
-STEPPING = """
-import dis, sys
-import gymnasium, mjrec
-env = gymnasium.make("HalfCheetah-v5", max_episode_steps=1000)
-{first}
-with mjrec.Monitor(env, sys.argv[1], lambda _: True, workers=0) as monitor:
-    monitor.reset(seed=0)
-    for _ in range(400):
-        monitor.step(monitor.action_space.sample())
-step = gymnasium.wrappers.TimeLimit.step
-for instruction in dis.get_instructions(step, adaptive=True):
-    print(instruction.opname, instruction.argval)
-"""
-LOOKING = "each = env\nwhile each is not each.unwrapped: vars(each); each = each.env"
-
 
 class Shown:
     """Has a method of each kind."""
@@ -44,18 +27,6 @@ class Shown:
     @staticmethod
     def size() -> int:
         return 3
-
-
-class Derived(Shown):
-    """Has the other's."""
-
-
-@pytest.mark.parametrize("name", ["render", "size", "nothing"])
-def test_methods_of_a_class_are_not_an_instances_own(name: str) -> None:
-    """Nor is one that is missing; also where a proxy stands for the instance."""
-    instance = Derived()
-    assert not has_own_method(instance, name)
-    assert not has_own_method(weakref.proxy(instance), name)
 
 
 @pytest.mark.parametrize(
@@ -71,13 +42,6 @@ def test_methods_set_on_an_instance_are_its_own(method: Any, name: str) -> None:
     assert has_own_method(instance, name)
     assert has_own_method(weakref.proxy(instance), name)
     assert not has_own_method(Shown(), name)
-
-
-def test_another_instances_method_is_an_instances_own() -> None:
-    """It shows the other one, though it is of the same class."""
-    instance = Shown()
-    instance.render = Shown().render  # type: ignore[method-assign]
-    assert has_own_method(instance, "render")
 
 
 @pytest.mark.parametrize("part", ["wrapper", "environment"])
@@ -96,29 +60,6 @@ def test_an_environment_that_shows_another_is_drawn_live(
         monitor.step(np.zeros(6))
         assert isinstance(monitor.video_recorder, mjrec.VideoRecorder)
     other.close()
-
-
-def instructions_of_a_step(directory: Path, first: str = "") -> list[str]:
-    """Return what CPython has made of TimeLimit.step under a monitor."""
-    if sys.implementation.name != "cpython" or sys.version_info[:2] != (3, 11):
-        pytest.skip("What CPython has specialised is named so in 3.11 only.")
-    done = subprocess.run(
-        [sys.executable, "-c", STEPPING.format(first=first), str(directory)],
-        check=True,
-        capture_output=True,
-        text=True,
-    )
-    return [line for line in done.stdout.splitlines() if line.endswith(" env")]
-
-
-def test_a_monitor_leaves_attributes_of_environments_fast(tmp_path: Path) -> None:
-    """Nothing has asked the wrappers for their `__dict__`."""
-    assert instructions_of_a_step(tmp_path) == ["LOAD_ATTR_INSTANCE_VALUE env"]
-
-
-def test_looking_into_a_wrapper_makes_its_attributes_slow(tmp_path: Path) -> None:
-    """So the test before tells the one from the other."""
-    assert instructions_of_a_step(tmp_path, LOOKING) == ["LOAD_ATTR_ADAPTIVE env"]
 
 
 def test_wrappers_that_change_something_are_named() -> None:

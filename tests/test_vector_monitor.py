@@ -15,6 +15,7 @@ import pytest
 from gymnasium.vector import AsyncVectorEnv, SyncVectorEnv
 from gymnasium.wrappers.vector import RecordEpisodeStatistics, TransformReward
 from processes import children
+from recordings import frames_of
 from vector_environments import (
     DISABLED,
     MODES,
@@ -109,11 +110,18 @@ def test_statistics_are_those_of_gymnasium(tmp_path: Path, mode: Any) -> None:
     assert len(ours) == expected[mode]
 
 
-def test_sub_environments_share_one_budget_of_tails(tmp_path: Path) -> None:
-    """Each of 64 is recorded, and their logs' tails have 4 MiB together."""
-    make = functools.partial(gymnasium.make, "InvertedPendulum-v5", max_episode_steps=2)
+# Takes more than five seconds: 64 videos.
+def test_sixty_four_sub_environments(tmp_path: Path) -> None:
+    """Each has its trajectory and its video; their logs' tails have 4 MiB together."""
+    make = functools.partial(
+        gymnasium.make,
+        "InvertedPendulum-v5",
+        max_episode_steps=2,
+        height=16,
+        width=16,
+    )
     vector = SyncVectorEnv([make] * 64)
-    with mjrec.Monitor(vector, tmp_path, False, mode="evaluation", render="off") as env:
+    with mjrec.Monitor(vector, tmp_path, workers=2, quality="draft") as env:
         env.reset(seed=1)
         env.step(env.action_space.sample())
         tails = [path.stat().st_size for path in tmp_path.glob("*.tail")]
@@ -122,8 +130,10 @@ def test_sub_environments_share_one_budget_of_tails(tmp_path: Path) -> None:
         env.step(env.action_space.sample())
     assert env.get_episode_lengths() == [[2]] * 64
     for monitor in env.monitors:
-        name = f"openaigym.trajectory.{monitor.infix}.episode000000.h5"
-        assert len(mjrec.load_trajectory(tmp_path / name).actions) == 2
+        name = f"openaigym.{{}}.{monitor.infix}.{{}}000000.{{}}"
+        trajectory = tmp_path / name.format("trajectory", "episode", "h5")
+        assert len(mjrec.load_trajectory(trajectory).actions) == 2
+        assert len(frames_of(tmp_path / name.format("video", "video", "mp4"))) == 3
 
 
 def test_closing_puts_the_environments_back(corridors: Any, tmp_path: Path) -> None:

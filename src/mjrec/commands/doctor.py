@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterator
 
 from rich.console import Console
 from rich.padding import Padding
@@ -11,12 +12,23 @@ from rich.table import Table
 from rich.text import Text
 
 from ..gl import EglDevice, Probe
-from ..machine_report import Cpus, Ffmpeg, MachineReport, Package, examine_machine
+from ..machine_report import Ffmpeg, MachineReport, Package, examine_machine
 from .terminal import print_json
 
 _INDENT = 2
 # Where values stand, right of names.
 _DEEPER = 14
+
+
+@dataclasses.dataclass(frozen=True)
+class _Row:
+    """A name, its value, a remark beside it, and lines below."""
+
+    name: str
+    value: str
+    remark: str = ""
+    style: str = ""
+    below: tuple[str, ...] = ()
 
 
 def doctor(*, json: bool = False) -> int:
@@ -41,46 +53,36 @@ def doctor(*, json: bool = False) -> int:
 
 def show_report(report: MachineReport, console: Console) -> None:
     """Print `report` for people."""
-    _heading(console, "OpenGL")
-    for probe in report.backends:
-        _show_probe(console, probe)
-    _show_choice(console, report)
-    _heading(console, "ffmpeg")
-    _show_ffmpeg(console, report.ffmpeg)
-    _heading(console, "Packages")
-    _line(console, "python", report.python, report.platform)
-    for package in report.packages:
-        _show_package(console, package)
-    _heading(console, "Extras and engines")
-    for extra in report.extras:
-        if extra.version is not None:
-            _line(console, extra.name, extra.version)
-        else:
-            _line(console, extra.name, "not found", style="yellow")
-            _whole_line(console, extra.fix)
-    _heading(console, "Machine")
-    _line(console, "CPUs", str(report.cpus.usable), _about_cpus(report.cpus))
-    files = ", ".join(report.gpu_device_files)
-    _line(console, "GPUs", files or "none", "" if files else "(no device file in /dev)")
+    sections = {
+        "OpenGL": [*map(_probe, report.backends), *_choice(report)],
+        "ffmpeg": [_ffmpeg(report.ffmpeg)],
+        "Packages": [
+            _Row("python", report.python, report.platform),
+            *map(_package, report.packages),
+        ],
+        "Extras and engines": [*map(_extra, report.extras)],
+        "Machine": [*_machine(report)],
+    }
+    for heading, rows in sections.items():
+        console.print(Text(heading, style="bold"))
+        for row in rows:
+            _print(console, row)
 
 
-def _show_probe(console: Console, probe: Probe) -> None:
+def _probe(probe: Probe) -> _Row:
     if not probe.renders:
         # In no alarming colour: one backend is enough.
-        _line(console, probe.backend, "does not render", style="yellow")
-        _explain(console, probe.cause, probe.fix)
-        return
+        below = _advice(probe.cause, probe.fix)
+        return _Row(probe.backend, "does not render", style="yellow", below=below)
     speed = probe.frames_per_second
     rate = "" if speed is None else f"{speed:.3g} frames a second, 480x480"
-    _line(console, probe.backend, "renders", rate, style="green")
-    if probe.gl_renderer:
-        _block(console, f"{probe.gl_renderer}{', on the CPU' * probe.software}")
-        _block(console, f"OpenGL {probe.gl_version}")
-    for device in probe.devices:
-        _block(console, _about_device(device))
+    renderer = f"{probe.gl_renderer}{', on the CPU' * probe.software}"
+    facts = (renderer, f"OpenGL {probe.gl_version}") if probe.gl_renderer else ()
+    below = (*facts, *map(_device, probe.devices))
+    return _Row(probe.backend, "renders", rate, "green", below)
 
 
-def _about_device(device: EglDevice) -> str:
+def _device(device: EglDevice) -> str:
     facts = [
         "the CPU" if device.software else "",
         device.device_file,
@@ -90,79 +92,70 @@ def _about_device(device: EglDevice) -> str:
     return f"EGL device {device.index}: {', '.join(filter(None, facts))}"
 
 
-def _show_choice(console: Console, report: MachineReport) -> None:
+def _choice(report: MachineReport) -> Iterator[_Row]:
     if report.backend:
-        remark = f"({report.reason})"
-        _line(console, "mjrec", f"uses {report.backend}", remark, style="green")
+        yield _Row("mjrec", f"uses {report.backend}", f"({report.reason})", "green")
     else:
-        _line(console, "mjrec", "cannot render", style="red")
         # The rest says again what stands above.
-        _block(console, report.reason.partition("\n")[0])
+        reason = report.reason.partition("\n")[0]
+        yield _Row("mjrec", "cannot render", style="red", below=(reason,))
     for problem in report.problems:
-        _line(console, "note", problem.cause)
-        _block(console, problem.fix)
+        yield _Row("note", problem.cause, below=(problem.fix,))
 
 
-def _show_ffmpeg(console: Console, ffmpeg: Ffmpeg) -> None:
+def _ffmpeg(ffmpeg: Ffmpeg) -> _Row:
+    path = (f"  {ffmpeg.path}",) if ffmpeg.path else ()
     if ffmpeg.encodes:
-        _line(console, "libx264", "encodes", style="green")
-        _block(console, ffmpeg.version.partition(" Copyright")[0])
-    else:
-        _line(console, "libx264", "does not encode", style="red")
-        _explain(console, ffmpeg.cause, ffmpeg.fix)
-    if ffmpeg.path:
-        _whole_line(console, ffmpeg.path)
+        below = (ffmpeg.version.partition(" Copyright")[0], *path)
+        return _Row("libx264", "encodes", style="green", below=below)
+    below = (*_advice(ffmpeg.cause, ffmpeg.fix), *path)
+    return _Row("libx264", "does not encode", style="red", below=below)
 
 
-def _show_package(console: Console, package: Package) -> None:
+def _package(package: Package) -> _Row:
     if package.version is None:
-        _line(console, package.name, "not installed", style="yellow")
-        _block(console, package.fix)
-    elif package.works is False:
-        _line(console, package.name, package.version, "does not work", style="red")
-        _explain(console, package.cause, package.fix)
-    else:
-        _line(console, package.name, package.version)
+        fix = (package.fix,)
+        return _Row(package.name, "not installed", style="yellow", below=fix)
+    if package.works is False:
+        below = _advice(package.cause, package.fix)
+        return _Row(package.name, package.version, "does not work", "red", below)
+    return _Row(package.name, package.version)
 
 
-def _about_cpus(cpus: Cpus) -> str:
+def _extra(extra: Package) -> _Row:
+    if extra.version is not None:
+        return _Row(extra.name, extra.version)
+    return _Row(extra.name, "not found", style="yellow", below=(f"  {extra.fix}",))
+
+
+def _machine(report: MachineReport) -> Iterator[_Row]:
+    cpus = report.cpus
     quota = "no quota" if cpus.quota is None else f"a quota of {cpus.quota:g}"
-    return f"usable ({cpus.allowed} allowed of {cpus.present} present, {quota})"
+    remark = f"usable ({cpus.allowed} allowed of {cpus.present} present, {quota})"
+    yield _Row("CPUs", str(cpus.usable), remark)
+    files = ", ".join(report.gpu_device_files)
+    yield _Row("GPUs", files or "none", "" if files else "(no device file in /dev)")
 
 
-def _heading(console: Console, text: str) -> None:
-    console.print(Text(text, style="bold"))
+def _advice(cause: str, fix: str) -> tuple[str, ...]:
+    return (f"Cause: {cause}", f"Fix: {fix}") if fix else (f"Cause: {cause}",)
 
 
-def _line(
-    console: Console, name: str, value: str, remark: str = "", *, style: str = ""
-) -> None:
-    """Print a name and its value, wrapped in the value's column."""
-    row = Table.grid(padding=0)
-    row.add_column(width=_DEEPER - _INDENT, no_wrap=True)
-    row.add_column()
-    text = Text(value, style=style)
-    text.append(f" {remark}" if remark else "", style="default")
-    row.add_row(name, text)
-    console.print(Padding(row, (0, 0, 0, _INDENT), expand=False))
+def _print(console: Console, row: _Row) -> None:
+    """Print a row, wrapped in the value's column; its lines that are commands are not.
 
-
-def _explain(console: Console, cause: str, fix: str) -> None:
-    _block(console, f"Cause: {cause}")
-    if fix:
-        _block(console, f"Fix: {fix}")
-
-
-def _block(console: Console, text: str) -> None:
-    """Print lines in the column of values; those that are commands unwrapped."""
-    for line in text.splitlines():
+    What is copied from a terminal stays one line.
+    """
+    grid = Table.grid(padding=0)
+    grid.add_column(width=_DEEPER - _INDENT, no_wrap=True)
+    grid.add_column()
+    text = Text(row.value, style=row.style)
+    text.append(f" {row.remark}" if row.remark else "", style="default")
+    grid.add_row(row.name, text)
+    console.print(Padding(grid, (0, 0, 0, _INDENT), expand=False))
+    for line in "\n".join(row.below).splitlines():
         if line.startswith("  "):
-            _whole_line(console, line)
+            command = Text(" " * _INDENT * 2 + line.strip(), style="cyan")
+            console.print(command, soft_wrap=True)
         else:
             console.print(Padding(Text(line), (0, 0, 0, _DEEPER), expand=False))
-
-
-def _whole_line(console: Console, line: str) -> None:
-    # Wrapped by the terminal, if at all: what is copied from it stays one line.
-    indent = " " * (_DEEPER if not line.startswith(" ") else _INDENT * 2)
-    console.print(Text(indent + line.strip(), style="cyan"), soft_wrap=True)

@@ -113,30 +113,25 @@ class DmControlEnvironment(NamedEnvironment):
         """Whether its model depends on the seed that it was made with."""
         return self._draws_when_made
 
-    def begin_episode(self, around: Any, seeds: EpisodeSeeds) -> Any:
-        """Reset to an episode's seeds.
+    def begin(self, around: Any, seeds: EpisodeSeeds, seed: int | None) -> Any:
+        """Reset.
 
         dm_env's `reset` takes no seed. dm_control's tasks draw all their random numbers
         from one `RandomState`, which is seeded in place, because what else holds it
         must see the same. A monitor is told the seed, for its metadata.
-        """
-        self._generator().seed(seeds.environment)
-        return self._reset(around, seeds.environment)
 
-    def begin_stream(self, around: Any, seed: int, seeds: EpisodeSeeds) -> Any:
-        """Reset, seeded for all episodes that follow.
-
-        An environment that was made with this seed and never reset is not seeded again:
-        it is as `suite.load(..., task_kwargs={"random": seed})` made it, and what it
-        drew while it was made stays drawn. Any other begins the seed's sequence anew.
+        An environment that was made with this seed and never reset is as
+        `suite.load(..., task_kwargs={"random": seed})` made it: what it drew then stays
+        drawn, and it was not seeded for this episode.
         """
-        if self._was_reset or self._made_with != seed:
+        if not self._was_reset and seed == self._made_with:
+            seed = None
+        if seed is not None:
             self._generator().seed(seed)
-        return self._reset(around, None)
-
-    def next_episode(self, around: Any, seeds: EpisodeSeeds) -> Any:
-        """Reset without seeding; a monitor says that the episode had no seed."""
-        return self._reset(around, None)
+        self._was_reset = True
+        if not callable(getattr(around, "seed", print)):
+            around.seed = seed
+        return around.reset().observation
 
     def step(self, around: Any, action: Any) -> Step:
         """Step, and return what that gave."""
@@ -165,12 +160,6 @@ class DmControlEnvironment(NamedEnvironment):
 
     def _generator(self) -> Any:
         return generator_of(self.environment)
-
-    def _reset(self, around: Any, seed: int | None) -> Any:
-        self._was_reset = True
-        if not callable(getattr(around, "seed", print)):
-            around.seed = seed
-        return around.reset().observation
 
 
 def _is_fresh(generator: Any, seed: Any) -> bool:

@@ -97,19 +97,10 @@ class GymnasiumEnvironment(NamedEnvironment):
             is_random=is_random,
         )
 
-    def begin_episode(self, around: Any, seeds: EpisodeSeeds) -> Any:
-        """Reset to an episode's seeds; its action space too, for who samples there."""
-        return self.begin_stream(around, seeds.environment, seeds)
-
-    def begin_stream(self, around: Any, seed: int, seeds: EpisodeSeeds) -> Any:
-        """Reset, seeded for all episodes that follow."""
+    def begin(self, around: Any, seeds: EpisodeSeeds, seed: int | None) -> Any:
+        """Reset; a policy may draw from the action space, which is seeded, too."""
         around.action_space.seed(seeds.actions)
         return around.reset(seed=seed)[0]
-
-    def next_episode(self, around: Any, seeds: EpisodeSeeds) -> Any:
-        """Reset without seeding."""
-        around.action_space.seed(seeds.actions)
-        return around.reset()[0]
 
     def step(self, around: Any, action: Any) -> Step:
         """Step, and return what that gave."""

@@ -122,23 +122,19 @@ class NamedEnvironment(abc.ABC):
         """Whether its model depends on the seed that it was made with."""
         return False
 
-    @abc.abstractmethod
     def begin_episode(self, around: Any, seeds: EpisodeSeeds) -> Any:
         """Reset to an episode's seeds, and return the first observation."""
+        return self.begin(around, seeds, seeds.environment)
 
     @abc.abstractmethod
-    def begin_stream(self, around: Any, seed: int, seeds: EpisodeSeeds) -> Any:
-        """Reset, seeded for all episodes that follow; return the first observation.
+    def begin(self, around: Any, seeds: EpisodeSeeds, seed: int | None) -> Any:
+        """Reset, and return the first observation.
 
         Args:
             around: the environment, or a wrapper of it.
-            seed: of the environment's randomness from here on.
-            seeds: of this episode; only its actions are seeded with them.
+            seeds: of the episode; what draws its actions is seeded with them.
+            seed: of the environment's randomness from here on; None lets it go on.
         """
-
-    @abc.abstractmethod
-    def next_episode(self, around: Any, seeds: EpisodeSeeds) -> Any:
-        """Reset without seeding: the randomness goes on. Return the observation."""
 
     @abc.abstractmethod
     def step(self, around: Any, action: Any) -> Step:

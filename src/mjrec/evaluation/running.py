@@ -373,9 +373,7 @@ def _begin_in_stream(
     stream: int | None, named: NamedEnvironment, env: Any, seeds: EpisodeSeeds
 ) -> Any:
     """Begin an episode; `stream` seeds a new stream, None goes on with the last one."""
-    if stream is None:
-        return named.next_episode(env, seeds)
-    return named.begin_stream(env, stream, seeds)
+    return named.begin(env, seeds, stream)
 
 
 def _play(acting: Acting, env: Any, seeds: EpisodeSeeds, begin: _Begin) -> None:

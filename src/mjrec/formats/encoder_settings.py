@@ -8,7 +8,6 @@ the conversion of colours rounds as its definition says.
 
 from __future__ import annotations
 
-import functools
 import numbers
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,10 +18,10 @@ from .ffmpeg import (
     every_frame_arguments,
     ffmpeg_executable,
     ffmpeg_version,
+    remembered,
     run_ffmpeg,
     video_encoders,
 )
-from .program_facts import remembered
 
 _DEFAULT_CODEC = "libx264"
 _WORST_CRF = 51.0
@@ -156,32 +155,17 @@ def encoder_settings(
 def check_encoding(settings: EncoderSettings, fps: Fraction) -> None:
     """Try an encoding, so that what cannot work fails before any work.
 
-    Once for each ffmpeg, where its success depends on nothing else.
+    Once for each ffmpeg.
 
     Raises:
         EncoderError: it cannot work.
     """
-    arguments = _trial_arguments(settings, fps)
-    if settings.codec != _DEFAULT_CODEC:
-        # Others may need a device.
-        _tried(ffmpeg_executable(), settings, fps)
-        return
-
-    def answer() -> str:
-        try_encoding(settings, fps)
-        return "it works"
-
-    remembered(ffmpeg_executable(), " ".join(arguments), answer)
+    question = " ".join(_trial_arguments(settings, fps))
+    remembered(ffmpeg_executable(), question, lambda: try_encoding(settings, fps))
 
 
-@functools.lru_cache
-def _tried(executable: str, settings: EncoderSettings, fps: Fraction) -> None:
-    del executable
-    try_encoding(settings, fps)
-
-
-def try_encoding(settings: EncoderSettings, fps: Fraction) -> None:
-    """Encode one small grey frame.
+def try_encoding(settings: EncoderSettings, fps: Fraction) -> str:
+    """Encode one small grey frame; return that it works.
 
     Raises:
         EncoderError: it cannot work.
@@ -192,6 +176,7 @@ def try_encoding(settings: EncoderSettings, fps: Fraction) -> None:
         what=f"ffmpeg cannot encode {fps} frames per second with {settings.codec} "
         f"into a {settings.muxer} file: choose another codec, rate or kind of file.",
     )
+    return "it works"
 
 
 def _trial_arguments(settings: EncoderSettings, fps: Fraction) -> list[str]:

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
+import json
 import os
 import re
 import select
@@ -24,11 +25,17 @@ from pathlib import Path
 from types import TracebackType
 from typing import IO, Self
 
-from ..atomic_files import file_sha256
-from ..errors import EncoderError, Error, InvalidArgument, MissingDependency
+from ..atomic_files import file_sha256, write_text
+from ..errors import (
+    EncoderError,
+    Error,
+    FileNotWritten,
+    InvalidArgument,
+    MissingDependency,
+)
 from ..frames import Frame
 from ..patience import Patience
-from .program_facts import remembered
+from .regular_files import read_regular
 
 _ENVIRONMENT_VARIABLE = "IMAGEIO_FFMPEG_EXE"
 _END_OF_STDERR = 2000
@@ -36,6 +43,11 @@ _PIPE_SIZE = 1 << 20
 _SECONDS_TO_DIE = 10.0
 # The libavutil of ffmpeg 5.1, which renamed an option; 9 took the old name away.
 _LIBAVUTIL_OF_FPS_MODE = (57, 28)
+_MOST_BYTES = 1 << 20
+_MOST_PROGRAMS = 8
+
+# Of each program what it answered.
+_answers: dict[str, dict[str, str]] = {}
 
 
 def ffmpeg_executable() -> str:
@@ -72,6 +84,47 @@ def ffmpeg_sha256() -> str:
     return remembered(
         executable, "sha256", lambda: file_sha256(Path(executable).resolve())
     )
+
+
+def remembered(program: str, question: str, answer: Callable[[], str]) -> str:
+    """Return the answer to a question about a program, asking only once.
+
+    Asking ffmpeg three questions and hashing its 80 megabytes takes as long as drawing
+    a hundred small frames. So the answers lie in `$XDG_CACHE_HOME/mjrec/programs.json`
+    (`~/.cache/mjrec/programs.json` by default), which can be deleted at any time. They
+    count only for the very file that was asked: the same path, device, inode, size and
+    times, of which the kernel sets the last.
+
+    Args:
+        program: its path.
+        question: what tells it from other questions.
+        answer: asks the program; what it raises is not remembered.
+    """
+    status = Path(program).stat()
+    times = (status.st_mtime_ns, status.st_ctime_ns)
+    numbers = (status.st_dev, status.st_ino, status.st_size, *times)
+    identity = " ".join(map(str, (*numbers, program)))
+    home = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")  # noqa: PTH111  `Path.home` raises for users without one
+    path = Path(home, "mjrec", "programs.json")
+    if identity not in _answers:
+        _answers[identity] = _read(path).get(identity, {})
+    answers = _answers[identity]
+    if question not in answers:
+        answers[question] = answer()
+        with contextlib.suppress(OSError, FileNotWritten):
+            path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+            others = {k: v for k, v in _read(path).items() if k != identity}
+            newest = dict(list(others.items())[1 - _MOST_PROGRAMS :])
+            write_text(path, json.dumps({**newest, identity: answers}))
+    return answers[question]
+
+
+def _read(path: Path) -> dict[str, dict[str, str]]:
+    # Whatever stands there, it can be found out again.
+    with contextlib.suppress(OSError, ValueError, TypeError, AttributeError):
+        said = json.loads(read_regular(path, limit=_MOST_BYTES))
+        return {key: dict(value) for key, value in said.items()}
+    return {}
 
 
 def video_encoders() -> list[str]:

@@ -46,6 +46,8 @@ from .trajectory_log import pack_change
 
 # A new log begins with the next recording then.
 _LONG = 64 << 20
+# Finding one of them means reading them all.
+_MANY = 256
 
 # The tail of a log of one recording is that much shorter: making it takes longer than
 # all else at the start of an episode.
@@ -138,6 +140,7 @@ class OpenLog:
         bodies: for each slot all words behind its head.
         is_alone: it is one recording's only, and ends with it.
         look_size: the bytes of all changes of the model so far.
+        begun: how many recordings it has.
     """
 
     def __init__(
@@ -151,7 +154,7 @@ class OpenLog:
         self.path = path
         self.facts = facts
         self.is_alone = False
-        self.look_size = 0
+        self.look_size = self.begun = 0
         self._dtype = dtype
         self._looks: int | None = None
         # What the disk was too full for, until it is said.
@@ -177,7 +180,7 @@ class OpenLog:
 
     def suits(self, dtype: np.dtype[Any]) -> bool:
         """Tell whether a recording with such rows can go on in this log."""
-        is_short = self.rows.size + self.look_size < _LONG
+        is_short = self.rows.size + self.look_size < _LONG and self.begun < _MANY
         is_free = self.rows.is_open and not self.is_alone
         return is_short and is_free and (self._dtype is dtype or self._dtype == dtype)
 
@@ -290,7 +293,6 @@ class SpanWriter:
         self.steps = self.frame_count = 0
         self.last_frame = -1
         self._name = name
-        self._first_row = log.rows.count
         known = log.facts
         own = {
             key: value
@@ -299,15 +301,11 @@ class SpanWriter:
             if key not in known or (known[key] is not value and known[key] != value)
         }
         without = [key for key in known if key not in facts]
-        line = {"begin": name, "row": self._first_row, "look": log.look_size}
+        line = {"begin": name, "row": log.rows.count, "look": log.look_size}
         line |= {"facts": own, **({"without": without} if without else {})}
         log.say_at_once(line)
         log.is_alone = alone
-
-    @property
-    def size(self) -> int:
-        """The bytes of its rows."""
-        return (self.log.rows.count - self._first_row) * self.log.rows.row_size
+        log.begun += 1
 
     def make_room(self) -> int:
         """Return the slot that the next row is to be filled in.

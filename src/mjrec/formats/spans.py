@@ -24,13 +24,12 @@ A recording is called by the path of the file that it will become.
 from __future__ import annotations
 
 import contextlib
+import functools
 import os
-import threading
-import time
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 
@@ -47,7 +46,7 @@ from .monitor_directory import (
     lock_name,
     names_in,
 )
-from .regular_files import open_regular
+from .regular_files import open_regular, regular_path
 from .row_log import tail_path
 from .trajectory import check_version, dtype_from_json
 
@@ -108,8 +107,6 @@ class SpanList:
     facts: Mapping[str, Any] = field(default_factory=dict)
     recordings: dict[str, Recording] = field(default_factory=dict)
     is_closed: bool = False
-    _first: bytes = b""
-    _offset: int = 0
 
     @property
     def log(self) -> Path:
@@ -131,27 +128,6 @@ class SpanList:
     def in_flight(self) -> list[Recording]:
         """Return the recordings that only the log has."""
         return [each for each in self.recordings.values() if each.is_in_flight]
-
-    def read_on(self, file: BinaryIO) -> bool:
-        """Read what was added; tell whether the file is the one that was read before.
-
-        Raises:
-            ValueError: it is no such list, or of a newer format.
-        """
-        # Names and inodes are given anew, where `force` removes what there was.
-        size = os.fstat(file.fileno()).st_size
-        if size < self._offset or file.read(len(self._first)) != self._first:
-            return False
-        file.seek(self._offset)
-        while line := file.readline(size - self._offset):
-            if not line.endswith(b"\n"):
-                # It is being written, or its writer was killed.
-                break
-            # In this order: what an error or Ctrl-C cuts short is taken again.
-            self._take(line)
-            self._first = self._first or line
-            self._offset += len(line)
-        return True
 
     def _take(self, line: bytes) -> None:
         if self.dtype is None:
@@ -248,38 +224,13 @@ def infix_of_recording(name: str) -> str | None:
     return None if episode_of(path) is None else infix_of(path)
 
 
-class _Known(threading.local):
-    """What a thread has read of directories and lists."""
-
-    def __init__(self) -> None:
-        # When a directory had changed last, and the names that it had then.
-        self.directory: tuple[Path, int, list[str]] | None = None
-        self.lists: dict[Path, SpanList] = {}
-
-
-_known = _Known()
-_MOST_LISTS = 32
-# A directory's time stands still for moments in which it changes.
-_SETTLED_NS = 1_000_000_000
-
-
 def list_paths(directory: Path, infix: Infix | str | None = None) -> Iterator[Path]:
     """Return the paths of the lists of a directory, or of one monitor in it."""
-    for name in _list_names(directory):
+    names = (name for name in names_in(directory) if name.endswith(SPANS))
+    for name in sorted(names):
         own = infix_of(name)
         if own is not None and (infix is None or own == str(infix)):
             yield directory / name
-
-
-def _list_names(directory: Path) -> list[str]:
-    # Each recording is looked for by itself, and there may be thousands of files.
-    changed, now = directory.stat().st_mtime_ns, time.time_ns()
-    if _known.directory is not None and _known.directory[:2] == (directory, changed):
-        return _known.directory[2]
-    names = sorted(name for name in names_in(directory) if name.endswith(SPANS))
-    is_settled = now - changed > _SETTLED_NS
-    _known.directory = (directory, changed, names) if is_settled else None
-    return names
 
 
 def read_list(path: Path) -> SpanList:
@@ -289,17 +240,23 @@ def read_list(path: Path) -> SpanList:
         UnreadableFile: it is no such list, or of a newer format, or there is no such
             file.
     """
-    with unreadable(path), open_regular(path) as file:
-        spans = _known.lists.pop(path, None)
-        if spans is None or not spans.read_on(file):
-            file.seek(0)
-            spans = SpanList(path)
-            spans.read_on(file)
-        # The oldest goes first.
-        _known.lists[path] = spans
-        if len(_known.lists) > _MOST_LISTS:
-            _known.lists.pop(next(iter(_known.lists)))
-        return spans
+    with unreadable(path):
+        status = regular_path(path).stat()
+        version = status.st_ino, status.st_size, status.st_mtime_ns
+        return _read_version(path, version)
+
+
+# Each recording is looked for by itself, in all lists of its monitor.
+@functools.lru_cache(maxsize=64)
+def _read_version(path: Path, version: tuple[int, ...]) -> SpanList:
+    del version
+    spans = SpanList(path)
+    with open_regular(path) as file:
+        for line in file:
+            # Without its end it is being written, or its writer was killed.
+            if line.endswith(b"\n"):
+                spans._take(line)
+    return spans
 
 
 def find_recording(path: Path) -> Recording | None:

@@ -8,6 +8,7 @@ besides: of the episode, of the pictures, of what went wrong.
 
 from __future__ import annotations
 
+import contextlib
 import re
 from collections.abc import Iterable, Mapping
 from fractions import Fraction
@@ -16,8 +17,14 @@ from typing import Any
 
 from .. import json_text
 from ..atomic_files import write_text
+from ..errors import Error
 from .json_fields import read_object, unreadable
 from .video_file import VideoFile
+
+_FAILED = ".failed.json"
+# What ffmpeg or a driver says can be long; what matters is where it begins and ends.
+_LONGEST_REASON = 1000
+_CUT = " [...] "
 
 # Of a file's name, as `video_names` makes them.
 _PART = re.compile(r"[A-Za-z0-9_%-]{1,200}", re.ASCII)
@@ -203,3 +210,44 @@ def _is_further(name: str, video: Path) -> bool:
     begin, end = f"{video.stem}.", ".mp4"
     part = name.removeprefix(begin).removesuffix(end)
     return name == f"{begin}{part}{end}" and _PART.fullmatch(part) is not None
+
+
+def failure_path(video: Path) -> Path:
+    """Return the name of the file that says why a video could not be rendered.
+
+    It is `{"reason": "no OpenGL backend works here: ..."}`, written when rendering has
+    failed, and removed once the video is there.
+
+    Args:
+        video: or a part of a clip, whose video may not be known.
+    """
+    return video.with_suffix(_FAILED)
+
+
+def note_failure(video: Path, reason: str) -> None:
+    """Write down why a video could not be rendered, as far as that can be written."""
+    with contextlib.suppress(Error, OSError):
+        text = json_text.dumps({"reason": _shortened(reason)})
+        write_text(failure_path(video), text)
+
+
+def forget_failure(video: Path) -> None:
+    """Remove what was said of a video that is there now."""
+    with contextlib.suppress(OSError):
+        failure_path(video).unlink(missing_ok=True)
+
+
+def reason_of(video: Path) -> str | None:
+    """Return why a video could not be rendered; None where it has not failed."""
+    try:
+        reason = read_object(failure_path(video)).get("reason")
+    except (OSError, ValueError):
+        return None
+    return reason if isinstance(reason, str) else None
+
+
+def _shortened(reason: str) -> str:
+    if len(reason) <= _LONGEST_REASON:
+        return reason
+    half = (_LONGEST_REASON - len(_CUT)) // 2
+    return f"{reason[:half]}{_CUT}{reason[-half:]}"

@@ -7,6 +7,4 @@ environments is monitored.
 
 from __future__ import annotations
 
-from .monitor import Monitor
-
-__all__ = ["Monitor"]
+from .monitor import Monitor as Monitor

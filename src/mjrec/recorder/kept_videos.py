@@ -29,9 +29,7 @@ class KeptVideos:
 
     def __init__(self, selection: Selection) -> None:
         self.selection = selection
-        # With their sizes, which do not change any more.
-        self._held: dict[int, tuple[EpisodeRecording, int]] = {}
-        self._bytes_held = self._most_bytes_held = 0
+        self._held: dict[int, EpisodeRecording] = {}
         self._is_decided = False
         # Why nothing could be decided, and which episodes stay for that.
         self._failure: str | None = None
@@ -51,22 +49,18 @@ class KeptVideos:
             episode: the episode; None where it was not completed.
         """
         if episode is not None:
+            if self.selection.holds_all and not self.selection.finished:
+                logger.info(
+                    "Which episodes get a video is decided at the end (keep=%s): until "
+                    "then the recordings of all of them stay on the disk.",
+                    self.selection.name,
+                )
             self.selection.add(episode)
         return self.selection.standing(episode_id)
 
     def hold(self, recording: EpisodeRecording) -> None:
         """Hold what there is of an episode that has ended, until it is decided on."""
-        if self.selection.holds_all and not self._most_bytes_held:
-            logger.info(
-                "Which episodes get a video is decided at the end (keep=%s): until "
-                "then the recordings of all of them stay on the disk.",
-                self.selection.name,
-            )
-        size = recording.size
-        self._held[recording.episode_id] = recording, size
-        self._bytes_held += size
-        if self.selection.standing(recording.episode_id) is Standing.CANDIDATE:
-            self._most_bytes_held = max(self._most_bytes_held, self._bytes_held)
+        self._held[recording.episode_id] = recording
 
     def settle(self) -> None:
         """Hand on what is chosen by now, and delete what has fallen out.
@@ -79,25 +73,27 @@ class KeptVideos:
             self._hand_on(list(self._held))
 
     def decide(self) -> None:
-        """Decide about all that is held: there are no more episodes. Idempotent.
+        """Decide about all that is held: there are no more episodes.
 
         Raises:
             InvalidArgument: the user's function could not choose. All episodes that
                 are held stay, and their videos are pending, or there.
             DirectoryNotWritable, FileNotWritten: as of `settle`.
         """
-        if self._failure is not None:
-            self._leave_all()
+        if self._is_decided or self._failure is not None:
             return
         try:
             self.selection.close()
         except InvalidArgument as error:
             self._failure = str(error)
-            self._leave_all()
+            self._left = list(self._held)
+            for recording in self._held.values():
+                recording.expect()
             raise
         self._is_decided = True
         # What is wanted first: should this be killed, it has not lost that.
-        self._hand_on(sorted(self._held, key=lambda k: not self._is_chosen(k)))
+        chosen = set(self.selection.chosen)
+        self._hand_on(sorted(self._held, key=lambda number: number not in chosen))
 
     def details(self) -> dict[str, Any]:
         """Return what the journal says of the choice, once it is made."""
@@ -107,35 +103,23 @@ class KeptVideos:
             "decided": self._is_decided,
             "chosen": self.selection.chosen,
             "finished": self.selection.finished,
-            "most_bytes_held": self._most_bytes_held,
             "recorded": self._left or self.selection.chosen,
             **failure,
         }
 
-    def _is_chosen(self, episode_id: int) -> bool:
-        return self.selection.standing(episode_id) is Standing.CHOSEN
-
     def _hand_on(self, episode_ids: Iterable[int]) -> None:
-        failed: list[Error] = []
+        failure: Error | None = None
         for episode_id in episode_ids:
             standing = self.selection.standing(episode_id)
             if standing is Standing.CANDIDATE:
                 continue
-            recording, size = self._held[episode_id]
+            recording = self._held.pop(episode_id)
             try:
                 if standing is Standing.CHOSEN:
                     recording.choose(self.chosen_facts())
                 else:
                     recording.drop()
             except Error as error:
-                failed.append(error)
-            self._bytes_held -= size
-            del self._held[episode_id]
-        if failed:
-            raise failed[0]
-
-    def _leave_all(self) -> None:
-        for episode_id, (recording, _) in self._held.items():
-            self._left.append(episode_id)
-            recording.expect()
-        self._held.clear()
+                failure = failure or error
+        if failure is not None:
+            raise failure

@@ -46,11 +46,6 @@ class LiveVideos:
         """The first camera's video."""
         return Path(str(self.recorders[0].path))
 
-    @property
-    def size(self) -> int:
-        """The bytes of all files."""
-        return sum(path.stat().st_size for path in self._files() if path.exists())
-
     def begin(self) -> None:
         """Take the frames of a reset."""
         self._each(VideoRecorder.capture_frame)
@@ -145,27 +140,15 @@ class LiveVideos:
         Raises:
             DirectoryNotWritable: they cannot be removed.
         """
-        for path in self._files():
-            try:
-                path.unlink(missing_ok=True)
-            except OSError as error:
-                raise DirectoryNotWritable(path.parent, error) from error
-
-    def _files(self) -> list[Path]:
-        """Return all files, in the order in which they may go.
-
-        The first camera's metadata, written last, is the sign that all are there.
-        """
-        return [
-            file
-            for recorder in reversed(self.recorders)
-            if recorder.path is not None and recorder.metadata_path is not None
-            for file in (
-                Path(recorder.metadata_path),
-                Path(recorder.path),
-                frame_hash_path(Path(recorder.path)),
-            )
-        ]
+        # The first camera's metadata, written last, is the sign that all are there.
+        for recorder in reversed(self.recorders):
+            video = Path(str(recorder.path))
+            about = Path(str(recorder.metadata_path))
+            for path in (about, video, frame_hash_path(video)):
+                try:
+                    path.unlink(missing_ok=True)
+                except OSError as error:
+                    raise DirectoryNotWritable(path.parent, error) from error
 
     def _each(self, capture: Callable[[VideoRecorder], None]) -> None:
         for recorder in self.recorders:

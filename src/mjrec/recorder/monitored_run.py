@@ -24,13 +24,13 @@ from .finishers import Finisher
 from .opening import OpenDirectory
 from .options import LIVE, WARN, RecorderOptions
 from .stats_recorder import StatsRecorder
+from .step_arrays import RowLayout
 from .subject import Subject, check_refusal
 from .tracking import Trackers
 from .video_recorder import VideoRecorder
 
 if TYPE_CHECKING:
     from ..simulation.capture import EpisodeStart
-    from .states import RowLayout
 
 logger = logging.getLogger(__name__)
 

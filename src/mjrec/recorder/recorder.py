@@ -21,8 +21,8 @@ from ..formats.monitor_directory import (
     stats_prefix,
     video_prefix,
 )
-from ..formats.render_failures import note_failure, reason_of
 from ..formats.spans import FINISHED, recordings_in_flight
+from ..formats.video_metadata import note_failure, reason_of
 from ..provenance import versions
 from ..results.manifest_writing import write_manifest_and_stats
 from .clips import Clips
@@ -64,6 +64,9 @@ class Recorder:
             is to be rendered now.
 
     Attributes:
+        directory: the monitor directory, absolute.
+        infix: what the names of this monitor's files have in the middle.
+        episode_id: the number of the next episode: as in gym, it rises at each reset.
         run: what all recordings share.
         stats_recorder: counts steps and rewards.
         closed: nothing is recorded any more.
@@ -112,8 +115,9 @@ class Recorder:
                 "views": [*subject.further_views],
             },
         )
-        infix = self._place.infix
-        self._next_episode_id = self._place.first_episode_id
+        self.directory, infix = self._place.path, self._place.infix
+        self.infix = str(infix)
+        self.episode_id = self._place.first_episode_id
         self._states = [
             each for each in (subject.states, subject.clip_states) if each is not None
         ]
@@ -138,21 +142,6 @@ class Recorder:
         )
         self._kept = None if selection is None else KeptVideos(selection)
         self._clips = Clips(self.run) if options.has_clips else None
-
-    @property
-    def directory(self) -> Path:
-        """The monitor directory, absolute."""
-        return self._place.path
-
-    @property
-    def infix(self) -> str:
-        """What the names of this monitor's files have in the middle."""
-        return str(self._place.infix)
-
-    @property
-    def episode_id(self) -> int:
-        """The number of the next episode: as in gym, it rises at each reset."""
-        return self._next_episode_id
 
     @property
     def done(self) -> bool | None:
@@ -226,7 +215,7 @@ class Recorder:
             PicturesDiffer: rendering was to be deferred, and cannot be.
         """
         if self._is_unbegun():
-            self._next_episode_id -= 1
+            self.episode_id -= 1
             if self._recording is not None:
                 self._recording.discard()
         else:
@@ -235,7 +224,7 @@ class Recorder:
         self.stats_recorder.after_reset()
         self.run.begin(
             BegunEpisode(
-                episode_id=self._next_episode_id,
+                episode_id=self.episode_id,
                 type=self.stats_recorder.episode_type,
                 start_time=self._reset_time,
                 seed=seed,
@@ -244,7 +233,7 @@ class Recorder:
                 reset_clock=self._subject.clock() if self._options.annotate else None,
             )
         )
-        self._next_episode_id += 1
+        self.episode_id += 1
         # That of the episode before is over, whatever the schedule raises.
         recording = EpisodeRecording(self.run, on_picture_error=self.note_error)
         self._recording = recording
@@ -664,7 +653,7 @@ class Recorder:
         self.run.note_surroundings(wait=True)
         if self._kept is not None:
             self.run.note("keep", self._kept.details())
-        self.run.note("closed", {"next_episode_id": self._next_episode_id})
+        self.run.note("closed", {"next_episode_id": self.episode_id})
         for name, why in self.failures().items():
             # Most were written down by the process that has failed.
             video = self.directory / self._video_of(name)

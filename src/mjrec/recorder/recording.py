@@ -60,11 +60,6 @@ class EpisodeRecording:
             return LIVE
         return DEFERRED if isinstance(self.video, DeferredVideo) else None
 
-    @property
-    def size(self) -> int:
-        """The bytes of what there is of it."""
-        return sum(each.size for each in (self.states, self.live) if each is not None)
-
     def begin(
         self, observation: Any, *, wants_video: bool, keeps: bool, stays: bool
     ) -> None:

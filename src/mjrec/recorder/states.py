@@ -9,7 +9,7 @@ import logging
 from collections.abc import Callable, Mapping
 from fractions import Fraction
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,33 +21,12 @@ from ..rates import rate_from_timestep, stride_for
 from ..simulation.raw_memory import words_of
 from .fast_path import FastPath, gathering
 from .monitored_run import MonitoredRun, What
-from .step_arrays import StepArray, action_array, step_array
+from .step_arrays import RowLayout, StepArray, action_array, step_array
 
 if TYPE_CHECKING:
     from ..simulation.capture import Capture, EpisodeStart
 
 logger = logging.getLogger(__name__)
-
-
-class RowLayout(NamedTuple):
-    """What rows consist of. The next recording's are usually the same.
-
-    Attributes:
-        state, snapshot: what is taken of the simulation.
-        action: memory for actions.
-        observation: dtype and shape of an observation.
-        start_words: where state and snapshot lie in memory, if they can be gathered.
-        dtype: of a row.
-        words: where all of a row but its head lies, if it can be gathered.
-    """
-
-    state: np.dtype[Any] | None
-    snapshot: np.dtype[Any] | None
-    action: StepArray | None
-    observation: np.dtype[Any] | None
-    start_words: NDArray[np.intp] | None
-    dtype: np.dtype[Any]
-    words: NDArray[np.intp] | None
 
 
 class StateRecorder:
@@ -159,11 +138,6 @@ class StateRecorder:
     def frame_count(self) -> int:
         """How many snapshots were taken."""
         return 0 if self._span is None else self._span.frame_count
-
-    @property
-    def size(self) -> int:
-        """The bytes of its rows."""
-        return 0 if self._span is None else self._span.size
 
     def before_step(self, action: Any) -> None:
         """Note the action of the coming step, which the environment may overwrite."""

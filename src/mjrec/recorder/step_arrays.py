@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Actions and observations as arrays of one kind, step after step."""
+"""Actions and observations as arrays of one kind, and the rows that hold them."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -133,3 +133,24 @@ def _of_mapping(example: Mapping[str, Any]) -> StepArray | None:
     shapes = {name: array.shape for name, array in arrays.items()}
     size = sum(array.size for array in arrays.values())
     return StepArray(np.dtype("<f8"), (size,), shapes)
+
+
+class RowLayout(NamedTuple):
+    """What rows consist of. The next recording's are usually the same.
+
+    Attributes:
+        state, snapshot: what is taken of the simulation.
+        action: memory for actions.
+        observation: dtype and shape of an observation.
+        start_words: where state and snapshot lie in memory, if they can be gathered.
+        dtype: of a row.
+        words: where all of a row but its head lies, if it can be gathered.
+    """
+
+    state: np.dtype[Any] | None
+    snapshot: np.dtype[Any] | None
+    action: StepArray | None
+    observation: np.dtype[Any] | None
+    start_words: NDArray[np.intp] | None
+    dtype: np.dtype[Any]
+    words: NDArray[np.intp] | None

@@ -280,7 +280,7 @@ class _Stopped(BaseException):
 def main() -> None:
     """Finish the recordings that the simulation's process names, until it ends."""
     # Not at the top: the simulation's process needs none of it.
-    from .finisher import Finisher
+    from .pool import WorkerPool
 
     parser = argparse.ArgumentParser()
     parser.add_argument("directory", type=Path)
@@ -295,12 +295,17 @@ def main() -> None:
     with contextlib.suppress(_Stopped, EOFError):
         signal.signal(signal.SIGTERM, _stop)
         first = parent.receive()
-        with contextlib.closing(
-            Finisher(directory, workers=workers, forks=True)
-        ) as finisher:
+        pool = WorkerPool(workers, directory=directory, forks=True)
+        with contextlib.closing(pool):
             if "expected" in first:
-                # Before there is a second thread, which a fork would not have.
-                finisher.start_workers()
+                # Before there is a second thread, which a fork would not have. What is
+                # in the way is said when there is something to draw.
+                with contextlib.suppress(Error):
+                    pool.start()
+            # They make their contexts while the rest is imported.
+            from .finisher import Finisher
+
+            finisher = Finisher(pool)
             parent.listen(_leave)
             _Work(finisher, directory, parent, strict=arguments.strict).do(first)
 

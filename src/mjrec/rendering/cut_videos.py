@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import EncoderError, Error, UnreadableFile
-from ..formats.asciicast import AsciicastWriter, unfinished_recording
+from ..formats.asciicast import unfinished_recording
 from ..formats.journal import KILLED
 from ..formats.locks import is_locked
 from ..formats.monitor_directory import episode_of
@@ -28,6 +28,7 @@ from ..formats.video_metadata import (
     timing_facts,
     write_metadata,
 )
+from ..formats.video_sink import VideoSink
 
 _MOMENT = 0.05
 # In the metadata of clips only.
@@ -163,20 +164,18 @@ def finish_text(
             return
         if "complete" not in known or known.get("length") != len(frames) - 1:
             known = {**_sums(known), **_CUT}
-        writer = AsciicastWriter(path, rate=rate)
+        sink = VideoSink(path, fps=rate)
         for frame in frames:
-            writer.write(frame)
-        writer.close()
-        metadata = {
+            sink.write(frame)
+        sink.finish()
+        said = {
             "episode_id": episode_of(path.name),
             "content_type": "video/vnd.openai.ansivid",
-            "encoder_version": {"backend": "TextEncoder", "version": 1},
             "recording": "live",
             **{key: facts[key] for key in _SAID_BY_TRAJECTORY if key in facts},
             **known,
             **timing_facts(StepRuns(range(len(frames))), fps=rate, timestep=None),
             "recovered": True,
         }
-        write_metadata(path, metadata)
-        yield path.name, _counted(len(frames), metadata)
+        yield path.name, _counted(len(frames), sink.describe(said))
     part.unlink(missing_ok=True)

@@ -13,13 +13,13 @@ import os
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import Executor
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 from ..engines.jobs import JobOutcome, Run, Work
 from ..simulation.model_trust import TRUST_VARIABLE, note_models, stored_models
 from .finisher import Finisher, note_failure
 from .jobs import Progress, RenderedVideos, VideoJob
+from .pool import WorkerPool
 from .recordings import may_be_left
 
 _WORKER = "mjrec.rendering.engine_jobs:VideoWorker"
@@ -124,7 +124,7 @@ class VideoWorker:
     def __init__(self, settings: Mapping[str, Any] | None = None) -> None:
         note_models((settings or {}).get("models", ()))
         # With a number of workers no directory's CPUs are shared.
-        self._finisher = Finisher(Path(), workers=1)
+        self._finisher = Finisher(WorkerPool(1))
 
     def __call__(self, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
         """Do a job."""

@@ -18,7 +18,7 @@ from ..errors import (
     GLError,
     InvalidArgument,
 )
-from ..formats import render_failures
+from ..formats import video_metadata
 from ..formats.spans import drop_recording
 from ..formats.trajectory_file import finish_trajectory
 from .jobs import Progress, RenderedVideos, VideoJob, key_of
@@ -53,8 +53,8 @@ def do_jobs(
         workers: how many processes draw; None is one for each free CPU.
         on_progress: called after every frame, and when a job is over.
     """
-    finisher = Finisher(directory, workers=workers, on_progress=on_progress)
-    with contextlib.closing(finisher):
+    pool = WorkerPool(workers, directory=directory)
+    with contextlib.closing(Finisher(pool, on_progress=on_progress)) as finisher:
         for job in jobs:
             finisher.add(job)
         while finisher:
@@ -73,17 +73,15 @@ def note_failure(directory: Path, name: str, reason: str) -> None:
     """
     key = key_of(name)
     if name.endswith(".mp4") or (key is not None and key.is_clip):
-        render_failures.note_failure(directory / name, reason)
+        video_metadata.note_failure(directory / name, reason)
 
 
 class Finisher:
     """Does the jobs that are added to it, in their order, with one pool of workers.
 
     Args:
-        directory: whose CPUs are shared.
-        workers: how many processes draw; None is one for each free CPU.
+        pool: of the workers; closed with it.
         on_progress: as of `do_jobs`. It may add jobs.
-        forks: as of `WorkerPool`.
 
     Attributes:
         progress: how far it is.
@@ -91,16 +89,11 @@ class Finisher:
     """
 
     def __init__(
-        self,
-        directory: Path,
-        *,
-        workers: int | None,
-        on_progress: _OnProgress = lambda _: None,
-        forks: bool = False,
+        self, pool: WorkerPool, *, on_progress: _OnProgress = lambda _: None
     ) -> None:
         self.progress = Progress(frames=0)
         self.on_progress = on_progress
-        self._pool = WorkerPool(workers, directory=directory, forks=forks)
+        self._pool = pool
         # None where a job cannot be planned: its turn says why.
         self._waiting: dict[str, tuple[VideoJob, Plan | None]] = {}
         self._gl_failure: GLError | None = None

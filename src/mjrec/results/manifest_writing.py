@@ -39,13 +39,14 @@ from ..formats.monitor_directory import (
     trajectory_prefix,
     video_prefix,
 )
-from ..formats.render_failures import forget_failure, reason_of
 from ..formats.spans import FINISHED, is_in_flight
 from ..formats.video_metadata import (
     finished_videos,
+    forget_failure,
     is_broken,
     is_done,
     metadata_path,
+    reason_of,
 )
 from ..formats.video_names import tiled_name, with_part
 from .journal_or_stats import MonitorResults
@@ -218,7 +219,6 @@ def _keep(run: Run) -> dict[str, Any] | None:
         "decided": False,
         "chosen": sorted(run.chosen),
         "finished": None,
-        "most_bytes_held": None,
         **run.facts["keep"],
     }
 

@@ -19,7 +19,7 @@ from .fields import apply_fields, read_fields
 from .model_sources import with_embedded_files
 from .model_store import load_model
 from .renderer import is_kept_by_context
-from .snapshot import restore_snapshot
+from .snapshot import check_layout, restore_snapshot
 from .view import view_from_facts
 
 _BLOCK_BYTES = 1 << 20
@@ -62,10 +62,14 @@ class RecordedScene:
         self.model = load_model(reader.path.parent, facts["model"])
         self.data = mujoco.MjData(self.model)
         self.count = reader.frame_count
+        self._rows = reader.snapshots(0, 0)
+        try:
+            check_layout(self.model, self.data, self._rows.dtype)
+        except InvalidArgument as error:
+            raise UnreadableFile(reader.path, error) from error
         self._restart()
         self._originals: dict[str, NDArray[Any]] = {}
         self._block = range(0)
-        self._rows = reader.snapshots(0, 0)
 
     def bring_to(self, index: int) -> bool:
         """Bring back what was there at frame `index`, one of `count`.

@@ -21,11 +21,10 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import InvalidArgument
 from ..formats.trajectory import columns_of
 from .captured_arrays import drawn_readings
 from .fields import apply_fields
-from .snapshot import SnapshotSource, layout_objection
+from .snapshot import SnapshotSource, check_layout
 from .states import STATE_BITS, STATE_SPEC, read_state, state_columns, state_dtype
 
 # What a simulation with these keeps outside its state, so that no step follows from it.
@@ -122,7 +121,7 @@ class SnapshotSteps(StateSteps):
         kind: np.dtype[Any],
     ) -> None:
         super().__init__(model, parts)
-        _check_snapshots(self._model, self._data, kind)
+        check_layout(self._model, self._data, kind)
         self._source = SnapshotSource(self._model, self._data, kind)
         names = np.array([name.partition("[")[0] for name in column_names(kind)])
         self._unseen = np.zeros(len(names), bool)
@@ -239,7 +238,7 @@ def live_snapshot(
     Raises:
         InvalidArgument: what is recorded is not of this model.
     """
-    _check_snapshots(model, data, kind)
+    check_layout(model, data, kind)
     columns = state_columns(model, parts)
     state = np.empty(len(columns))
     state[columns] = read_state(model, data)
@@ -275,14 +274,6 @@ def turns_by_rk4(model: mujoco.MjModel) -> bool:
     kinds = (mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_BALL)
     by_rk4 = model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4
     return bool(by_rk4 and np.isin(model.jnt_type, [int(k) for k in kinds]).any())
-
-
-def _check_snapshots(
-    model: mujoco.MjModel, data: mujoco.MjData, kind: np.dtype[Any]
-) -> None:
-    objection = layout_objection(model, data, kind)
-    if objection is not None:
-        raise InvalidArgument(objection)
 
 
 def _input_numbers(model: mujoco.MjModel) -> NDArray[np.bool_]:

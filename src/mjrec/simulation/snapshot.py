@@ -115,51 +115,51 @@ class TendonColours:
                 self.rgba[geom.objid] = geom.rgba
 
 
-def layout_objection(
+def check_layout(
     model: mujoco.MjModel, data: mujoco.MjData, kind: np.dtype[Any]
-) -> str | None:
-    """Say why recorded snapshots are none of this model; None if they may be.
+) -> None:
+    """Check that recorded snapshots are of this model, before they are restored.
 
     They hold at least what MuJoCo's default option needs.
+
+    Raises:
+        InvalidArgument: they are not, or of another version of MuJoCo.
     """
     for name in kind.names or ():
         is_colour = name == TENDON_RGBA
         if not is_colour and name not in SNAPSHOT_ARRAYS:
-            return f"The snapshots hold {name!r:.40}, which no frame needs."
+            raise InvalidArgument(
+                f"The snapshots hold {name!r:.40}, which no frame needs."
+            )
         own = array_kind(model if is_colour else data, name)
         if kind[name] != own:
-            return f"The snapshots' {name} is {kind[name]}, and in this model {own}."
+            raise InvalidArgument(
+                f"The snapshots' {name} is {kind[name]}, and here it is {own}: they "
+                "belong to another model or version of MuJoCo."
+            )
     held = {*(kind.names or ())}
     missing = {name for name in ALWAYS if array_kind(data, name) is not None} - held
     if missing:
-        return f"The snapshots hold no {', no '.join(sorted(missing))}."
-    return None
+        raise InvalidArgument(f"The snapshots hold no {', no '.join(sorted(missing))}.")
 
 
 def restore_snapshot(row: Any, model: mujoco.MjModel, data: mujoco.MjData) -> None:
     """Put what a snapshot holds back, ready for `mjv_updateScene`.
 
     Args:
-        row: one of `TrajectoryReader.snapshots`.
+        row: one of `TrajectoryReader.snapshots`, whose layout was checked.
         model: the colours of its tendons are set where `row` has them.
         data: its data.
 
     Raises:
-        InvalidArgument: an array is of another kind, or leads to where the model has
-            nothing, which MuJoCo would not notice.
+        InvalidArgument: a tendon leads to where the model has nothing, which MuJoCo
+            would not notice.
     """
-    kind = row.dtype
-    for name in kind.names or ():
+    names = row.dtype.names or ()
+    for name in names:
         target = model if name == TENDON_RGBA else data
-        is_known = name in SNAPSHOT_ARRAYS or name == TENDON_RGBA
-        own = array_kind(target, name) if is_known else None
-        if kind[name] != own:
-            raise InvalidArgument(
-                f"The snapshot's {name} is {kind[name]}, and here it is {own}: it "
-                "belongs to another model or version of MuJoCo."
-            )
         getattr(target, name)[...] = row[name]
-    if not {*_PATHS}.isdisjoint(kind.names or ()):
+    if not {*_PATHS}.isdisjoint(names):
         _check_paths(model, data)
 
 

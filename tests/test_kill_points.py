@@ -1,0 +1,206 @@
+# SPDX-License-Identifier: Apache-2.0
+"""SIGKILL between any two things that a recorder or a finisher does to its files."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from parts import parametrize
+from recordings import frames_in, manifest_of, metadata_of, stats_of
+from result_files import entry, write_journal
+from trajectories_by_hand import INFIX, Painter, write_log
+from waiting import wait_until
+
+import mjrec
+from mjrec.formats.locks import is_locked
+from mjrec.formats.monitor_directory import lock_name
+from mjrec.rendering.finish import finish
+
+START = f"""
+import os, signal, sys, time
+sys.path.insert(0, {str(Path(__file__).parent)!r})
+directory, place = sys.argv[1], sys.argv[2]
+
+def die(*_, **__):
+    os.kill(os.getpid(), signal.SIGKILL)
+
+"""
+
+
+def run(program: str, directory: Path, place: object) -> bool:
+    """Run a program; tell whether it was killed, and not over before that."""
+    done = subprocess.run(
+        [sys.executable, "-c", START + program, directory, str(place)],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode in (0, -signal.SIGKILL), done.stderr
+    # An encoder outlives it for a moment.
+    wait_until(lambda: not any(map(is_locked, directory.glob(".*.part"))))
+    return done.returncode != 0
+
+
+# Renames, removals and openings for writing, of which each comes with a file's name.
+FINISH = """
+from pathlib import Path
+from trajectories_by_hand import Painter
+import mjrec.rendering.finisher
+from mjrec.rendering.finish import finish
+
+mjrec.rendering.finisher.WorkerPool = lambda count, **rest: Painter()
+left = int(place)
+
+def count(event, arguments):
+    global left
+    changes = event in ("os.rename", "os.remove") or (
+        event == "open" and isinstance(arguments[2], int) and arguments[2] & os.O_CREAT
+    )
+    if changes and str(arguments[0]).startswith(directory):
+        if not left:
+            die()
+        left -= 1
+
+sys.addaudithook(count)
+for result in finish(Path(directory), workers=1):
+    assert not result.failures, result
+"""
+
+
+# Takes more than five seconds: a process that finishes, for each moment.
+@parametrize(
+    "moments",
+    [range(first, 100, 8) for first in range(8)],
+    default=[range(3, 100, 8)],
+    part=pytest.mark.crashes,
+)
+def test_a_finisher_killed_at_any_change_of_a_file_is_taken_up_again(
+    moments: range, tmp_path: Path, painter: Painter
+) -> None:
+    """Of a dead monitor; with a trajectory that stays, and one that does not."""
+    for moment in moments:
+        directory = tmp_path / str(moment)
+        directory.mkdir()
+        (directory / lock_name(INFIX)).touch()
+        lines = []
+        for number, kept in ((0, True), (1, False)):
+            write_log(directory, number, kept=kept, start_time=9.0)
+            facts = {"terminated": False, "truncated": True, "recording": "deferred"}
+            lines.append(entry(number, length=4, reward=2.0, chosen=True, **facts))
+        # The second line was cut off with its monitor, before it was written.
+        write_journal(directory, str(INFIX), lines[0])
+        was_killed = run(FINISH, directory, moment)
+        assert not any(each.failures for each in finish(directory, workers=1))
+        assert [len(frames_in(directory, number)) for number in (0, 1)] == [5, 5]
+        assert all(metadata_of(directory, number)["complete"] for number in (0, 1))
+        assert len(list(directory.glob("*.framehash"))) == 2
+        assert [p.name[-4:] for p in directory.glob("*.h5")] == ["0.h5"]
+        manifest = manifest_of(directory)
+        assert len(manifest["videos"]) == 2
+        assert manifest["mjrec"]["pending"] == []
+        assert not list(directory.glob(".*")) + list(directory.glob("*.states.*"))
+        assert not mjrec.recover(directory)
+        if not was_killed:
+            break
+    else:
+        pytest.fail("there were more changes than moments")
+
+
+RECORD = """
+import gymnasium, mjrec
+from conftest import Corridor
+import mjrec.formats.appending, mjrec.formats.row_log
+from mjrec.formats import video_file, video_metadata, video_sink
+from mjrec.formats.journal import JournalWriter
+
+def before(owner, name, when=lambda *_: True):
+    known = getattr(owner, name)
+    def function(*arguments, **options):
+        if when(*arguments):
+            die()
+        return known(*arguments, **options)
+    setattr(owner, name, function)
+
+def half_a_line(descriptor, line):
+    if bytes(line).startswith(b'{"episode_id": 1,'):
+        written(descriptor, line[:40])
+        die()
+    return written(descriptor, line)
+
+def fed(encoding):
+    # What waits for the encoder is lost with the process.
+    while encoding._encoded < 5:
+        time.sleep(0.001)
+    return True
+
+second = lambda *arguments: "episode000001" in str(arguments) or "video000001" in str(
+    [getattr(each, "path", each) for each in arguments]
+)
+if place == "before the journal's line":
+    before(JournalWriter, "append", lambda _, entry: entry.episode_id == 1)
+elif place == "in the journal's line":
+    written = os.write
+    os.write = half_a_line
+elif place == "before the tail is written":
+    before(mjrec.formats.row_log.RowLog, "write")
+elif place == "where no tail is mapped":
+    mjrec.formats.row_log._may_be_mapped = lambda _: False
+    before(JournalWriter, "append", lambda _, entry: entry.episode_id == 1)
+elif place == "before ffmpeg's end":
+    before(video_file.Encoding, "finish", lambda e: second(e._file) and fed(e))
+elif place == "between ffmpeg's end and the names":
+    before(video_file.Encoding, "_checked", lambda e: second(e._file))
+elif place == "between the hashes' name and the video's":
+    from pathlib import Path
+    before(Path, "replace", lambda p, to: second(to) and str(to).endswith(".mp4"))
+elif place == "between the video's name and the metadata":
+    before(video_sink, "write_metadata", second)
+
+render = "live" if place in LIVE else "deferred"
+env = Corridor(length=4)
+if render == "deferred":
+    env = gymnasium.make("InvertedPendulum-v5", max_episode_steps=4)
+with mjrec.Monitor(
+    env, directory, lambda _: True, env_id="Short-v0", render=render, workers=0
+) as monitor:
+    for _ in range(2):
+        monitor.reset(seed=0)
+        for _ in range(4):
+            monitor.step(monitor.action_space.sample() * 0 + (render == "live"))
+"""
+DEFERRED = ("before the journal's line", "in the journal's line")
+DEFERRED += ("before the tail is written", "where no tail is mapped")
+LIVE = (
+    "before ffmpeg's end",
+    "between ffmpeg's end and the names",
+    "between the hashes' name and the video's",
+    "between the video's name and the metadata",
+)
+
+
+@parametrize("place", [*DEFERRED, *LIVE], default=8)
+def test_a_recorder_killed_between_two_things_loses_no_episode(
+    place: str, tmp_path: Path
+) -> None:
+    """Rows, journal, encoder and names: whichever of them was first."""
+    assert run(f"LIVE = {LIVE!r}\n{RECORD}", tmp_path, place)
+    assert not mjrec.recover(tmp_path).failures
+    assert not mjrec.recover(tmp_path)
+    lengths = stats_of(tmp_path)["episode_lengths"]
+    assert lengths == [4, 4]
+    assert [each.length for each in mjrec.iter_episodes(tmp_path)] == lengths
+    if place in LIVE:
+        assert [len(frames_in(tmp_path, number)) for number in (0, 1)] == [5, 5]
+        assert all(metadata_of(tmp_path, number)["complete"] for number in (0, 1))
+    else:
+        paths = sorted(tmp_path.glob("*.h5"))
+        facts = [mjrec.load_trajectory(path).facts for path in paths]
+        assert [(each["complete"], each["length"]) for each in facts] == [(True, 4)] * 2
+    assert not list(tmp_path.glob(".*"))
+    for path in tmp_path.glob("*.json"):
+        json.loads(path.read_text())

@@ -1,0 +1,88 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A file system that is full: what was recorded before and after is there."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from recordings import manifest_of, stats_of
+
+import mjrec
+
+STEPS = 8
+
+
+@pytest.fixture
+def disk(tmp_path: Path) -> Iterator[Path]:
+    """A file system of two megabytes."""
+    if os.geteuid() != 0:
+        pytest.skip("mounting a small file system takes root")
+    place = tmp_path / "disk"
+    place.mkdir()
+    mount = ["mount", "-t", "tmpfs", "-o", "size=2m", "none", str(place)]
+    done = subprocess.run(mount, capture_output=True, text=True, check=False)
+    if done.returncode:
+        pytest.skip(f"no file system can be mounted here: {done.stderr}")
+    yield place
+    subprocess.run(["umount", "-l", str(place)], check=True)
+
+
+PROGRAM = f"""
+import os, signal, sys
+import gymnasium, mjrec
+
+disk, room, ending = sys.argv[1], int(sys.argv[2]), sys.argv[3]
+env = gymnasium.make("InvertedPendulum-v5", max_episode_steps={STEPS})
+monitor = mjrec.Monitor(env, disk + "/run", lambda _: True, workers=0, on_error="warn")
+
+def episode():
+    monitor.reset(seed=0)
+    for _ in range({STEPS}):
+        monitor.step(monitor.action_space.sample() * 0)
+
+episode()
+with open(disk + "/filler", "wb") as file:
+    free = os.statvfs(disk)
+    os.posix_fallocate(file.fileno(), 0, free.f_bavail * free.f_bsize - room)
+episode()
+episode()
+if ending == "killed":
+    os.kill(os.getpid(), signal.SIGKILL)
+os.unlink(disk + "/filler")
+monitor.close(wait=False)
+"""
+
+
+@pytest.mark.parametrize("ending", ["closed", "killed"])
+@pytest.mark.parametrize("room", [0, 4096, 65536])
+def test_episodes_of_a_full_disk_are_complete(
+    room: int, ending: str, disk: Path
+) -> None:
+    """Whether the monitor closes when there is room again, or never does.
+
+    Rows tell what lines could not, and nothing claims what is not so.
+    """
+    done = subprocess.run(
+        [sys.executable, "-c", PROGRAM, str(disk), str(room), ending],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == (0 if ending == "closed" else -9), done.stderr
+    (disk / "filler").unlink(missing_ok=True)
+    run = disk / "run"
+    assert not mjrec.recover(run).failures
+    paths = sorted(run.glob("*.h5"))
+    assert stats_of(run)["episode_lengths"] == [STEPS] * len(paths) == [STEPS] * 3
+    for trajectory in map(mjrec.load_trajectory, paths):
+        facts = trajectory.facts
+        assert (len(trajectory.rewards), facts["complete"]) == (STEPS, True)
+        assert (facts["length"], facts["truncated"]) == (STEPS, True)
+        assert "reason" not in facts
+    assert len(manifest_of(run)["mjrec"]["pending"]) == 3
+    assert not list(run.glob(".*"))
