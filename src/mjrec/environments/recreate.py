@@ -340,19 +340,15 @@ def _dm_control(
                 "within bounds"
             )
     from .dm_control_environments import load_task
-    from .dm_env_episodes import StepLimit
 
     with _failures(env_id):
-        env = load_task(name, kwargs)
         task_kwargs = (kwargs or {}).get("task_kwargs") or {}
         if name.domain == "lqr" and "random" not in task_kwargs:
             raise NotRecreated(
                 f"{name} draws its model at random when it is made, and from which "
                 "seed is not recorded"
             )
-        own = getattr(env, "_step_limit", np.inf)
-        if limit is not None and limit < own:
-            env = StepLimit(env, limit)
+        env = load_task(name, kwargs, limit=limit)
         return Recreated(environment=env, is_dm_env=True)
 
 

@@ -38,7 +38,7 @@ class DmEnvMonitor(EnvironmentMonitor, dm_env.Environment):  # type: ignore[misc
 
     Attributes:
         seed: what the journal and the metadata say of the next episode's seed.
-            dm_env's `reset` takes none, so whoever seeds the environment says so here.
+            dm_env's `reset` takes none, so say here what you seeded it with.
     """
 
     allows_early_reset = True
