@@ -9,7 +9,7 @@ from typing import Any
 from ..errors import InvalidArgument
 from ..formats.monitor_directory import further_parts
 from ..frames import Frame, check_frame, grid_frame, grid_shape
-from ..recorder.subject import EpisodePictures
+from ..recorder.recorded_environment import EpisodePictures
 from ..recorder.video_recorder import can_give_pictures
 from ..rendering.views import plain_camera
 
@@ -29,7 +29,7 @@ def camera_pictures(
 
     Returns:
         The only camera, or the first, the one that scenes are recorded with; and what
-        `Subject` is told: `pictures`, `further_pictures` and `cameras`.
+        `RecordedEnvironment` gets: `pictures`, `further_pictures` and `cameras`.
 
     Raises:
         InvalidArgument: the list is empty, or has one camera twice, or None in another
@@ -61,6 +61,31 @@ def camera_pictures(
         further = zip(further_parts(plain), sources[1:], strict=True)
         said["further_pictures"] = dict(further)
     return cameras[0], said
+
+
+def recorded_view(
+    camera: Any, *, height: int | None, width: int | None, own: Any = None
+) -> dict[str, Any]:
+    """Return what a journal says of how a run is shown; what is the default is not.
+
+    Args:
+        camera: as of `camera_pictures`.
+        height: that was asked for.
+        width: likewise.
+        own: number or name of the camera that the environment shows by itself.
+    """
+    several = isinstance(camera, Sequence) and not isinstance(camera, str)
+    plain = [
+        None if each is None else plain_camera(each)
+        for each in (camera if several else [camera])
+    ]
+    said = {
+        "camera": plain if several else plain[0],
+        "height": None if height is None else int(height),
+        "width": None if width is None else int(width),
+        "own_camera": own,
+    }
+    return {name: value for name, value in said.items() if value is not None}
 
 
 def _check(cameras: list[Any]) -> None:

@@ -15,7 +15,7 @@ from ..environments.scenes import NoPictureSource, Scenes
 from ..errors import InvalidArgument
 from ..recorder.options import RecorderOptions
 from .base import EnvironmentMonitor
-from .cameras import camera_pictures
+from .cameras import camera_pictures, recorded_view
 
 logger = logging.getLogger(__name__)
 
@@ -38,7 +38,7 @@ class DmEnvMonitor(EnvironmentMonitor, dm_env.Environment):  # type: ignore[misc
 
     Attributes:
         seed: what the journal and the metadata say of the next episode's seed.
-            dm_env's `reset` takes none, so whoever seeds the environment says so here.
+            dm_env's `reset` takes none, so say here what you seeded it with.
     """
 
     allows_early_reset = True
@@ -74,6 +74,7 @@ class DmEnvMonitor(EnvironmentMonitor, dm_env.Environment):  # type: ignore[misc
             scenes=lambda: _scenes(env, env_id=env_id, camera=first, **size),
             close_environment=operator.methodcaller("close"),
             env_id=env_id or _env_id(env),
+            view=recorded_view(camera, **size),
             **pictures,
         )
 

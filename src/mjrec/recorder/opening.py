@@ -11,9 +11,8 @@ from __future__ import annotations
 import contextlib
 import itertools
 import os
-import threading
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
@@ -43,19 +42,30 @@ from ..results.monitor_files import MonitorFiles, monitors_of
 JOIN = "join"
 
 
-class _MonitorIds:
-    """Counts the monitors of this process; no number is given twice."""
-
-    def __init__(self) -> None:
-        self._next = itertools.count()
-        self._guard = threading.Lock()
-
-    def take(self) -> int:
-        with self._guard:
-            return next(self._next)
+# Counts the monitors of this process.
+_monitor_ids = itertools.count()
 
 
-_monitor_ids = _MonitorIds()
+@dataclass(frozen=True, kw_only=True)
+class Statements:
+    """What of a run can never come out again: given where a run is made again.
+
+    Attributes:
+        infix: what the names of its files have in the middle; nobody has claimed it.
+        first_episode_id: the number of its first episode.
+        surroundings: its provenance; None where that was not known.
+        surroundings_after: how many episodes were completed before it was.
+        clock: returns the time, in seconds since the epoch.
+        only_counted: episodes without a video keep no trajectory: it is only asked
+            what rewards and ends there were.
+    """
+
+    infix: Infix
+    first_episode_id: int
+    surroundings: Mapping[str, Any] | None
+    surroundings_after: int
+    clock: Callable[[], float]
+    only_counted: bool = False
 
 
 @dataclass(frozen=True)
@@ -85,6 +95,7 @@ def open_directory(
     uid: str | None,
     env_info: Mapping[str, str],
     facts: Mapping[str, Any] = MappingProxyType({}),
+    statements: Statements | None = None,
 ) -> OpenDirectory:
     """Claim a place in `directory`, which is made where it is missing.
 
@@ -94,13 +105,14 @@ def open_directory(
         resume: add to the recordings that are there. Episodes are numbered on from
             the highest number of the monitors with this `uid` that closed or died
             (without `uid`: of all of them); monitors that are still open do not count.
-            `JOIN` looks at nobody else's files, however many there are: the caller
+            `JOIN` looks at no other monitor's files, however many there are: the caller
             knows that they are of the same environment, and episodes are numbered
             from 0.
         uid: stands in the file names instead of the process id.
         env_info: `env_id` of the environment, among others.
         facts: what else is known of the run. It stands in the lock: so much is known of
             a process that was killed before its journal had a line.
+        statements: of a run that is made again.
 
     Raises:
         ExistingRecordings: there are recordings, and neither `force` nor `resume`.
@@ -112,19 +124,30 @@ def open_directory(
     wanted_uid = None if uid is None else check_uid(uid)
     # Absolute, so that a later chdir does not scatter the files.
     path = Path(directory).absolute()
-    with _made(path):
+    with made_directory(path):
         _check_existing(path, force=force, resume=resume, env_id=env_info["env_id"])
         joins = resume == JOIN and not force
         numbers_on = not (force or joins)
-        first = _next_episode_id(path, uid=wanted_uid) if numbers_on else 0
+        if statements is not None:
+            first = statements.first_episode_id
+        else:
+            first = _next_episode_id(path, uid=wanted_uid) if numbers_on else 0
         run = {"env_info": dict(env_info), **facts, "first_episode_id": first}
-        infix, lock = _claim(path, uid=wanted_uid, run=run, looks=not joins)
+        if statements is not None:
+            infix = statements.infix
+            lock = Lock(path / lock_name(infix), json_text.dumps({"run": run}))
+        else:
+            infix, lock = _claim(path, uid=wanted_uid, run=run, looks=not joins)
     return OpenDirectory(path, infix, first, lock, run)
 
 
 @contextlib.contextmanager
-def _made(path: Path) -> Iterator[None]:
-    """Make `path` and its parents; remove those made if the block raises."""
+def made_directory(path: Path) -> Iterator[None]:
+    """Make `path` and its parents; remove those made if the block raises.
+
+    Raises:
+        DirectoryNotWritable: it cannot be made or written to.
+    """
     try:
         missing = [p for p in (path, *path.parents) if not p.exists()]
         path.mkdir(parents=True, exist_ok=True)
@@ -136,7 +159,7 @@ def _made(path: Path) -> Iterator[None]:
         yield
     except BaseException:
         for made in missing:
-            # Somebody else's files may have come into it meanwhile.
+            # Other files may have come into it meanwhile.
             with contextlib.suppress(OSError):
                 made.rmdir()
         raise
@@ -210,12 +233,12 @@ def _claim(
             directory, so that names are the same whichever process records.
         run: what is known of the run.
         looks: also for stray files with it. Without that, a manifest, a journal or a
-            lock say that it was somebody's: each monitor leaves one of them.
+            lock say that it was a monitor's: each monitor leaves one of them.
     """
     content = json_text.dumps({"pid": os.getpid(), "since": time.time(), "run": run})
     of_directory = itertools.count()
     while True:
-        number = _monitor_ids.take() if uid is None else next(of_directory)
+        number = next(_monitor_ids if uid is None else of_directory)
         infix = Infix(number, uid or str(os.getpid()))
         if _is_taken(path, infix, looks=looks):
             continue
