@@ -152,18 +152,11 @@ class Recreated:
             state: a row of a trajectory's states.
             observation: that it gave before.
         """
-        # They load MuJoCo.
-        import mujoco
-
-        from ..simulation.states import set_state
+        from ..simulation.states import enter_state  # It loads MuJoCo.
 
         simulated = simulation_below(self.environment)
-        model, data = simulated.model, simulated.data
         row = state.view(np.float64).reshape(-1)
-        set_state(model, data, columns_of(state.dtype), row)
-        mujoco.mj_forward(model, data)
-        # That may have changed the warm start.
-        set_state(model, data, columns_of(state.dtype), row)
+        enter_state(simulated.model, simulated.data, columns_of(state.dtype), row)
         observe = getattr(self.environment.unwrapped, "_get_obs", None)
         return observation if observe is None else observe()
 
