@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from ..errors import InvalidArgument
-from ..formats.video_names import further_parts
+from ..formats.monitor_directory import further_parts
 from ..frames import Frame, check_frame, grid_frame, grid_shape
 from ..recorder.recorded_environment import EpisodePictures
 from ..recorder.video_recorder import can_give_pictures

@@ -10,9 +10,9 @@ from typing import Any
 
 from ..errors import DirectoryNotWritable, Error
 from ..formats.frame_hashes import frame_hash_path
+from ..formats.monitor_directory import second_name_of
 from ..formats.second_names import give_second_names
 from ..formats.video_metadata import amend_metadata
-from ..formats.video_names import second_name_of
 from .monitored_run import MonitoredRun
 from .video_recorder import VideoRecorder
 

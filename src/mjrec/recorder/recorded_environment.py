@@ -9,7 +9,7 @@ from fractions import Fraction
 from typing import TYPE_CHECKING, Any, Protocol
 
 from ..errors import NoPictures, PicturesDiffer
-from ..formats.video_names import further_parts
+from ..formats.monitor_directory import further_parts
 from .options import RenderingChoice
 from .video_recorder import PictureSource, can_give_pictures
 

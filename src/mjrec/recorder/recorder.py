@@ -396,7 +396,7 @@ class Recorder:
                 self._end_recordings()
             self.run.trackers.end()
             pending = self._write_last_results()
-        self._leave()
+            self._leave()
         self._say_what_is_left(pending)
         failures.raise_first()
         logger.info("Finished writing results. They are in %s.", self.directory)

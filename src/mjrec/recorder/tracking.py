@@ -14,14 +14,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ..formats.monitor_directory import episode_of
+from ..formats.monitor_directory import episode_of, view_of
 from ..formats.video_metadata import (
     finished_videos,
     is_broken,
     is_done,
     metadata_path,
 )
-from ..formats.video_names import view_of
 
 logger = logging.getLogger(__name__)
 
