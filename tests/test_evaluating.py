@@ -4,6 +4,7 @@ from __future__ import annotations
 import contextlib
 import csv
 import hashlib
+import importlib
 import importlib.util
 import json
 import math
@@ -37,7 +38,6 @@ from mjrec.evaluation.evaluation import Evaluation, EvaluationProgress
 from mjrec.evaluation.plan import EvaluationPlan
 from mjrec.evaluation.planning import chunks_of
 from mjrec.evaluation.results_files import read_results
-from mjrec.evaluation.worker import EvaluationWorker
 from mjrec.formats.locks import try_lock
 from mjrec.formats.video_metadata import metadata_path
 
@@ -177,19 +177,21 @@ class Wandering(Executor):
 
     def __init__(self, homes: Path) -> None:
         self.homes = homes
-        self.worker: EvaluationWorker | None = None
+        self.workers: dict[str, Any] = {}
 
     def submit(
         self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any
     ) -> Future[Any]:
         place, job = json.loads(json.dumps(args))
-        if self.worker is None:
+        if place not in self.workers:
             work = json.loads(Path(place, "work.json").read_bytes())
-            self.worker = EvaluationWorker(work["settings"])
+            module, _, name = work["entry"].partition(":")
+            make = getattr(importlib.import_module(module), name)
+            self.workers[place] = make(work["settings"])
         future: Future[Any] = Future()
         with pytest.MonkeyPatch.context() as patch:
             patch.setenv("XDG_STATE_HOME", str(self.homes / job["key"]))
-            future.set_result({"value": self.worker(job["arguments"])})
+            future.set_result({"value": self.workers[place](job["arguments"])})
         return future
 
 
