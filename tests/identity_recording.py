@@ -44,7 +44,7 @@ class Diary(gymnasium.Env[Any, Any]):
 def pendulum() -> Any:
     return gymnasium.make(
         "InvertedPendulum-v5",
-        xml_file=str(HERE / "models" / "mbrunelli.xml"),
+        xml_file=str(HERE / "models" / "robot.xml"),
         max_episode_steps=4,
         render_mode="rgb_array",
         width=32,

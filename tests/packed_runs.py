@@ -121,22 +121,24 @@ def _make_crate_fit(bag: Path) -> Callable[[Any], None]:
         for path in _files(payload)
         if path.name != "ro-crate-metadata.json"
     }
-    recorded = [{"@id": name} for name in sizes if name.startswith("recordings/")]
-    others = [{"@id": name} for name in sizes if not name.startswith("recordings/")]
-    parts = {"./": [*others, {"@id": "recordings/"}], "recordings/": recorded}
 
     def edit(crate: Any) -> None:
-        graph = [e for e in crate["@graph"] if e["@type"] != "File"]
-        for entity in graph:
-            if entity["@id"] in parts:
-                entity["hasPart"] = parts[entity["@id"]]
-        crate["@graph"] = [
-            *graph,
-            *(
-                {"@id": name, "@type": "File", "contentSize": str(size)}
-                for name, size in sizes.items()
-            ),
-        ]
+        graph = {entity["@id"]: entity for entity in crate["@graph"]}
+        files = {i for i, entity in graph.items() if entity["@type"] == "File"}
+        for entity_id in files - sizes.keys():
+            del graph[entity_id]
+        for entity_id, size in sizes.items():
+            new = {"@id": entity_id, "@type": "File"}
+            graph.setdefault(entity_id, new)["contentSize"] = str(size)
+        for whole, parts in (
+            ("./", [i for i in sizes if not i.startswith("recordings/")]),
+            ("recordings/", [i for i in sizes if i.startswith("recordings/")]),
+        ):
+            said = graph[whole]["hasPart"]
+            known = [p["@id"] for p in said if p["@id"] in {*sizes, "recordings/"}]
+            new = [i for i in parts if i not in known]
+            graph[whole]["hasPart"] = [{"@id": i} for i in (*known, *new)]
+        crate["@graph"] = list(graph.values())
 
     return edit
 

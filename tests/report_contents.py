@@ -155,7 +155,7 @@ def hostile_report() -> ReportContents:
         across=dict.fromkeys(HOSTILE, scores),
         problems=list(HOSTILE),
         verdicts=[
-            Verdict(source=text, passed=False, counts={text: 1}, level=text)
+            Verdict(source=text, verdict="FAIL", counts={text: 1}, level=text)
             for text in HOSTILE
         ],
     )

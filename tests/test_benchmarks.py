@@ -148,9 +148,19 @@ MEASURED: list[Any] = [
     ),
     pytest.param(
         verifying,
-        {"rounds": 1, "episodes": 2, "few": 1, "steps": 20},
+        {
+            "rounds": 1,
+            "episodes": 2,
+            "short": 3,
+            "long_episodes": 1,
+            "long": 5,
+            "videos": 1,
+            "frames": 3,
+            "size": 32,
+            "workers": 1,
+        },
         None,
-        {"≤ 1.5", "≤ 2.5"},
+        {"≤ 20", "≤ 4.2", "≤ 0.0025", "≤ 1.5"},
         marks=thorough,
     ),
     pytest.param(

@@ -48,8 +48,7 @@ def test_json_names_the_page(
 
 def test_a_single_file_and_a_verdict(recordings: Path, tmp_path: Path) -> None:
     """What the options say reaches the page."""
-    counts = {"pass": 1, "fail": 2, "not checkable": 0}
-    said = {"path": "run", "level": "stats", "passed": False, "counts": counts}
+    said = {"path": "run", "level": "stats", "verdict": "FAIL", "findings": []}
     path = tmp_path / "said.json"
     path.write_text(json.dumps(said))
     page = tmp_path / "one.html"

@@ -318,14 +318,15 @@ def test_roles_are_those_of_an_evaluation(tmp_path: Path) -> None:
 def test_verdicts_are_found_and_given(tmp_path: Path) -> None:
     """In the directory, and as a file."""
     write_journal(tmp_path / "run", "0.a", "X-v0", [entry(0)])
-    counts = {"pass": 3, "fail": 0, "not checkable": 1}
-    said = {"path": "run", "level": "physics", "passed": True, "counts": counts}
+    findings = [{"outcome": each} for each in ("made again", "believed", "noted")]
+    said: dict[str, Any] = {"path": "run", "level": "physics", "verdict": "PARTLY"}
+    said["findings"] = findings
     (tmp_path / "run" / "verification.json").write_text(json.dumps(said))
-    bad = {**said, "passed": False, "counts": {**counts, "fail": 2}}
+    bad = {**said, "verdict": "FAIL", "findings": [{"outcome": "different"}]}
     (tmp_path / "other.json").write_text(json.dumps(bad))
     contents = gather(tmp_path / "run", verifications=[tmp_path / "other.json"])
-    assert [verdict.passed for verdict in contents.verdicts] == [True, False]
-    assert contents.verdicts[0].counts == counts
+    assert [each.verdict for each in contents.verdicts] == ["PARTLY", "FAIL"]
+    assert contents.verdicts[0].counts == {"made again": 1, "believed": 1}
     assert contents.verdicts[0].level == "physics"
 
 
@@ -334,10 +335,9 @@ def test_verdicts_are_found_and_given(tmp_path: Path) -> None:
     [
         "no JSON",
         "{}",
-        '{"path": "x", "level": "pixels", "passed": true, '
-        '"counts": {"pass": 1, "fail": 1, "not checkable": 0}}',
-        '{"path": "x", "level": "all", "passed": true, '
-        '"counts": {"pass": 1, "fail": 0, "not checkable": 0}}',
+        '{"path": "x", "level": "pixels", "verdict": "PASS", '
+        '"findings": [{"outcome": "different"}]}',
+        '{"path": "x", "level": "all", "verdict": "PASS", "findings": []}',
     ],
 )
 def test_a_verdict_that_is_none_is_not_shown(tmp_path: Path, text: str) -> None:

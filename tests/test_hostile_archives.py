@@ -16,6 +16,7 @@ from pathlib import Path
 import pytest
 
 import mjrec
+from mjrec.evidence.archive import bring_in
 
 GOOD = "run/data/recordings/openaigym.episodes.0.7.jsonl"
 EVIL = Path("/tmp/evil-of-mjrec-tests")
@@ -172,7 +173,7 @@ HARMS: list[tuple[Make, str]] = [
     (two_entries_over_the_same_bytes, "overlaps"),
     (rare_compression, "not everybody can unpack"),
     (lambda path: write(path, ("run/readme.txt", b"1")), "data/recordings"),
-    (linked_folder, "data/recordings"),
+    (linked_folder, "neither a file nor a folder"),
 ]
 
 
@@ -188,22 +189,30 @@ def temporary(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 @pytest.mark.parametrize(
     ("make", "reason"), HARMS, ids=[f"{n} {why}" for n, (_, why) in enumerate(HARMS)]
 )
-def test_harm_is_refused(
-    make: Make, reason: str, tmp_path: Path, temporary: Path
-) -> None:
-    """With its reason; nothing is there afterwards that was not there before."""
-    archive = tmp_path / "run.zip"
+def test_harm_is_refused(make: Make, reason: str, tmp_path: Path) -> None:
+    """With its reason; nothing is written outside of the folder for it."""
+    archive, place = tmp_path / "run.zip", tmp_path / "place"
     make(archive)
     before = sorted(tmp_path.rglob("*"))
-    with pytest.raises(mjrec.UnreadableFile, match=reason):
-        mjrec.verify(archive, level="files")
-    assert sorted(tmp_path.rglob("*")) == before
-    assert list(temporary.iterdir()) == []
+    place.mkdir()
+    with pytest.raises(mjrec.UnreadableArchive, match=reason):
+        bring_in(archive, place / "given")
+    outside = [path for path in tmp_path.rglob("*") if place not in path.parents]
+    assert sorted(outside) == sorted([*before, place])
     assert not EVIL.exists()
 
 
+def test_harm_in_a_verification_is_refused(tmp_path: Path, temporary: Path) -> None:
+    """By the process that unpacks, of which nothing is left."""
+    archive = tmp_path / "run.zip"
+    write_called("../evil", archive)
+    with pytest.raises(mjrec.UnreadableArchive, match="leads out"):
+        mjrec.verify(archive, level="files")
+    assert list(temporary.iterdir()) == []
+
+
 def test_archive_that_does_not_fit_on_the_disk_is_an_error(
-    tmp_path: Path, temporary: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Before anything is written, and with the room that it takes."""
     path = tmp_path / "run.zip"
@@ -211,8 +220,8 @@ def test_archive_that_does_not_fit_on_the_disk_is_an_error(
     usage = type("Usage", (), {"free": 999})
     monkeypatch.setattr("shutil.disk_usage", lambda _: usage)
     with pytest.raises(mjrec.Error, match=r"takes 1000 bytes, and 999 are free"):
-        mjrec.verify(path, level="files")
-    assert list(temporary.iterdir()) == []
+        bring_in(path, tmp_path / "given")
+    assert not (tmp_path / "given").exists()
 
 
 def test_words_about_a_bad_archive_say_what_to_do(tmp_path: Path) -> None:

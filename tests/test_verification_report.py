@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import base64
 import html.parser
 import re
 import subprocess
@@ -11,39 +10,17 @@ import sys
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
-from imageio.v3 import imwrite
+from verifications import HOSTILE, excuse, finding, verification
 
-from mjrec.evidence.verification import Check, Level, Verdict, Verification
-from mjrec.evidence.verifying.verification_report import write_verification_report
-
-HOSTILE = (
-    "</li><script>alert(1)</script><img src=x onerror=alert(1)>\u202e\x00'\"{{7*7}}"
-)
+from mjrec.evidence.findings import Finding, Outcome, Topic
+from mjrec.evidence.verification_report import write_verification_report
 
 
-def check(verdict: Verdict = Verdict.PASS, **changes: Any) -> Check:
-    usual: dict[str, Any] = {
-        "level": Level.PIXELS,
-        "claim": "the shipped frames show the pictures drawn",
-        "subject": "a.mp4",
-        "verdict": verdict,
-        "reason": "21 frames",
-    }
-    return Check(**{**usual, **changes})
-
-
-def page(tmp_path: Path, *checks: Check, **changes: Any) -> str:
-    pictures = changes.pop("pictures", None)
-    usual: dict[str, Any] = {
-        "path": Path("somewhere/run.zip"),
-        "level": Level.PIXELS,
-        "checks": checks,
-    }
-    verification = Verification(**{**usual, **changes})
-    write_verification_report(verification, tmp_path / "verify.html", pictures=pictures)
-    return (tmp_path / "verify.html").read_text(encoding="utf-8")
+def page(tmp_path: Path, *findings: Finding, **changes: Any) -> str:
+    path = tmp_path / "verify.html"
+    write_verification_report(verification(*findings, **changes), path)
+    return path.read_text(encoding="utf-8")
 
 
 class Elements(html.parser.HTMLParser):
@@ -76,79 +53,72 @@ def words(text: str) -> str:
     return " ".join(filter(None, Elements(text).text))
 
 
-@pytest.mark.parametrize(
-    ("verdicts", "headline"),
-    [
-        ([Verdict.PASS], "Everything holds."),
-        ([Verdict.PASS, Verdict.NOT_CHECKABLE], "Everything that could be checked"),
-        ([Verdict.NOT_CHECKABLE], "Nothing was proved"),
-        ([], "Nothing was proved"),
-        ([Verdict.PASS, Verdict.FAIL], "This run does not hold: 1 of 2 checks failed."),
-    ],
-)
-def test_the_verdict_comes_first(
-    tmp_path: Path, verdicts: list[Verdict], headline: str
-) -> None:
-    """In words, and never better than what was proved."""
-    shown = words(page(tmp_path, *map(check, verdicts)))
-    assert shown.startswith(
-        f"Verification of run.zip Verification of run.zip {headline}"
-    )
-
-
-def test_failures_stand_before_all_else(tmp_path: Path) -> None:
-    """With their reason; and what could not be checked, with its own."""
+def test_the_verdict_comes_first_and_then_what_differs(tmp_path: Path) -> None:
+    """With excuses, inputs, a line for each topic, and all findings."""
     shown = words(
         page(
             tmp_path,
-            check(reason="seven frames"),
-            check(Verdict.NOT_CHECKABLE, subject="b.mp4", reason="no model is there"),
-            check(Verdict.FAIL, subject="c.mp4", reason="frame 3 is another"),
+            finding(reason="seven steps"),
+            finding(Outcome.DIFFERENT, reason="frame 3 is another"),
+            finding(Outcome.BELIEVED, reason="one is missing", is_headline=True),
+            excuses=(excuse(),),
+            inputs={"recording 0.u": {"max_episode_steps": 12}},
+            facts={"versions": {"mujoco": "3.17.0"}},
         )
     )
-    assert shown.index("frame 3 is another") < shown.index("What was checked")
-    assert "Not so: the shipped frames show the pictures drawn." in shown
-    assert "no model is there" in shown
-    assert "The shipped frames show the pictures drawn: 1 of 3." in shown
+    order = [
+        "FAIL run.zip: it is not what its inputs give",
+        "one is missing",
+        "frame 3 is another",
+        "NVIDIA H100, here llvmpipe",
+        "What was made again",
+        "max_episode_steps 12",
+        "All findings",
+        "seven steps",
+        "versions: mujoco 3.17.0",
+    ]
+    assert sorted(order, key=shown.index) == order
+    assert all(str(topic) in shown for topic in Topic)
 
 
-def test_levels_that_were_not_asked_for_are_said_so(tmp_path: Path) -> None:
-    """A report of the files alone does not look like one of everything."""
-    shown = words(page(tmp_path, check(level=Level.FILES), level=Level.FILES))
-    assert shown.count("Not asked for.") == 3
-    assert "mjrec verify run.zip --level files" in shown
+def test_it_says_how_to_make_it_again(tmp_path: Path) -> None:
+    """With the options that it was made with."""
+    facts = {"sample": 20, "seed": 7, "trust": ["A b-v0"], "allow": ["gl=H100"]}
+    shown = words(page(tmp_path, facts=facts))
+    assert (
+        "mjrec verify run.zip --level pixels --sample 20 --seed 7 --trust 'A b-v0' "
+        "--allow gl=H100"
+    ) in shown
 
 
 def test_the_page_is_whole_and_loads_nothing(tmp_path: Path) -> None:
     """Its elements close, and no attribute leads anywhere."""
-    pictures = tmp_path / "pictures"
-    pictures.mkdir()
-    imwrite(pictures / "worst-000000.png", np.zeros((4, 4, 3), np.uint8))
-    figures = {"picture": "worst-000000.png", "worst_frame": 3, "psnr": 44.0}
-    text = page(tmp_path, check(figures=figures), pictures=pictures)
+    text = page(tmp_path, *map(finding, Outcome), excuses=(excuse(),))
     elements = Elements(text)
     assert elements.open == []
     names = {name for name, _ in elements.found}
     assert names.isdisjoint({"script", "link", "iframe", "object", "form", "base"})
-    sources = [
-        v for _, a in elements.found for k, v in a.items() if k in ("src", "href")
-    ]
-    [source] = sources
-    kind, _, data = str(source).partition(",")
-    assert kind == "data:image/png;base64"
-    assert base64.b64decode(data).startswith(b"\x89PNG")
+    attributes = {key for _, a in elements.found for key in a}
+    assert attributes.isdisjoint({"src", "href"})
     assert "default-src 'none'" in text
     assert not re.search(r"url\(|@import|https?:", text)
 
 
 def test_hostile_text_stays_text(tmp_path: Path) -> None:
     """Wherever it comes from: nothing is marked up, nothing is hidden."""
-    clean = Elements(page(tmp_path, *map(check, Verdict), facts={"a": {"b": "c"}}))
-    hostile = {"claim": HOSTILE, "subject": HOSTILE, "reason": HOSTILE}
+    given: dict[str, Any] = {
+        "excuses": (excuse(),),
+        "inputs": {"a": {"b": "c"}},
+        "facts": {"a": {"b": "c"}},
+    }
+    outcomes = [finding(each) for each in Outcome]
+    clean = Elements(page(tmp_path, *outcomes, **given))
     text = page(
         tmp_path,
-        *(check(verdict, **hostile) for verdict in Verdict),
+        *(finding(each, item=HOSTILE, reason=HOSTILE) for each in Outcome),
         path=Path(f"somewhere/{HOSTILE.replace('/', '')}"),
+        excuses=(excuse(claimed=HOSTILE, here=HOSTILE),),
+        inputs={HOSTILE: {HOSTILE: HOSTILE}},
         facts={HOSTILE: {"x": HOSTILE}, "sample": 2, "seed": 1, "trust": [HOSTILE]},
     )
     dirty = Elements(text)
@@ -161,29 +131,13 @@ def test_hostile_text_stays_text(tmp_path: Path) -> None:
     assert "{{7*7}}" in text
 
 
-@pytest.mark.parametrize(
-    "name", ["../secret.png", "/etc/passwd", "absent.png", "link.png", 7, "a\n.png"]
-)
-def test_only_pictures_of_the_folder_are_shown(tmp_path: Path, name: Any) -> None:
-    """A name comes from a process that has read hostile files."""
-    pictures = tmp_path / "pictures"
-    pictures.mkdir()
-    secret = tmp_path / "secret.png"
-    imwrite(secret, np.zeros((4, 4, 3), np.uint8))
-    (pictures / "link.png").symlink_to(secret)
-    text = page(tmp_path, check(figures={"picture": name}), pictures=pictures)
-    assert "<img" not in text
-
-
-def test_many_checks_make_no_endless_page(tmp_path: Path) -> None:
+def test_many_findings_make_no_endless_page(tmp_path: Path) -> None:
     """What is left out is counted."""
-    many = [
-        check(Verdict.FAIL, subject=f"{n}.mp4", reason="x" * 5000) for n in range(1500)
-    ]
+    many = [finding(Outcome.DIFFERENT, reason=f"{n} {'x' * 5000}") for n in range(1500)]
     text = page(tmp_path, *many)
-    assert len(text) < 4_000_000
+    assert len(text) < 2_000_000
     assert "And 1300 more" in words(text)
-    assert "500 more are not listed" in words(text)
+    assert "1300 more are not listed" in words(text)
 
 
 def test_without_jinja_it_is_said_what_to_install(tmp_path: Path) -> None:
@@ -191,9 +145,9 @@ def test_without_jinja_it_is_said_what_to_install(tmp_path: Path) -> None:
     program = (
         "import sys; sys.modules['jinja2'] = None\n"
         "from pathlib import Path\n"
-        "from mjrec.evidence.verification import Level, Verification\n"
-        "from mjrec.evidence.verifying import verification_report as report\n"
-        "found = Verification(path=Path('x'), level=Level.FILES, checks=())\n"
+        "from mjrec.evidence.findings import Level, Verification\n"
+        "from mjrec.evidence import verification_report as report\n"
+        "found = Verification(path=Path('x'), level=Level.FILES, findings=())\n"
         "try:\n"
         "    report.write_verification_report(found, Path(sys.argv[1]))\n"
         "except report.MissingDependency as error:\n"
@@ -207,3 +161,39 @@ def test_without_jinja_it_is_said_what_to_install(tmp_path: Path) -> None:
     ).stdout
     assert "pip install 'mjrec[evidence]'" in said
     assert not (tmp_path / "verify.html").exists()
+
+
+@pytest.mark.axe
+@pytest.mark.browser
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_the_page_keeps_nobody_out(tmp_path: Path, scheme: Any) -> None:
+    """axe-core finds nothing serious, and a phone scrolls in one direction only."""
+    # Here: most tests of this file need no browser.
+    import shutil
+
+    from axe_playwright_python.sync_playwright import Axe
+    from playwright.sync_api import sync_playwright
+
+    page(
+        tmp_path,
+        *(finding(each, reason="x" * 300, is_headline=False) for each in Outcome),
+        finding(Outcome.BELIEVED, reason=HOSTILE, is_headline=True),
+        excuses=(excuse(),),
+        inputs={"recording 0.u": {"camera": "side"}},
+        facts={"versions": {"mujoco": "3.17.0"}},
+    )
+    with sync_playwright() as playwright:
+        found = shutil.which("chromium") or playwright.chromium.executable_path
+        browser = playwright.chromium.launch(
+            executable_path=found, args=["--no-sandbox"]
+        )
+        size: Any = {"width": 360, "height": 800}
+        with browser.new_context(viewport=size, color_scheme=scheme) as context:
+            shown = context.new_page()
+            shown.goto((tmp_path / "verify.html").as_uri())
+            shown.evaluate("document.querySelector('details').open = true")
+            assert shown.evaluate("document.scrollingElement.scrollWidth") <= 360
+            violations = Axe().run(shown).response["violations"]
+        browser.close()
+    bad = [v["id"] for v in violations if v["impact"] in ("serious", "critical")]
+    assert bad == []

@@ -24,10 +24,12 @@ if TYPE_CHECKING:
     from .evaluation.comparing import compare as compare
     from .evaluation.evaluating import evaluate as evaluate
     from .evaluation.evaluation import Evaluation as Evaluation
-    from .evidence.packing import pack as pack
-    from .evidence.verification import Check as Check
-    from .evidence.verification import Verification as Verification
-    from .evidence.verifying import verify as verify
+    from .evaluation.statistics import Bootstrap as Bootstrap
+    from .evidence.findings import Finding as Finding
+    from .evidence.findings import Verdict as Verdict
+    from .evidence.findings import Verification as Verification
+    from .evidence.pack import pack as pack
+    from .evidence.verify import verify as verify
     from .formats.archive import write_archive as write_archive
     from .formats.video_writer import VideoWriter as VideoWriter
     from .formats.video_writer import save_video as save_video
@@ -68,9 +70,10 @@ _NAMES = {
     "evaluation.comparing": "Comparison compare",
     "evaluation.evaluating": "evaluate",
     "evaluation.evaluation": "Evaluation",
-    "evidence.packing": "pack",
-    "evidence.verification": "Check Verification",
-    "evidence.verifying": "verify",
+    "evaluation.statistics": "Bootstrap",
+    "evidence.findings": "Finding Verdict Verification",
+    "evidence.pack": "pack",
+    "evidence.verify": "verify",
     "formats.archive": "write_archive",
     "formats.video_writer": "VideoWriter save_video",
     "gl": "use_gl",

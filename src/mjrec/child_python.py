@@ -432,6 +432,12 @@ def environment_of_child(environ: Mapping[str, str]) -> dict[str, str]:
     return {**environ, "PYTHONPATH": os.pathsep.join(entries_said)}
 
 
+def places_of_main() -> list[str]:
+    """Return the folder of the main script, where modules are found beside it."""
+    first = sys.path[:1]
+    return [str(Path(each).absolute()) for each in first if _is_of_main(each)]
+
+
 def _is_of_main(entry: str) -> bool:
     file = getattr(sys.modules.get("__main__"), "__file__", None)
     return entry == "" or (

@@ -55,6 +55,11 @@ _SECONDS_FOR_GIT = 5.0
 _SECONDS_AT_THE_END = 2.0
 
 
+def is_of_drawing(variable: str) -> bool:
+    """Tell whether frames, or the last bits of numbers, may depend on a variable."""
+    return variable in _VARIABLES or variable.startswith(_PREFIXES)
+
+
 class Provenance:
     """What a process records with, found on a thread of its own.
 
@@ -71,7 +76,7 @@ class Provenance:
         self._variables = {
             name: value
             for name, value in sorted(os.environ.items())
-            if name in _VARIABLES or name.startswith(_PREFIXES)
+            if is_of_drawing(name)
         }
         self._thread = threading.Thread(
             target=self._look, name="mjrec-provenance", daemon=True

@@ -15,14 +15,16 @@ import os
 import resource
 import signal
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
 from . import json_text
-from .child_python import Child
+from .child_python import Child, places_of_main
+from .confined import VARIABLE
 from .errors import Error
 from .parent import Parent
+from .provenance import is_of_drawing
 
 logger = logging.getLogger(__name__)
 
@@ -45,6 +47,10 @@ _TRUST_VARIABLE = "MJREC_TRUST_MODELS"
 # Says to what runs in a sandbox, and to what that starts, that it does.
 _INSIDE_VARIABLE = "MJREC_SANDBOX"
 
+_CONFINED = "mjrec.confined"
+# Of the variables, what Python, OpenGL and ffmpeg need to be found: a token is none.
+_KEPT = frozenset({"PATH", "LANG", "LD_LIBRARY_PATH", "TZ", "IMAGEIO_FFMPEG_EXE"})
+
 _NOTHING: Mapping[str, str] = {}
 
 
@@ -58,6 +64,10 @@ class Sandbox(Child):
             where its temporary files are.
         limits: by their names in `resource`.
         more_environ: environment variables besides this process's.
+        readable: where given, it can read nothing but Python, the system and these,
+            write nothing but `place` and `writable`, and has no network and no home,
+            as far as `confined` can have it here.
+        writable: folders besides `place`.
 
     Raises:
         Error: it cannot be started.
@@ -73,12 +83,24 @@ class Sandbox(Child):
         place: Path,
         limits: Mapping[str, int] = LIMITS,
         more_environ: Mapping[str, str] = _NOTHING,
+        readable: Sequence[Path] | None = None,
+        writable: Sequence[Path] = (),
     ) -> None:
         environ = {k: v for k, v in os.environ.items() if k != _TRUST_VARIABLE}
+        command = [module]
+        if readable is not None:
+            environ = {k: v for k, v in environ.items() if k in _KEPT or _is_kept(k)}
+            paths = {
+                "readable": [str(path) for path in readable],
+                "writable": [str(path) for path in (place, *writable)],
+                "hidden": places_of_main(),
+            }
+            environ |= {"HOME": str(place), VARIABLE: json.dumps(paths)}
+            command = [_CONFINED, module]
         environ |= {**more_environ, "TMPDIR": str(place), _INSIDE_VARIABLE: "1"}
         try:
             # MuJoCo's own log appears where it runs.
-            super().__init__(module, environ=environ, cwd=str(place))
+            super().__init__(*command, environ=environ, cwd=str(place))
         except OSError as error:
             raise Error(
                 f"No process with limits could be started: {sys.executable!r}: {error}."
@@ -120,6 +142,10 @@ def enter() -> tuple[Any, Callable[..., None]]:
     # With those of its group.
     parent.listen(lambda: os.killpg(0, signal.SIGKILL))
     return told["request"], lambda **said: parent.send(**_plain(said))
+
+
+def _is_kept(name: str) -> bool:
+    return is_of_drawing(name) or name.startswith(("LC_", "PYTHON", "__GLX_", "VK_"))
 
 
 def _plain(said: Mapping[str, Any]) -> Any:

@@ -132,6 +132,7 @@ def record_session(
             session.directory,
             replace(
                 options,
+                seed=session.seed,
                 video_callable=schedule,
                 # Without videos it is still the schedule that chooses what is kept.
                 trajectory_callable=schedule if options.render == OFF else None,

@@ -14,8 +14,8 @@ import rich.console
 import tyro
 
 from ..errors import InvalidArgument
-from ..evidence.packing import pack as pack_directory
-from ..evidence.packing.sizes import shown_size
+from ..evidence.pack import pack as pack_directory
+from ..evidence.size_limit import shown_size
 from ..monitors.progress import render_progress
 from .help_text import flowing_help
 

@@ -1,40 +1,22 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`mjrec verify`: what a packed run proves, item by item."""
+"""`mjrec verify`: make a packed run again, and compare."""
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Annotated, Any, Final, Literal
+from typing import Annotated, Literal
 
-import rich.box
 import rich.console
-import rich.markup
-import rich.table
 import tyro
 
 from .. import json_text
-from ..evidence.verification import Check, Level, Verdict, Verification
-from ..evidence.verifying import verify as verify_archive
+from ..evidence.verify import VerificationProgress
+from ..evidence.verify import verify as verify_archive
 from ..monitors.progress import progress_bar
 from .help_text import flowing_help
-from .terminal import printable, result_console
-
-_FAILED = 1
-_MOST_SHOWN = 50
-
-_QUESTIONS: Final[Mapping[Level, str]] = {
-    Level.FILES: "are all files there, unchanged?",
-    Level.STATS: "do statistics follow from rewards, and videos from the schedule?",
-    Level.PHYSICS: "do states follow from actions?",
-    Level.PIXELS: "do pictures follow from states?",
-}
-_STYLES: Final[Mapping[Verdict, str]] = {
-    Verdict.PASS: "green",
-    Verdict.FAIL: "bold red",
-    Verdict.NOT_CHECKABLE: "yellow",
-}
+from .terminal import result_console
+from .verification_screen import show_verification
 
 
 @flowing_help
@@ -44,143 +26,55 @@ def verify(
     *,
     level: Literal["files", "stats", "physics", "pixels"] = "pixels",
     sample: int | None = None,
-    seed: int = 0,
+    seed: int | None = None,
     trust: tyro.conf.UseAppendAction[tuple[str, ...]] = (),
+    allow: tyro.conf.UseAppendAction[tuple[str, ...]] = (),
     report: Path | None = None,
+    verbose: bool = False,
     as_json: Annotated[bool, tyro.conf.arg(name="json")] = False,
 ) -> int:
-    """Check a packed run, and say item by item what it proves.
+    """Make a packed run again from its seeds and actions, and compare.
 
-    What is checked may be anybody's: it is unpacked into a temporary folder, read in a
-    process of its own with limits, and no code that it names is run. The exit status
-    is 0 where nothing failed; what is not checkable is no failure, and no proof.
+    What is verified may be anybody's: it is read, made again and compared in processes
+    with limits, without network and home, and no code that it names is run. The exit
+    status is 0 where everything was made again and is equal (PASS), 3 where nothing
+    contradicts it and something is believed (PARTLY), 1 else (FAIL).
 
     Args:
-        path: what mjrec pack has made, be it unpacked, or a monitor directory.
-        level: how deep to go; each level includes those before it.
-        sample: how many frames of each video to draw again; all, if left out.
-        seed: of the random choice of these frames.
+        path: what mjrec pack has made, that unpacked, or a monitor directory.
+        level: where to stop. files is the bag only; stats makes rewards, ends,
+            statistics and the selection of episodes again; physics all states too;
+            pixels all frames and files too.
+        sample: how many frames of each video to draw; all, if left out.
+        seed: of the random choice of these frames; one that nobody knows before, if
+            left out. It is printed.
         trust: the id of an environment that may be made though it is in no registry of
             Gymnasium's or dm_control's. This runs code that you have installed. May be
             given several times.
+        allow: an excuse that is taken, by name and value, "gl=NVIDIA H100" for
+            instance. May be given several times.
         report: where to write a page about it (HTML, one file).
+        verbose: show every finding.
         as_json: print one JSON object, instead of text.
     """
-    console = rich.console.Console(stderr=True)
-    with progress_bar(console) as show:
+    with progress_bar(rich.console.Console(stderr=True)) as show:
+
+        def show_progress(now: VerificationProgress) -> None:
+            total = max(1, now.total)
+            show(now.phase, now.done, total, f"{100 * now.done // total} %")
+
         verification = verify_archive(
             path,
             level=level,
             sample=sample,
             seed=seed,
             trust=trust,
+            allow=allow,
             report=report,
-            on_progress=lambda progress: show(
-                progress.level.value,
-                progress.done,
-                max(1, progress.total),
-                f"{100 * progress.done // max(1, progress.total)} %",
-            ),
+            on_progress=show_progress,
         )
     if as_json:
-        sys.stdout.write(json_text.dumps(_fields(verification)) + "\n")
+        sys.stdout.write(json_text.dumps(verification.as_json()) + "\n")
     else:
-        _show(verification)
-    return 0 if verification.passed else _FAILED
-
-
-def _show(verification: Verification) -> None:
-    console = result_console()
-    for level in verification.level.included:
-        checks = [check for check in verification.checks if check.level is level]
-        console.print(_table(level, checks))
-    console.print(_verdict(verification), highlight=False, markup=False, soft_wrap=True)
-
-
-def _table(level: Level, checks: list[Check]) -> rich.table.Table:
-    table = rich.table.Table(
-        title=f"{level.value}: {_QUESTIONS[level]}",
-        title_justify="left",
-        title_style="bold",
-        box=rich.box.SIMPLE_HEAD,
-        padding=(0, 1, 0, 0),
-        pad_edge=False,
-        show_header=False,
-        expand=False,
-    )
-    for ratio in (None, 2, 3):
-        table.add_column(ratio=ratio, overflow="fold")
-    # What failed comes first, and is never left out.
-    order = [Verdict.FAIL, Verdict.NOT_CHECKABLE, Verdict.PASS]
-    groups = sorted(_alike(checks), key=lambda group: order.index(group[0].verdict))
-    failed = sum(group[0].verdict is Verdict.FAIL for group in groups)
-    most = max(_MOST_SHOWN, failed)
-    for group in groups[:most]:
-        table.add_row(*map(_cell, _texts(group)), style=None)
-    if len(groups) > most:
-        table.add_row("", f"... and {len(groups) - most} more (--json has all)", "")
-    return table
-
-
-def _alike(checks: list[Check]) -> Iterable[list[Check]]:
-    """Return the checks in groups of those that say the same of several subjects."""
-    groups: dict[Any, list[Check]] = {}
-    for number, check in enumerate(checks):
-        key: Any = (check.verdict, check.claim)
-        if check.verdict is Verdict.FAIL:
-            key = number
-        elif check.verdict is Verdict.NOT_CHECKABLE:
-            key = (*key, check.reason)
-        groups.setdefault(key, []).append(check)
-    return groups.values()
-
-
-def _texts(group: list[Check]) -> tuple[tuple[str, str], ...]:
-    first, last = group[0], group[-1]
-    what = f"{first.subject}: {first.claim}" if first.subject else first.claim
-    reason = first.reason
-    if len(group) > 1:
-        what = f"{len(group)} times, {first.subject} to {last.subject}: {first.claim}"
-        is_same = all(check.reason == reason for check in group)
-        reason = reason if is_same else f"{reason}; others likewise (--json has all)"
-    return (first.verdict.value, _STYLES[first.verdict]), (what, ""), (reason, "")
-
-
-def _cell(text: tuple[str, str]) -> str:
-    words = rich.markup.escape(printable(text[0]))
-    return f"[{text[1]}]{words}[/]" if text[1] else words
-
-
-def _verdict(verification: Verification) -> str:
-    counts = {verdict: verification.count(verdict) for verdict in Verdict}
-    numbers = (
-        f"{counts[Verdict.PASS]} passed, {counts[Verdict.FAIL]} failed, "
-        f"{counts[Verdict.NOT_CHECKABLE]} not checkable"
-    )
-    if not verification.passed:
-        return f"FAILED: {numbers}."
-    if counts[Verdict.NOT_CHECKABLE]:
-        return f"Nothing failed: {numbers}. What is not checkable is not proved."
-    return f"Verified: {numbers}."
-
-
-def _fields(verification: Verification) -> dict[str, Any]:
-    """Return what `--json` prints; `docs/verifying.md` says what each field is."""
-    return {
-        "path": str(verification.path),
-        "level": verification.level.value,
-        "passed": verification.passed,
-        "counts": {verdict.value: verification.count(verdict) for verdict in Verdict},
-        "checks": [
-            {
-                "level": check.level.value,
-                "verdict": check.verdict.value,
-                "claim": check.claim,
-                "subject": check.subject,
-                "reason": check.reason,
-                "figures": dict(check.figures),
-            }
-            for check in verification.checks
-        ],
-        "facts": dict(verification.facts),
-    }
+        show_verification(verification, result_console(), verbose=verbose)
+    return verification.verdict.exit_status

@@ -73,6 +73,24 @@ def make_dm_control(
     return _limited(environment, options)
 
 
+def load_task(
+    name: DmControlName, kwargs: Mapping[str, Any] | None
+) -> dm_env.Environment:
+    """Return a task as a recording says that it was made, with its own limit.
+
+    Args:
+        name: of the task.
+        kwargs: of `suite.load`; None where the recording does not know them: then
+            neither does a recording of what is returned.
+    """
+    if kwargs is None:
+        return suite.load(name.domain, name.task)
+    arguments = _arguments(kwargs)
+    environment = suite.load(name.domain, name.task, **arguments)
+    setattr(environment.task, MADE_WITH, arguments)
+    return environment
+
+
 class DmControlEnvironment(NamedEnvironment):
     """A task of the suite.
 

@@ -100,6 +100,32 @@ def gymnasium_scenes(
     return dataclasses.replace(scenes, obstacle=obstacle, environment=environment)
 
 
+def own_camera(env: gymnasium.Env[Any, Any]) -> int | str | None:
+    """Return the camera that an environment shows by itself; None for a free one.
+
+    It may be another one than its arguments say: who made it may have chosen another.
+    """
+    shown = drawn_part(env.unwrapped)
+    chosen = getattr(getattr(shown, "mujoco_renderer", shown), "camera_id", None)
+    if chosen is None and has_own_scenes(shown):
+        chosen = shown.camera
+    return chosen if isinstance(chosen, int | str) and chosen != -1 else None
+
+
+def set_own_camera(env: gymnasium.Env[Any, Any], camera: int | str) -> None:
+    """Let an environment show a camera by itself, as `own_camera` returns it."""
+    shown = drawn_part(env.unwrapped)
+    if has_own_scenes(shown):
+        shown.camera = camera
+    elif (renderer := getattr(shown, "mujoco_renderer", None)) is not None:
+        renderer.camera_id = camera
+
+
+def has_own_scenes(base: Any) -> bool:
+    """Tell whether an environment is one of ours, which knows itself."""
+    return hasattr(type(base), "mjrec_scenes")
+
+
 def drawn_part(base: Any) -> Any:
     """Return the environment that a maze or a kitchen shows; others show themselves.
 

@@ -208,8 +208,12 @@ class MjcfEnvironment(gymnasium.Env[NDArray[np.float64], NDArray[np.float64]]):
             environment={
                 "framework": "mjcf",
                 "id": self.spec.id if self.spec else None,
-                # All there is to say stands in the file.
-                "kwargs": {},
+                # All else there is to say stands in the file.
+                "kwargs": {
+                    name: side
+                    for name, side in (("height", self.height), ("width", self.width))
+                    if side != _SIDE
+                },
             },
             # Nothing in it is random.
             random_state=lambda: generator_state(self._np_random),

@@ -12,8 +12,9 @@ from collections.abc import Iterable
 from typing import Any
 
 import gymnasium
+from gymnasium.utils import RecordConstructorArgs
 
-from .scenes import class_name
+from .scenes import class_name, plain_arguments
 
 # They hand actions, rewards and the ends of episodes on as they are. `TimeLimit` does
 # not, and is told apart, by its number.
@@ -41,14 +42,17 @@ def around_gymnasium(env: gymnasium.Env[Any, Any]) -> dict[str, Any]:
 
     Returns:
         `wrappers`, the full names of the classes of wrappers, outermost first, that may
-        change what goes through them, and `max_episode_steps`, the least limit of a
-        `TimeLimit`, or None.
+        change what goes through them, where there are any the `wrapper_arguments` of
+        each, and `max_episode_steps`, the least limit of a `TimeLimit`, or None.
     """
     layers: list[Any] = []
     while isinstance(env, gymnasium.Wrapper):
         layers.append(env)
         env = env.env
-    return _facts(layers, (getattr(e, "_max_episode_steps", None) for e in layers))
+    facts = _facts(layers, (getattr(e, "_max_episode_steps", None) for e in layers))
+    if facts["wrappers"]:
+        facts["wrapper_arguments"] = list(map(_arguments_of, _changing(layers)))
+    return facts
 
 
 def around_dm_env(env: Any) -> dict[str, Any]:
@@ -69,12 +73,26 @@ def around_dm_env(env: Any) -> dict[str, Any]:
 
 
 def _facts(layers: list[Any], limits: Iterable[Any]) -> dict[str, Any]:
-    names = (class_name(type(layer)) for layer in layers)
     known = [int(limit) for limit in limits if _is_limit(limit)]
     return {
-        "wrappers": [name for name in names if name not in _TRANSPARENT],
+        "wrappers": [class_name(type(layer)) for layer in _changing(layers)],
         "max_episode_steps": min(known, default=None),
     }
+
+
+def _changing(layers: Iterable[Any]) -> list[Any]:
+    return [layer for layer in layers if class_name(type(layer)) not in _TRANSPARENT]
+
+
+def _arguments_of(wrapper: Any) -> dict[str, Any] | None:
+    """Return what a wrapper of Gymnasium's was made with; None where it keeps it not.
+
+    None also where an argument is more than JSON can hold, a function for instance.
+    """
+    saved = getattr(wrapper, "_saved_kwargs", None)
+    if not isinstance(wrapper, RecordConstructorArgs) or saved is None:
+        return None
+    return plain_arguments(saved)
 
 
 def _dm_env_limit(env: Any) -> Any:

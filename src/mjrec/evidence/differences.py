@@ -1,60 +1,132 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How a packed run and the same run, made again, differ: the words for it."""
+"""What comparators say: items that are equal, and places that differ.
+
+A comparator looks at one file of two packed runs. It judges nothing: whether an excuse
+allows a difference is decided elsewhere, by the aspect of it.
+"""
 
 from __future__ import annotations
 
-import dataclasses
 import enum
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
-from typing import Any
+from typing import Any, Final
+
+from ..formats.monitor_directory import episode_of, infix_of
+from .findings import Topic
+
+_LONGEST: Final = 120
+_VIDEO_OR_TRAJECTORY: Final = re.compile(r"openaigym\.(video|trajectory)\.")
 
 
-class Item(enum.StrEnum):
-    """What is proved, a line of the one screen each, in its order."""
+class Aspect(enum.Enum):
+    """How an item differs, which decides what may excuse it.
 
-    IDENTITY = "identity"
-    BEGINNING = "beginning"
-    PHYSICS = "physics"
-    REWARDS = "rewards and ends"
-    SELECTION = "selection of episodes"
-    VIDEOS = "videos shown"
-    PICTURES = "pictures"
-    FILES = "files"
+    Attributes:
+        EXACT: it must be equal; no version or machine changes it.
+        STATE: numbers of the simulation.
+        DERIVED: numbers that the environment computes of states.
+        SOLVER: what only the solver uses to begin from: the warm start.
+        MODEL: the compiled model.
+        PICTURE: a frame's pixels, as the file shows them.
+        HASH: a frame's hash, that follows from its pixels.
+        ENCODED: bytes of the encoder that show nothing by themselves.
+        STORED: all contents are equal, the bytes that store them are not.
+        CLAIM: a version, or a name of hardware.
+        STATEMENT: what nothing can make again; or what follows from a file of the
+            archive itself, and is right for that. Nothing is to be said of it.
+    """
+
+    EXACT = "exact"
+    STATE = "state"
+    DERIVED = "derived"
+    SOLVER = "solver"
+    MODEL = "model"
+    PICTURE = "picture"
+    HASH = "hash"
+    ENCODED = "encoded"
+    STORED = "stored"
+    CLAIM = "claim"
+    STATEMENT = "statement"
 
 
 @dataclass(frozen=True, kw_only=True)
-class Difference:
-    """One place where the two differ.
+class Place:
+    """Where an item is.
 
     Attributes:
-        item: what it tells against.
-        file: its name in the archive, below `data/`; "" for the whole.
-        where: the place in it: "states[12].qpos", "episode 27: reward", "frame 13".
-        recorded: what the archive has there, short and printable.
-        made: what was made again, likewise.
-        size: how far off. Of numbers the largest `abs(x - y) / (1 + abs(x))`; of
-            frames the root mean square of the worst 8x8 block, in levels of 255. None
-            where it is no matter of degree.
-        figures: more numbers, by name: `count` of the places alike that this one
-            stands for; of frames `psnr`, `ssim` and `block`, the worst of each.
+        topic: what it tells about.
+        file: its name below `data/`.
+        count: how many `unit` it stands for.
+        unit: "episode", "step", "frame", "video", "file".
+        episode: the number of the episode that it is of; None where the file says it.
     """
 
-    item: Item
-    file: str
-    where: str
-    recorded: str
-    made: str
+    topic: Topic
+    file: str = ""
+    count: int = 1
+    unit: str = "file"
+    episode: int | None = None
+
+    @property
+    def scopes(self) -> tuple[str, ...]:
+        """What an excuse may name to reach it: episode, recording, file."""
+        name = self.file.rpartition("/")[2]
+        infix = infix_of(name)
+        if infix is None:
+            return (name,)
+        number = self.episode
+        if number is None and _VIDEO_OR_TRAJECTORY.match(name):
+            number = episode_of(name)
+        episode = () if number is None else (f"episode {number} of {infix}",)
+        return (*episode, f"recording {infix}", name)
+
+    @property
+    def item(self) -> str:
+        """What a finding calls it: the episode, else the file."""
+        first = self.scopes[0]
+        return first if first.startswith("episode ") else self.file
+
+
+@dataclass(frozen=True, kw_only=True)
+class Same(Place):
+    """Something that is equal, bit for bit."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Difference(Place):
+    """One place, or several alike, where the two differ.
+
+    Attributes:
+        aspect: how.
+        where: "states[12].qpos", "frame 13", "mjrec.schedule".
+        given: what the archive has there, short and printable.
+        made: what was made again.
+        size: of numbers the largest `abs(x - y) / (1 + abs(x))`; None where it is no
+            matter of degree.
+        claim: of a CLAIM, whose: "mujoco", "gl", "ffmpeg", "machine".
+        figures: more numbers by name: of PICTURE `psnr`, `ssim` and `block`.
+    """
+
+    aspect: Aspect = Aspect.EXACT
+    where: str = ""
+    given: str = ""
+    made: str = ""
     size: float | None = None
+    claim: str = ""
     figures: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
 
-    def to_json(self) -> dict[str, Any]:
-        """Return it as JSON has it."""
-        fields = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
-        return {**fields, "figures": dict(self.figures)}
+    @property
+    def reason(self) -> str:
+        """The difference as a clause."""
+        place = f"{self.where}: " if self.where else ""
+        return f"{place}the archive has {self.given}, made again it is {self.made}"
 
-    @classmethod
-    def from_json(cls, said: Mapping[str, Any]) -> Difference:
-        """Return the difference that `to_json` was called of."""
-        return cls(**{**said, "item": Item(said["item"])})
+
+def short(value: Any) -> str:
+    """Return a value as one short line of text."""
+    text = value if isinstance(value, str) else repr(value)
+    text = text if text.isprintable() else ascii(text)[1:-1]
+    return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 4]} ..."

@@ -18,7 +18,7 @@
             └── recordings/             the monitor directory
                 └── openaigym.*
 
-Packing writes it and verifying reads it; they share nothing else.
+Packing writes it and verifying reads it.
 """
 
 from __future__ import annotations
@@ -44,3 +44,13 @@ STATISTICS_COLUMNS: Final = (
     *("start_time", "end_time", "seed", "terminated", "truncated"),
     *("video", "video_sha256", "trajectory"),
 )
+
+# Packing refuses to make archives of more files, and verifying to read them. That of
+# thirty thousand recorded episodes has fewer.
+MOST_ENTRIES: Final = 100_000
+
+# In the key `mjrec` of a packed manifest: the episodes that were chosen for packing.
+PACKED_EPISODES: Final = "packed_episodes"
+# In the facts of a packed trajectory of another episode, of which actions, rewards and
+# seeds are packed: its states and snapshots were left out.
+STATES_LEFT_OUT: Final = "states_left_out"

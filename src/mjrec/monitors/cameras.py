@@ -63,6 +63,31 @@ def camera_pictures(
     return cameras[0], said
 
 
+def recorded_view(
+    camera: Any, *, height: int | None, width: int | None, own: Any = None
+) -> dict[str, Any]:
+    """Return what a journal says of how a run is shown; what is the default is not.
+
+    Args:
+        camera: as of `camera_pictures`.
+        height: that was asked for.
+        width: likewise.
+        own: number or name of the camera that the environment shows by itself.
+    """
+    several = isinstance(camera, Sequence) and not isinstance(camera, str)
+    plain = [
+        None if each is None else plain_camera(each)
+        for each in (camera if several else [camera])
+    ]
+    said = {
+        "camera": plain if several else plain[0],
+        "height": None if height is None else int(height),
+        "width": None if width is None else int(width),
+        "own_camera": own,
+    }
+    return {name: value for name, value in said.items() if value is not None}
+
+
 def _check(cameras: list[Any]) -> None:
     if not cameras:
         raise InvalidArgument(

@@ -15,7 +15,7 @@ from ..environments.scenes import NoPictureSource, Scenes
 from ..errors import InvalidArgument
 from ..recorder.options import RecorderOptions
 from .base import EnvironmentMonitor
-from .cameras import camera_pictures
+from .cameras import camera_pictures, recorded_view
 
 logger = logging.getLogger(__name__)
 
@@ -74,6 +74,7 @@ class DmEnvMonitor(EnvironmentMonitor, dm_env.Environment):  # type: ignore[misc
             scenes=lambda: _scenes(env, env_id=env_id, camera=first, **size),
             close_environment=operator.methodcaller("close"),
             env_id=env_id or _env_id(env),
+            view=recorded_view(camera, **size),
             **pictures,
         )
 

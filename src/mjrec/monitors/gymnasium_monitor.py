@@ -15,11 +15,11 @@ import numpy as np
 from gymnasium.envs.registration import EnvSpec
 
 from ..environments.gymnasium_pictures import close_environment, gymnasium_pictures
-from ..environments.gymnasium_scenes import gymnasium_scenes
+from ..environments.gymnasium_scenes import gymnasium_scenes, own_camera
 from ..recorder.finishers import Finisher
 from ..recorder.options import RecorderOptions
 from .base import NO_SIMULATION, EnvironmentMonitor
-from .cameras import camera_pictures
+from .cameras import camera_pictures, recorded_view
 
 logger = logging.getLogger(__name__)
 
@@ -76,6 +76,7 @@ class GymnasiumMonitor(EnvironmentMonitor, gymnasium.Wrapper[Any, Any, Any, Any]
             rendering=rendering,
             env_id=env_id or env_id_of(env),
             env_index=env_index,
+            view=recorded_view(camera, **size, own=own_camera(env)),
             **pictures,
         )
 

@@ -17,7 +17,6 @@ The last part ends as an episode's trajectory does, with `complete`; those befor
 
 from __future__ import annotations
 
-import time
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -172,7 +171,7 @@ class _Clip:
         if start.refusal is not None:
             part.end_frames(start.refusal)
             return
-        part.end({"continues": True, "end_time": time.time()})
+        part.end({"continues": True, "end_time": self._run.clock()})
         if part.broken_reason is None:
             self._begin_part(start)
 
@@ -209,7 +208,7 @@ class _Clip:
         elif self._part is not None:
             try:
                 last = {"last_episode_id": self._last_episode_id}
-                self._part.end({**known, **last, "end_time": time.time()})
+                self._part.end({**known, **last, "end_time": run.clock()})
             finally:
                 # Else the disk was too full for a single row: nothing is promised.
                 if self._parts > 1 or self._part.is_there:

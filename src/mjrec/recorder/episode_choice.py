@@ -30,6 +30,8 @@ class EpisodeChoice:
         if options.step_trigger is not None or mode == OFF:
             self._schedule = disable_videos
         self._trajectories = options.trajectory_callable
+        stated = options.statements
+        self._only_counted = stated is not None and stated.only_counted
         # The episodes that were asked about last.
         self._decided = (-1, False)
         self._kept = (-1, False)
@@ -79,6 +81,8 @@ class EpisodeChoice:
             has_video: it gets a video.
         """
         asked = self._trajectories
+        if self._only_counted:
+            return has_video
         if asked is None:
             return has_video or episode_type == _EVALUATION
         if not callable(asked):

@@ -81,6 +81,7 @@ class MonitoredRun:
         subject, options, stats, finisher, selection: as given.
         directory: the monitor directory.
         infix: what its files have in the middle.
+        clock: returns the time, in seconds since the epoch.
         events: what the journal says so far, also what the disk was too full for.
         trackers: are told of episodes and finished videos.
         logs: of the episodes' rows.
@@ -101,13 +102,15 @@ class MonitoredRun:
     ) -> None:
         self.directory, self.infix = place.path, place.infix
         self.subject, self.options, self.stats = subject, options, stats
+        self.clock = options.clock
         self.finisher, self.selection = finisher, selection
         self.events = Run(place.run)
         self._journal_path = self.directory / journal_name(self.infix)
         self._journal = JournalWriter(self._journal_path, run=place.run)
         self._faults: set[tuple[int | None, What, str]] = set()
         self._policy = _policy_facts(options)
-        self._surroundings = look_around()
+        self._statements = options.statements
+        self._surroundings = None if options.statements else look_around()
         self._environment_facts = {
             "infix": str(self.infix),
             "env_id": subject.env_id,
@@ -174,9 +177,9 @@ class MonitoredRun:
             wait: wait for it a little.
         """
         if self.events.surroundings is None:
-            found = self._surroundings.found(wait=wait)
+            found = self._found(wait=wait)
             if found is not None:
-                self.note("surroundings", {**found, **self._policy})
+                self.note("surroundings", found)
 
     def tolerates(
         self, what: What, error: BaseException, *, of_episode: bool = True
@@ -229,6 +232,15 @@ class MonitoredRun:
         for logs in (self.logs, self.clip_logs):
             logs.release()
         self._journal.close()
+
+    def _found(self, *, wait: bool) -> Mapping[str, Any] | None:
+        if (stated := self._statements) is not None:
+            is_time = wait or self.events.count >= stated.surroundings_after
+            return stated.surroundings if is_time else None
+        found = (
+            None if self._surroundings is None else self._surroundings.found(wait=wait)
+        )
+        return None if found is None else {**found, **self._policy}
 
     def _write(self, write: Callable[[], None]) -> None:
         try:

@@ -13,7 +13,7 @@ import itertools
 import os
 import threading
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
@@ -58,6 +58,28 @@ class _MonitorIds:
 _monitor_ids = _MonitorIds()
 
 
+@dataclass(frozen=True, kw_only=True)
+class Statements:
+    """What of a run can never come out again: given where a run is made again.
+
+    Attributes:
+        infix: what the names of its files have in the middle; nobody has claimed it.
+        first_episode_id: the number of its first episode.
+        surroundings: its provenance; None where that was not known.
+        surroundings_after: how many episodes were completed before it was.
+        clock: returns the time, in seconds since the epoch.
+        only_counted: episodes without a video keep no trajectory: it is only asked
+            what rewards and ends there were.
+    """
+
+    infix: Infix
+    first_episode_id: int
+    surroundings: Mapping[str, Any] | None
+    surroundings_after: int
+    clock: Callable[[], float]
+    only_counted: bool = False
+
+
 @dataclass(frozen=True)
 class OpenDirectory:
     """A monitor directory with a claim in it.
@@ -85,6 +107,7 @@ def open_directory(
     uid: str | None,
     env_info: Mapping[str, str],
     facts: Mapping[str, Any] = MappingProxyType({}),
+    statements: Statements | None = None,
 ) -> OpenDirectory:
     """Claim a place in `directory`, which is made where it is missing.
 
@@ -101,6 +124,7 @@ def open_directory(
         env_info: `env_id` of the environment, among others.
         facts: what else is known of the run. It stands in the lock: so much is known of
             a process that was killed before its journal had a line.
+        statements: of a run that is made again.
 
     Raises:
         ExistingRecordings: there are recordings, and neither `force` nor `resume`.
@@ -116,9 +140,16 @@ def open_directory(
         _check_existing(path, force=force, resume=resume, env_id=env_info["env_id"])
         joins = resume == JOIN and not force
         numbers_on = not (force or joins)
-        first = _next_episode_id(path, uid=wanted_uid) if numbers_on else 0
+        if statements is not None:
+            first = statements.first_episode_id
+        else:
+            first = _next_episode_id(path, uid=wanted_uid) if numbers_on else 0
         run = {"env_info": dict(env_info), **facts, "first_episode_id": first}
-        infix, lock = _claim(path, uid=wanted_uid, run=run, looks=not joins)
+        if statements is not None:
+            infix = statements.infix
+            lock = Lock(path / lock_name(infix), json_text.dumps({"run": run}))
+        else:
+            infix, lock = _claim(path, uid=wanted_uid, run=run, looks=not joins)
     return OpenDirectory(path, infix, first, lock, run)
 
 

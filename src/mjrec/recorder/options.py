@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import os
 import re
+import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
@@ -18,15 +19,17 @@ from ..errors import InvalidArgument
 from ..formats.row_log import TAIL_BYTES
 from ..frames import check_quality
 from ..rates import to_rate
-from ..schedules import check_takes_one
+from ..schedules import check_takes_one, schedule_name
 from .keep_rules import selection_from
-from .opening import JOIN
+from .opening import JOIN, Statements
 from .tracking import FinishedEpisode, Tracker
 
 DEFERRED, LIVE, OFF = "deferred", "live", "off"
 RAISE, WARN = "raise", "warn"
 # Not gym's own, which would be taken for a monitor's files.
 _NAME_PREFIX = re.compile(r"(?!openaigym)[A-Za-z0-9_][A-Za-z0-9_.-]{0,99}", re.ASCII)
+# They change what is in files.
+_SWITCHES = ("observations", "annotate", "tiled")
 _MODES = {None: "t", "training": "t", "evaluation": "e"}
 
 
@@ -65,6 +68,10 @@ class RecorderOptions:
     policy_file: str | os.PathLike[str] | None = None
     # Of a row log; vector environments share a budget.
     tail_bytes: int = TAIL_BYTES
+    # From which the seeds of episodes follow, where they do.
+    seed: int | None = None
+    # Of a run that is made again.
+    statements: Statements | None = None
 
     def __post_init__(self) -> None:
         type_of_mode(self.mode)
@@ -188,6 +195,33 @@ class RecorderOptions:
                 "policy_file must be the path of the file in which the policy is, "
                 f"whose sha256 the manifest will say, got {given!r}, which is no file."
             )
+
+    @property
+    def clock(self) -> Callable[[], float]:
+        """Returns the time, in seconds since the epoch."""
+        return time.time if self.statements is None else self.statements.clock
+
+    def recorded(self) -> dict[str, Any]:
+        """Return what a journal says of them: those on which other files depend.
+
+        What is the default is left out. Functions go by their names; schedule and rule
+        are said elsewhere.
+        """
+        kept, trigger = self.trajectory_callable, self.step_trigger
+        length = self.video_length
+        said: dict[str, Any] = {
+            "fps": None if self.fps is None else str(self.fps),
+            "max_fps": None if self.max_fps is None else str(self.max_fps),
+            "quality": None if self.quality == "full" else self.quality,
+            "render": self.render,
+            "trajectories": schedule_name(kept) if callable(kept) else kept,
+            "step_trigger": None if trigger is None else schedule_name(trigger),
+            "video_length": None if length is None else int(length),
+            "name_prefix": self.name_prefix,
+            "seed": self.seed,
+            **{name: getattr(self, name) or None for name in _SWITCHES},
+        }
+        return {name: value for name, value in said.items() if value is not None}
 
     @property
     def has_clips(self) -> bool:

@@ -6,7 +6,6 @@ from __future__ import annotations
 import contextlib
 import logging
 import os
-import time
 import weakref
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager
@@ -113,7 +112,10 @@ class Recorder:
                 "keep": keep,
                 "versions": dict(versions()),
                 "views": [*subject.further_views],
+                "environment": subject.environment,
+                "options": {**options.recorded(), **subject.view},
             },
+            statements=options.statements,
         )
         self.directory, infix = self._place.path, self._place.infix
         self.infix = str(infix)
@@ -130,6 +132,7 @@ class Recorder:
             allow_early_reset=options.allow_early_reset,
         )
         self.stats_recorder.type = type_of_mode(options.mode)
+        self.stats_recorder.clock = options.clock
         self.run = MonitoredRun(
             self._place,
             subject=subject,
@@ -190,10 +193,11 @@ class Recorder:
         """
         self.check_process()
         self.fast = None
-        self.stats_recorder.before_reset(after_error=self._ending is not None)
+        now = self.run.clock()
+        self.stats_recorder.before_reset(after_error=self._ending is not None, now=now)
         if not self._is_unbegun():
             self._take_last_frame()
-        self._reset_time = time.time()
+        self._reset_time = now
         self._random_state = None
         if self._choice.may_keep_trajectory(self.stats_recorder.type):
             self._random_state = self._subject.random_state()
@@ -516,7 +520,7 @@ class Recorder:
                 if kept is not None and standing is Standing.CHOSEN and recording.live:
                     recording.live.say(selection=kept.chosen_facts())
                 with failures:
-                    recording.end(facts)
+                    recording.end(facts, end_time=self._end_time(facts, episode))
                 with failures:
                     if kept is None:
                         recording.hand_on()
@@ -532,6 +536,13 @@ class Recorder:
         if episode is not None:
             has_video = recording.video.enabled and standing is not Standing.DROPPED
             self.run.trackers.episode(episode, has_video=has_video)
+
+    def _end_time(
+        self, facts: Mapping[str, Any], episode: FinishedEpisode | None
+    ) -> float:
+        if episode is not None:
+            return episode.end_time
+        return self._reset_time if facts.get("reason") == RESET else self.run.clock()
 
     def _finished_episode(
         self, flags: dict[str, bool], success: bool | None

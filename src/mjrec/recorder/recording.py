@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -130,17 +129,18 @@ class EpisodeRecording:
         if self.live is not None:
             self.live.leave()
 
-    def end(self, facts: Mapping[str, Any]) -> None:
+    def end(self, facts: Mapping[str, Any], *, end_time: float) -> None:
         """Write what is known of the end, and finish live videos.
 
         Args:
             facts: of the episode's end.
+            end_time: in seconds since the epoch.
         """
         stats = self._run.stats
         known = {**facts, "length": stats.steps, "reward": stats.rewards}
         try:
             if self.states is not None:
-                own = {"length": self.states.steps, "end_time": time.time()}
+                own = {"length": self.states.steps, "end_time": end_time}
                 self.states.end({**known, **own})
         finally:
             if self.live is not None:

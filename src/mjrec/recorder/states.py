@@ -149,12 +149,12 @@ class StateRecorder:
             # Unlike those of the episode before: the rows will be others.
             self._take_back()
             self._use_action(action_array(action))
-            if self._action is not None:
-                self._action.set(action)
-        elif self._action is not None:
-            self._note_irregular("actions")
-            where = {"episode_id": self._run.episode.episode_id, "step": self.steps}
-            self._run.note("action", {**where, "value": action})
+            if self._action is not None and self._action.set(action):
+                return
+        self._note_irregular("actions")
+        where = {"episode_id": self._run.episode.episode_id, "step": self.steps}
+        given = {"dtype": action.dtype.name} if hasattr(action, "dtype") else {}
+        self._run.note("action", {**where, **given, "value": action})
 
     def step(
         self,

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import os
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -74,6 +75,7 @@ class StatsRecorder:
         self.done: bool | None = None
         self.total_steps = 0
         self.closed = False
+        self.clock: Callable[[], float] = time.time
         self.path = str(Path(self.directory) / f"{file_prefix}.stats.json")
         self._type = _TYPES[0]
         self._episode_type = _TYPES[0]
@@ -152,11 +154,14 @@ class StatsRecorder:
         if done:
             self.save_complete()
 
-    def before_reset(self, *, after_error: bool = False) -> None:
+    def before_reset(
+        self, *, after_error: bool = False, now: float | None = None
+    ) -> None:
         """Check that a reset may be made.
 
         Args:
             after_error: the environment has raised, so that there is no other way on.
+            now: the time, where the caller has read the clock already.
 
         Raises:
             ResetNotAllowed: the episode has begun and is not over.
@@ -172,7 +177,7 @@ class StatsRecorder:
                 "no part of the statistics."
             )
         if self.initial_reset_timestamp is None:
-            self.initial_reset_timestamp = time.time()
+            self.initial_reset_timestamp = self.clock() if now is None else now
 
     def after_reset(self, observation: object = None) -> None:
         """Begin an episode."""
@@ -188,7 +193,7 @@ class StatsRecorder:
         self.episode_lengths.append(self.steps)
         self.episode_rewards.append(self.rewards)
         self.episode_types.append(self._episode_type)
-        self.timestamps.append(time.time())
+        self.timestamps.append(self.clock())
 
     def close(self) -> None:
         """Write the statistics file and end. A second call does nothing."""

@@ -44,6 +44,8 @@ class Subject:
             run beside episodes, and a source has one reader only. None where there
             are no such videos.
         environment: what it can be made from again, for the trajectories.
+        view: the cameras and sizes that were asked for, and how the environment is
+            shown by itself, for JSON; what is not said is the default.
         random_state: returns the state of its random generator, for JSON, or None.
     """
 
@@ -58,6 +60,7 @@ class Subject:
     states: Capture | None = None
     clip_states: Capture | None = None
     environment: Mapping[str, Any] | None = None
+    view: Mapping[str, Any] = field(default_factory=dict)
     random_state: Callable[[], Any] = lambda: None
 
     @property

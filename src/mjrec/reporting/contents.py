@@ -115,13 +115,13 @@ class Verdict:
 
     Attributes:
         source: what was verified, and which file says so.
-        passed: whether nothing failed.
-        counts: how many checks passed, failed and were not checkable, by verdict.
+        verdict: `PASS`, `PARTLY` or `FAIL`.
+        counts: how many findings say made again, within tolerance, believed, different.
         level: how deep it went.
     """
 
     source: str
-    passed: bool
+    verdict: str
     counts: Mapping[str, int]
     level: str
 

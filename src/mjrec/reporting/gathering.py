@@ -22,16 +22,15 @@ from numpy.typing import NDArray
 
 from ..errors import InvalidArgument, UnreadableFile
 from ..evaluation.results_files import ReadResults, is_evaluation, read_results
+from ..formats.json_fields import field as json_field
 from ..formats.json_fields import (
-    boolean,
-    integer,
+    list_of,
     mapping,
     one_of,
     read_object,
     text,
     unreadable,
 )
-from ..formats.json_fields import field as json_field
 from ..formats.monitor_directory import monitor_directories_in
 from ..results.episodes import Episode, episodes_of
 from ..results.journal_or_stats import MonitorResults
@@ -63,7 +62,8 @@ _NO_MONITOR: Final = -2
 
 # Where a verdict is looked for, in each directory with recordings.
 _VERIFICATION_NAME: Final = "verification.json"
-_VERDICTS: Final = ("pass", "fail", "not checkable")
+_VERDICTS: Final = ("PASS", "PARTLY", "FAIL")
+_OUTCOMES: Final = ("made again", "within tolerance", "believed", "different")
 _LEVELS: Final = ("files", "stats", "physics", "pixels")
 
 
@@ -387,18 +387,17 @@ def _read_verdict(path: Path) -> Verdict:
     """
     with unreadable(path):
         said = read_object(path)
-        told = json_field(said, "counts", mapping)
-        counts = {name: json_field(told, name, integer) for name in _VERDICTS}
-        passed = json_field(said, "passed", boolean)
-        if passed != (counts["fail"] == 0):
+        verdict = json_field(said, "verdict", one_of(*_VERDICTS))
+        findings = json_field(said, "findings", list_of(mapping))
+        outcomes = Counter(json_field(each, "outcome", text) for each in findings)
+        if verdict != "FAIL" and outcomes["different"]:
             raise ValueError(
-                f"it says passed is {str(passed).lower()}, and that {counts['fail']} "
-                "checks failed"
+                f"it says {verdict}, and that {outcomes['different']} items differ"
             )
         return Verdict(
             source=f"{json_field(said, 'path', text)} ({path})",
-            passed=passed,
-            counts=counts,
+            verdict=verdict,
+            counts={name: outcomes[name] for name in _OUTCOMES if outcomes[name]},
             level=json_field(said, "level", one_of(*_LEVELS)),
         )
 

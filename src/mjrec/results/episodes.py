@@ -165,10 +165,13 @@ def _files(results: MonitorResults, number: int) -> dict[str, Any]:
     trajectory = files.trajectories.get(number)
     # Metadata without a video is what is left of one that could not be made.
     is_missing = trajectory is not None and video is None and metadata is None
+    # A packed run may have the actions alone of an episode that was not chosen.
+    packed = results.details.get("packed_episodes")
+    is_left_out = isinstance(packed, list) and number not in packed
     return {
         "monitor": files.infix,
         "video": video,
         "metadata": metadata,
         "trajectory": trajectory,
-        "pending": is_missing and number in results.promised,
+        "pending": is_missing and not is_left_out and number in results.promised,
     }

@@ -16,7 +16,7 @@ from __future__ import annotations
 import itertools
 import os
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from .. import json_text
@@ -43,11 +43,18 @@ class MonitorCsvTracker(Tracker):
             `logs/a.monitor.csv`, `logs/a.1.monitor.csv` ... None is the monitor
             directory. In a directory the name is
             `openaigym.results.<infix>.monitor.csv`.
+        clock: returns the time, in seconds since the epoch.
     """
 
-    def __init__(self, path: str | os.PathLike[str] | None = None) -> None:
+    def __init__(
+        self,
+        path: str | os.PathLike[str] | None = None,
+        *,
+        clock: Callable[[], float] = time.time,
+    ) -> None:
         # Absolute, because the working directory may be another one by then.
         self._path = None if path is None else Path(path).absolute()
+        self._clock = clock
         self._files: dict[Run, tuple[AppendOnlyFile, float]] = {}
 
     def begin(self, run: Run) -> None:
@@ -57,7 +64,7 @@ class MonitorCsvTracker(Tracker):
             DirectoryNotWritable: the directory cannot be made or written to.
             FileNotWritten: the disk is full.
         """
-        file, t_start = AppendOnlyFile(self._names(run)), time.time()
+        file, t_start = AppendOnlyFile(self._names(run)), self._clock()
         self._files[run] = file, t_start
         header = json_text.dumps({"t_start": t_start, "env_id": run.env_id})
         file.append(f"#{header}\nr,l,t\n".encode())

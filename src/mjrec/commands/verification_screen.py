@@ -1,0 +1,94 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A verification on one screen: the verdict, excuses, a line for each topic."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Final
+
+import rich.box
+import rich.console
+import rich.markup
+import rich.table
+
+from ..evidence import summary
+from ..evidence.findings import Finding, Outcome, Verdict, Verification
+from .terminal import printable
+
+_MOST_SHOWN: Final = 8
+_STYLES: Final = {
+    str(Verdict.PASS): "bold green",
+    str(Verdict.PARTLY): "bold yellow",
+    str(Verdict.FAIL): "bold red",
+    str(Outcome.MADE_AGAIN): "green",
+    str(Outcome.WITHIN_TOLERANCE): "yellow",
+    str(Outcome.BELIEVED): "yellow",
+    str(Outcome.DIFFERENT): "bold red",
+}
+
+
+def show_verification(
+    verification: Verification, console: rich.console.Console, *, verbose: bool = False
+) -> None:
+    """Print a verification.
+
+    Args:
+        verification: the result.
+        console: where to.
+        verbose: list all findings, and what it was made with.
+    """
+    most = None if verbose else _MOST_SHOWN
+    verdict = str(verification.verdict)
+    console.print(f"{_styled(verdict)}  {_plain(summary.headline(verification))}")
+    _list(console, "", summary.remarks(verification), most)
+    _list(console, "Different", summary.failures(verification), most)
+    _list(console, "Excuses", summary.excuses(verification), most)
+    console.print(_table(verification))
+    if drawn := summary.sampled(verification):
+        console.print(f"  {drawn}")
+    _list(console, "Asked for", summary.inputs(verification), most)
+    if verbose:
+        said = [_finding(each) for each in verification.findings]
+        _list(console, "Findings", said, None)
+        facts = (f"{key}: {value}" for key, value in verification.facts.items())
+        _list(console, "Made with", facts, None)
+
+
+def _table(verification: Verification) -> rich.table.Table:
+    table = rich.table.Table(
+        box=rich.box.SIMPLE, show_header=False, pad_edge=False, padding=(0, 2, 0, 0)
+    )
+    for ratio in (None, None, 1):
+        table.add_column(ratio=ratio, overflow="fold", no_wrap=ratio is None)
+    for line in summary.lines(verification):
+        table.add_row(str(line.topic), _styled(line.outcome), _plain(line.text))
+    return table
+
+
+def _finding(finding: Finding) -> str:
+    many = summary.counted(finding.count, finding.unit)
+    excuse = f" (excuse: {finding.excuse})" if finding.excuse else ""
+    parts = (finding.topic, finding.outcome, finding.item, many, finding.reason)
+    return " | ".join(str(part) for part in parts if part) + excuse
+
+
+def _list(
+    console: rich.console.Console, title: str, said: Iterable[str], most: int | None
+) -> None:
+    texts = list(said)
+    if not texts:
+        return
+    if title:
+        console.print(f"[bold]{title}[/]")
+    for text in texts[:most]:
+        console.print(f"  {_plain(text)}", highlight=False, soft_wrap=True)
+    if most is not None and len(texts) > most:
+        console.print(f"  ... and {len(texts) - most} more (--verbose lists all)")
+
+
+def _styled(word: str) -> str:
+    return f"[{_STYLES[word]}]{word}[/]" if word in _STYLES else word
+
+
+def _plain(text: str) -> str:
+    return rich.markup.escape(printable(text))

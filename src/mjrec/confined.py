@@ -1,0 +1,149 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A process without network, home and other files; run as `python -m` with a module.
+
+It confines itself before it imports anything, because what confines a thread confines
+no other that is there already. What an unprivileged Linux process can have:
+
+- Landlock (Linux 5.13): only Python, the system and what is named may be read, only
+  what is named may be written; from Linux 6.7 on no TCP connection either.
+- A network namespace without any network, where the system lets users make one.
+
+Where the kernel has neither, the limits of the sandbox, an empty home and a short list
+of environment variables are all there is.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import json
+import os
+import runpy
+import sys
+from collections.abc import Iterable
+from pathlib import Path
+
+VARIABLE = "MJREC_CONFINED"
+
+_SYSTEM = (
+    *("/usr", "/lib", "/lib64", "/bin", "/sbin", "/etc", "/proc", "/sys", "/opt"),
+    # Drivers and their lists are in some of these.
+    *("/nix", "/run/opengl-driver", "/var/lib"),
+)
+_CLONE_NEWUSER, _CLONE_NEWNET = 0x1000_0000, 0x4000_0000
+_NO_NEW_PRIVILEGES = 38
+
+# The numbers of system calls are the same on every architecture of today.
+_CREATE, _ADD, _RESTRICT = 444, 445, 446
+_PATH_BENEATH = 1
+_READ = 0b1101  # execute, read a file, read a folder
+# By the version of Landlock: how many of its rights to files there are.
+_RIGHTS = {1: 13, 2: 14, 3: 15, 4: 15, 5: 16}
+_NO_TCP = 0b11
+_SCOPES = 0b11  # abstract sockets and signals
+# Version 4 brought TCP, 6 the scopes.
+_WITH_TCP, _WITH_SCOPES = 4, 6
+
+
+class _Ruleset(ctypes.Structure):
+    _fields_ = (
+        ("files", ctypes.c_uint64),
+        ("network", ctypes.c_uint64),
+        ("scopes", ctypes.c_uint64),
+    )
+
+
+class _PathBeneath(ctypes.Structure):
+    _pack_ = 1
+    _layout_ = "ms"
+    _fields_ = (("rights", ctypes.c_uint64), ("parent", ctypes.c_int32))
+
+
+_libc = ctypes.CDLL(None, use_errno=True)
+
+
+def confine(
+    readable: Iterable[str], writable: Iterable[str], hidden: Iterable[str] = ()
+) -> dict[str, bool]:
+    """Confine this process, for good, and all that it starts.
+
+    Args:
+        readable: files and folders besides Python's and the system's.
+        writable: folders.
+        hidden: where modules are not to be found: the folder of the caller's script.
+
+    Returns:
+        `files` and `network`: whether the kernel keeps it from other files, and from
+        the network.
+    """
+    without_network = _leave_network()
+    version = _libc.syscall(_CREATE, None, ctypes.c_size_t(0), 1)
+    if version < 1:
+        return {"files": False, "network": without_network}
+    has_tcp = version >= _WITH_TCP
+    files = (1 << _RIGHTS.get(version, 16)) - 1
+    rules = _Ruleset(
+        files,
+        _NO_TCP if has_tcp else 0,
+        _SCOPES if version >= _WITH_SCOPES else 0,
+    )
+    # An older kernel knows a shorter one.
+    size = 8 if not has_tcp else 16 if version < _WITH_SCOPES else 24
+    ruleset = _libc.syscall(_CREATE, ctypes.byref(rules), ctypes.c_size_t(size), 0)
+    if ruleset < 0:
+        return {"files": False, "network": without_network}
+    for path in {*_SYSTEM, *_python(), *readable} - {*hidden}:
+        _allow(ruleset, path, _READ)
+    for path in {"/dev", *writable}:
+        _allow(ruleset, path, files)
+    _libc.prctl(_NO_NEW_PRIVILEGES, 1, 0, 0, 0)
+    is_confined = _libc.syscall(_RESTRICT, ruleset, 0) == 0
+    os.close(ruleset)
+    return {"files": is_confined, "network": without_network}
+
+
+def _python() -> set[str]:
+    return {sys.prefix, sys.base_prefix, *filter(None, sys.path)}
+
+
+def _leave_network() -> bool:
+    user, group = os.getuid(), os.getgid()
+    # Who may not, may where it is root of a user namespace of its own.
+    if _libc.unshare(_CLONE_NEWNET) == 0:
+        return True
+    if _libc.unshare(_CLONE_NEWUSER | _CLONE_NEWNET) != 0:
+        return False
+    with contextlib.suppress(OSError):
+        for name, text in (
+            ("setgroups", "deny"),
+            ("uid_map", f"{user} {user} 1"),
+            ("gid_map", f"{group} {group} 1"),
+        ):
+            Path("/proc/self", name).write_text(text)
+    return True
+
+
+def _allow(ruleset: int, path: str, rights: int) -> None:
+    try:
+        parent = os.open(path, os.O_PATH | os.O_CLOEXEC)
+    except OSError:
+        return
+    if not Path(path).is_dir():
+        # What belongs to folders is refused for files.
+        rights &= 0b101 | 1 << 1 | 1 << 14 | 1 << 15
+    rule = _PathBeneath(rights, parent)
+    _libc.syscall(_ADD, ruleset, _PATH_BENEATH, ctypes.byref(rule), 0)
+    os.close(parent)
+
+
+def main() -> None:
+    """Confine this process as the environment says, and run the module."""
+    said = json.loads(os.environ.pop(VARIABLE))
+    holds = confine(**said)
+    os.environ[f"{VARIABLE}_HOLDS"] = json.dumps(holds)
+    module = sys.argv.pop(1)
+    runpy.run_module(module, run_name="__main__", alter_sys=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,422 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From what a recording says of its environment to that environment, or to a refusal.
+
+A recording may come from anybody, and making an environment runs its code. So nothing
+that a recording names is imported: an environment is made only where its id stands in
+the installed registry already, as one of Gymnasium's own, of Gymnasium-Robotics or of
+dm_control's suite, with arguments that are plain values within bounds and name no file.
+Wrappers are Gymnasium's own, with such arguments. The reader may trust further ids, one
+by one.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.util
+import re
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium.envs import registration
+from numpy.typing import NDArray
+
+from ..formats.trajectory import columns_of
+from .gymnasium_scenes import drawn_part, set_own_camera
+from .names import DmControlName
+from .scenes import (
+    class_name,
+    generator_state,
+    set_generator_state,
+    simulation_below,
+)
+from .stand_ins import StandIn, stand_ins
+
+# Where the registry's entry points of what is trusted without asking lie.
+_TRUSTED = (
+    *("gymnasium.envs.mujoco", "gymnasium.envs.classic_control"),
+    *("gymnasium.envs.toy_text", "gymnasium_robotics"),
+)
+_ROBOTICS = "gymnasium_robotics"
+
+# gymnasium.make's own arguments, which are no environment's.
+_MAKE = frozenset(("id", "vector_kwargs", "disable_env_checker", "max_episode_steps"))
+
+# A word: no path, no name of a file, nothing with an extension.
+_WORD = re.compile(r"[A-Za-z0-9_ -]{0,64}", re.ASCII)
+_FILES = re.compile(r"(xml|model|mesh|asset|file|path|texture)", re.IGNORECASE)
+_RENDER_MODES = (None, "rgb_array", "rgb_array_list", "ansi", "depth_array")
+_MOST_VALUES = 10_000
+_LARGEST = 1e9
+# Of a count of anything that takes memory or time: pictures, frames skipped, stacks.
+# A suite task's `random` is a seed.
+_LARGEST_COUNT = 10_000
+
+_SUITE_NAME = re.compile(r"dm_control/(\w{1,50})-(\w{1,50})")
+_SUITE_ARGUMENTS = ("task_kwargs", "environment_kwargs", "visualize_reward")
+
+
+class NotRecreated(Exception):
+    """An environment is not made again.
+
+    Its text is a clause that says why, and what to do.
+
+    Args:
+        reason: the clause.
+        excuse: "environment", or "wrappers": what the reader does not have.
+    """
+
+    def __init__(self, reason: str, *, excuse: str = "environment") -> None:
+        super().__init__(reason)
+        self.excuse = excuse
+
+
+@dataclass(frozen=True, kw_only=True)
+class Recreated:
+    """An environment that was made again.
+
+    Attributes:
+        environment: a `gymnasium.Env` or a `dm_env.Environment`.
+        is_dm_env: it is the latter.
+        stand_in: takes recorded steps, where wrappers are not here; None else.
+    """
+
+    environment: Any
+    is_dm_env: bool = False
+    stand_in: StandIn | None = None
+
+    def random_state(self) -> Any:
+        """Return the state of its random generators now, as a recording has it."""
+        if self.is_dm_env:
+            return generator_state(self._dm_generator())
+        base: Any = self.environment.unwrapped
+        own, shown = generator_state(base._np_random), drawn_part(base)
+        if shown is base:
+            return own
+        return {"env": own, "inner": generator_state(shown._np_random)}
+
+    def set_random_state(self, state: Any) -> None:
+        """Put its random generators into a recorded state.
+
+        Raises:
+            NotRecreated: it is no state of theirs.
+        """
+        try:
+            if self.is_dm_env:
+                set_generator_state(self._dm_generator(), state)
+                return
+            base: Any = self.environment.unwrapped
+            parts = state if "inner" in state else {"env": state, "inner": None}
+            for holder, part in ((base, "env"), (drawn_part(base), "inner")):
+                if parts[part] is not None:
+                    set_generator_state(holder.np_random, parts[part])
+        except Exception as error:
+            raise NotRecreated(
+                f"its random state is none of the environment's: {error!s:.100}"
+            ) from error
+
+    def seed(self, seed: int) -> None:
+        """Seed dm_control's generator; Gymnasium's is seeded by the reset."""
+        self._dm_generator().seed(seed)
+
+    def warnings(self) -> dict[str, int]:
+        """Return how often MuJoCo has warned since its data was reset."""
+        simulated = simulation_below(self.environment)
+        if simulated is None:
+            return {}
+        from ..simulation.warnings import warning_counts  # It loads MuJoCo.
+
+        return warning_counts(simulated)
+
+    def seed_behind(self, state: Any) -> int | None:
+        """Return the seed that a generator was just made with; None for none.
+
+        Of dm_control's: NumPy's legacy generator has its seed as its first word.
+        """
+        key = state.get("state", {}).get("key") if isinstance(state, Mapping) else None
+        if not self.is_dm_env or not isinstance(key, list) or not key:
+            return None
+        seed = key[0]
+        if type(seed) is not int or not 0 <= seed < 2**32:
+            return None
+        fresh = generator_state(np.random.RandomState(seed))
+        return seed if fresh == state else None
+
+    def enter(self, state: NDArray[Any], observation: Any) -> Any:
+        """Put Gymnasium's simulation into a recorded state; return its observation.
+
+        Args:
+            state: a row of a trajectory's states.
+            observation: that it gave before.
+        """
+        # They load MuJoCo.
+        import mujoco
+
+        from ..simulation.states import set_state
+
+        simulated = simulation_below(self.environment)
+        model, data = simulated.model, simulated.data
+        row = state.view(np.float64).reshape(-1)
+        set_state(model, data, columns_of(state.dtype), row)
+        mujoco.mj_forward(model, data)
+        # That may have changed the warm start.
+        set_state(model, data, columns_of(state.dtype), row)
+        observe = getattr(self.environment.unwrapped, "_get_obs", None)
+        return observation if observe is None else observe()
+
+    def _dm_generator(self) -> Any:
+        from .dm_control_scenes import generator_of
+
+        return generator_of(self.environment)
+
+
+def recreate(
+    said: Mapping[str, Any],
+    *,
+    own_camera: int | str | None = None,
+    trust: frozenset[str] = frozenset(),
+    mjcf: tuple[Path, Any] | None = None,
+) -> Recreated:
+    """Return the environment of a recording.
+
+    Args:
+        said: `framework`, `id`, `kwargs`, `wrappers` and so on, of the journal.
+        own_camera: that the environment showed by itself, where that was set after it
+            was made.
+        trust: further ids that the reader has named, `Id` or `module:Id`. The module
+            is the reader's word, never the recording's.
+        mjcf: the author's MJCF file and its model, of an environment made from one.
+
+    Raises:
+        NotRecreated: the rule of trust forbids it, or it cannot be made here.
+    """
+    env_id, kwargs = said.get("id"), said.get("kwargs")
+    limit = said.get("max_episode_steps")
+    if not isinstance(env_id, str) or not (
+        limit is None or (type(limit) is int and 0 < limit <= _LARGEST)
+    ):
+        raise NotRecreated(f"what it says of its environment cannot be: {said!r:.200}")
+    if not isinstance(kwargs, Mapping | None):
+        raise NotRecreated(f"its arguments cannot be {kwargs!r:.100}")
+    match said.get("framework"):
+        case "gymnasium":
+            env = _gymnasium(env_id, kwargs, limit, trust)
+        case "dm_control":
+            if said.get("wrappers"):
+                raise _wrappers_refused(said["wrappers"])
+            return _dm_control(env_id, kwargs, limit)
+        case "mjcf" if mjcf is not None:
+            env = _mjcf(*mjcf, kwargs or {}, limit)
+        case _:
+            raise NotRecreated("what its model was made from is not in the archive")
+    with _failures(env_id):
+        if own_camera is not None:
+            set_own_camera(env, own_camera)
+        return _wrapped(env, said)
+
+
+def checked_options(options: Any) -> dict[str, Any] | None:
+    """Return the options of a reset, which are plain values.
+
+    Raises:
+        NotRecreated: they are more than that.
+    """
+    if options is None:
+        return None
+    if not isinstance(options, Mapping) or not all(
+        _is_plain_item(*item) for item in options.items()
+    ):
+        raise NotRecreated(
+            f"the options of a reset ({options!r:.100}) are more than plain values"
+        )
+    return dict(options)
+
+
+def _gymnasium(
+    env_id: str,
+    kwargs: Mapping[str, Any] | None,
+    limit: int | None,
+    trust: frozenset[str],
+) -> gymnasium.Env[Any, Any]:
+    trusted = {each.rpartition(":")[2]: each for each in trust}.get(env_id)
+    entry_point = _entry_point(env_id)
+    if trusted is None and not any(_is_below(entry_point, each) for each in _TRUSTED):
+        raise NotRecreated(
+            f"would run code from the archive: {env_id!r:.100} is none of the "
+            "environments of Gymnasium, Gymnasium-Robotics or dm_control that are "
+            f"installed here. If you trust it: --trust {env_id:.100}"
+        )
+    if kwargs is None:
+        raise NotRecreated(
+            "it was made with arguments that a recording cannot hold, and so cannot "
+            "be made again"
+        )
+    for name, value in kwargs.items():
+        is_shown = name != "render_mode" or value in _RENDER_MODES
+        if name in _MAKE or not is_shown or not _is_plain_item(name, value):
+            raise NotRecreated(
+                f"its argument {name!r:.80} ({value!r:.80}) is more than a plain "
+                "value within bounds, or names a file"
+            )
+    with _failures(env_id):
+        return gymnasium.make(
+            trusted or env_id,
+            # gymnasium.make's word for no limit.
+            max_episode_steps=-1 if limit is None else limit,
+            disable_env_checker=True,
+            **kwargs,
+        )
+
+
+def _wrapped(env: gymnasium.Env[Any, Any], said: Mapping[str, Any]) -> Recreated:
+    """Return an environment in the wrappers of a recording, or in stand-ins."""
+    names = [str(name) for name in said.get("wrappers") or ()]
+    arguments = said.get("wrapper_arguments") or [None] * len(names)
+    if len(arguments) != len(names):
+        raise _wrappers_refused(names)
+    kinds = [_known_wrapper(*each) for each in zip(names, arguments, strict=True)]
+    if None in kinds:
+        if simulation_below(env) is None:
+            raise _wrappers_refused(names)
+        outermost, stand_in = stand_ins(env, names, arguments)
+        return Recreated(environment=outermost, stand_in=stand_in)
+    for kind, given in reversed(list(zip(kinds, arguments, strict=True))):
+        assert kind is not None
+        env = kind(env, **given)
+    return Recreated(environment=env)
+
+
+def _known_wrapper(name: str, given: Any) -> Callable[..., Any] | None:
+    """Return Gymnasium's own wrapper of a name, if its arguments are plain."""
+    kind = getattr(gymnasium.wrappers, name.rpartition(".")[2], None)
+    if not isinstance(kind, type) or class_name(kind) != name:
+        return None
+    is_plain = isinstance(given, Mapping) and all(
+        _is_plain_item(*item) for item in given.items()
+    )
+    return kind if is_plain else None
+
+
+def _wrappers_refused(names: Any) -> NotRecreated:
+    return NotRecreated(
+        "wrappers stood between the monitor and the environment that are none of "
+        f"Gymnasium's own with plain arguments: {', '.join(map(str, names)):.300}; put "
+        "Monitor around the environment itself, and wrappers around the monitor",
+        excuse="wrappers",
+    )
+
+
+def _mjcf(
+    path: Path, model: Any, kwargs: Mapping[str, Any], limit: int | None
+) -> gymnasium.Env[Any, Any]:
+    # It loads MuJoCo.
+    from .mjcf_environments import MjcfEnvironment
+
+    with _failures(path.stem):
+        size = {name: kwargs[name] for name in ("height", "width") if name in kwargs}
+        env: gymnasium.Env[Any, Any] = MjcfEnvironment(path, model=model, **size)
+        return env if limit is None else gymnasium.wrappers.TimeLimit(env, limit)
+
+
+def _dm_control(
+    env_id: str, kwargs: Mapping[str, Any] | None, limit: int | None
+) -> Recreated:
+    name = _suite_name(env_id)
+    if name is None:
+        raise NotRecreated(
+            f"{env_id!r:.100} is no task of the installed dm_control's suite, or "
+            'that does not work here: pip install "mjrec[dm-control]"'
+        )
+    for key, value in (kwargs or {}).items():
+        parts = value if isinstance(value, Mapping) else {key: value}
+        if key not in _SUITE_ARGUMENTS or not all(
+            _is_plain_item(*item) for item in parts.items()
+        ):
+            raise NotRecreated(
+                f"its argument {key!r:.80} ({value!r:.80}) is more than plain values "
+                "within bounds"
+            )
+    from .dm_control_environments import load_task
+    from .dm_env_episodes import StepLimit
+
+    with _failures(env_id):
+        env = load_task(name, kwargs)
+        task_kwargs = (kwargs or {}).get("task_kwargs") or {}
+        if name.domain == "lqr" and "random" not in task_kwargs:
+            raise NotRecreated(
+                f"{name} draws its model at random when it is made, and from which "
+                "seed is not recorded"
+            )
+        own = getattr(env, "_step_limit", np.inf)
+        if limit is not None and limit < own:
+            env = StepLimit(env, limit)
+        return Recreated(environment=env, is_dm_env=True)
+
+
+def _is_plain_item(name: Any, value: Any) -> bool:
+    """Tell whether an argument is a plain value within bounds, and names no file."""
+    if not isinstance(name, str) or _FILES.search(name):
+        return False
+    if name != "random" and isinstance(value, int) and abs(value) > _LARGEST_COUNT:
+        return False
+    return _is_plain(value, [_MOST_VALUES])
+
+
+def _is_plain(value: Any, left: list[int]) -> bool:
+    left[0] -= 1
+    if left[0] < 0:
+        return False
+    if isinstance(value, list):
+        return all(_is_plain(item, left) for item in value)
+    if isinstance(value, Mapping):
+        items = (_is_plain_item(name, item) for name, item in value.items())
+        return len(value) < _MOST_VALUES and all(items)
+    if isinstance(value, str):
+        return _WORD.fullmatch(value) is not None
+    if isinstance(value, bool) or value is None:
+        return True
+    return isinstance(value, int | float) and abs(value) <= _LARGEST
+
+
+def _entry_point(env_id: str) -> Any:
+    """Return where the installed registry says that an id's environment is defined."""
+    spec = registration.registry.get(env_id)
+    if spec is None and importlib.util.find_spec(_ROBOTICS) is not None:
+        # It registers its environments when it is imported; its name is ours.
+        with contextlib.suppress(Exception):
+            importlib.import_module(_ROBOTICS)
+        spec = registration.registry.get(env_id)
+    return None if spec is None else spec.entry_point
+
+
+def _is_below(entry_point: Any, package: str) -> bool:
+    module = entry_point.partition(":")[0] if isinstance(entry_point, str) else ""
+    return f"{module}.".startswith(f"{package}.")
+
+
+def _suite_name(env_id: str) -> DmControlName | None:
+    """Return the name of a task that the installed suite has; None for another."""
+    # Where dm_control does not work none of its names is one that is installed.
+    with contextlib.suppress(Exception):
+        from .dm_control_environments import tasks_of
+
+        match = _SUITE_NAME.fullmatch(env_id)
+        if match and match[2] in tasks_of(match[1]):
+            return DmControlName(match[1], match[2])
+    return None
+
+
+@contextlib.contextmanager
+def _failures(what: str) -> Iterator[None]:
+    """Turn whatever an environment's own code raises into a reason."""
+    try:
+        yield
+    except NotRecreated:
+        raise
+    except Exception as error:
+        raise NotRecreated(
+            f"{what:.100} failed here: {type(error).__name__}: {error!s:.300}"
+        ) from error

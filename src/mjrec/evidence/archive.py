@@ -1,0 +1,218 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Opening what is to be verified: a packed run, its unpacked folder, or recordings.
+
+What is given may be anybody's; this is done in a sandbox. Everything is brought into
+one folder of the sandbox's own, as a packed run has it, and only regular files are.
+"""
+
+from __future__ import annotations
+
+import enum
+import hashlib
+import os
+import shutil
+import stat
+import zipfile
+import zlib
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import IO, Any
+
+from ..errors import FileNotWritten, UnreadableArchive
+from ..formats.monitor_directory import iter_monitor_files
+from ..formats.regular_files import open_regular
+from .layout import PAYLOAD, RECORDINGS
+from .portable_names import check_distinct, portable_parts
+from .zip_contents import ZipContents, check_table, zip_contents
+
+# What makes a folder a bag.
+BAG_DECLARATION = "bagit.txt"
+
+_CHUNK = 1 << 20
+# What else is on a disk that is nearly full must go on.
+_ROOM = 1 << 26
+
+# zipfile raises RuntimeError for an encrypted file, NotImplementedError for methods and
+# versions that it does not know.
+_NOT_READ = (
+    *(ValueError, zipfile.BadZipFile, zlib.error, EOFError),
+    *(RuntimeError, NotImplementedError, MemoryError),
+)
+
+
+class Kind(enum.StrEnum):
+    """What was given to be verified."""
+
+    ZIP = "packed run"
+    BAG = "unpacked run"
+    DIRECTORY = "monitor directory"
+
+
+def bring_in(path: Path, into: Path) -> Mapping[str, Any]:
+    """Bring what is to be verified into a folder, as a packed run has it.
+
+    Args:
+        path: a zip file; a folder with a bag in it, or one folder with a bag in it; or
+            a monitor directory.
+        into: a folder that is not there yet.
+
+    Returns:
+        `kind`; of a zip file its `sha256` and `bytes`.
+
+    Raises:
+        UnreadableArchive: it is none of these, or damaged, or made to do harm.
+        FileNotWritten: there is too little room.
+    """
+    try:
+        if path.is_dir():
+            return _of_folder(path, into)
+        facts = {"kind": Kind.ZIP, **_hashed(path)}
+        _unpack(path, into)
+    except FileNotWritten:
+        raise
+    except OSError as error:
+        raise UnreadableArchive(path, error.strerror or error) from error
+    except _NOT_READ as error:
+        raise UnreadableArchive(path, error) from error
+    _check_recordings(into, path)
+    return facts
+
+
+def digest_of(path: Path, algorithm: str) -> str:
+    """Return the digest of a regular file, in hexadecimal digits.
+
+    Raises:
+        OSError: it cannot be read.
+        ValueError: it is no regular file.
+    """
+    digest = hashlib.new(algorithm)
+    with open_regular(path) as file:
+        while chunk := file.read(_CHUNK):
+            digest.update(chunk)
+    return digest.hexdigest()
+
+
+def _hashed(path: Path) -> dict[str, Any]:
+    return {"sha256": digest_of(path, "sha256"), "bytes": path.stat().st_size}
+
+
+def _of_folder(path: Path, into: Path) -> Mapping[str, Any]:
+    bag = _bag_in(path)
+    if bag is not None:
+        _copy_files(_files_below(bag), bag, into, given=path)
+        _check_recordings(into, path)
+        return {"kind": Kind.BAG}
+    recordings = list(iter_monitor_files(path))
+    if not recordings:
+        raise UnreadableArchive(
+            path,
+            "it is neither a packed run (a zip file, or a folder with bagit.txt) nor a "
+            "monitor directory: nothing is recorded in it",
+        )
+    _copy_files(recordings, path, into / PAYLOAD / RECORDINGS, given=path)
+    return {"kind": Kind.DIRECTORY}
+
+
+def _bag_in(path: Path) -> Path | None:
+    if (path / BAG_DECLARATION).exists():
+        return path
+    # As `unzip` leaves it.
+    inside = [entry for entry in path.iterdir() if not entry.name.startswith(".")]
+    if len(inside) == 1 and (inside[0] / BAG_DECLARATION).exists():
+        if inside[0].is_symlink():
+            raise UnreadableArchive(path, "the folder that it holds is a link")
+        return inside[0]
+    return None
+
+
+def _files_below(folder: Path) -> Iterator[Path]:
+    for entry in folder.iterdir():
+        status = entry.lstat()
+        if stat.S_ISDIR(status.st_mode):
+            yield from _files_below(entry)
+        elif stat.S_ISREG(status.st_mode):
+            yield entry
+        else:
+            raise ValueError(f"{entry.name!r} is neither a file nor a folder")
+
+
+def _copy_files(
+    files: Iterator[Path] | list[Path], top: Path, into: Path, *, given: Path
+) -> None:
+    paths = list(files)
+    names = [path.relative_to(top).as_posix() for path in paths]
+    check_distinct(names)
+    into.mkdir(parents=True)
+    _check_room(sum(path.lstat().st_size for path in paths), into, given)
+    for path, name in zip(paths, names, strict=True):
+        target = into.joinpath(*portable_parts(name))
+        target.parent.mkdir(parents=True, exist_ok=True)
+        with open_regular(path) as source, target.open("xb") as output:
+            size = os.fstat(source.fileno()).st_size
+            _copy(source, output, target, size)
+
+
+def _check_recordings(bag: Path, given: Path) -> None:
+    if not (bag / PAYLOAD / RECORDINGS).is_dir():
+        raise UnreadableArchive(
+            given,
+            f"it has no folder {PAYLOAD}/{RECORDINGS}: it is not what `mjrec pack` "
+            "makes",
+        )
+
+
+def _unpack(path: Path, into: Path) -> None:
+    """Unpack a zip file's one folder.
+
+    Everything is streamed to the disk, and counted while it is: an archive that holds
+    more than it says is refused at the first byte too many.
+    """
+    check_table(path)
+    with open_regular(path) as file, zipfile.ZipFile(file) as archive:
+        contents = zip_contents(archive)
+        unpacked = into.with_name(f"{into.name}.unpacked")
+        unpacked.mkdir()
+        _check_room(contents.size, unpacked, path)
+        _write_all(archive, contents, unpacked)
+    (unpacked / contents.top).rename(into)
+
+
+def _check_room(size: int, into: Path, path: Path) -> None:
+    free = shutil.disk_usage(into).free
+    if size + _ROOM > free:
+        raise FileNotWritten(
+            into.parent,
+            f"unpacking {path} takes {size} bytes, and {free} are free",
+            then="choose another disk with the variable TMPDIR",
+        )
+
+
+def _write_all(archive: zipfile.ZipFile, contents: ZipContents, into: Path) -> None:
+    for name in contents.folders:
+        into.joinpath(*portable_parts(name.removesuffix("/"))).mkdir(
+            parents=True, exist_ok=True
+        )
+    for info in contents.files:
+        target = into.joinpath(*portable_parts(info.filename))
+        try:
+            target.parent.mkdir(parents=True, exist_ok=True)
+            output = target.open("xb")
+        except OSError as error:
+            raise FileNotWritten(target, error.strerror) from error
+        with archive.open(info) as packed, output:
+            _copy(packed, output, target, info.file_size)
+
+
+def _copy(source: IO[bytes], output: IO[bytes], target: Path, size: int) -> None:
+    """Copy a file of exactly `size` bytes."""
+    left = size
+    while chunk := source.read(_CHUNK):
+        left -= len(chunk)
+        if left < 0:
+            break
+        try:
+            output.write(chunk)
+        except OSError as error:
+            raise FileNotWritten(target, error.strerror) from error
+    if left:
+        raise ValueError(f"{target.name!r} has another size than it is said to have")

@@ -1,0 +1,132 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What an archive claims of its versions and hardware, where the reader's are others.
+
+Both runs were recorded by the same code: so each says of itself what it was made with,
+and where these differ is where a claim is.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import glob
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, Final
+
+from ..errors import Error
+from ..formats.json_fields import json_object, read_object
+from ..formats.monitor_directory import infix_of
+from ..formats.regular_files import open_regular
+from ..formats.trajectory_file import open_trajectory
+from .excuses import excuse_of
+from .findings import Excuse
+from .layout import ENVIRONMENT, RECORDINGS
+
+_LONGEST_LINE: Final = 1 << 24
+_COMPILING: Final = ("mujoco", "machine")
+_GL: Final = ("gl_vendor", "gl_renderer", "gl_version")
+
+
+def claimed_excuses(given: Path, made: Path) -> list[Excuse]:
+    """Return the excuses that two runs claim; below both lie the recordings."""
+    found: list[Excuse] = []
+    recordings = given / RECORDINGS
+    # All trajectories of a recording come from one machine.
+    looked_at = set()
+    for path in sorted(recordings.glob("openaigym.*")):
+        other = made / RECORDINGS / path.name
+        infix = infix_of(path.name)
+        if infix is None or not other.is_file():
+            continue
+        if path.suffix == ".h5":
+            if infix in looked_at:
+                continue
+            looked_at.add(infix)
+        try:
+            found += _claims(path, other, f"recording {infix}")
+        except (Error, OSError, ValueError):
+            # Whatever cannot be read is found when it is compared.
+            continue
+    files = [folder / ENVIRONMENT for folder in (given, made)]
+    if all(path.is_file() for path in files):
+        packed, here = (read_object(path).get("packed_with") for path in files)
+        found += _versions(packed, here)
+    return [_with_models(excuse, recordings) for excuse in found]
+
+
+def _with_models(excuse: Excuse, recordings: Path) -> Excuse:
+    """Return an excuse that reaches the compiled models of its recordings, too."""
+    if excuse.name not in _COMPILING:
+        return excuse
+    models: dict[str, None] = {}
+    for item in excuse.items:
+        infix = item.removeprefix("recording ")
+        for path in recordings.glob(f"openaigym.trajectory.{glob.escape(infix)}.*.h5"):
+            with contextlib.suppress(Error), open_trajectory(path) as reader:
+                models[str(_mapping(reader.facts.get("model")).get("mjb"))] = None
+    return dataclasses.replace(excuse, items=(*excuse.items, *models))
+
+
+def _claims(given: Path, made: Path, recording: str) -> Iterator[Excuse]:
+    name = given.name
+    if name.endswith(".jsonl"):
+        runs = [_first_line(path).get("run") for path in (given, made)]
+        one, other = (_mapping(run).get("versions") for run in runs)
+        yield from _versions(one, other, recording)
+    elif name.endswith(".h5"):
+        with open_trajectory(given) as a, open_trajectory(made) as b:
+            yield from _machine(a.facts, b.facts, recording)
+    elif name.endswith(".meta.json"):
+        said, here = read_object(given), read_object(made)
+        video = name.removesuffix(".meta.json")
+        items = [f"{video}{end}" for end in (".mp4", ".meta.json", ".framehash")]
+        yield from _versions(
+            said.get("rendered_with"), here.get("rendered_with"), *items
+        )
+        yield from _machine(said, here, *items)
+        yield from _claim("gl", _joined(said), _joined(here), *items)
+        if said.get("ffmpeg_sha256") != here.get("ffmpeg_sha256"):
+            yield excuse_of("ffmpeg", _encoder(said), _encoder(here), *items)
+
+
+def _versions(given: Any, made: Any, *items: str) -> Iterator[Excuse]:
+    one, other = _mapping(given), _mapping(made)
+    for package in dict.fromkeys((*one, *other)):
+        if package != "options":
+            values = (str(each.get(package, "none")) for each in (one, other))
+            yield from _claim(package, *values, *items)
+
+
+def _machine(
+    given: Mapping[str, Any], made: Mapping[str, Any], *items: str
+) -> Iterator[Excuse]:
+    values = []
+    for facts in (given, made):
+        machine = _mapping(facts.get("machine"))
+        # Of the flags of a CPU the beginning tells them apart.
+        values.append(" ".join(str(value)[:16] for value in machine.values()))
+    yield from _claim("machine", *values, *items)
+
+
+def _claim(name: str, claimed: str, here: str, *items: str) -> Iterator[Excuse]:
+    if claimed != here:
+        yield excuse_of(name, claimed[:200], here[:200], *items)
+
+
+def _joined(metadata: Mapping[str, Any]) -> str:
+    return ", ".join(str(metadata[key]) for key in _GL if metadata.get(key))
+
+
+def _encoder(metadata: Mapping[str, Any]) -> str:
+    version = _mapping(metadata.get("encoder_version")).get("version")
+    return str(version)[:60]
+
+
+def _mapping(value: Any) -> Mapping[str, Any]:
+    return value if isinstance(value, Mapping) else {}
+
+
+def _first_line(path: Path) -> Mapping[str, Any]:
+    with open_regular(path) as file:
+        return json_object(file.readline(_LONGEST_LINE))

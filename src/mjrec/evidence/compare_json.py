@@ -1,0 +1,359 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Two files of JSON, value by value: journal, statistics, manifest, metadata, crate.
+
+Each key that may be other than made again stands in a table here, with what it tells
+about and how it may differ. Any other key has to be equal, and to be there.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+import re
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, BinaryIO, Final, NamedTuple, TypeAlias
+
+from ..formats.json_fields import json_object, read_object, unreadable
+from ..formats.regular_files import open_regular, read_regular
+from .differences import Aspect, Difference, Same, short
+from .findings import Topic
+
+_LONGEST_LINE: Final = 1 << 24
+_LONGEST_FILE: Final = 1 << 28
+_SOFTWARE: Final = "SoftwareApplication"
+_EPISODE: Final = re.compile(rb'\{"episode_id": (\d{1,15}),')
+_ABSENT: Final = object()
+
+
+class Rule(NamedTuple):
+    """What a key tells about, how it may differ, and of a CLAIM whose it is."""
+
+    topic: Topic
+    aspect: Aspect = Aspect.EXACT
+    claim: str = ""
+
+
+_OF_FILES: Final = Rule(Topic.FILES)
+# Whether a value that is other than made again is right for the archive's own file:
+# its hash, its size. Called with the file's name and the value.
+Own: TypeAlias = Callable[[str, Any], bool]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Rules:
+    """How the values of a file are compared.
+
+    Attributes:
+        keys: by the outermost key that stands here; what is below it has the same.
+        usual: of all other keys.
+        own: by key, of values that follow from a file of the archive itself.
+        claims: keys whose values are versions by the names of packages.
+        left_out: keys that are not looked at.
+        renamed: names in the archive, and those of the same files made again: a
+            compiled model has its hash in its name.
+    """
+
+    keys: Mapping[str, Rule] = field(default_factory=dict)
+    usual: Rule = _OF_FILES
+    own: Mapping[str, Own] = field(default_factory=dict)
+    claims: frozenset[str] = frozenset(("versions", "rendered_with", "packed_with"))
+    left_out: frozenset[str] = frozenset()
+    renamed: Mapping[str, str] = field(default_factory=dict)
+
+    def translated(self, text: bytes) -> bytes:
+        """Return a text of the archive with the names that were made again."""
+        for name, again in self.renamed.items():
+            text = text.replace(name.encode(), again.encode())
+        return text
+
+
+_REWARD: Final = Rule(Topic.REWARDS, Aspect.DERIVED)
+_END: Final = Rule(Topic.REWARDS)
+_BEGINNING: Final = Rule(Topic.BEGINNING)
+_SELECTION: Final = Rule(Topic.SELECTION)
+_IDENTITY: Final = Rule(Topic.IDENTITY)
+_VIDEO: Final = Rule(Topic.VIDEOS)
+_STATEMENT: Final = Rule(Topic.FILES, Aspect.STATEMENT)
+_GL: Final = Rule(Topic.PICTURES, Aspect.CLAIM, "gl")
+_FFMPEG: Final = Rule(Topic.VIDEOS, Aspect.CLAIM, "ffmpeg")
+_MODEL: Final = Rule(Topic.IDENTITY, Aspect.MODEL)
+
+# Of all files: a key means the same wherever it stands.
+KEYS: Final[Mapping[str, Rule]] = {
+    **dict.fromkeys(("reward", "episode_rewards", "reward_before"), _REWARD),
+    **dict.fromkeys(("length", "episode_lengths", "terminated", "truncated"), _END),
+    **dict.fromkeys(("success", "type", "episode_types", "warnings"), _END),
+    **dict.fromkeys(("seed", "options", "random_state"), _BEGINNING),
+    **dict.fromkeys(("schedule", "keep", "chosen", "selection", "dropped"), _SELECTION),
+    **dict.fromkeys(("pending", "broken", "packed_episodes", "cut"), _SELECTION),
+    **dict.fromkeys(("first_episode_id", "next_episode_id"), _SELECTION),
+    **dict.fromkeys(("env_info", "env_id", "environment", "infix"), _IDENTITY),
+    **dict.fromkeys(("camera", "scene", "height", "width", "fps", "quality"), _VIDEO),
+    **dict.fromkeys(("timestep", "playback_speed", "stride", "rate"), _VIDEO),
+    **dict.fromkeys(("frame_count", "frame_steps", "recording", "video"), _VIDEO),
+    **dict.fromkeys(("gl_vendor", "gl_renderer", "gl_version"), _GL),
+    # Which of several alike; EGL numbers them, others do not.
+    "gl_device": _STATEMENT,
+    **dict.fromkeys(("ffmpeg_sha256",), _FFMPEG),
+    **dict.fromkeys(("start_time", "end_time", "timestamps"), _OF_FILES),
+    **dict.fromkeys(("initial_reset_timestamp", "surroundings"), _OF_FILES),
+    "machine": Rule(Topic.PHYSICS, Aspect.CLAIM, "machine"),
+    "model": _MODEL,
+}
+# The program's name and version; what it was told is no claim.
+_ENCODER: Final = (
+    *("encoder_version.version", "encoder_version.cmdline[0]"),
+    *("encoders[0].version",),
+)
+# What drew and what encoded is listed in `environment.json`, each once: the lists of
+# two machines have two entries, and one of them here.
+LISTED: Final[Mapping[str, Rule]] = {"pictures": _GL, "encoders": _FFMPEG}
+
+
+def compare_objects(
+    given: Path, made: Path, file: str, rules: Rules
+) -> Iterator[Same | Difference]:
+    """Yield how two files differ, each a JSON object.
+
+    Raises:
+        UnreadableFile: one is damaged.
+    """
+    with unreadable(given):
+        one = json_object(rules.translated(read_regular(given, limit=_LONGEST_FILE)))
+    yield from _or_bytes(json_differences(one, read_object(made), file, rules), file)
+
+
+def compare_crates(
+    given: Path, made: Path, file: str, rules: Rules
+) -> Iterator[Same | Difference]:
+    """Yield how two crates differ: entities by their names, packages by theirs.
+
+    Raises:
+        UnreadableFile: one is damaged.
+    """
+    with unreadable(given):
+        one = json_object(rules.translated(read_regular(given, limit=_LONGEST_FILE)))
+        view, again = _crate_view(one), _crate_view(read_object(made))
+    yield from _or_bytes(json_differences(view, again, file, rules), file)
+
+
+def _crate_view(crate: Mapping[str, Any]) -> dict[str, Any]:
+    graph = crate.get("@graph")
+    if not isinstance(graph, list) or not all(isinstance(e, dict) for e in graph):
+        raise ValueError("it has no graph of entities")
+    software = [each for each in graph if each.get("@type") == _SOFTWARE]
+    named = {str(each.get("@id")) for each in software}
+    entities: dict[str, Any] = {}
+    for entity in graph:
+        if entity.get("@type") == _SOFTWARE:
+            continue
+        key = str(entity.get("@id"))
+        if key in entities:
+            raise ValueError(f"the entity {key!r:.100} is there twice")
+        entities[key] = {name: _without(named, v) for name, v in entity.items()}
+    rest = {key: value for key, value in crate.items() if key != "@graph"}
+    # An entity whose name has the version in it cannot be found under another one.
+    return {
+        **rest,
+        "packed_with": {str(each.get("name")): each for each in software},
+        "graph": entities,
+    }
+
+
+def _without(names: set[str], value: Any) -> Any:
+    """Return a reference, or a list of them, without those to named entities."""
+    if isinstance(value, list):
+        return [each for each in value if _without(names, each) is not None]
+    is_named = isinstance(value, dict) and value.get("@id") in names
+    return None if is_named else value
+
+
+def compare_journals(
+    given: Path, made: Path, file: str, rules: Rules
+) -> Iterator[Same | Difference]:
+    """Yield how two journals differ, line by line, and how many episodes are equal.
+
+    Raises:
+        UnreadableFile: one is damaged.
+    """
+    with unreadable(given), open_regular(given) as one, open_regular(made) as other:
+        pairs = itertools.zip_longest(_lines(one), _lines(other))
+        for number, (a, b) in enumerate(pairs, start=1):
+            if a is None or b is None:
+                said = ["no more" if each is None else "a line" for each in (a, b)]
+                yield Difference(
+                    topic=Topic.REWARDS,
+                    file=file,
+                    where=f"line {number}",
+                    given=said[0],
+                    made=said[1],
+                )
+                return
+            yield from _compare_lines(number, rules.translated(a), b, file, rules)
+
+
+def same_journal(path: Path, file: str) -> Iterator[Same]:
+    """Yield the episodes of a journal that is equal to the other, byte for byte."""
+    with unreadable(path), open_regular(path) as journal:
+        for line in _lines(journal):
+            if begin := _EPISODE.match(line):
+                number = int(begin[1])
+                yield Same(
+                    topic=Topic.REWARDS, file=file, unit="episode", episode=number
+                )
+
+
+def _compare_lines(
+    number: int, one: bytes, other: bytes, file: str, rules: Rules
+) -> Iterator[Same | Difference]:
+    given = json_object(one)
+    episode = given.get("episode_id")
+    episode = episode if type(episode) is int else None
+    found = []
+    if one != other:
+        where = f"line {number}" if episode is None else f"episode {episode}"
+        found = list(
+            json_differences(
+                given, json_object(other), file, rules, where=where, episode=episode
+            )
+        )
+        yield from _or_bytes(found, file)
+    if not found and episode is not None:
+        yield Same(topic=Topic.REWARDS, file=file, unit="episode", episode=episode)
+
+
+def json_differences(
+    given: Any,
+    made: Any,
+    file: str,
+    rules: Rules,
+    *,
+    where: str = "",
+    episode: int | None = None,
+    rule: Rule | None = None,
+) -> Iterator[Difference]:
+    """Yield where two values of JSON differ.
+
+    Args:
+        given: the archive's.
+        made: made again.
+        file: where both stand.
+        rules: how they are compared.
+        where: their place in it.
+        episode: the number of the episode that they are of.
+        rule: of all that is in them; None before a key that has one.
+    """
+    if given is made or (type(given) is type(made) and given == made):
+        return
+    if isinstance(given, dict) and isinstance(made, dict):
+        for key in dict.fromkeys((*given, *made)):
+            if key in rules.left_out:
+                continue
+            inner = f"{where}.{key}" if where else key
+            own = rules.own.get(key)
+            value = given.get(key, _ABSENT)
+            if own is not None and key in made and own(_owner(given, file), value):
+                if value != made[key]:
+                    yield _leaf(value, made[key], file, inner, episode, _STATEMENT)
+                continue
+            yield from json_differences(
+                value,
+                made.get(key, _ABSENT),
+                file,
+                rules,
+                where=inner,
+                episode=episode,
+                rule=_rule(key, inner, rules, rule),
+            )
+    elif _is_listed(given, made, where):
+        key = where.rpartition(".")[2]
+        yield _leaf(given, made, file, where, episode, LISTED[key])
+    elif isinstance(given, list) and isinstance(made, list) and len(given) == len(made):
+        for index, pair in enumerate(zip(given, made, strict=True)):
+            inner = f"{where}[{index}]"
+            deeper = _FFMPEG if inner.endswith(_ENCODER) else rule
+            yield from json_differences(
+                *pair, file, rules, where=inner, episode=episode, rule=deeper
+            )
+    else:
+        yield _leaf(given, made, file, where, episode, rule or rules.usual)
+
+
+def _is_listed(given: Any, made: Any, where: str) -> bool:
+    """Tell whether two lists of what drew or encoded are not of one length."""
+    are_lists = isinstance(given, list) and isinstance(made, list)
+    return are_lists and len(given) != len(made) and where.endswith(tuple(LISTED))
+
+
+def _rule(key: str, where: str, rules: Rules, outer: Rule | None) -> Rule | None:
+    if where.endswith(_ENCODER):
+        return _FFMPEG
+    if outer is not None and not outer.claim.endswith("*"):
+        return outer
+    if outer is not None:
+        return Rule(outer.topic, Aspect.CLAIM, key)
+    if key in rules.claims:
+        # The names of what has a version come next.
+        return Rule(Topic.IDENTITY, Aspect.CLAIM, "*")
+    return rules.keys.get(key)
+
+
+def _leaf(
+    given: Any, made: Any, file: str, where: str, episode: int | None, rule: Rule
+) -> Difference:
+    size = None
+    if isinstance(given, int | float) and isinstance(made, int | float):
+        error = abs(given - made) / (1 + abs(given))
+        size = error if math.isfinite(error) else None
+    aspect = rule.aspect
+    is_gone = given is _ABSENT or made is _ABSENT
+    if (is_gone and aspect not in (Aspect.CLAIM, Aspect.STATEMENT)) or (
+        aspect is Aspect.DERIVED and size is None
+    ):
+        # No version makes a number of what is none, nor leaves a key out. But a
+        # package may be missing here.
+        aspect = Aspect.EXACT
+    values = ["nothing" if each is _ABSENT else short(each) for each in (given, made)]
+    return Difference(
+        topic=rule.topic,
+        file=file,
+        unit="value" if episode is None else "episode",
+        episode=episode,
+        aspect=aspect,
+        where=where,
+        given=values[0],
+        made=values[1],
+        size=size,
+        claim=rule.claim,
+    )
+
+
+def _owner(value: Mapping[str, Any], file: str) -> str:
+    """Return which file a hash or size is of: the one that the object names."""
+    name = value.get("@id")
+    return name if isinstance(name, str) else file
+
+
+def _or_bytes(found: Any, file: str) -> Iterator[Same | Difference]:
+    """Yield differences; without one, that the same is written otherwise."""
+    is_any = False
+    for difference in found:
+        is_any = True
+        yield difference
+    if not is_any:
+        yield Difference(
+            topic=Topic.FILES,
+            file=file,
+            aspect=Aspect.STORED,
+            given="the same values, written otherwise",
+            made="as mjrec writes them",
+        )
+
+
+def _lines(file: BinaryIO) -> Iterator[bytes]:
+    while line := file.readline(_LONGEST_LINE):
+        if len(line) >= _LONGEST_LINE:
+            raise ValueError("a line is too long")
+        yield line

@@ -1,0 +1,337 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Two trajectories, dataset by dataset and attribute by attribute.
+
+Rows are read in blocks, so that memory does not grow with an episode.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Final
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import UnreadableFile
+from ..formats.json_fields import json_object
+from ..formats.trajectory_hdf5 import open_hdf5
+from .compare_json import Rules, json_differences
+from .differences import Aspect, Difference, Same, short
+from .findings import Topic
+
+_BLOCK_BYTES: Final = 1 << 22
+# `model_changes/<n>/<field>`.
+_DEEPEST: Final = 3
+
+# What the datasets tell about, and how their numbers may differ.
+_DATASETS: Final = {
+    "states": (Topic.PHYSICS, Aspect.STATE),
+    "snapshots": (Topic.PICTURES, Aspect.STATE),
+    "model_changes": (Topic.PHYSICS, Aspect.STATE),
+    "observations": (Topic.REWARDS, Aspect.DERIVED),
+    "rewards": (Topic.REWARDS, Aspect.DERIVED),
+    "terminated": (Topic.REWARDS, Aspect.EXACT),
+    "truncated": (Topic.REWARDS, Aspect.EXACT),
+    "frame_steps": (Topic.VIDEOS, Aspect.EXACT),
+    "actions": (Topic.PHYSICS, Aspect.EXACT),
+}
+_UNITS: Final = {"snapshots": "snapshot", "model_changes": "change"}
+_FACTS: Final = "facts"
+# It follows from the facts; reading a trajectory checks it.
+_CHECKSUM: Final = "crc32"
+
+
+def compare_trajectories(
+    given: Path, made: Path, file: str, rules: Rules
+) -> Iterator[Same | Difference]:
+    """Yield how two trajectories compare.
+
+    Args:
+        given: the archive's.
+        made: made again.
+        file: the name of both, below `data/`.
+        rules: of their facts.
+
+    Raises:
+        UnreadableFile: one is damaged.
+    """
+    differs = False
+    try:
+        # Whatever is no trajectory ends here.
+        open_hdf5(given).close()
+        with h5py.File(given, "r") as one, h5py.File(made, "r") as other:
+            for found in _compare_groups(one, other, file, rules):
+                differs |= isinstance(found, Difference)
+                yield found
+    except (AttributeError, LookupError, OSError, RuntimeError, ValueError) as error:
+        raise UnreadableFile(given, error) from error
+    if not differs:
+        yield Difference(
+            topic=Topic.FILES,
+            file=file,
+            aspect=Aspect.STORED,
+            where="its bytes",
+            given=_digest(given),
+            made=_digest(made),
+        )
+
+
+def same_trajectory(path: Path, file: str) -> Iterator[Same]:
+    """Yield what a trajectory holds that is equal, byte for byte, to the other."""
+    with h5py.File(path, "r") as trajectory:
+        for name in ("rewards", "states"):
+            yield from _same(name, trajectory.get(name), file)
+
+
+def compare_rewards(
+    given: Path, made: NDArray[np.float64], file: str
+) -> Iterator[Same | Difference]:
+    """Yield how the rewards of a trajectory compare with those made again.
+
+    Raises:
+        UnreadableFile: it is damaged.
+    """
+    with open_hdf5(given) as reader:
+        rewards = reader.rewards
+    if rewards.shape != made.shape:
+        counts = [f"{len(each)} steps" for each in (rewards, made)]
+        yield _difference(Topic.REWARDS, file, "rewards", *counts)
+        return
+    found = _Rows("rewards", *_DATASETS["rewards"], file)
+    if rewards.tobytes() != made.tobytes():
+        found.add(0, rewards, made)
+    yield from found.differences()
+    if not found.any:
+        yield Same(topic=Topic.REWARDS, file=file, unit="trajectory")
+
+
+def _compare_groups(
+    one: h5py.File, other: h5py.File, file: str, rules: Rules
+) -> Iterator[Same | Difference]:
+    named = [_objects(each) for each in (one, other)]
+    yield from _compare_attributes(one, other, file, rules)
+    for name in sorted(named[0] | named[1]):
+        dataset = name.partition("/")[0]
+        topic, _ = _DATASETS.get(dataset, (Topic.FILES, Aspect.EXACT))
+        if name not in named[0] or name not in named[1]:
+            where = [f"{name} is there" if name in each else "none" for each in named]
+            yield _difference(topic, file, name, *where)
+            continue
+        a, b = one[name], other[name]
+        yield from _compare_attributes(a, b, file, rules, name)
+        if isinstance(a, h5py.Dataset) and isinstance(b, h5py.Dataset):
+            yield from _compare_datasets(name, a, b, file)
+        elif type(a) is not type(b):
+            yield _difference(topic, file, name, type(a).__name__, type(b).__name__)
+
+
+def _objects(file: h5py.File) -> set[str]:
+    """Return the paths of all that is in a file, each a hard link of its own."""
+    found: set[str] = set()
+    open_groups = [""]
+    while open_groups:
+        path = open_groups.pop()
+        group = file[path] if path else file
+        for name in group:
+            inner = f"{path}/{name}" if path else name
+            if not isinstance(group.get(name, getlink=True), h5py.HardLink):
+                raise ValueError(f"its {inner} leads elsewhere")
+            found.add(inner)
+            if group.get(name, getclass=True) is h5py.Group:
+                if inner.count("/") >= _DEEPEST:
+                    raise ValueError("its groups are nested too deeply")
+                open_groups.append(inner)
+    return found
+
+
+def _compare_attributes(
+    a: Any, b: Any, file: str, rules: Rules, name: str = ""
+) -> Iterator[Difference]:
+    where = f"{name}: attribute " if name else "attribute "
+    for key in sorted({*a.attrs, *b.attrs}):
+        if key not in a.attrs or key not in b.attrs:
+            values = ["one" if key in each.attrs else "none" for each in (a, b)]
+            yield _difference(Topic.FILES, file, f"{where}{key}", *values)
+            continue
+        left, right = (_raw_attribute(each, key) for each in (a, b))
+        if left == right or (key == _CHECKSUM and not name):
+            continue
+        if key == _FACTS and not name:
+            given = json_object(rules.translated(bytes(a.attrs[key])))
+            made = json_object(bytes(b.attrs[key]))
+            yield from json_differences(given, made, file, rules)
+        else:
+            yield _difference(
+                Topic.FILES, file, f"{where}{key}", short(left[-1]), short(right[-1])
+            )
+
+
+def _raw_attribute(owner: Any, key: str) -> tuple[Any, ...]:
+    identifier = owner.attrs.get_id(key)
+    if identifier.dtype.kind not in "Siuf":
+        raise ValueError(f"its attribute {key!r} is of another type")
+    value = np.asarray(owner.attrs[key])
+    return identifier.dtype.str, value.shape, value.tobytes()
+
+
+def _compare_datasets(
+    name: str, a: h5py.Dataset, b: h5py.Dataset, file: str
+) -> Iterator[Same | Difference]:
+    topic, aspect = _DATASETS.get(name.partition("/")[0], (Topic.FILES, Aspect.EXACT))
+    if a.is_virtual or a.external:
+        raise ValueError(f"its {name} is stored outside it")
+    kinds = [f"{each.dtype} of {each.shape}" for each in (a, b)]
+    if kinds[0] != kinds[1]:
+        yield _difference(topic, file, name, *map(short, kinds))
+        return
+    found = _Rows(name, topic, aspect, file)
+    rows = a.shape[0] if a.shape else 0
+    step = max(1, _BLOCK_BYTES // max(1, a.nbytes // rows)) if rows else 1
+    # A single value has no rows.
+    for start in range(0, max(rows, 1), step):
+        key = np.s_[start : start + step] if a.shape else ()
+        left, right = np.asarray(a[key]), np.asarray(b[key])
+        if left.tobytes() != right.tobytes():
+            found.add(start, left, right)
+    yield from found.differences()
+    yield from _same(name, a, file, found)
+
+
+def _same(
+    name: str, item: Any, file: str, differing: _Rows | None = None
+) -> Iterator[Same]:
+    """Yield what a dataset proves, so far as it is equal."""
+    if not isinstance(item, h5py.Dataset):
+        return
+    is_equal = differing is None or not differing.any
+    if name == "rewards" and is_equal:
+        yield Same(topic=Topic.REWARDS, file=file, unit="trajectory")
+    if name == "states" and item.shape[0] and item.dtype.names:
+        if differing is None or not differing.is_first_other:
+            yield Same(topic=Topic.BEGINNING, file=file, unit="episode")
+        if is_equal:
+            count = item.shape[0] - 1
+            yield Same(topic=Topic.PHYSICS, file=file, count=count, unit="step")
+
+
+class _Rows:
+    """The rows of a dataset that differ: how many, and by how much at most.
+
+    Those of one aspect count together; the first state, which is a beginning, apart.
+
+    Args:
+        name: of the dataset.
+        topic: what it tells about.
+        aspect: of its numbers.
+        file: the trajectory's name, below `data/`.
+    """
+
+    def __init__(self, name: str, topic: Topic, aspect: Aspect, file: str) -> None:
+        self._name, self._topic, self._aspect, self._file = name, topic, aspect, file
+        self._counts: Counter[tuple[Topic, Aspect]] = Counter()
+        self._worst: dict[tuple[Topic, Aspect], Difference] = {}
+
+    @property
+    def any(self) -> bool:
+        """Whether any differ."""
+        return bool(self._worst)
+
+    @property
+    def is_first_other(self) -> bool:
+        """Whether a beginning differs."""
+        return any(topic is Topic.BEGINNING for topic, _ in self._worst)
+
+    def add(self, start: int, a: NDArray[Any], b: NDArray[Any]) -> None:
+        """Look at a block of rows that differs; its first row is number `start`."""
+        is_beginning = start == 0 and self._name in ("states", "observations")
+        differing: dict[tuple[Topic, Aspect], NDArray[np.bool_]] = {}
+        for member in a.dtype.names or ("",):
+            left, right = (_table(each[member] if member else each) for each in (a, b))
+            is_other = _bits(left) != _bits(right)
+            aspect = Aspect.SOLVER if member == "warmstart" else self._aspect
+            parts = [(self._topic, slice(None))]
+            if is_beginning:
+                parts = [(Topic.BEGINNING, np.s_[:1]), (self._topic, np.s_[1:])]
+            for topic, rows in parts:
+                here = is_other[rows]
+                if not here.any():
+                    continue
+                known = differing.setdefault((topic, aspect), here.any(axis=1))
+                known |= here.any(axis=1)
+                first = start + (rows.start or 0)
+                self._note(topic, aspect, member, first, left[rows], right[rows], here)
+        for key, rows_of_key in differing.items():
+            self._counts[key] += int(rows_of_key.sum())
+
+    def _note(
+        self,
+        topic: Topic,
+        aspect: Aspect,
+        member: str,
+        first: int,
+        left: NDArray[Any],
+        right: NDArray[Any],
+        is_other: NDArray[np.bool_],
+    ) -> None:
+        errors = np.where(is_other, _errors(left, right), -1.0)
+        row, column = map(int, np.unravel_index(np.argmax(errors), errors.shape))
+        size = float(errors[row, column])
+        known = self._worst.get((topic, aspect))
+        if known is not None and size <= (np.inf if known.size is None else known.size):
+            return
+        is_finite, unit = np.isfinite(size), _UNITS.get(self._name, "step")
+        if topic is Topic.BEGINNING:
+            unit = "episode"
+        if aspect is Aspect.SOLVER:
+            unit = "warm start"
+        self._worst[topic, aspect] = Difference(
+            topic=topic,
+            file=self._file,
+            unit=unit,
+            aspect=aspect if is_finite else Aspect.EXACT,
+            where=f"{self._name}[{first + row}]" + (f".{member}" if member else ""),
+            given=short(left[row, column].item()),
+            made=short(right[row, column].item()),
+            size=size if is_finite else None,
+        )
+
+    def differences(self) -> Iterator[Difference]:
+        """Yield the worst of each kind, with the number of rows that it stands for."""
+        for key, worst in self._worst.items():
+            yield replace(worst, count=self._counts[key])
+
+
+def _table(values: NDArray[Any]) -> NDArray[Any]:
+    """Return values as rows of numbers."""
+    rows = np.atleast_1d(values)
+    return rows.reshape(len(rows), -1)
+
+
+def _errors(left: NDArray[Any], right: NDArray[Any]) -> NDArray[np.float64]:
+    """Return `abs(x - y) / (1 + abs(x))`; infinite for what is no matter of degree."""
+    if left.dtype.kind != "f":
+        return np.full(left.shape, np.inf)
+    with np.errstate(all="ignore"):
+        x, y = left.astype(np.float64), right.astype(np.float64)
+        errors = np.abs(x - y) / (1 + np.abs(x))
+    return np.where(np.isfinite(errors), errors, np.inf)
+
+
+def _bits(values: NDArray[Any]) -> NDArray[Any]:
+    return np.ascontiguousarray(values).view(f"u{values.dtype.itemsize}")
+
+
+def _difference(
+    topic: Topic, file: str, where: str, given: str, made: str
+) -> Difference:
+    return Difference(topic=topic, file=file, where=where, given=given, made=made)
+
+
+def _digest(path: Path) -> str:
+    with path.open("rb") as file:
+        return f"sha256 {hashlib.file_digest(file, 'sha256').hexdigest()[:16]}"

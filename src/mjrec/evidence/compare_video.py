@@ -1,0 +1,233 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Two videos: the boxes of the file, its times and shape, and each frame.
+
+The same frames, settings and ffmpeg make the same bytes. Where the bytes differ, all
+that a player goes by has to be equal all the same, and each frame is decoded.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Final
+
+import imageio.v3
+import numpy as np
+
+from ..formats.json_fields import unreadable
+from ..formats.regular_files import read_regular
+from .decoded_video import DecodedVideo
+from .differences import Aspect, Difference, Same, short
+from .findings import Topic
+from .mp4_boxes import Box, read_boxes, shown_times
+from .picture_similarity import (
+    OTHER_ENCODER,
+    OTHER_RENDERER,
+    Planes,
+    Similarity,
+    but_for_shadows,
+    planes_of,
+    similarity,
+)
+
+# What another encoder, or other frames, change in a file that shows the same.
+_ENCODED: Final = frozenset(
+    ("mdat", "avcC", "btrt", "stsz", "stsc", "stco", "co64", "stss", "ctts", "elst")
+)
+# Only where frames are stored in another order than shown, or are no key frames.
+_OPTIONAL: Final = frozenset(("ctts", "stss"))
+_LONGEST_HASHES: Final = 1 << 28
+_EQUAL: Final = Similarity(100.0, 1.0, 0.0)
+
+
+def compare_videos(
+    given: Path,
+    made: Path,
+    file: str,
+    on_decoded: Callable[[str], object] = lambda _: None,
+) -> Iterator[Same | Difference]:
+    """Yield how two videos differ that are not the same bytes.
+
+    Args:
+        given: the archive's.
+        made: made again.
+        file: the name of both, below `data/`.
+        on_decoded: called with the sha256 of all planes of the archive's.
+
+    Raises:
+        UnreadableFile, EncoderError: one is damaged.
+    """
+    boxes, again = read_boxes(given), read_boxes(made)
+    found = list(_compare_boxes(boxes, again, file))
+    with unreadable(given):
+        times = [shown_times(each) for each in (boxes, again)]
+    if times[0] != times[1]:
+        said = [
+            each if isinstance(each, str) else f"{each[0]} frames of {each[1]} s"
+            for each in times
+        ]
+        found.append(_differs(file, "times", *said))
+    yield from found
+    yield Difference(
+        topic=Topic.FILES,
+        file=file,
+        unit="encoding",
+        aspect=Aspect.ENCODED,
+        where="its bytes",
+        given="one encoding",
+        made="another",
+    )
+    frames = list(_compare_frames(given, made, file, on_decoded))
+    yield from frames
+    if not found and not any(each.topic is Topic.VIDEOS for each in frames):
+        yield Same(topic=Topic.VIDEOS, file=file, unit="video")
+
+
+def _compare_boxes(
+    given: Sequence[Box], made: Sequence[Box], file: str
+) -> Iterator[Difference]:
+    kept = [[b for b in boxes if b.name not in _OPTIONAL] for boxes in (given, made)]
+    paths = [[box.path for box in boxes] for boxes in kept]
+    if paths[0] != paths[1]:
+        extra = [path for path in paths[0] if path not in paths[1]] or paths[0]
+        missing = [path for path in paths[1] if path not in paths[0]] or paths[1]
+        yield _differs(file, "boxes", short(", ".join(extra)), ", ".join(missing))
+        return
+    for one, other in zip(*kept, strict=True):
+        if one.name not in _ENCODED and one.content != other.content:
+            yield _differs(file, one.path, one.content.hex(), other.content.hex())
+
+
+def _compare_frames(
+    given: Path, made: Path, file: str, on_decoded: Callable[[str], object]
+) -> Iterator[Same | Difference]:
+    worst, digest = Worst(file), hashlib.sha256()
+    with DecodedVideo(given) as one, DecodedVideo(made) as other:
+        if one.header != other.header:
+            yield _differs(file, "the stream", one.header, other.header)
+            return
+        for number, (a, b) in enumerate(itertools.zip_longest(one, other)):
+            if a is None or b is None:
+                which = ["no frame" if each is None else "one" for each in (a, b)]
+                yield _differs(file, f"frame {number}", *which)
+                return
+            for plane in a:
+                digest.update(np.ascontiguousarray(plane).data)
+            worst.add(number, a, b)
+    on_decoded(digest.hexdigest())
+    yield from worst.differences()
+
+
+def compare_sampled(
+    video: Path, hashes: Path, drawn: Path, file: str
+) -> Iterator[Same | Difference]:
+    """Yield how some drawn frames compare with a video and the hashes of its frames.
+
+    Args:
+        video: the archive's.
+        hashes: the `.framehash` file beside it.
+        drawn: the folder of `<number>.png`.
+        file: the video's name, below `data/`.
+
+    Raises:
+        UnreadableFile, EncoderError: one is damaged.
+    """
+    with unreadable(hashes):
+        lines = read_regular(hashes, limit=_LONGEST_HASHES).splitlines()
+    recorded = [line.rpartition(b", ")[2] for line in lines if line[:1].isdigit()]
+    wanted = {int(path.stem): path for path in drawn.glob("*.png")}
+    # The encoder loses something of every frame; these limits hold for any machine.
+    worst, shipped, equal = Worst(file), Worst(file), 0
+    with DecodedVideo(video) as decoded:
+        for number, planes in enumerate(decoded):
+            path = wanted.pop(number, None)
+            if path is None:
+                continue
+            frame = np.ascontiguousarray(imageio.v3.imread(path)[..., :3])
+            expected = planes_of(frame)
+            if expected.luma.shape != planes.luma.shape:
+                sizes = [f"{p.luma.shape[::-1]} pixels" for p in (planes, expected)]
+                yield _differs(file, f"frame {number}", *sizes)
+                return
+            is_equal = number < len(recorded) and (
+                recorded[number] == hashlib.sha256(frame.data).hexdigest().encode()
+            )
+            equal += is_equal
+            (shipped if is_equal else worst).add(number, planes, expected)
+    if wanted:
+        yield _differs(file, f"frame {min(wanted)}", "no such frame", "one")
+    if shipped.strain > 1:
+        for difference in shipped.differences():
+            yield _differs(file, difference.where, difference.given, difference.made)
+    yield from worst.differences()
+    if equal:
+        yield Same(topic=Topic.PICTURES, file=file, count=equal, unit="frame")
+
+
+class Worst:
+    """Is told of pairs of frames, and says how far the worst of them are apart."""
+
+    def __init__(self, file: str) -> None:
+        self._file = file
+        self._plain, self._lit, self._shadow = _EQUAL, _EQUAL, 0.0
+        self._differing, self._worst = 0, 0
+        self.strain = 0.0
+
+    def add(self, number: int, one: Planes, other: Planes) -> None:
+        """Compare a frame with the other one."""
+        pairs = zip(one, other, strict=True)
+        if all(np.array_equal(a, b) for a, b in pairs):
+            return
+        self._differing += 1
+        found = similarity(one, other)
+        lit = found
+        if OTHER_RENDERER.strain(found) > 1:
+            but, share = but_for_shadows(one, other)
+            self._shadow = max(self._shadow, share)
+            lit = similarity(one, but)
+        self._plain, self._lit = _lower(self._plain, found), _lower(self._lit, lit)
+        if (strain := OTHER_ENCODER.strain(found)) > self.strain:
+            self.strain, self._worst = strain, number
+
+    def differences(self) -> Iterator[Difference]:
+        """Yield what all of them come to; nothing where all are equal."""
+        if not self._differing:
+            return
+        plain, lit = self._plain, self._lit
+        yield Difference(
+            topic=Topic.PICTURES,
+            file=self._file,
+            count=self._differing,
+            unit="frame",
+            aspect=Aspect.PICTURE,
+            where=f"frame {self._worst}",
+            given=f"{plain.psnr:.1f} dB from it, {plain.block:.0f} levels in a block",
+            made="another frame",
+            figures={
+                **plain._asdict(),
+                **{f"{name}_lit": value for name, value in lit._asdict().items()},
+                "shadow": self._shadow,
+                "worst_frame": self._worst,
+            },
+        )
+
+
+def _lower(one: Similarity, other: Similarity) -> Similarity:
+    return Similarity(
+        min(one.psnr, other.psnr),
+        min(one.ssim, other.ssim),
+        max(one.block, other.block),
+    )
+
+
+def _differs(file: str, where: str, given: str, made: str) -> Difference:
+    return Difference(
+        topic=Topic.VIDEOS,
+        file=file,
+        unit="video",
+        where=where,
+        given=short(given),
+        made=short(made),
+    )

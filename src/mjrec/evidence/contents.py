@@ -1,0 +1,277 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What of a monitor directory is packed: all that its manifests vouch for.
+
+Of each monitor: the manifest and what it names (statistics, finished videos, those
+that broke), the journal, the frame hashes, the trajectories, and the models of these.
+Locks, unfinished files, logs that nobody can read, second names of videos, and videos
+that were rendered again another way are left out: no manifest knows them.
+
+Where episodes are chosen, the trajectories of all others are packed without states and
+snapshots: actions, rewards and seeds of every episode stay, so that anyone can make all
+of them again.
+"""
+
+from __future__ import annotations
+
+import operator
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from ..errors import (
+    DirectoryInUse,
+    DirectoryNotWritable,
+    InvalidArgument,
+    PackError,
+    UnfinishedRecordings,
+    UnknownName,
+    UnreadableFile,
+)
+from ..formats.frame_hashes import frame_hash_path
+from ..formats.json_fields import base_name, unreadable
+from ..formats.locks import is_locked
+from ..formats.manifest import Manifest, read_manifest
+from ..formats.monitor_directory import (
+    FILE_PREFIX,
+    episode_of,
+    infix_of,
+    is_manifest,
+    iter_monitor_files,
+    where_recordings_are,
+)
+from ..formats.regular_files import regular_path
+from ..rendering.leftovers import leftovers_of
+from ..rendering.recorded_facts import open_for_rendering
+from ..rendering.recordings import look_at, recordings
+from ..results import iter_episodes
+from ..results.monitor_files import monitors_of
+from .layout import PACKED_EPISODES
+
+_RENDER = "To render what is pending: mjrec render {}"
+_STRAY = (
+    "There is no manifest of their monitor, which would say what they are. Put it "
+    "back, or move them away."
+)
+_RECOVER = (
+    "Their process was killed, or results are missing; to put that in order: mjrec "
+    "recover {}"
+)
+_OF_BROKEN_VIDEO = (".mp4", ".avi", ".json", ".framehash")
+
+
+@dataclass(kw_only=True)
+class Contents:
+    """What is packed.
+
+    Attributes:
+        directory: the monitor directory.
+        packed_episodes: the numbers of the chosen episodes; None where all are packed.
+        files: those that are packed as they are, by name.
+        manifests: by name, those that are packed with other content.
+        without_states: trajectories that are packed without states and snapshots.
+        surroundings: what the manifests say of where their recordings were made.
+    """
+
+    directory: Path
+    packed_episodes: tuple[int, ...] | None
+    files: dict[str, Path] = field(default_factory=dict)
+    manifests: dict[str, Manifest] = field(default_factory=dict)
+    without_states: dict[str, Path] = field(default_factory=dict)
+    surroundings: list[Mapping[str, Any]] = field(default_factory=list)
+
+    def is_chosen(self, name: str) -> bool:
+        """Tell whether a file is of an episode that was chosen."""
+        return self.packed_episodes is None or episode_of(name) in self.packed_episodes
+
+    def add(self, path: Path, *, of: str | None = None) -> None:
+        """Add a file, which the one called `of` names."""
+        _check_name(path)
+        try:
+            with unreadable(path):
+                self.files[path.name] = regular_path(path)
+        except UnreadableFile:
+            if of is None or path.exists():
+                raise
+            raise PackError(
+                f"{of} names {path.name}, which is not in {self.directory}. Put it "
+                "back; a run that lacks what it names would not be verified."
+            ) from None
+
+
+def look_for_contents(directory: Path, episodes: Iterable[int] | None) -> Contents:
+    """Return what of a monitor directory is to be packed.
+
+    Args:
+        directory: the monitor directory.
+        episodes: those whose videos and states are packed; all, if None.
+
+    Raises:
+        InvalidArgument: it is no monitor directory, or an episode is no number.
+        UnknownName: there is no such episode.
+        DirectoryInUse: a monitor is open, or somebody renders.
+        UnfinishedRecordings: videos are pending, or a monitor was killed.
+        PackError: a file that is to be packed is gone, or has a name that archives
+            cannot hold everywhere.
+        UnreadableFile: a file is damaged, or a link that leads out of the directory.
+    """
+    _check_nobody_writes(directory)
+    files = list(iter_monitor_files(directory))
+    if not files:
+        raise InvalidArgument(
+            f"{directory} holds no recordings that could be packed. "
+            f"{where_recordings_are(directory)}"
+        )
+    _check_all_is_done(directory)
+    chosen = None if episodes is None else _chosen(directory, files, episodes)
+    contents = Contents(directory=directory, packed_episodes=chosen)
+    of_infix: dict[str, list[Path]] = {}
+    for path in files:
+        of_infix.setdefault(infix_of(path.name) or "", []).append(path)
+    for monitor in monitors_of(directory):
+        if monitor.manifest is not None:
+            _add_monitor(contents, monitor.manifest, of_infix[monitor.infix])
+    return contents
+
+
+def _check_nobody_writes(directory: Path) -> None:
+    for path in iter_monitor_files(directory, hidden=True):
+        try:
+            is_held = path.suffix == ".lock" and is_locked(path)
+        except OSError as error:
+            raise DirectoryNotWritable(directory, error.strerror) from error
+        if is_held:
+            what = (
+                "a monitor that is still open writes there"
+                if path.name == f".{FILE_PREFIX}.{infix_of(path.name)}.lock"
+                else "somebody renders there"
+            )
+            raise DirectoryInUse(
+                f"Cannot pack {directory}: {what} (it holds {path.name}). Close the "
+                "monitor, or wait for the rendering, and pack then."
+            )
+
+
+def _check_all_is_done(directory: Path) -> None:
+    closed = [files for files in monitors_of(directory) if not files.is_open]
+    killed = [each.infix for each in closed if leftovers_of(directory, each)]
+    if killed:
+        raise UnfinishedRecordings(directory, killed, advice=_RECOVER.format(directory))
+    visible = [
+        [path.name for path in files.paths if not path.name.startswith(".")]
+        for files in closed
+    ]
+    strays = [name for own in visible if not any(map(is_manifest, own)) for name in own]
+    if strays:
+        raise UnfinishedRecordings(directory, strays, advice=_STRAY)
+    pending = [
+        key.told_name
+        for key in recordings(directory)
+        if look_at(directory, key) is not None
+    ]
+    if pending:
+        raise UnfinishedRecordings(directory, pending, advice=_RENDER.format(directory))
+
+
+def _chosen(
+    directory: Path, files: Iterable[Path], episodes: Iterable[int]
+) -> tuple[int, ...]:
+    """Return the numbers of the chosen episodes, sorted, each once."""
+    given = list(episodes)
+    try:
+        numbers = [operator.index(n) for n in given if not isinstance(n, bool)]
+    except TypeError:
+        numbers = []
+    if not numbers or len(numbers) < len(given):
+        raise InvalidArgument(
+            f"episodes is a list of the numbers of episodes, got {given!r}."
+        )
+    known = {episode.episode_id for episode in iter_episodes(directory)}
+    known |= {n for path in files if (n := episode_of(path.name)) is not None}
+    for number in numbers:
+        if number not in known:
+            there = [str(each) for each in sorted(known)]
+            raise UnknownName(f"episode in {directory} with the number", number, there)
+    return tuple(sorted(set(numbers)))
+
+
+def _add_monitor(contents: Contents, path: Path, files: list[Path]) -> None:
+    manifest = read_manifest(path)
+    _add_manifest(contents, path, manifest)
+    contents.add(path.with_name(manifest.stats), of=path.name)
+    for file in files:
+        if file.name.endswith((".jsonl", ".monitor.csv")):
+            contents.add(file)
+        elif file.suffix == ".h5":
+            _add_trajectory(contents, file)
+    for video, metadata in manifest.videos:
+        if contents.is_chosen(video):
+            contents.add(path.with_name(video), of=path.name)
+            contents.add(path.with_name(metadata), of=path.name)
+            hashes = frame_hash_path(path.with_name(video))
+            if hashes.exists():
+                contents.add(hashes)
+    with unreadable(path):
+        broken = [name for name in _broken_of(manifest) if contents.is_chosen(name)]
+    for metadata in broken:
+        stem = metadata.removesuffix(".meta.json")
+        names = {metadata, *(f"{stem}{ending}" for ending in _OF_BROKEN_VIDEO)}
+        for file in files:
+            if file.name in names:
+                contents.add(file)
+
+
+def _add_manifest(contents: Contents, path: Path, manifest: Manifest) -> None:
+    details = manifest.mjrec
+    surroundings = (details or {}).get("surroundings")
+    if isinstance(surroundings, Mapping):
+        contents.surroundings.append(surroundings)
+    if contents.packed_episodes is None:
+        contents.add(path)
+        return
+    if details is None:
+        raise InvalidArgument(
+            f"{path.name} is gym's own, whose videos do not say which episode they "
+            "show: its episodes cannot be chosen from. Pack all of them."
+        )
+    _check_name(path)
+    details = {**details, PACKED_EPISODES: list(contents.packed_episodes)}
+    if "broken" in details:
+        broken = _broken_of(manifest)
+        details["broken"] = [name for name in broken if contents.is_chosen(name)]
+    videos = tuple(pair for pair in manifest.videos if contents.is_chosen(pair[0]))
+    contents.manifests[path.name] = replace(manifest, videos=videos, mjrec=details)
+
+
+def _add_trajectory(contents: Contents, path: Path) -> None:
+    if not contents.is_chosen(path.name):
+        _check_name(path)
+        contents.without_states[path.name] = path
+        return
+    contents.add(path)
+    with open_for_rendering(path) as reader:
+        model = reader.facts.get("model") or {}
+    for name in filter(None, (model.get("mjb"), model.get("xml"))):
+        # What it was made from may not be known, and a compiled one may be gone.
+        if (contents.directory / name).exists():
+            contents.add(contents.directory / name)
+
+
+def _broken_of(manifest: Manifest) -> Iterator[str]:
+    """Yield the names of the metadata of videos that ended early, checked."""
+    for name in (manifest.mjrec or {}).get("broken") or ():
+        yield base_name(name)
+
+
+def _check_name(path: Path) -> None:
+    """Check that a name means the same file wherever it is unpacked."""
+    try:
+        path.name.encode()
+        is_portable = path.name.isprintable() and "\\" not in path.name
+    except UnicodeEncodeError:
+        is_portable = False
+    if not is_portable:
+        raise PackError(
+            f"{path.name!r} cannot be packed: on some systems that is no name of a "
+            "file. Record with another uid."
+        )

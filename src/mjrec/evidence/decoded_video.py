@@ -1,0 +1,133 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The frames of a shipped video, decoded one after the other.
+
+ffmpeg reads the file as nothing but an mp4 with H.264 in it, whatever it says of
+itself, and opens no other file for it. What it gives tells its own size, so that a file
+of another size is not taken for one of the recorded size.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from types import TracebackType
+from typing import Final, Self
+
+import numpy as np
+
+from ..errors import UnreadableFile
+from ..formats.ffmpeg import FfmpegProcess, as_file, every_frame_arguments
+from ..formats.regular_files import regular_path
+from .picture_similarity import Planes
+
+_READ_SIZE: Final = 1 << 20
+_LONGEST_HEADER: Final = 1024
+_HEADER: Final = re.compile(rb"YUV4MPEG2 W(\d{1,5}) H(\d{1,5}) [^\n]*")
+_FRAME: Final = b"FRAME\n"
+
+
+class DecodedVideo:
+    """A video that is being decoded; used in a `with` block.
+
+    Args:
+        path: of the mp4.
+
+    Attributes:
+        height: of its frames, in pixels.
+        width: likewise.
+        header: what ffmpeg says of the stream: size, rate, shape of a pixel, format.
+
+    Raises:
+        UnreadableFile: it is no regular file.
+        EncoderError: it cannot be decoded.
+        Error: ffmpeg cannot be started.
+    """
+
+    def __init__(self, path: Path) -> None:
+        try:
+            source = regular_path(path)
+        except (OSError, ValueError) as error:
+            raise UnreadableFile(path, error) from error
+        self._rest = b""
+        self._process = FfmpegProcess(
+            [
+                *("-hide_banner", "-loglevel", "error", "-nostdin", "-xerror"),
+                *("-threads", "2", "-protocol_whitelist", "file"),
+                *("-f", "mp4", "-c:v", "h264", "-i", as_file(source)),
+                *("-map", "0:v:0", *every_frame_arguments()),
+                *("-pix_fmt", "yuv420p", "-f", "yuv4mpegpipe", "pipe:1"),
+            ],
+            what=f"The video {path.name} cannot be decoded.",
+            writes=True,
+        )
+        try:
+            self._read_header(path)
+        except BaseException:
+            self.close()
+            raise
+
+    def __iter__(self) -> Iterator[Planes]:
+        """Yield the planes of each frame, to the end of the file.
+
+        Raises:
+            EncoderError: it cannot be decoded to its end.
+        """
+        size = self.height * self.width
+        while self._take(len(_FRAME)) == _FRAME:
+            data = np.frombuffer(self._take(size * 3 // 2), np.uint8)
+            if data.size < size * 3 // 2:
+                break
+            half = self.height // 2, self.width // 2
+            quarter = size // 4
+            yield Planes(
+                data[:size].reshape(self.height, self.width),
+                data[size : size + quarter].reshape(half),
+                data[size + quarter :].reshape(half),
+            )
+        self._process.wait()
+
+    def close(self) -> None:
+        """End ffmpeg, whatever it is at. Idempotent."""
+        self._process.kill()
+        self._process.release()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def _read_header(self, path: Path) -> None:
+        while b"\n" not in self._rest and len(self._rest) < _LONGEST_HEADER:
+            block = self._process.read(_LONGEST_HEADER)
+            if not block:
+                self._process.wait()
+                raise UnreadableFile(path, "there is no frame in it")
+            self._rest += block
+        line, _, self._rest = self._rest.partition(b"\n")
+        match = _HEADER.fullmatch(line)
+        if match is None:
+            raise UnreadableFile(path, f"ffmpeg says {line!r:.80} of it")
+        width, height = map(int, match.groups())
+        if height % 2 or width % 2:
+            raise UnreadableFile(path, f"its frames are {width}x{height}")
+        self.height, self.width = height, width
+        self.header = line.decode("ascii", "backslashreplace")
+
+    def _take(self, size: int) -> bytes:
+        """Return so many bytes; fewer at the end."""
+        parts, missing = [self._rest[:size]], size - len(self._rest[:size])
+        self._rest = self._rest[size:]
+        while missing:
+            block = self._process.read(min(_READ_SIZE, missing))
+            if not block:
+                break
+            parts.append(block)
+            missing -= len(block)
+        return b"".join(parts)

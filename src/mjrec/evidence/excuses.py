@@ -1,0 +1,431 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Excuses: claims that allow a stated difference, each of them tried.
+
+The exact comparison comes first, always. An excuse reaches what its rule below names,
+in the recordings, episodes or files that it is claimed of: it widens a finite
+tolerance, or excludes an item, which is then believed. Where the claimed difference
+ought to show and nothing differs, the claim is refuted.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Final, TypeAlias
+
+from ..errors import InvalidArgument
+from .differences import Aspect, Difference, Place, Same
+from .findings import Excuse, ExcuseKind, Finding, Outcome, Topic
+from .notes import Note
+from .picture_similarity import (
+    OTHER_CPU,
+    OTHER_ENCODER,
+    OTHER_RENDERER,
+    Limits,
+    Similarity,
+)
+
+_Allowed: TypeAlias = Mapping[Aspect, float | Limits]
+
+# Between MuJoCo 3.17 and 4.0, and with and without the CPU's FMA, a step of a model
+# whose bodies touch as spheres, capsules and planes differs by 2e-12. Contacts that are
+# found by iterating (boxes, meshes, height fields) jump: by 2e-7 without FMA, by 2.5e-3
+# between major versions. Velocities are differences divided by a time, and rewards are
+# made of them.
+_NEAR: Final[_Allowed] = {Aspect.STATE: 1e-6, Aspect.DERIVED: 1e-4}
+_OTHER_MAJOR: Final[_Allowed] = {Aspect.STATE: 1e-2, Aspect.DERIVED: 1e-2}
+# Sums in another order.
+_ROUNDED: Final[_Allowed] = {Aspect.STATE: 1e-9, Aspect.DERIVED: 1e-6}
+_REDRAWN: Final[_Allowed] = {Aspect.HASH: math.inf, Aspect.ENCODED: math.inf}
+_RESTORED: Final[_Allowed] = {Aspect.STORED: math.inf}
+_RECOMPILED: Final[_Allowed] = {Aspect.SOLVER: math.inf, Aspect.MODEL: math.inf}
+_ALIKE: Final[_Allowed] = {**_REDRAWN, **_RESTORED, Aspect.PICTURE: OTHER_ENCODER}
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Rule:
+    """What an excuse does.
+
+    Attributes:
+        kind: which of the three.
+        costs: what it takes away, a clause.
+        allows: by aspect, up to which size.
+        excludes: topics that are believed, whatever differs in them.
+        is_fed: what it excludes was fed to the maker, and is believed though it is
+            equal.
+    """
+
+    kind: ExcuseKind
+    costs: str
+    allows: _Allowed = field(default_factory=dict)
+    excludes: Sequence[Topic] = ()
+    is_fed: bool = False
+
+
+_STEPS: Final = "steps and rewards are compared within a tolerance"
+_BY_NAME: Final[Mapping[str, _Rule]] = {
+    "mujoco": _Rule(
+        kind=ExcuseKind.VERSION,
+        costs=f"{_STEPS}, compiled models are believed",
+        allows={**_ALIKE, **_RECOMPILED, **_NEAR},
+    ),
+    "machine": _Rule(
+        kind=ExcuseKind.HARDWARE,
+        costs=_STEPS,
+        allows={**_ALIKE, **_RECOMPILED, **_NEAR, Aspect.PICTURE: OTHER_CPU},
+    ),
+    "gl": _Rule(
+        kind=ExcuseKind.HARDWARE,
+        costs="frames are alike within a tolerance, their hashes are believed",
+        allows={**_ALIKE, Aspect.PICTURE: OTHER_RENDERER},
+    ),
+    "ffmpeg": _Rule(
+        kind=ExcuseKind.VERSION,
+        costs="frames in the files are alike within a tolerance",
+        allows=_ALIKE,
+    ),
+    **dict.fromkeys(
+        ("numpy", "gymnasium", "gymnasium-robotics", "dm-control"),
+        _Rule(
+            kind=ExcuseKind.VERSION,
+            costs="beginnings and rewards are compared within a tolerance",
+            allows={**_ROUNDED, **_RESTORED},
+        ),
+    ),
+    "mjrec": _Rule(
+        kind=ExcuseKind.VERSION,
+        costs="descriptions are believed",
+        allows=_RESTORED,
+    ),
+    "environment": _Rule(
+        kind=ExcuseKind.CODE,
+        costs="its beginning, physics, rewards and videos are believed",
+        excludes=tuple(Topic),
+    ),
+    "wrappers": _Rule(
+        kind=ExcuseKind.CODE,
+        costs="rewards and ends that differ without it are believed",
+        excludes=(Topic.REWARDS,),
+        is_fed=True,
+    ),
+    **dict.fromkeys(
+        ("schedule", "rule", "step_trigger"),
+        _Rule(
+            kind=ExcuseKind.CODE,
+            costs="which episodes it chose is believed",
+            excludes=(Topic.SELECTION,),
+            is_fed=True,
+        ),
+    ),
+    "actions not kept": _Rule(
+        kind=ExcuseKind.EVENT,
+        costs="returns and ends are believed",
+        excludes=(Topic.REWARDS, Topic.BEGINNING, Topic.PHYSICS),
+        is_fed=True,
+    ),
+    "unseeded beginning": _Rule(
+        kind=ExcuseKind.EVENT,
+        costs="the state that it begins from is believed",
+        excludes=(Topic.BEGINNING,),
+        is_fed=True,
+    ),
+    **dict.fromkeys(
+        ("kill", "early reset", "exception", "fault", "close"),
+        _Rule(
+            kind=ExcuseKind.EVENT,
+            costs="where it ends is believed",
+            excludes=(Topic.REWARDS,),
+            is_fed=True,
+        ),
+    ),
+}
+_ANY_VERSION: Final = _Rule(
+    kind=ExcuseKind.VERSION, costs="nothing but its own version", allows=_RESTORED
+)
+# In the README, all versions are one line.
+_VERSIONS: Final = "versions"
+_DESCRIPTIONS: Final = ("README.md", "CITATION.cff", "ro-crate-metadata.json")
+_OUTCOMES: Final = {
+    Aspect.CLAIM: Outcome.NOTED,
+    Aspect.STORED: Outcome.NOTED,
+    Aspect.ENCODED: Outcome.NOTED,
+    Aspect.STATE: Outcome.WITHIN_TOLERANCE,
+    Aspect.DERIVED: Outcome.WITHIN_TOLERANCE,
+    Aspect.PICTURE: Outcome.WITHIN_TOLERANCE,
+}
+# Why no tolerance says anything of it.
+_BELIEVED: Final = {
+    Aspect.SOLVER: "from there the solver begins, and comes to the same end",
+    Aspect.MODEL: "it was compiled elsewhere",
+    Aspect.HASH: "they were drawn elsewhere",
+}
+# How many of the frames may be equal bit for bit: of another rasteriser, next to none;
+# of the same one on another CPU, those in which nothing was rounded otherwise.
+_MOST_EQUAL_FRAMES: Final = {"gl": 0.5, "machine": 0.8}
+_FAMILIES: Final = ("llvmpipe", "softpipe", "nvidia", "amd", "radeon", "intel", "apple")
+
+
+def excuse_of(name: str, claimed: str, here: str = "", *items: str) -> Excuse:
+    """Return the excuse of a name.
+
+    Args:
+        name: of the rule; of a package where there is none.
+        claimed: the archive's value.
+        here: the reader's.
+        items: what it is claimed of; nothing is the whole archive.
+    """
+    rule = _BY_NAME.get(name, _ANY_VERSION)
+    return Excuse(
+        kind=rule.kind,
+        name=name,
+        claimed=claimed,
+        here=here,
+        items=items,
+        costs=rule.costs,
+    )
+
+
+def merged(excuses: Iterable[Excuse]) -> tuple[Excuse, ...]:
+    """Return excuses of one name and value as one, of all their items."""
+    found: dict[tuple[str, str, str], Excuse] = {}
+    items: dict[tuple[str, str, str], dict[str, None]] = {}
+    of_all = set()
+    for excuse in excuses:
+        key = excuse.name, excuse.claimed, excuse.here
+        found.setdefault(key, excuse)
+        items.setdefault(key, {}).update(dict.fromkeys(excuse.items))
+        if not excuse.items:
+            of_all.add(key)
+    return tuple(
+        dataclasses.replace(each, items=() if key in of_all else tuple(items[key]))
+        for key, each in found.items()
+    )
+
+
+def with_allowed(excuses: Iterable[Excuse], allow: Iterable[str]) -> tuple[Excuse, ...]:
+    """Return excuses, those marked that the reader takes.
+
+    Args:
+        excuses: that were claimed.
+        allow: "NAME=VALUE" each; the value is a part of what is claimed, or "any".
+
+    Raises:
+        InvalidArgument: one has no value.
+    """
+    taken = []
+    for text in allow:
+        name, _, value = text.partition("=")
+        if not name.strip() or not value.strip():
+            raise InvalidArgument(
+                f"allow takes the name of an excuse and its value, as in "
+                f'"gl=NVIDIA H100", got {text!r}.'
+            )
+        taken.append((name.strip(), value.strip().lower()))
+    return tuple(
+        dataclasses.replace(
+            excuse,
+            allowed=any(
+                name == excuse.name
+                and (value == "any" or value in excuse.claimed.lower())
+                for name, value in taken
+            ),
+        )
+        for excuse in excuses
+    )
+
+
+class Trial:
+    """Tries excuses: is told of all that is equal and all that differs.
+
+    Args:
+        excuses: that are claimed.
+    """
+
+    def __init__(self, excuses: Sequence[Excuse]) -> None:
+        self._excuses = excuses
+        self._scopes = [frozenset(excuse.items) for excuse in excuses]
+        self._used: Counter[int] = Counter()
+        # By what is counted.
+        self._equal: Counter[tuple[int, str]] = Counter()
+        self._other: Counter[tuple[int, str]] = Counter()
+
+    def same(self, place: Same) -> bool:
+        """Note what is equal; return whether that is no proof: it was fed in."""
+        is_fed = False
+        for index in self._reaching(place):
+            self._equal[index, place.unit] += place.count
+            rule = _rule(self._excuses[index])
+            is_fed |= rule.is_fed and place.topic in rule.excludes
+        return is_fed
+
+    def judge(self, found: Difference) -> Finding | None:
+        """Return what a difference comes to; None where nothing is to be said of it."""
+        if found.aspect is Aspect.STATEMENT:
+            return None
+        for index in self._reaching(found):
+            excuse = self._excuses[index]
+            outcome = _outcome(excuse, found)
+            if outcome is None:
+                continue
+            self._other[index, found.unit] += found.count
+            if outcome is not Outcome.NOTED:
+                self._used[index] += found.count
+            return _finding(found, outcome, excuse)
+        return _finding(found, Outcome.DIFFERENT, None)
+
+    def use(self, name: str) -> None:
+        """Note that something was believed for the excuse of a name."""
+        for index, excuse in enumerate(self._excuses):
+            self._used[index] += excuse.name == name
+
+    @property
+    def excuses(self) -> tuple[Excuse, ...]:
+        """The excuses that were used, or are refuted."""
+        tried = (
+            dataclasses.replace(excuse, refuted=self._refutation(index) is not None)
+            for index, excuse in enumerate(self._excuses)
+        )
+        return tuple(
+            excuse
+            for index, excuse in enumerate(tried)
+            if self._used[index] or excuse.refuted
+        )
+
+    def refutations(self) -> Iterator[Finding]:
+        """Yield what contradicts a claim."""
+        for index, excuse in enumerate(self._excuses):
+            reason = self._refutation(index)
+            if reason is not None:
+                yield Finding(
+                    topic=Topic.IDENTITY,
+                    item=", ".join(excuse.items[:3]),
+                    outcome=Outcome.DIFFERENT,
+                    reason=f"{excuse.name} is claimed to be {excuse.claimed}, here it "
+                    f"is {excuse.here}: {reason}",
+                    unit="claim",
+                )
+
+    def _reaching(self, place: Place) -> Iterator[int]:
+        scopes = place.scopes
+        for index, items in enumerate(self._scopes):
+            # Descriptions speak of all recordings.
+            if not items or "/" not in place.file or not items.isdisjoint(scopes):
+                yield index
+
+    def _refutation(self, index: int) -> str | None:
+        """Return why the claimed difference is none; None where it may be one."""
+        excuse, equal = self._excuses[index], self._equal
+        frames, videos = equal[index, "frame"], equal[index, "encoding"]
+        if excuse.name == "mujoco" and equal[index, "compiled model"]:
+            return "the compiled model was written by the same version"
+        if excuse.name == "ffmpeg" and videos and self._other[index, "encoding"]:
+            return f"{videos} videos are equal byte for byte, others are not"
+        others = self._other[index, "frame hash"]
+        if excuse.name == "gl" and _family(excuse.claimed) == _family(excuse.here):
+            return None
+        if excuse.name == "machine" and not others:
+            # It need not show: no step of the half cheetah depends on the CPU.
+            return None
+        most = _MOST_EQUAL_FRAMES.get(excuse.name)
+        if frames and most is not None and frames >= most * (frames + others):
+            return f"{frames} frames are equal bit for bit"
+        return None
+
+
+def believed(note: Note) -> tuple[Excuse, Finding | None]:
+    """Return what a note of the maker is: an excuse, and what is believed for it.
+
+    The finding is None where nothing is believed unless something differs.
+    """
+    name, item, reason = note.excuse, note.item, note.reason
+    rule = _BY_NAME.get(name)
+    # Of code the reason says whose.
+    is_code = rule is not None and rule.kind is ExcuseKind.CODE
+    excuse = excuse_of(name, reason if is_code else "", "", item)
+    if rule is not None and not rule.is_fed:
+        return excuse, None
+    if rule is None:
+        excuse = dataclasses.replace(excuse, kind=ExcuseKind.EVENT, costs=reason)
+    finding = Finding(
+        topic=rule.excludes[0] if rule else Topic.FILES,
+        item=item,
+        outcome=Outcome.BELIEVED,
+        reason=reason,
+        excuse=name,
+        count=note.count,
+        unit=note.unit,
+    )
+    return excuse, finding
+
+
+def _outcome(excuse: Excuse, found: Difference) -> Outcome | None:
+    """Return what an excuse makes of a difference; None where it does not allow it."""
+    rule = _rule(excuse)
+    if found.topic in rule.excludes:
+        return Outcome.BELIEVED
+    if found.aspect is Aspect.CLAIM:
+        is_version = found.claim == _VERSIONS and excuse.kind is ExcuseKind.VERSION
+        return Outcome.NOTED if is_version or found.claim == excuse.name else None
+    if found.aspect is Aspect.EXACT:
+        is_described = excuse.name == "mjrec" and found.file in _DESCRIPTIONS
+        return Outcome.BELIEVED if is_described else None
+    limit = _allows(excuse, rule).get(found.aspect)
+    if limit is None:
+        return None
+    if isinstance(limit, Limits):
+        is_within = _is_alike(found.figures, limit)
+    else:
+        is_within = math.isinf(limit) or (
+            found.size is not None and found.size <= limit
+        )
+    return _OUTCOMES.get(found.aspect, Outcome.BELIEVED) if is_within else None
+
+
+def _allows(excuse: Excuse, rule: _Rule) -> _Allowed:
+    if excuse.name == "mujoco" and _major(excuse.claimed) != _major(excuse.here):
+        return {**rule.allows, **_OTHER_MAJOR}
+    if excuse.name == "gl" and _family(excuse.claimed) == _family(excuse.here):
+        return {**rule.allows, Aspect.PICTURE: OTHER_ENCODER}
+    return rule.allows
+
+
+def _is_alike(figures: Mapping[str, float], limits: Limits) -> bool:
+    suffix = "_lit" if 0 < figures["shadow"] <= limits.shadow else ""
+    names = (f"{name}{suffix}" for name in Similarity._fields)
+    return limits.strain(Similarity(*(figures[name] for name in names))) <= 1
+
+
+def _finding(found: Difference, outcome: Outcome, excuse: Excuse | None) -> Finding:
+    figures = dict(found.figures)
+    reason, is_believed = found.reason, outcome is Outcome.BELIEVED
+    if excuse is not None and is_believed:
+        reason = _BELIEVED.get(found.aspect, excuse.costs)
+    if found.size is not None and not is_believed:
+        figures["maximum"] = found.size
+    return Finding(
+        topic=found.topic,
+        item=found.item,
+        outcome=outcome,
+        reason=reason,
+        excuse=excuse.name if excuse else None,
+        count=found.count,
+        unit=found.unit,
+        figures=figures,
+    )
+
+
+def _rule(excuse: Excuse) -> _Rule:
+    return _BY_NAME.get(excuse.name, _ANY_VERSION)
+
+
+def _major(version: str) -> str:
+    return version.partition(".")[0]
+
+
+def _family(renderer: str) -> str:
+    """Return who makes a renderer, as far as that is known; else all of its name."""
+    name = renderer.lower()
+    return next((family for family in _FAMILIES if family in name), name)

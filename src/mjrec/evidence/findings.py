@@ -1,0 +1,233 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a verification says: findings, excuses and one verdict.
+
+A packed run is made again from its inputs and compared, item by item. Each finding is
+about one or several items; each excuse is a claim of the archive that allows some of
+them to be other than made again.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import enum
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, Final
+
+_NOTHING: Final[Mapping[str, Any]] = MappingProxyType({})
+
+
+class Level(enum.StrEnum):
+    """How deep a verification goes; each level includes those before it."""
+
+    FILES = "files"
+    STATS = "stats"
+    PHYSICS = "physics"
+    PIXELS = "pixels"
+
+    @property
+    def included(self) -> tuple[Level, ...]:
+        """This level and those before it, in order."""
+        levels = tuple(Level)
+        return levels[: levels.index(self) + 1]
+
+
+class Topic(enum.StrEnum):
+    """What is proved: a line of the one screen each, in its order."""
+
+    IDENTITY = "identity"
+    BEGINNING = "beginning"
+    PHYSICS = "physics"
+    REWARDS = "rewards and ends"
+    SELECTION = "selection of episodes"
+    VIDEOS = "videos shown"
+    PICTURES = "pictures"
+    FILES = "files"
+
+
+class Outcome(enum.StrEnum):
+    """How an item compares with what was made again."""
+
+    MADE_AGAIN = "made again"
+    WITHIN_TOLERANCE = "within tolerance"
+    BELIEVED = "believed"
+    DIFFERENT = "different"
+    # A remark about what was made again; it does not lower the verdict.
+    NOTED = "noted"
+
+
+class ExcuseKind(enum.StrEnum):
+    """Why an item need not come out again; there are no other reasons."""
+
+    VERSION = "version"
+    HARDWARE = "hardware"
+    CODE = "code"
+    EVENT = "event"
+
+
+class Verdict(enum.StrEnum):
+    """The result of a verification."""
+
+    PASS = "PASS"
+    PARTLY = "PARTLY"
+    FAIL = "FAIL"
+
+    @property
+    def exit_status(self) -> int:
+        """What `mjrec verify` exits with."""
+        return {Verdict.PASS: 0, Verdict.FAIL: 1, Verdict.PARTLY: 3}[self]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Finding:
+    """One item, or several alike, compared with what was made again.
+
+    Attributes:
+        topic: the line of the one screen that it belongs to.
+        item: "episode 27 of 0.4711", a file's name below `data/`, or "" for the whole.
+        outcome: how it compares.
+        reason: a clause. Of DIFFERENT: where, what the archive has, what was made
+            again. Of BELIEVED: why it was not made again.
+        excuse: the name of the excuse that allows it; None where none was needed, or
+            none applies.
+        count: how many `unit` it stands for.
+        unit: what is counted: "episode", "step", "frame", "video", "file".
+        figures: numbers by name, for JSON: `maximum`, `tolerance`, `psnr` ...
+        is_headline: it stands beside the verdict: gaps, episodes that are the same.
+    """
+
+    topic: Topic
+    item: str
+    outcome: Outcome
+    reason: str = ""
+    excuse: str | None = None
+    count: int = 1
+    unit: str = "file"
+    figures: Mapping[str, Any] = field(default_factory=lambda: _NOTHING)
+    is_headline: bool = False
+
+    def as_json(self) -> dict[str, Any]:
+        """Return it as JSON has it."""
+        return {**_fields(self), "figures": dict(self.figures)}
+
+    @classmethod
+    def from_json(cls, said: Mapping[str, Any]) -> Finding:
+        """Return the finding of which `as_json` made this."""
+        kinds = {"topic": Topic(said["topic"]), "outcome": Outcome(said["outcome"])}
+        return cls(**{**said, **kinds})
+
+
+@dataclass(frozen=True, kw_only=True)
+class Excuse:
+    """A claim that allows some items to be other than made again.
+
+    Attributes:
+        kind: which of the three kinds (other versions or hardware; code that the
+            reader does not have; events from outside).
+        name: "mujoco", "cpu", "gl", "environment", "unseeded beginning" ...
+        claimed: the archive's value: "NVIDIA H100", "3.17.0", "episode 0 of 0.4711".
+        here: the reader's value; "" where there is none.
+        items: what it applies to: infixes of recordings, files' names below
+            `recordings/`, or "episode 27 of 0.4711"; empty for the whole archive.
+        costs: what it takes away from the proof, a clause.
+        refuted: the difference that it claims ought to show, and nothing differs.
+        allowed: the reader takes it (`--allow`), so that it does not lower the verdict.
+    """
+
+    kind: ExcuseKind
+    name: str
+    claimed: str
+    here: str = ""
+    items: tuple[str, ...] = ()
+    costs: str = ""
+    refuted: bool = False
+    allowed: bool = False
+
+    def as_json(self) -> dict[str, Any]:
+        """Return it as JSON has it."""
+        return {**_fields(self), "items": list(self.items)}
+
+    @classmethod
+    def from_json(cls, said: Mapping[str, Any]) -> Excuse:
+        """Return the excuse of which `as_json` made this."""
+        kinds = {"kind": ExcuseKind(said["kind"]), "items": tuple(said["items"])}
+        return cls(**{**said, **kinds})
+
+
+@dataclass(frozen=True, kw_only=True)
+class Verification:
+    """The result of `mjrec.verify`.
+
+    Attributes:
+        path: as given.
+        level: how deep it went.
+        findings: in the order in which they were made.
+        excuses: those that were claimed.
+        inputs: inputs that are not the default and were used, by their names.
+        facts: what it was made with: versions, machine, the archive's sha256, sample
+            and its seed, the trusted environments.
+    """
+
+    path: Path
+    level: Level
+    findings: tuple[Finding, ...]
+    excuses: tuple[Excuse, ...] = ()
+    inputs: Mapping[str, Any] = field(default_factory=lambda: _NOTHING)
+    facts: Mapping[str, Any] = field(default_factory=lambda: _NOTHING)
+
+    @property
+    def verdict(self) -> Verdict:
+        """PASS, PARTLY or FAIL."""
+        if self.failures or any(excuse.refuted for excuse in self.excuses):
+            return Verdict.FAIL
+        if self.level is Level.FILES:
+            return Verdict.PARTLY
+        if not any(map(_is_proof, self.findings)):
+            return Verdict.FAIL
+        allowed = {excuse.name for excuse in self.excuses if excuse.allowed}
+        # Less deep levels leave files and frames out.
+        is_whole = self.level is Level.PIXELS and all(
+            finding.outcome in (Outcome.MADE_AGAIN, Outcome.NOTED)
+            or finding.excuse in allowed
+            for finding in self.findings
+        )
+        return Verdict.PASS if is_whole else Verdict.PARTLY
+
+    @property
+    def passed(self) -> bool:
+        """Whether everything was made again and is equal, or allowed."""
+        return self.verdict is Verdict.PASS
+
+    @property
+    def failures(self) -> tuple[Finding, ...]:
+        """The findings that contradict the archive."""
+        return tuple(f for f in self.findings if f.outcome is Outcome.DIFFERENT)
+
+    def as_json(self) -> dict[str, Any]:
+        """Return all of it as JSON has it."""
+        return {
+            "path": str(self.path),
+            "level": str(self.level),
+            "verdict": str(self.verdict),
+            "findings": [finding.as_json() for finding in self.findings],
+            "excuses": [excuse.as_json() for excuse in self.excuses],
+            "inputs": dict(self.inputs),
+            "facts": dict(self.facts),
+        }
+
+
+def _is_proof(finding: Finding) -> bool:
+    """Tell whether something that the environment or the renderer gives came out."""
+    return finding.topic in _MADE and finding.outcome in (
+        Outcome.MADE_AGAIN,
+        Outcome.WITHIN_TOLERANCE,
+    )
+
+
+_MADE: Final = (Topic.PHYSICS, Topic.REWARDS, Topic.PICTURES)
+
+
+def _fields(facts: Finding | Excuse) -> dict[str, Any]:
+    return {each.name: getattr(facts, each.name) for each in dataclasses.fields(facts)}

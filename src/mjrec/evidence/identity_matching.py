@@ -1,0 +1,211 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where in a text an identity is, and the text without it.
+
+What is matched how, in capitals or not:
+
+- URLs of repositories, addresses of mail and ORCIDs: anywhere.
+- Paths of homes and working directories: with everything that begins with them;
+  and all that is called `/home/<name>` or `/Users/<name>`.
+- Full names: their words in this order or with the last one first, joined by a space,
+  a dot, a comma, a hyphen, an underline or nothing; the last word alone where it has
+  six letters or more, between what is no letter.
+- Login names and names of machines with six letters or more: anywhere, also inside
+  other words. With four or five: between what is no letter, or as a word of
+  `CamelCase`.
+- Those with fewer, and those that are ordinary words here (`root`, `user`, `hopper`):
+  only as a whole part of a path, before `@` of a name of a machine, or after it.
+  HalfCheetah has joints called `rootx`, which are no account's.
+"""
+
+from __future__ import annotations
+
+import importlib.resources
+import re
+from collections.abc import Iterable, Iterator, Sequence
+
+from .identity import HOME_OF_ANYBODY, Identity
+
+_ORDINARY_WORDS = frozenset(
+    importlib.resources.files(__package__)
+    .joinpath("ordinary_words.txt")
+    .read_text("utf-8")
+    .split()
+)
+_SHORTEST_INSIDE_WORDS = 6
+_SHORTEST_WORD = 4
+_SHORTEST_PERSON_INSIDE_WORDS = 9
+
+_NO_LETTER_BEFORE = r"(?<![^\W\d_])"
+_NO_LETTER_AFTER = r"(?![^\W\d_])"
+_JOINTS = r"[\s._,-]*"
+# What may follow a part of a path.
+_PART_END = r"(?=[/\\\s\"':,;)\]>]|$)"
+_MACHINE = r"[a-z0-9][\w.-]*"
+
+# Texts in what is no text: as long as what is believed there.
+_ASCII_RUN = re.compile(rb"[\x20-\x7e]{6,}")
+_UTF16_RUNS = {
+    "utf-16-le": re.compile(rb"(?:[\x20-\x7e]\0){6,}"),
+    "utf-16-be": re.compile(rb"(?:\0[\x20-\x7e]){6,}"),
+}
+# In compressed data and in numbers any four letters occur by chance, in every few
+# hundred megabytes; inside so long a run of text they do not.
+_LONG_RUN = 12
+
+_ESCAPED = re.compile(r"\\u([0-9a-fA-F]{4})")
+
+
+class IdentityMatcher:
+    """Finds an identity in texts, in names of files and in bytes.
+
+    Args:
+        identity: what to look for.
+    """
+
+    def __init__(self, identity: Identity) -> None:
+        patterns = list(_patterns(identity))
+        self._texts = _alternatives(patterns)
+        self._names = _alternatives([*patterns, *_short_parts(identity)])
+        self._literals = [
+            (text, text.encode(encoding, errors="replace"))
+            for texts in vars(identity).values()
+            for text in sorted(texts)
+            if not text.isascii() and len(text) > 1
+            for encoding in ("utf-8", *_UTF16_RUNS)
+        ]
+
+    def replaced(self, text: str) -> str:
+        """Return a text with placeholders: `<home>`, `<path>`, `<user>`, `<host>`."""
+        return self._texts.sub(lambda match: f"<{_placeholder(match)}>", text)
+
+    def replaced_in_name(self, name: str) -> str:
+        """Return a file's name, or a part of one, with words that are portable there.
+
+        A short login name counts there too, between dots, hyphens and underlines.
+        """
+        return self._names.sub(_placeholder, name)
+
+    def found_in(self, text: str) -> list[str]:
+        """Return what of the identity is in a text, each once."""
+        return _unique(match[0] for match in self._texts.finditer(text))
+
+    def found_in_name(self, name: str) -> list[str]:
+        """Return what of the identity is in a file's name, each once."""
+        return _unique(match[0] for match in self._names.finditer(name))
+
+    def found_in_bytes(self, content: bytes, *, by_chance: bool = False) -> list[str]:
+        r"""Return what is in bytes, which are a text, in UTF-8 or UTF-16, or hold some.
+
+        In what is no text, fewer than six letters count only in a line of a dozen
+        characters and more: among numbers, and in what is compressed, they occur by
+        chance. Letters that JSON has as `\u00e9` are read.
+
+        Args:
+            content: anything.
+            by_chance: whether it is compressed or numbers, which hold no UTF-16.
+        """
+        found = [text for text, data in self._literals if data in content]
+        try:
+            text = "" if by_chance else content.decode()
+        except UnicodeDecodeError:
+            text = ""
+        if text:
+            unescaped = _ESCAPED.sub(lambda match: chr(int(match[1], 16)), text)
+            found = [*self.found_in(text), *self.found_in(unescaped), *found]
+        else:
+            found += self._found_in_runs(_ASCII_RUN, content, "ascii")
+        for encoding, runs in {} if by_chance else _UTF16_RUNS.items():
+            found += self._found_in_runs(runs, content, encoding)
+        return _unique(found)
+
+    def _found_in_runs(
+        self, runs: re.Pattern[bytes], content: bytes, encoding: str
+    ) -> Iterator[str]:
+        # In one text, because there are many.
+        text = "\n".join(run.decode(encoding) for run in runs.findall(content))
+        for match in self._texts.finditer(text):
+            start = text.rfind("\n", 0, match.start()) + 1
+            end = text.find("\n", match.end())
+            run = (len(text) if end < 0 else end) - start
+            if len(match[0]) >= _SHORTEST_INSIDE_WORDS or run >= _LONG_RUN:
+                yield match[0]
+
+
+def _alternatives(patterns: Iterable[tuple[str, str]]) -> re.Pattern[str]:
+    """Return one pattern; the name of the group that matched ends in a placeholder."""
+    groups = (
+        f"(?P<_{number}_{placeholder}>{pattern})"
+        for number, (placeholder, pattern) in enumerate(patterns)
+    )
+    return re.compile("|".join(groups), re.IGNORECASE)
+
+
+def _placeholder(match: re.Match[str]) -> str:
+    return str(match.lastgroup).rpartition("_")[2]
+
+
+def _patterns(identity: Identity) -> Iterator[tuple[str, str]]:
+    """Yield placeholders and what they replace; of two that fit, the first does."""
+    for remote in _longest_first(identity.remotes):
+        yield "path", re.escape(remote)
+    for address in _longest_first(identity.addresses):
+        yield "user", rf"(?<!\w){re.escape(address)}(?!\w)"
+    for path in _longest_first(identity.homes | identity.directories):
+        kind = "home" if path in identity.homes else "path"
+        yield kind, rf"(?<!\w){re.escape(path)}(?![\w-])"
+    yield "home", rf"(?<!\w){HOME_OF_ANYBODY}"
+    people = [re.findall(r"[^\s._,-]+", n) for n in _longest_first(identity.people)]
+    for words in filter(None, people):
+        yield "user", _of_person(words)
+    for host in _longest_first(identity.hosts):
+        yield "host", _of_name(host, rf"(?<=\w@){re.escape(host)}(?![\w-])")
+    for user in _longest_first(identity.users):
+        before_machine = rf"(?<![\w.+-]){re.escape(user)}(?=@{_MACHINE})"
+        yield "user", _of_name(user, before_machine)
+    for *_, last in filter(None, people):
+        if _is_distinctive(last, _SHORTEST_INSIDE_WORDS):
+            yield "user", f"{_NO_LETTER_BEFORE}{re.escape(last)}{_NO_LETTER_AFTER}"
+
+
+def _of_person(words: Sequence[str]) -> str:
+    *first, last = map(re.escape, words)
+    orders = {_JOINTS.join(order) for order in ([*first, last], [last, *first])}
+    pattern = "|".join(sorted(orders))
+    if sum(map(len, words)) >= _SHORTEST_PERSON_INSIDE_WORDS:
+        return pattern
+    # Of "An Li", "italian" would be one.
+    return f"{_NO_LETTER_BEFORE}(?:{pattern}){_NO_LETTER_AFTER}"
+
+
+def _of_name(name: str, beside_at: str) -> str:
+    escaped = re.escape(name)
+    if _is_distinctive(name, _SHORTEST_INSIDE_WORDS):
+        return escaped
+    if _is_distinctive(name, _SHORTEST_WORD):
+        capital = re.escape(name[0].upper() + name[1:].lower())
+        return (
+            rf"{_NO_LETTER_BEFORE}{escaped}{_NO_LETTER_AFTER}"
+            rf"|(?-i:(?<![A-Z]){capital}(?![a-z]))"
+        )
+    return rf"(?<=[/\\]){escaped}{_PART_END}|{beside_at}"
+
+
+def _short_parts(identity: Identity) -> Iterator[tuple[str, str]]:
+    for placeholder, names in (("user", identity.users), ("host", identity.hosts)):
+        for name in _longest_first(names):
+            if _is_distinctive(name, 1):
+                yield placeholder, rf"(?<![^\W_]){re.escape(name)}(?![^\W_])"
+
+
+def _is_distinctive(name: str, length: int) -> bool:
+    """Tell whether a name of at least `length` is no ordinary word, and no number."""
+    has_letters = any(character.isalpha() for character in name)
+    return len(name) >= length and has_letters and name.lower() not in _ORDINARY_WORDS
+
+
+def _longest_first(texts: Iterable[str]) -> list[str]:
+    return sorted(texts, key=lambda text: (-len(text), text))
+
+
+def _unique(found: Iterable[str]) -> list[str]:
+    return list(dict.fromkeys(found))

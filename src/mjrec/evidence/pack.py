@@ -1,0 +1,338 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Packing: from a monitor directory to one zip file that can be verified.
+
+It is put together in a hidden folder beside the archive. Files get there as hard links
+where that is possible, so that a run of many gigabytes needs little room. Nothing there
+is ever written in place: what is to become different is written anew and renamed.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import os
+import shutil
+import stat
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+
+import numpy as np
+
+from ..atomic_files import temporary_path
+from ..errors import (
+    DirectoryNotWritable,
+    Error,
+    FileNotWritten,
+    IdentityLeft,
+    InvalidArgument,
+    PackError,
+    UnreadableFile,
+)
+from ..formats.manifest import write_manifest
+from ..formats.monitor_directory import FILE_PREFIX
+from ..formats.trajectory import row_dtype
+from ..formats.trajectory_hdf5 import open_hdf5, write_hdf5
+from ..rendering.jobs import Progress
+from .anonymity import make_anonymous
+from .bag import TRY_AGAIN, check_bagit, make_bag, write_zip
+from .contents import Contents, look_for_contents
+from .descriptions import write_descriptions
+from .identity import Identity, identity_of_user
+from .identity_traces import remaining_identity
+from .layout import (
+    FORMAT_KEY,
+    FORMAT_VERSION,
+    MOST_ENTRIES,
+    PAYLOAD,
+    RECORDINGS,
+    STATES_LEFT_OUT,
+)
+from .packed_run import PackingOptions, read_run
+from .size_limit import archive_within, byte_count
+from .statements import state
+
+_ENDING = ".zip"
+# Its name until it is whole.
+_ARCHIVE = "archive.zip"
+# How many files beside the recordings there are: the bag's own, and what describes it.
+_DESCRIPTIONS = 9
+# Of a recording, what episodes keep that were not chosen says nothing of these.
+_OF_STATES = ("model", "video")
+
+
+def pack(
+    directory: str | os.PathLike[str],
+    path: str | os.PathLike[str],
+    *,
+    title: str | None = None,
+    authors: Iterable[str] | None = None,
+    license: str | None = None,
+    episodes: Iterable[int] | None = None,
+    anonymous: bool = False,
+    max_size: int | str | None = None,
+    on_progress: Callable[[Progress], object] = lambda _: None,
+) -> Path:
+    """Pack a monitor directory into one file that a stranger can verify.
+
+    It is a zip file with one folder, which is called as the file: a BagIt bag with
+    sha512 checksums, whose payload is an RO-Crate with the monitor directory's files,
+    `environment.json`, the statistics as CSV, a README and `CITATION.cff`. The same
+    recordings, statements and versions give the same bytes. Nothing in the directory
+    changes, and where anything fails there is no archive.
+
+    ::
+
+        mjrec.pack("videos", "run.zip", authors=["Ada Lovelace"], license="CC-BY-4.0")
+        mjrec.verify("run.zip")
+
+    Args:
+        directory: the monitor directory. Its monitors are closed, and its videos
+            rendered.
+        path: the archive; its name ends in `.zip`, and nothing of that name exists.
+        title: of the run; what was recorded, if None.
+        authors: each "Name", "Name <address>" or "Name <ORCID>", in their order.
+        license: the SPDX identifier of the licence, such as "CC-BY-4.0", or its URL.
+        episodes: the numbers of those whose videos and recorded states are packed;
+            all, if None. Statistics, actions and seeds are of all in any case, and the
+            archive says that a choice was made.
+        anonymous: whether everything is taken out that names a user, a machine or an
+            author; for blind reviews.
+        max_size: the most bytes of the archive, as a number or as `"50M"` (50 million).
+            If it would be larger, the videos are drawn again from the recorded states
+            at 3/4, 1/2, 3/8 and 1/4 of width and height, which the archive says.
+        on_progress: told how far that drawing is.
+
+    Returns:
+        The path of the archive.
+
+    Raises:
+        MissingDependency: the extra `evidence` is not installed.
+        InvalidArgument: a value that cannot be, no monitor directory, or a file that
+            is there already.
+        UnknownName: there is no such episode.
+        DirectoryInUse: a monitor is open, or somebody renders.
+        UnfinishedRecordings: videos are pending, or a monitor was killed.
+        ArchiveTooLarge: `max_size` cannot be kept.
+        IdentityLeft: `anonymous`, and a name could not be taken out.
+        PackError: a file is missing, or cannot be packed; or there are more files than
+            `verify` takes.
+        UnreadableFile: a file is damaged.
+        FileNotWritten, DirectoryNotWritable: there is no room, or no permission.
+    """
+    target, source = _checked_paths(Path(path), Path(directory))
+    if authors is not None and not isinstance(authors, str):
+        authors = tuple(authors)
+    statements = state(title=title, authors=authors, license=license)
+    contents = look_for_contents(source, episodes)
+    options = PackingOptions(
+        name=target.stem,
+        title=statements.title,
+        authors=() if anonymous else tuple(authors or ()),
+        license=license,
+        episodes=contents.packed_episodes,
+        anonymous=anonymous,
+        max_size=None if max_size is None else byte_count(max_size),
+    )
+    identity = None
+    if anonymous:
+        identity = identity_of_user(contents.surroundings, statements.authors)
+    with _folder_beside(target) as folder:
+        try:
+            bag = _bag(contents, folder, options, identity, on_progress)
+            finished = folder / _ARCHIVE
+            if not finished.exists():
+                write_zip(bag, finished)
+            _publish(finished, target)
+        except FileExistsError:
+            raise _exists(target) from None
+        except Error:
+            raise
+        except OSError as error:
+            reason = error.strerror or error
+            raise FileNotWritten(target, reason, then=TRY_AGAIN) from error
+    return target
+
+
+def pack_folder(directory: Path, folder: Path, options: PackingOptions) -> None:
+    """Pack a monitor directory into a new folder: what the archive would hold.
+
+    Where it is anonymous nothing is searched for names: the recordings have none.
+
+    Raises:
+        Error: as `pack`.
+    """
+    contents = look_for_contents(directory, options.episodes)
+    identity = Identity() if options.anonymous else None
+    with _folder_beside(folder) as temporary:
+        _bag(contents, temporary, options, identity, lambda _: None).rename(folder)
+
+
+def _bag(
+    contents: Contents,
+    folder: Path,
+    options: PackingOptions,
+    identity: Identity | None,
+    on_progress: Callable[[Progress], object],
+) -> Path:
+    """Return the bag, below `folder`; with a largest size, the archive is there too."""
+    check_bagit()
+    _check_count(contents)
+    staged, bag = folder / "staged", folder / "whole" / options.name
+    _stage(contents, staged)
+    if options.max_size is None:
+        _make_bag(staged, bag, options, identity)
+        return bag
+
+    def make() -> Path:
+        archive = folder / _ARCHIVE
+        archive.unlink(missing_ok=True)
+        _make_bag(staged, bag, options, identity)
+        write_zip(bag, archive)
+        return archive
+
+    archive_within(options.max_size, staged, make=make, on_progress=on_progress)
+    return bag
+
+
+def _make_bag(
+    staged: Path, bag: Path, options: PackingOptions, identity: Identity | None
+) -> None:
+    """Make the bag of what is staged, in the place of an earlier one."""
+    shutil.rmtree(bag, ignore_errors=True)
+    recordings = bag / PAYLOAD / RECORDINGS
+    recordings.mkdir(parents=True)
+    for path in sorted(staged.iterdir()):
+        _link_or_copy(path, recordings / path.name)
+    if identity is not None:
+        make_anonymous(recordings, identity=identity)
+    statements = state(
+        title=options.title, authors=options.authors, license=options.license
+    )
+    run = read_run(recordings, options=options, statements=statements)
+    write_descriptions(run, bag / PAYLOAD)
+    make_bag(
+        bag,
+        {
+            FORMAT_KEY: str(FORMAT_VERSION),
+            "Bagging-Date": run.date,
+            "External-Description": run.title,
+            "Bag-Software-Agent": "mjrec <https://pypi.org/project/mjrec/>",
+        },
+    )
+    found = [] if identity is None else remaining_identity(bag.parent, identity)
+    if found:
+        raise IdentityLeft(found)
+
+
+def _checked_paths(path: Path, directory: Path) -> tuple[Path, Path]:
+    if not directory.is_dir():
+        raise InvalidArgument(f"There is no directory {directory} to pack.")
+    if path.suffix != _ENDING or path.name.startswith("."):
+        raise InvalidArgument(
+            f"The archive is a zip file: its name ends in {_ENDING} and does not begin "
+            f"with a dot, got {str(path)!r}."
+        )
+    if not path.name.isprintable() or "\\" in path.name:
+        raise InvalidArgument(f"{path.name!r} is no name for an archive.")
+    if path.name.startswith(FILE_PREFIX):
+        raise InvalidArgument(
+            f"{path.name} is called as files of monitors are. Choose another name."
+        )
+    if os.path.lexists(path):
+        raise _exists(path)
+    # The working directory may be another one by the time it is written.
+    return path.absolute(), directory.absolute()
+
+
+def _exists(path: Path) -> InvalidArgument:
+    return InvalidArgument(
+        f"{path} exists already, and evidence is never replaced. Choose another name, "
+        "or move it away."
+    )
+
+
+def _check_count(contents: Contents) -> None:
+    kinds = (contents.files, contents.manifests, contents.without_states)
+    count = sum(len(files) for files in kinds)
+    if count > MOST_ENTRIES - _DESCRIPTIONS:
+        raise PackError(
+            f"The archive would hold {count} recorded files, and mjrec verify takes "
+            f"archives of at most {MOST_ENTRIES} files. Choose episodes with "
+            "--episodes, or record into several directories."
+        )
+
+
+@contextlib.contextmanager
+def _folder_beside(archive: Path) -> Iterator[Path]:
+    """Yield a new hidden folder beside `archive`, and remove it at the end."""
+    folder = temporary_path(archive)
+    try:
+        folder.mkdir(mode=0o700)
+    except OSError as error:
+        raise DirectoryNotWritable(archive.parent, error.strerror) from error
+    try:
+        yield folder
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def _stage(contents: Contents, folder: Path) -> None:
+    """Put what is to be packed into a new folder."""
+    folder.mkdir()
+    for name, path in contents.files.items():
+        _link_or_copy(path, folder / name)
+    for name, manifest in contents.manifests.items():
+        write_manifest(folder / name, manifest)
+    for name, path in contents.without_states.items():
+        _write_without_states(path, folder / name)
+
+
+def _write_without_states(source: Path, target: Path) -> None:
+    """Write a trajectory with its actions, rewards and facts, and nothing to draw."""
+    with open_hdf5(source) as reader:
+        facts = {k: v for k, v in reader.facts.items() if k not in _OF_STATES}
+        kept = dataclasses.replace(
+            reader,
+            facts={**facts, STATES_LEFT_OUT: True},
+            dtype=row_dtype(action=reader.kind("action")),
+            frame_steps=np.empty(0, np.int64),
+            change_count=0,
+        )
+        write_hdf5(kept, target)
+
+
+def _publish(finished: Path, path: Path) -> None:
+    """Give a finished archive its name, and replace nothing."""
+    try:
+        path.hardlink_to(finished)
+    except FileExistsError:
+        raise
+    except OSError:
+        # A file system without links: the moment between look and renaming stays.
+        if os.path.lexists(path):
+            raise FileExistsError(path) from None
+        finished.rename(path)
+
+
+def _link_or_copy(source: Path, target: Path) -> None:
+    try:
+        os.link(source, target, follow_symlinks=False)
+    except OSError:
+        # Another file system, one without links, or another user's file.
+        _copy(source, target)
+    if not stat.S_ISREG(target.lstat().st_mode):
+        raise UnreadableFile(source, "it is no regular file any more")
+    if not os.access(target, os.R_OK):
+        raise UnreadableFile(source, "permission denied")
+
+
+def _copy(source: Path, target: Path) -> None:
+    try:
+        file = source.open("rb")
+    except OSError as error:
+        raise UnreadableFile(source, error.strerror) from error
+    try:
+        with file, target.open("xb") as copy:
+            shutil.copyfileobj(file, copy)
+    except OSError as error:
+        raise FileNotWritten(target, error.strerror, then=TRY_AGAIN) from error

@@ -1,0 +1,350 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Reading the inputs of a run from an unpacked archive, which may be anybody's.
+
+It is done in a sandbox: what is read are journals and HDF5 files.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from numpy.typing import NDArray
+
+from .. import json_text
+from ..errors import UnreadableFile
+from ..formats.journal import JournalEntry, JournalReader
+from ..formats.json_fields import read_object
+from ..formats.monitor_directory import FILE_PREFIX, Infix
+from ..formats.regular_files import open_regular
+from ..formats.trajectory import TrajectoryReader
+from ..formats.trajectory_hdf5 import open_hdf5
+from ..results.monitor_files import MonitorFiles, monitors_of
+from ..results.run import EVALUATION
+from .inputs import OPTIONS, EpisodeInputs, Inputs, RecordingInputs
+from .layout import ENVIRONMENT, RECORDINGS
+from .packed_run import PackingOptions
+from .portable_names import portable_parts
+
+_SOURCES = re.compile(r"openaigym\.model\.[0-9a-f]{16}\.zip", re.ASCII)
+_LONGEST_HEADER = 10_000
+_MOST_EPISODES = 1_000_000
+_DTYPES = frozenset(
+    f"{kind}{bits}" for kind in ("float", "int", "uint") for bits in (8, 16, 32, 64)
+) | {"bool"}
+
+
+class NotReadable(Exception):
+    """The inputs cannot be read; its text is a clause that says why."""
+
+
+def read_inputs(data: Path) -> tuple[Inputs, dict[str, NDArray[Any]]]:
+    """Return the inputs of a run, and the arrays of actions that they name.
+
+    Args:
+        data: the folder that holds the recordings and, of a packed run, its
+            descriptions.
+
+    Raises:
+        NotReadable: a file is damaged, or says what cannot be.
+    """
+    arrays: dict[str, NDArray[Any]] = {}
+    try:
+        recordings = [
+            _recording(files, arrays) for files in monitors_of(data / RECORDINGS)
+        ]
+        packing = _packing(data / ENVIRONMENT)
+    except UnreadableFile as error:
+        raise NotReadable(f"{error.path.name}: {error.reason}") from error
+    except (TypeError, ValueError, KeyError) as error:
+        raise NotReadable(str(error)) from error
+    return Inputs(recordings=tuple(sorted(recordings, key=_begun)), packing=packing), (
+        arrays
+    )
+
+
+def _begun(recording: RecordingInputs) -> tuple[float, str]:
+    times = [e.start_time for e in recording.episodes if e.start_time is not None]
+    return min(times, default=0.0), recording.infix
+
+
+def _packing(path: Path) -> Mapping[str, Any]:
+    if not path.exists():
+        return {}
+    packed_with = read_object(path).get("packed_with")
+    said = packed_with.get("options") if isinstance(packed_with, Mapping) else None
+    if not isinstance(said, Mapping):
+        return {}
+    packing_options(said)
+    return said
+
+
+def packing_options(said: Mapping[str, Any]) -> PackingOptions:
+    """Return the options of packing that an archive says.
+
+    Raises:
+        ValueError, TypeError: they cannot be.
+    """
+    name, authors, episodes = said["name"], said["authors"], said["episodes"]
+    if not isinstance(name, str) or len(portable_parts(name)) != 1:
+        raise ValueError(f"an archive cannot be called {name!r:.80}")
+    if episodes is not None:
+        episodes = tuple(map(_count, episodes))
+    return PackingOptions(**{**said, "authors": tuple(authors), "episodes": episodes})
+
+
+def _recording(files: MonitorFiles, arrays: dict[str, NDArray[Any]]) -> RecordingInputs:
+    if Infix.parse(files.infix) is None:
+        raise NotReadable(f"{files.infix!r} is no name that a monitor has")
+    journal = _Journal(files.journal)
+    run = journal.run
+    env_info, keep = run.get("env_info"), run.get("keep")
+    environment = run.get("environment")
+    return RecordingInputs(
+        infix=files.infix,
+        env_id=str(env_info.get("env_id")) if isinstance(env_info, Mapping) else "",
+        environment=environment if isinstance(environment, Mapping) else None,
+        sources=_sources(files, environment),
+        options=_options(run.get("options")),
+        schedule=_text(run.get("schedule")),
+        rule=_text(keep.get("rule")) if isinstance(keep, Mapping) else None,
+        first_episode_id=_count(run.get("first_episode_id", 0)),
+        kept=journal.kept,
+        clip_starts=tuple(sorted(journal.clip_starts())),
+        episodes=tuple(_episodes(files, journal, arrays)),
+        evaluation_keep=journal.evaluation_keep,
+        monitor_csv_start=_monitor_csv_start(files),
+        surroundings=journal.surroundings,
+        surroundings_after=journal.surroundings_after,
+        was_killed=journal.was_killed,
+        is_closed=journal.is_closed,
+    )
+
+
+def _monitor_csv_start(files: MonitorFiles) -> float | None:
+    name = f"{FILE_PREFIX}.results.{files.infix}.monitor.csv"
+    if files.journal is None or not (path := files.journal.with_name(name)).is_file():
+        return None
+    with open_regular(path) as file:
+        header = file.readline(_LONGEST_HEADER).decode()
+    return _time(json_text.loads(header.removeprefix("#")).get("t_start"))
+
+
+class _Journal:
+    """What a journal says.
+
+    Args:
+        path: of it; None where there is none.
+    """
+
+    def __init__(self, path: Path | None) -> None:
+        self.run: Mapping[str, Any] = {}
+        self.surroundings: Mapping[str, Any] | None = None
+        self.surroundings_after = 0
+        self.entries: dict[int, JournalEntry] = {}
+        self.cuts: dict[int, Mapping[str, Any]] = {}
+        self.irregular: dict[int, list[Mapping[str, Any]]] = {}
+        self.clips: list[Mapping[str, Any]] = []
+        self.evaluation_keep: Mapping[str, Any] | None = None
+        self.kept: tuple[int, ...] = ()
+        self.was_killed = self.is_closed = False
+        if path is None:
+            return
+        for entry in JournalReader(path, on_event=self._note):
+            self.entries[entry.episode_id] = entry
+            if len(self.entries) > _MOST_EPISODES:
+                raise NotReadable(f"more than {_MOST_EPISODES} episodes")
+
+    def clip_starts(self) -> Iterator[int]:
+        """Yield the numbers of steps at which a trigger began clips."""
+        for clip in self.clips:
+            _, marker, number = str(clip.get("video")).rpartition(".step")
+            digits = number.removesuffix(".mp4")
+            if marker and digits.isdecimal():
+                yield int(digits)
+
+    def _note(self, kind: str, facts: Any) -> None:
+        match kind, facts:
+            case "run", dict():
+                self.run = facts
+            case "surroundings", dict():
+                self.surroundings = facts
+                self.surroundings_after = len(self.entries)
+            case "cut", {"episode_id": int(number)}:
+                self.cuts[number] = facts
+            case "action", {"episode_id": int(number), "step": int()}:
+                self.irregular.setdefault(number, []).append(facts)
+            case "clip", dict():
+                self.clips.append(facts)
+            case "keep", {"scope": "evaluation"}:
+                self.evaluation_keep = facts
+            case "keep", {"recorded": list(numbers)}:
+                self.kept = tuple(map(_count, numbers))
+            case "recovered", _:
+                self.was_killed = True
+            case "closed", _:
+                self.is_closed = True
+            case _:
+                pass
+
+
+def _episodes(
+    files: MonitorFiles, journal: _Journal, arrays: dict[str, NDArray[Any]]
+) -> Iterator[EpisodeInputs]:
+    for number in sorted({*journal.entries, *journal.cuts}):
+        entry, cut = journal.entries.get(number), journal.cuts.get(number)
+        episode = EpisodeInputs(episode_id=number)
+        if number in files.trajectories:
+            episode = _with_trajectory(
+                episode,
+                files.trajectories[number],
+                name=f"{files.infix}.{number}",
+                irregular=journal.irregular.get(number, []),
+                is_wrapped=bool((journal.run.get("environment") or {}).get("wrappers")),
+                arrays=arrays,
+            )
+        if entry is not None:
+            episode = _with_entry(episode, entry)
+        elif cut is not None:
+            episode = dataclasses.replace(
+                episode,
+                cut=str(cut.get("reason")),
+                is_chosen=cut.get("chosen") is True,
+            )
+        yield episode
+
+
+def _with_entry(episode: EpisodeInputs, entry: JournalEntry) -> EpisodeInputs:
+    evaluation = entry.evaluation or {}
+    return dataclasses.replace(
+        episode,
+        type=entry.type,
+        seed=entry.seed,
+        options=entry.options,
+        steps=episode.steps if episode.has_trajectory else entry.length,
+        is_chosen=entry.chosen,
+        start_time=entry.start_time,
+        end_time=entry.end_time,
+        believed={
+            "reward": entry.reward,
+            "terminated": entry.terminated,
+            "truncated": entry.truncated,
+            "success": entry.success,
+        },
+        evaluation={k: evaluation.get(k) for k in ("seed", "episode")}
+        if evaluation
+        else None,
+    )
+
+
+def _with_trajectory(
+    episode: EpisodeInputs,
+    path: Path,
+    *,
+    name: str,
+    irregular: list[Mapping[str, Any]],
+    is_wrapped: bool,
+    arrays: dict[str, NDArray[Any]],
+) -> EpisodeInputs:
+    with open_hdf5(path) as reader:
+        facts, steps = reader.facts, reader.step_count
+        given = reader.actions(0, steps)
+        first = None
+        if facts.get("seed") is None and facts.get("random_state") is None:
+            first = reader.read("state", 0, 1) if reader.kind("state") else None
+        taken = _steps_taken(reader) if is_wrapped else {}
+    arrays.update({f"{name}.{part}": values for part, values in taken.items()})
+    if given is not None:
+        arrays[name] = given
+    if first is not None:
+        arrays[f"{name}.state"] = first
+    parts = facts.get("action_parts")
+    exception = facts.get("exception")
+    # Where no action fits into an array, each of them is in the journal.
+    is_whole = given is not None or len(irregular) == steps
+    return dataclasses.replace(
+        episode,
+        type=str(facts.get("type")),
+        seed=facts.get("seed"),
+        options=facts.get("options"),
+        random_state=facts.get("random_state"),
+        first_state=None if first is None else f"{name}.state",
+        steps=steps,
+        steps_taken=name if taken else None,
+        actions=name if is_whole else None,
+        dtypes=tuple(_dtypes(facts.get("action_dtypes"))),
+        parts=None if parts is None else tuple(_parts(parts)),
+        irregular=tuple(irregular),
+        exception=exception if isinstance(exception, Mapping) else None,
+        selection=_selection(facts.get("video")),
+        has_trajectory=facts.get("kept") is not False,
+        start_time=_time(facts.get("start_time")),
+        end_time=_time(facts.get("end_time")),
+    )
+
+
+def _steps_taken(reader: TrajectoryReader) -> dict[str, NDArray[Any]]:
+    """Return the parts of `RecordedSteps`; nothing where controls are not recorded."""
+    kind = reader.kind("state")
+    if kind is None or "ctrl" not in (kind.names or ()):
+        return {}
+    return {
+        "controls": reader.read("state", 1, reader.row_count)["ctrl"],
+        "rewards": reader.rewards,
+        "terminated": reader.terminated,
+        "truncated": reader.truncated,
+    }
+
+
+def _selection(video: Any) -> Mapping[str, Any] | None:
+    said = video.get("selection") if isinstance(video, Mapping) else None
+    is_evaluation = isinstance(said, Mapping) and said.get("scope") == EVALUATION
+    return said if is_evaluation else None
+
+
+def _sources(files: MonitorFiles, environment: Any) -> str | None:
+    is_mjcf = isinstance(environment, Mapping) and environment["framework"] == "mjcf"
+    if not is_mjcf or not files.trajectories:
+        return None
+    with open_hdf5(files.trajectories[min(files.trajectories)]) as reader:
+        model = reader.facts.get("model")
+    name = model.get("xml") if isinstance(model, Mapping) else None
+    return name if isinstance(name, str) and _SOURCES.fullmatch(name) else None
+
+
+def _options(said: Any) -> dict[str, Any]:
+    if not isinstance(said, Mapping):
+        return {}
+    for name, value in said.items():
+        if name not in OPTIONS or type(value) not in OPTIONS[name]:
+            raise NotReadable(f"the option {name!r:.80} cannot be {value!r:.80}")
+    return dict(said)
+
+
+def _dtypes(said: Any) -> Iterator[tuple[int, str]]:
+    for step, name in said or ():
+        if name not in _DTYPES:
+            raise NotReadable(f"actions cannot be of dtype {name!r:.80}")
+        yield _count(step), name
+
+
+def _parts(said: Any) -> Iterator[tuple[str, tuple[int, ...]]]:
+    for name, shape in said:
+        yield str(name), tuple(map(_count, shape))
+
+
+def _text(value: Any) -> str | None:
+    return value if isinstance(value, str) else None
+
+
+def _count(value: Any) -> int:
+    if type(value) is not int or value < 0:
+        raise NotReadable(f"{value!r:.80} is no count")
+    return value
+
+
+def _time(value: Any) -> float | None:
+    return float(value) if isinstance(value, int | float) else None

@@ -1,0 +1,209 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From the inputs of a recording to the monitor that records it again."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable, Sequence
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+from ..environments.recreate import NotRecreated, Recreated
+from ..errors import Error
+from ..formats.monitor_directory import Infix
+from ..monitors.base import EnvironmentMonitor
+from ..recorder.opening import JOIN, Statements
+from ..recorder.options import RecorderOptions
+from ..recorder.tracking import FinishedEpisode, Tracker
+from ..schedules import Schedule, schedule_from_text
+from ..trackers.monitor_csv import MonitorCsvTracker
+from .inputs import RecordingInputs
+from .notes import Notes
+
+# Our own schedules and rules, which are asked again, by their names in a journal.
+_SCHEDULES = {
+    "capped_cubic_video_schedule": "cubic",
+    "record_all": "all",
+    "disable_videos": "none",
+}
+_SCHEDULE = re.compile(r"(every|at):[\d,]+", re.ASCII)
+_RULE = re.compile(r"(best|worst|failures):\d{1,18}|failures|median", re.ASCII)
+
+
+def monitor_again(
+    recording: RecordingInputs,
+    recreated: Recreated,
+    directory: Path,
+    *,
+    clock: Callable[[], float],
+    only_counted: bool,
+    notes: Notes,
+) -> EnvironmentMonitor:
+    """Return a monitor that was asked for what the recording's was asked for.
+
+    Args:
+        recording: its inputs.
+        recreated: its environment.
+        directory: where others of the same run may be already.
+        clock: returns the time, in seconds since the epoch.
+        only_counted: only rewards and ends are asked for.
+        notes: which choices were the author's, and are believed.
+
+    Raises:
+        NotRecreated: an option cannot be.
+    """
+    given = recording.options
+    infix = Infix.parse(recording.infix)
+    assert infix is not None, "it was read"
+    try:
+        options = RecorderOptions(
+            video_callable=_schedule(recording, notes),
+            keep=_rule(recording, notes),
+            resume=JOIN,
+            fps=_rate(given.get("fps")),
+            max_fps=_rate(given.get("max_fps")),
+            quality=given.get("quality", "full"),
+            render=given.get("render"),
+            # They are drawn when all is played.
+            workers=0,
+            trajectory_callable=_trajectories(recording),
+            observations=given.get("observations", False),
+            allow_early_reset=True,
+            step_trigger=_step_trigger(recording, notes),
+            video_length=given.get("video_length"),
+            name_prefix=given.get("name_prefix"),
+            seed=given.get("seed"),
+            annotate=given.get("annotate", False),
+            tiled=given.get("tiled", False),
+            trackers=_trackers(recording),
+            statements=Statements(
+                infix=infix,
+                first_episode_id=recording.first_episode_id,
+                surroundings=recording.surroundings,
+                surroundings_after=recording.surroundings_after,
+                clock=clock,
+                only_counted=only_counted,
+            ),
+        )
+        return _monitor_class(recreated)(
+            recreated.environment,
+            directory,
+            options,
+            camera=_camera(given.get("camera")),
+            height=given.get("height"),
+            width=given.get("width"),
+            env_id=recording.env_id,
+        )
+    except (Error, TypeError, ValueError) as error:
+        raise NotRecreated(f"it cannot be recorded so: {error!s:.300}") from error
+
+
+def _monitor_class(recreated: Recreated) -> Callable[..., EnvironmentMonitor]:
+    # Each loads its framework, and dm_env may not be there.
+    if recreated.is_dm_env:
+        from ..monitors.dm_env_monitor import DmEnvMonitor
+
+        return DmEnvMonitor
+    from ..monitors.gymnasium_monitor import GymnasiumMonitor
+
+    return GymnasiumMonitor
+
+
+def _schedule(recording: RecordingInputs, notes: Notes) -> Schedule | None:
+    name = recording.schedule or ""
+    if recording.rule is not None or "step_trigger" in recording.options:
+        return None
+    if name in _SCHEDULES or _SCHEDULE.fullmatch(name):
+        return schedule_from_text(_SCHEDULES.get(name, name))
+    chosen = {each.episode_id for each in recording.episodes if each.is_chosen}
+    notes.add(
+        recording.name,
+        "schedule",
+        f"the schedule {name!r:.80} is a function of the author's: that it chose these "
+        "episodes is believed",
+        count=len(recording.episodes),
+        unit="episode",
+    )
+    return _named(name, chosen.__contains__)
+
+
+def _rule(
+    recording: RecordingInputs, notes: Notes
+) -> str | Callable[[Sequence[FinishedEpisode]], Iterable[int]] | None:
+    name = recording.rule
+    if name is None or _RULE.fullmatch(name):
+        return name
+    notes.add(
+        recording.name,
+        "rule",
+        f"the rule {name!r:.80} is a function of the author's: that it chose these "
+        "episodes is believed",
+        count=len(recording.episodes),
+        unit="episode",
+    )
+    kept = recording.kept
+    return _named(name, lambda _: kept)
+
+
+def _trajectories(recording: RecordingInputs) -> Callable[[int], bool] | bool | None:
+    asked = recording.options.get("trajectories")
+    if not isinstance(asked, str):
+        return asked
+    kept = {each.episode_id for each in recording.episodes if each.has_trajectory}
+    return _named(asked, kept.__contains__)
+
+
+def _step_trigger(
+    recording: RecordingInputs, notes: Notes
+) -> Callable[[int], bool] | None:
+    name = recording.options.get("step_trigger")
+    if name is None:
+        return None
+    notes.add(
+        recording.name,
+        "schedule",
+        f"{name!r:.80}, which began clips, is a function of the author's: that it "
+        "chose these steps is believed",
+        count=len(recording.clip_starts),
+        unit="clip",
+    )
+    return _named(name, set(recording.clip_starts).__contains__)
+
+
+def _trackers(recording: RecordingInputs) -> Sequence[Tracker]:
+    start = recording.monitor_csv_start
+    return () if start is None else [MonitorCsvTracker(clock=lambda: start)]
+
+
+def _named(name: str, function: Callable[[Any], Any]) -> Callable[[Any], Any]:
+    """Return a function that files call by a name."""
+
+    def named(what: Any) -> Any:
+        return function(what)
+
+    named.__qualname__ = name
+    return named
+
+
+def _rate(text: str | None) -> float | Fraction | None:
+    """Return a rate as it was given, so that it is written the same way."""
+    if text is None:
+        return None
+    is_float = "." in text or "e" in text
+    return float(text) if is_float else Fraction(text)
+
+
+def _camera(said: Any) -> Any:
+    if isinstance(said, list):
+        return [_camera(each) for each in said]
+    if not isinstance(said, dict):
+        return said
+    import mujoco  # It settles the OpenGL backend.
+
+    camera = mujoco.MjvCamera()
+    for name, value in said.items():
+        if name.startswith("_") or not hasattr(camera, name):
+            raise ValueError(f"a camera has no {name!r:.80}")
+        setattr(camera, name, value)
+    return camera

@@ -1,0 +1,196 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The three processes of a verification, one after the other, each in a sandbox.
+
+- `open` sees what was given: it brings it in, checks the bag, and reads the inputs.
+- `make` sees the inputs and nothing else, and makes the run again.
+- `compare` sees the two runs.
+
+What one says to `verify`, which has started it: `count` (of how much is done),
+`finding`, `excuses`, `facts`, and at the end `done`, or `failure` with the reason;
+`refused` where what was given is nothing that can be verified, `error` where this
+machine has too little room.
+"""
+
+from __future__ import annotations
+
+import shutil
+import sys
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, Final
+
+from numpy.typing import NDArray
+
+from ..errors import Error, FileNotWritten, UnreadableArchive
+from ..sandbox import enter
+from .findings import Level
+from .inputs import ARRAYS_FILE, Inputs
+from .layout import PAYLOAD, RECORDINGS
+from .notes import REWARDS_FILE, Notes
+
+MODULE: Final = "mjrec.evidence.stages"
+
+_SECONDS_BETWEEN_COUNTS = 0.2
+_Say = Callable[..., None]
+
+
+class _Counter:
+    """Says how much is done, not too often."""
+
+    def __init__(self, say: _Say) -> None:
+        self._say = say
+        self._said_at = 0.0
+
+    def __call__(self, done: int, total: int) -> None:
+        now = time.monotonic()
+        if done >= total or now - self._said_at > _SECONDS_BETWEEN_COUNTS:
+            self._said_at = now
+            self._say(count=[int(done), int(total)])
+
+
+def main() -> int:
+    """Do what `verify` asks for."""
+    request, say = enter()
+    stage = {"open": _open, "make": _make, "compare": _compare}[request["stage"]]
+    try:
+        stage(request, say)
+    except UnreadableArchive as error:
+        say(refused=str(error.reason))
+        return 1
+    except FileNotWritten as error:
+        say(error=str(error))
+        return 1
+    except MemoryError:
+        say(failure="it needs more memory than it may use")
+        return 1
+    except Exception as error:
+        text = str(error) or type(error).__name__
+        say(failure=text if isinstance(error, Error) else f"{error!r:.500}")
+        return 1
+    say(done=True)
+    return 0
+
+
+# Each imports its own part: making needs MuJoCo and environments, reading h5py.
+
+
+def _open(request: Mapping[str, Any], say: _Say) -> None:
+    from .archive import bring_in
+    from .checked_bag import check_bag
+    from .honesty import remarks
+    from .read_inputs import NotReadable, read_inputs
+
+    given, counter = Path(request["given"]), _Counter(say)
+    say(facts=dict(bring_in(Path(request["path"]), given)))
+    if (given / "bagit.txt").exists():
+        for finding in check_bag(given, counter):
+            say(finding=finding.as_json())
+    if request["level"] == Level.FILES:
+        return
+    try:
+        inputs, arrays = read_inputs(given / PAYLOAD)
+    except NotReadable as error:
+        say(failure=f"its inputs cannot be read: {error}")
+        return
+    folder = Path(request["inputs"])
+    folder.mkdir()
+    inputs.write(folder, arrays)
+    for recording in inputs.recordings:
+        if recording.sources is not None:
+            sources = given / PAYLOAD / RECORDINGS / recording.sources
+            if sources.exists():
+                shutil.copyfile(sources, folder / recording.sources)
+    say(inputs=inputs.unusual())
+    for finding in remarks(inputs, arrays):
+        say(finding=finding.as_json())
+
+
+def _make(request: Mapping[str, Any], say: _Say) -> None:
+    import numpy as np
+
+    from ..environments.recreate import NotRecreated
+    from ..rendering.recovery import recover
+    from .draw_again import SAMPLED, draw_all, draw_sample
+    from .make_again import play_recording
+    from .model_sources import unpack_sources
+    from .pack import pack_folder
+    from .read_inputs import packing_options
+
+    level, folder = Level(request["level"]), Path(request["inputs"])
+    made, place = Path(request["made"]), Path(request["place"])
+    inputs, counter, notes = Inputs.read(folder), _Counter(say), Notes()
+    is_packed = bool(inputs.packing) and level is Level.PIXELS
+    is_packed = is_packed and request["sample"] is None
+    played = (place / "played" if is_packed else made / PAYLOAD) / RECORDINGS
+    played.mkdir(parents=True)
+    steps = sum(e.steps for each in inputs.recordings for e in each.episodes)
+    taken = 0
+    rewards: dict[str, NDArray[Any]] = {}
+
+    def count_steps(more: int) -> None:
+        nonlocal taken
+        taken += more
+        counter(min(taken, steps - 1), steps)
+
+    with np.load(folder / ARRAYS_FILE, allow_pickle=False) as arrays:
+        for recording in inputs.recordings:
+            try:
+                mjcf = None
+                if recording.sources is not None:
+                    mjcf = unpack_sources(folder / recording.sources, place)
+                rewards |= play_recording(
+                    recording,
+                    played,
+                    arrays=arrays,
+                    trust=frozenset(request["trust"]),
+                    mjcf=mjcf,
+                    only_counted=level is Level.STATS,
+                    notes=notes,
+                    on_steps=count_steps,
+                )
+            except NotRecreated as error:
+                episodes = max(1, len(recording.episodes))
+                notes.add(recording.name, error.excuse, str(error), count=episodes)
+    if any(recording.was_killed for recording in inputs.recordings):
+        recover(played)
+    say(phase="drawing")
+    if not any(played.iterdir()):
+        is_packed = False
+    elif level is Level.PIXELS and request["sample"] is None:
+        draw_all(played, counter)
+    elif level is Level.PIXELS:
+        sampled = made / SAMPLED
+        draw_sample(
+            played,
+            sampled,
+            count=request["sample"],
+            seed=request["seed"],
+            on_progress=counter,
+        )
+    if is_packed:
+        pack_folder(played, made, packing_options(inputs.packing))
+    (made / PAYLOAD / RECORDINGS).mkdir(parents=True, exist_ok=True)
+    if level is Level.STATS:
+        np.savez(made / REWARDS_FILE, **rewards)  # type: ignore[arg-type]  # its stub takes no mapping
+    notes.write(made)
+
+
+def _compare(request: Mapping[str, Any], say: _Say) -> None:
+    from .compare import Comparison
+
+    comparison = Comparison(
+        Path(request["given"]),
+        Path(request["made"]),
+        level=Level(request["level"]),
+        sampled=request["sample"] is not None,
+        allow=request["allow"],
+        on_progress=_Counter(say),
+    )
+    for finding in comparison:
+        say(finding=finding.as_json())
+    say(excuses=[excuse.as_json() for excuse in comparison.excuses])
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,200 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A verification in few words: a verdict, what it rests on, a line for each topic.
+
+The screen and the page show the same words.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any, Final
+
+from .. import json_text
+from .findings import Excuse, Finding, Level, Outcome, Topic, Verdict, Verification
+
+_MOST_ITEMS: Final = 3
+_LONGEST_INPUT: Final = 100
+# The worst first: it is what a line says.
+_ORDER: Final = (
+    Outcome.DIFFERENT,
+    Outcome.BELIEVED,
+    Outcome.WITHIN_TOLERANCE,
+    Outcome.MADE_AGAIN,
+)
+_NOT_LOOKED_AT: Final = "not looked at"
+# What counts best for people, where a topic is counted in several ways.
+_UNITS: Final = {
+    Topic.REWARDS: "episode",
+    Topic.SELECTION: "recording",
+    Topic.FILES: "file",
+}
+
+
+@dataclass(frozen=True)
+class Line:
+    """What a topic comes to.
+
+    Attributes:
+        topic: its name.
+        outcome: the worst of its findings; "not looked at" without one.
+        text: how many were made again, and what else is to be said.
+    """
+
+    topic: Topic
+    outcome: str
+    text: str
+
+
+def headline(verification: Verification) -> str:
+    """Return the verdict as a sentence."""
+    name = verification.path.name or str(verification.path)
+    match verification.verdict:
+        case Verdict.PASS:
+            taken = [e.name for e in verification.excuses if e.allowed]
+            allowed = f", or allowed ({', '.join(taken)})" if taken else ""
+            return f"{name}: everything was made again and is equal{allowed}."
+        case Verdict.PARTLY if verification.level is Level.FILES:
+            return f"{name}: files are unchanged; nothing was made again."
+        case Verdict.PARTLY:
+            return f"{name}: nothing contradicts it, but not everything is proved."
+    count = sum(finding.count for finding in verification.failures)
+    if count or any(excuse.refuted for excuse in verification.excuses):
+        return f"{name}: it is not what its inputs give; {_places(count)} differ."
+    return f"{name}: nothing could be made again, so nothing is proved."
+
+
+def remarks(verification: Verification) -> list[str]:
+    """Return what stands beside the verdict: gaps, episodes that are the same."""
+    return [_said(each) for each in verification.findings if each.is_headline]
+
+
+def failures(verification: Verification) -> list[str]:
+    """Return what contradicts the archive."""
+    return [_said(finding) for finding in verification.failures]
+
+
+def excuses(verification: Verification) -> list[str]:
+    """Return the excuses, each with its cost."""
+    return [_excuse(each, verification) for each in verification.excuses]
+
+
+def lines(verification: Verification) -> list[Line]:
+    """Return a line for each topic, in their order."""
+    found: dict[Topic, list[Finding]] = {topic: [] for topic in Topic}
+    for finding in verification.findings:
+        if not finding.is_headline:
+            found[finding.topic].append(finding)
+    return [Line(topic, *_line(topic, said)) for topic, said in found.items()]
+
+
+def inputs(verification: Verification) -> list[str]:
+    """Return the inputs that are not the default."""
+    return [
+        f"{name}: " + ", ".join(f"{key} {_short(value)}" for key, value in said.items())
+        if isinstance(said, Mapping)
+        else f"{name} {_short(said)}"
+        for name, said in verification.inputs.items()
+    ]
+
+
+def sampled(verification: Verification) -> str | None:
+    """Return how many frames were drawn, and what chose them; None where all were."""
+    count, seed = (verification.facts.get(key) for key in ("sample", "seed"))
+    if count is None:
+        return None
+    return f"{count} frames of each video were drawn, chosen by --seed {seed}"
+
+
+def counted(count: int, unit: str) -> str:
+    """Return a number of things: "1 step", "12 steps", "2 frame hashes"."""
+    if count == 1:
+        return f"1 {unit}"
+    if unit.endswith("y"):
+        return f"{count:,} {unit[:-1]}ies"
+    return f"{count:,} {unit}{'es' if unit.endswith('sh') else 's'}"
+
+
+def _line(topic: Topic, found: list[Finding]) -> tuple[str, str]:
+    outcomes = [each.outcome for each in found]
+    worst = next((outcome for outcome in _ORDER if outcome in outcomes), None)
+    if worst is None:
+        return _NOT_LOOKED_AT, "; ".join(_notes(found))
+    texts = [
+        f"{_counts(topic, (f for f in found if f.outcome is outcome))}"
+        + (f" {outcome}" if outcome is not worst else "")
+        for outcome in reversed(_ORDER)
+        if outcome in outcomes and outcome is not Outcome.BELIEVED
+    ]
+    return str(worst), "; ".join([*texts, *_beliefs(found), *_notes(found)])
+
+
+def _counts(topic: Topic, found: Iterable[Finding]) -> str:
+    counts: Counter[str] = Counter()
+    for finding in found:
+        counts[finding.unit] += finding.count
+    if (unit := _UNITS.get(topic)) in counts:
+        counts = Counter({str(unit): counts[str(unit)]})
+    if len(counts) > 1:
+        # Single values of files say little beside them.
+        del counts["value"]
+    return ", ".join(counted(count, unit) for unit, count in counts.items())
+
+
+def _beliefs(found: list[Finding]) -> Iterator[str]:
+    for each in found:
+        if each.outcome is Outcome.BELIEVED:
+            yield f"{counted(each.count, each.unit)} believed: {each.reason}"
+
+
+def _notes(found: list[Finding]) -> Iterator[str]:
+    for each in found:
+        if each.outcome is Outcome.NOTED and each.excuse is None:
+            # Of several alike the sum says how many.
+            many = f" ({counted(each.count, each.unit)})" if each.count > 1 else ""
+            yield f"{each.reason}{many}"
+
+
+def _said(finding: Finding) -> str:
+    subject = f"{finding.item}: " if finding.item else ""
+    return f"{subject}{finding.reason}"
+
+
+def _excuse(excuse: Excuse, verification: Verification) -> str:
+    here = f", here {excuse.here}" if excuse.here else ""
+    claimed = f" {excuse.claimed}{here}" if excuse.claimed else ""
+    if excuse.refuted:
+        return f"{excuse.name}:{claimed}. Refuted: what it claims would show"
+    found = [each for each in verification.findings if each.excuse == excuse.name]
+    costs = [
+        f"{counted(each.count, each.unit)} {each.outcome}{_worst(each)}"
+        for each in found
+        if each.outcome is not Outcome.NOTED and each.unit != "value"
+    ]
+    of = "" if not excuse.items else f" ({_some(excuse.items)})"
+    allowed = ", allowed" if excuse.allowed else ""
+    told = f": {', '.join(costs)}" if costs else ""
+    return f"{excuse.name}{allowed}:{claimed}{of}. {excuse.costs}{told}"
+
+
+def _worst(finding: Finding) -> str:
+    figures = finding.figures
+    if "psnr" in figures:
+        return f", the worst {figures['psnr']:.1f} dB"
+    return f", at most {figures['maximum']:.1g} apart" if "maximum" in figures else ""
+
+
+def _some(items: tuple[str, ...]) -> str:
+    more = len(items) - _MOST_ITEMS
+    shown = ", ".join(items[:_MOST_ITEMS])
+    return f"{shown} and {more} more" if more > 0 else shown
+
+
+def _places(count: int) -> str:
+    return counted(count, "place")
+
+
+def _short(value: Any) -> str:
+    text = value if isinstance(value, str) else json_text.dumps(value)
+    return text if len(text) <= _LONGEST_INPUT else f"{text[:_LONGEST_INPUT]} ..."

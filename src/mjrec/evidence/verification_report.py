@@ -1,0 +1,154 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The report of a verification: one HTML file for people, that loads nothing.
+
+Whatever is in it may come from a hostile archive. It is shown as text: escaped, cut
+where it is long, and with what nobody sees (control characters, marks that turn the
+direction of writing) spelled out.
+"""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, Final
+
+from ..atomic_files import write_text
+from ..errors import MissingDependency
+from . import summary
+from .findings import Finding, Outcome, Topic, Verdict, Verification
+
+_TEMPLATE: Final = "verification_report.html.jinja"
+
+_STYLES: Final = {
+    str(Verdict.PASS): "pass",
+    str(Verdict.PARTLY): "open",
+    str(Verdict.FAIL): "fail",
+    str(Outcome.MADE_AGAIN): "pass",
+    str(Outcome.WITHIN_TOLERANCE): "open",
+    str(Outcome.BELIEVED): "open",
+    str(Outcome.DIFFERENT): "fail",
+}
+_MEANINGS: Final = {
+    Topic.IDENTITY: "The environment and the model are those that are named.",
+    Topic.BEGINNING: "Seeds and options lead to the state that an episode begins from.",
+    Topic.PHYSICS: "Actions lead from each state to the next.",
+    Topic.REWARDS: "Actions give the rewards and ends, and these the statistics.",
+    Topic.SELECTION: "The stated rule chooses the episodes that have a video.",
+    Topic.VIDEOS: "A video is of the size, speed, length and camera that it says.",
+    Topic.PICTURES: "The states give the frames of the videos.",
+    Topic.FILES: "All files are there, unchanged, and no others.",
+}
+# Failures first.
+_ORDER: Final = (
+    *(Outcome.DIFFERENT, Outcome.BELIEVED, Outcome.WITHIN_TOLERANCE),
+    *(Outcome.NOTED, Outcome.MADE_AGAIN),
+)
+# What a browser shows at once, and a person reads.
+_MOST_LISTED: Final = 200
+_LONGEST_TEXT: Final = 1500
+
+
+def write_verification_report(verification: Verification, path: Path) -> None:
+    """Write a verification as one HTML file.
+
+    It needs no network and no scripts, and can be read on a phone, in the dark and on
+    paper. A file of that name is replaced when the new one is whole.
+
+    Raises:
+        MissingDependency: there is no Jinja2.
+        FileNotWritten: the file cannot be written.
+    """
+    template = _template()
+    write_text(path, template.render(**_page(verification)) + "\n")
+
+
+def _template() -> Any:
+    try:
+        # Here, because it is an extra: verifying without a report needs none.
+        import jinja2
+    except ImportError as error:
+        raise MissingDependency(
+            "Jinja2",
+            purpose="Writing a report",
+            install="pip install 'mjrec[evidence]'",
+        ) from error
+    environment = jinja2.Environment(
+        loader=jinja2.FileSystemLoader(Path(__file__).parent),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        finalize=_shown,
+    )
+    return environment.get_template(_TEMPLATE)
+
+
+def _page(verification: Verification) -> dict[str, Any]:
+    ordered = sorted(verification.findings, key=lambda f: _ORDER.index(f.outcome))
+    different = summary.failures(verification)
+    return {
+        "name": verification.path.name or str(verification.path),
+        "verdict": str(verification.verdict),
+        "styles": _STYLES,
+        "headline": summary.headline(verification),
+        "remarks": summary.remarks(verification)[:_MOST_LISTED],
+        "different": different[:_MOST_LISTED],
+        "left_out": len(different[_MOST_LISTED:]),
+        "lines": summary.lines(verification),
+        "meanings": _MEANINGS,
+        "excuses": summary.excuses(verification)[:_MOST_LISTED],
+        "inputs": summary.inputs(verification)[:_MOST_LISTED],
+        "findings": [_row(finding) for finding in ordered[:_MOST_LISTED]],
+        "findings_left_out": len(ordered[_MOST_LISTED:]),
+        "facts": list(_flat(verification.facts)),
+        "command": _command(verification),
+    }
+
+
+def _row(finding: Finding) -> dict[str, str]:
+    return {
+        "outcome": str(finding.outcome),
+        "topic": str(finding.topic),
+        "subject": finding.item or "the whole",
+        "extent": summary.counted(finding.count, finding.unit),
+        "reason": finding.reason,
+    }
+
+
+def _flat(facts: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, str]]:
+    """Yield facts in facts as one list, with names such as `versions: numpy`."""
+    for key, value in facts.items():
+        name = f"{above}: {key}" if above else str(key)
+        if isinstance(value, Mapping):
+            yield from _flat(value, name)
+        elif isinstance(value, list | tuple):
+            yield name, ", ".join(map(str, value)) or "none"
+        else:
+            yield name, "none" if value is None else str(value)
+
+
+def _command(verification: Verification) -> str:
+    command = ["mjrec", "verify", verification.path.name or str(verification.path)]
+    command += ["--level", str(verification.level)]
+    facts = verification.facts
+    for option in ("sample", "seed"):
+        if isinstance(facts.get(option), int) and facts.get("sample") is not None:
+            command += [f"--{option}", str(facts[option])]
+    for option in ("trust", "allow"):
+        for value in facts.get(option) or ():
+            command += [f"--{option}", str(value)]
+    return shlex.join(command)
+
+
+def _shown(value: Any) -> Any:
+    """Return a text with what nobody sees spelled out, and cut where it is long."""
+    if not isinstance(value, str):
+        return value
+    if len(value) > _LONGEST_TEXT:
+        value = f"{value[:_LONGEST_TEXT]} ..."
+    if value.isprintable():
+        return value
+    return "".join(
+        c if c.isprintable() or c == "\n" else f"\\u{ord(c):04x}" for c in value
+    )

@@ -1,0 +1,213 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a zip file says it holds, looked at before anything of it is unpacked.
+
+Only plain archives are taken: files and folders below one folder, one behind the other
+from the first byte to the table of contents, which ends the file. Whatever is more
+(a comment, bytes before, between or behind, two entries over the same bytes) some
+programs see and others do not, so that two readers would check two different things.
+"""
+
+from __future__ import annotations
+
+import stat
+import struct
+import zipfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import BinaryIO
+
+from ..formats.regular_files import open_regular
+from .layout import MOST_ENTRIES
+from .portable_names import check_distinct, portable_parts
+
+_LONGEST_TABLE = 1 << 26
+
+# `end of central directory`, its form for large files, and what says where that is.
+_END = struct.Struct("<4s4H2LH")
+_END_64 = struct.Struct("<4sQ2H2L4Q")
+_LOCATOR_64 = struct.Struct("<4sLQL")
+_LOCAL = struct.Struct("<4s5H3L2H")
+_FULL_16, _FULL_32 = 0xFFFF, 0xFFFF_FFFF
+
+# With bit 3 of the flags: what follows the data, in its four forms.
+_DESCRIPTOR = 0x0008
+_DESCRIPTOR_SIZES = (12, 16, 20, 24)
+# Encrypted, patched, strongly encrypted, with a masked table.
+_UNREADABLE = 0x0001 | 0x0020 | 0x0040 | 0x2000
+
+# Text packs tenfold, deflate at most a thousandfold.
+_ALWAYS_FINE = 1 << 26
+_MOST_EXPANSION = 100
+
+
+@dataclass(frozen=True)
+class ZipContents:
+    """What is to be unpacked.
+
+    Attributes:
+        top: the one folder that everything is in.
+        files: in the order in which they lie in the archive.
+        folders: the names of folders that have entries of their own.
+        size: of all files together, in bytes, as the archive states it.
+    """
+
+    top: str
+    files: tuple[zipfile.ZipInfo, ...]
+    folders: tuple[str, ...]
+    size: int
+
+
+def check_table(path: Path) -> None:
+    """Check the end of a zip file, by which its table of contents is found.
+
+    To be called before anything reads the table: its length is bounded here.
+
+    Raises:
+        OSError: it cannot be read.
+        ValueError: it is no zip file, or no plain one.
+    """
+    with open_regular(path) as file:
+        size = file.seek(0, 2)
+        table_size, table_offset, entries, end = _table_of(file, size)
+    if entries > MOST_ENTRIES or table_size > _LONGEST_TABLE:
+        raise ValueError(
+            f"it says that it holds {entries} files, and {MOST_ENTRIES} would be many"
+        )
+    if table_offset + table_size != end:
+        raise ValueError(
+            "it holds something before its first file, or behind its table of contents"
+        )
+
+
+def zip_contents(archive: zipfile.ZipFile) -> ZipContents:
+    """Return what is in an archive, checked.
+
+    Raises:
+        ValueError: it is no plain archive, or a bomb.
+        OSError: it cannot be read.
+    """
+    infos = archive.infolist()
+    for info in infos:
+        _check_entry(info)
+    _check_places(archive, infos)
+    files = tuple(info for info in infos if not info.is_dir())
+    # On some systems two of them may be one; folders may be said twice.
+    check_distinct(info.filename for info in files)
+    tops = {portable_parts(info.filename.rstrip("/"))[0] for info in infos}
+    if len(tops) != 1 or any("/" not in info.filename for info in files):
+        raise ValueError(
+            "what is in it is not in one folder: a packed run has a single folder at "
+            f"the top, and this has {len(tops)}"
+        )
+    return ZipContents(
+        top=tops.pop(),
+        files=tuple(sorted(files, key=lambda info: info.header_offset)),
+        folders=tuple(info.filename for info in infos if info.is_dir()),
+        size=_checked_size(files),
+    )
+
+
+def _table_of(file: BinaryIO, size: int) -> tuple[int, int, int, int]:
+    """Return the table's size and offset, its entries, and where it must end."""
+    if size < _END.size:
+        raise ValueError("it is no zip file")
+    file.seek(size - _END.size)
+    mark, disk, first_disk, _, entries, table_size, offset, comment = _END.unpack(
+        file.read(_END.size)
+    )
+    if mark != b"PK\x05\x06":
+        raise ValueError(
+            "it is no zip file, or has a comment or something else at its end"
+        )
+    if comment or disk or first_disk:
+        raise ValueError("it has a comment, or is a part of several")
+    end = size - _END.size
+    if _FULL_16 not in (entries,) and _FULL_32 not in (table_size, offset):
+        return table_size, offset, entries, end
+    return _large_table_of(file, end)
+
+
+def _large_table_of(file: BinaryIO, end: int) -> tuple[int, int, int, int]:
+    begin = end - _LOCATOR_64.size - _END_64.size
+    if begin < 0:
+        raise ValueError("it is damaged: its table of contents cannot be found")
+    file.seek(begin)
+    mark, rest, _, _, disk, first_disk, _, entries, table_size, offset = _END_64.unpack(
+        file.read(_END_64.size)
+    )
+    locator, _, place, disks = _LOCATOR_64.unpack(file.read(_LOCATOR_64.size))
+    is_plain = (
+        (mark, locator) == (b"PK\x06\x06", b"PK\x06\x07")
+        and rest == _END_64.size - 12
+        and (disk, first_disk, disks, place) == (0, 0, 1, begin)
+    )
+    if not is_plain:
+        raise ValueError("it is damaged: its table of contents cannot be found")
+    return table_size, offset, entries, begin
+
+
+def _check_entry(info: zipfile.ZipInfo) -> None:
+    # zipfile cuts a name off at its first NUL; unpackers differ.
+    name = info.orig_filename
+    portable_parts(name.removesuffix("/"))
+    kind = stat.S_IFMT(info.external_attr >> 16)
+    fitting = stat.S_IFDIR if info.is_dir() else stat.S_IFREG
+    if kind not in (0, fitting):
+        raise ValueError(f"{name!r} is neither a file nor a folder, but a link or such")
+    if info.flag_bits & _UNREADABLE:
+        raise ValueError(f"{name!r} is encrypted")
+    if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+        raise ValueError(f"{name!r} is packed in a way that not everybody can unpack")
+    if info.is_dir() and info.file_size:
+        raise ValueError(f"{name!r} is a folder, and has content")
+    if info.compress_type == zipfile.ZIP_STORED and (
+        info.compress_size != info.file_size
+    ):
+        raise ValueError(f"{name!r} has two sizes")
+
+
+def _check_places(archive: zipfile.ZipFile, infos: Sequence[zipfile.ZipInfo]) -> None:
+    """Check that the entries lie one behind the other, and nothing else there."""
+    end, may_have_descriptor = 0, False
+    for info in sorted(infos, key=lambda info: info.header_offset):
+        _check_gap(info.header_offset - end, may_have_descriptor, info.filename)
+        end = _end_of(archive, info)
+        may_have_descriptor = bool(info.flag_bits & _DESCRIPTOR)
+    _check_gap(archive.start_dir - end, may_have_descriptor, "the table of contents")
+
+
+def _check_gap(gap: int, may_have_descriptor: bool, before: str) -> None:
+    allowed = _DESCRIPTOR_SIZES if may_have_descriptor else (0,)
+    if gap not in allowed:
+        what = "overlaps what is before it" if gap < 0 else "has hidden bytes before it"
+        raise ValueError(f"{before!r} {what}")
+
+
+def _end_of(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> int:
+    """Return where an entry's data ends, by the header that stands before it."""
+    assert archive.fp is not None
+    archive.fp.seek(info.header_offset)
+    header = archive.fp.read(_LOCAL.size)
+    if len(header) < _LOCAL.size or header[:4] != b"PK\x03\x04":
+        raise ValueError(f"{info.filename!r} is not where it is said to be")
+    fields = _LOCAL.unpack(header)
+    name = archive.fp.read(fields[-2])
+    encoding = "utf-8" if fields[2] & 0x0800 else "cp437"
+    if fields[2:4] != (info.flag_bits, info.compress_type) or (
+        name.decode(encoding, errors="replace") != info.orig_filename
+    ):
+        raise ValueError(f"{info.filename!r} is called so in one of two places only")
+    name_size, extra_size = int(fields[-2]), int(fields[-1])
+    begin = info.header_offset + _LOCAL.size + name_size + extra_size
+    return begin + info.compress_size
+
+
+def _checked_size(files: Sequence[zipfile.ZipInfo]) -> int:
+    size = sum(info.file_size for info in files)
+    packed = sum(info.compress_size for info in files)
+    if size > max(_ALWAYS_FINE, _MOST_EXPANSION * packed):
+        raise ValueError(
+            f"its {packed} bytes would become {size}, which is made to fill a disk"
+        )
+    return size

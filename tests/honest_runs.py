@@ -1,0 +1,234 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Monitor directories of short honest runs, one function for each kind of run."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+
+import mjrec
+from mjrec.environments.mjcf_environments import MjcfEnvironment
+
+_SMALL: dict[str, Any] = {"render_mode": "rgb_array", "width": 32, "height": 32}
+_POLE = "InvertedPendulum-v5"
+
+_ROBOT = """
+<mujoco>
+  <visual><global offwidth="64" offheight="64"/></visual>
+  <worldbody>
+    <light pos="0 0 3"/>
+    <body name="pole" pos="0 0 1">
+      <joint name="hinge" type="hinge" axis="0 1 0"/>
+      <geom name="rod" type="capsule" size=".05" fromto="0 0 0 0 0 .6" rgba="1 0 0 1"/>
+    </body>
+  </worldbody>
+  <actuator>
+    <motor name="motor" joint="hinge" ctrlrange="-1 1" ctrllimited="true"/>
+  </actuator>
+</mujoco>
+"""
+
+
+def play(
+    env: Any,
+    episodes: int,
+    *,
+    seed: Callable[[int], int | None] = lambda episode: episode,
+    most: int = 20,
+    kind: type = np.float32,
+) -> None:
+    """Play episodes with random actions, and close the environment."""
+    generator, space = np.random.default_rng(5), env.action_space
+    with contextlib.closing(env):
+        for episode in range(episodes):
+            env.reset(seed=seed(episode))
+            for _ in range(most):
+                action = 0.9 * generator.uniform(space.low, space.high)
+                _, _, terminated, truncated, _ = env.step(action.astype(kind))
+                if terminated or truncated:
+                    break
+
+
+def pendulum(
+    directory: Path, episodes: int = 4, *, longest: int = 5, **options: Any
+) -> None:
+    """Record evaluated episodes that end by a fall or after five steps."""
+    make = {**_SMALL, **options.pop("make", {})}
+    env = gymnasium.make(_POLE, max_episode_steps=longest, **make)
+    options = {"mode": "evaluation", "uid": "u", "workers": 1, **options}
+    play(mjrec.Monitor(env, directory, **options), episodes)
+
+
+def cheetah(directory: Path, **options: Any) -> None:
+    """Record an environment that never falls, with one seed at the first reset."""
+    env = gymnasium.make("HalfCheetah-v5", max_episode_steps=4, **_SMALL)
+    monitor = mjrec.Monitor(env, directory, workers=1, mode="evaluation", **options)
+    play(monitor, 3, seed=lambda episode: None if episode else 7)
+
+
+def suite(directory: Path, **options: Any) -> None:
+    """Record a task of dm_control's suite."""
+    from dm_control import suite as tasks
+
+    env = tasks.load("cartpole", "balance", task_kwargs={"random": 3})
+    options = {"mode": "evaluation", "env_id": "dm_control/cartpole-balance", **options}
+    monitor: Any = mjrec.Monitor(
+        env, directory, workers=1, width=32, height=32, **options
+    )
+    generator = np.random.default_rng(3)
+    with contextlib.closing(monitor):
+        for _ in range(2):
+            monitor.reset()
+            for _ in range(4):
+                monitor.step(generator.uniform(-1, 1, monitor.action_spec().shape))
+    # The last one was cut off by closing.
+
+
+def vector(directory: Path, **options: Any) -> None:
+    """Record one of two environments that reset themselves."""
+    env = gymnasium.make_vec(
+        _POLE, 2, vectorization_mode="sync", max_episode_steps=4, **_SMALL
+    )
+    monitor: Any = mjrec.Monitor(
+        env, directory, mode="evaluation", workers=1, **options
+    )
+    monitor.reset(seed=3)
+    for _ in range(12):
+        monitor.step(np.zeros(monitor.action_space.shape, np.float32))
+    monitor.close()
+
+
+def clips(directory: Path) -> None:
+    """Record clips of four steps, which cross episodes."""
+    pendulum(directory, step_trigger=_every_sixth, video_length=4)
+
+
+def _every_sixth(step: int) -> bool:
+    return step % 6 == 0
+
+
+def kept(directory: Path, *, rule: str = "worst:1") -> None:
+    """Record the video of one episode, chosen when all had ended."""
+    pendulum(directory, episodes=5, longest=9, keep=rule)
+
+
+def live(directory: Path) -> None:
+    """Record frames of `env.render()` itself."""
+    pendulum(directory, episodes=2, render="live")
+
+
+def several(directory: Path) -> None:
+    """Record two monitors in one directory."""
+    pendulum(directory, episodes=2)
+    pendulum(directory, episodes=2, uid="v", resume="join")
+
+
+def resumed(directory: Path) -> None:
+    """Record on in a second monitor, where the first one stopped."""
+    pendulum(directory, episodes=2)
+    pendulum(directory, episodes=2, resume=True)
+
+
+def killed(directory: Path) -> None:
+    """Record in a process that is killed in its third episode, and finish that."""
+    child = os.fork()
+    if child == 0:
+        env = gymnasium.make(_POLE, max_episode_steps=5, **_SMALL)
+        monitor = mjrec.Monitor(env, directory, uid="u", mode="evaluation", workers=1)
+        for episode in range(3):
+            monitor.reset(seed=episode)
+            for _ in range(3 if episode < 2 else 2):
+                monitor.step(np.full(1, 0.1, np.float32))
+            if episode < 2:
+                monitor.step(np.full(1, 0.1, np.float32))
+                monitor.step(np.full(1, 0.1, np.float32))
+        os.kill(os.getpid(), signal.SIGKILL)
+    os.waitpid(child, 0)
+    mjrec.recover(directory)
+    mjrec.render_videos(directory)
+
+
+def unseeded(directory: Path) -> None:
+    """Record episodes whose beginning nothing leads to."""
+    env = gymnasium.make(_POLE, max_episode_steps=5, **_SMALL)
+    monitor = mjrec.Monitor(env, directory, mode="evaluation", workers=1)
+    play(monitor, 2, seed=lambda _: None)
+
+
+def early(directory: Path) -> None:
+    """Record an episode that a reset cut off."""
+    env = gymnasium.make(_POLE, max_episode_steps=9, **_SMALL)
+    monitor = mjrec.Monitor(
+        env, directory, mode="evaluation", workers=1, allow_early_reset=True
+    )
+    play(monitor, 3, most=2)
+
+
+def wrapped(directory: Path) -> None:
+    """Record with wrappers of Gymnasium's own between monitor and environment."""
+    env: Any = gymnasium.make("HalfCheetah-v5", max_episode_steps=4, **_SMALL)
+    env = gymnasium.wrappers.RescaleAction(env, -1.0, 1.0)
+    play(mjrec.Monitor(env, directory, mode="evaluation", workers=1), 2)
+
+
+def wrapped_in_code(directory: Path) -> None:
+    """Record with a wrapper that only its author has."""
+    env: Any = gymnasium.make("HalfCheetah-v5", max_episode_steps=4, **_SMALL)
+    env = gymnasium.wrappers.TransformReward(env, lambda reward: 2 * reward)
+    play(mjrec.Monitor(env, directory, mode="evaluation", workers=1), 2)
+
+
+def text(directory: Path) -> None:
+    """Record an environment that draws with letters."""
+    env = gymnasium.make("Taxi-v4", render_mode="ansi", max_episode_steps=3)
+    with mjrec.Monitor(env, directory, mode="evaluation") as monitor:
+        for seed in range(2):
+            monitor.reset(seed=seed)
+            for action in (0, 1, 2):
+                monitor.step(action)
+
+
+def mjcf(directory: Path) -> None:
+    """Record the environment of an MJCF file."""
+    path = directory.with_name("robot.xml")
+    path.write_text(_ROBOT)
+    env = gymnasium.wrappers.TimeLimit(MjcfEnvironment(path, width=32, height=32), 4)
+    play(mjrec.Monitor(env, directory, mode="evaluation", workers=1), 2)
+
+
+def training(directory: Path) -> None:
+    """Record a training run, which keeps the actions of scheduled episodes only."""
+    pendulum(directory, episodes=4, mode="training")
+
+
+def doubles(directory: Path) -> None:
+    """Record actions in float64."""
+    env = gymnasium.make("HalfCheetah-v5", max_episode_steps=4, **_SMALL)
+    play(
+        mjrec.Monitor(env, directory, mode="evaluation", workers=1), 2, kind=np.float64
+    )
+
+
+def views(directory: Path) -> None:
+    """Record from another camera, at another size and rate, with the observations."""
+    env = gymnasium.make("HalfCheetah-v5", max_episode_steps=6, **_SMALL)
+    monitor = mjrec.Monitor(
+        env,
+        directory,
+        mode="evaluation",
+        workers=1,
+        camera=["track", -1],
+        width=48,
+        height=32,
+        max_fps=10,
+        observations=True,
+        video_callable=lambda episode: episode == 1,
+    )
+    play(monitor, 2)

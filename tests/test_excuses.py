@@ -1,0 +1,140 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Excuses: what each allows, where, and up to which size."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from mjrec.errors import InvalidArgument
+from mjrec.evidence.differences import Aspect, Difference
+from mjrec.evidence.excuses import Trial, excuse_of, merged, with_allowed
+from mjrec.evidence.findings import Outcome, Topic
+
+RECORDING = "recording 0.u"
+EPISODE = "episode 3 of 0.u"
+TRAJECTORY = "recordings/openaigym.trajectory.0.u.episode000003.h5"
+VIDEO = "recordings/openaigym.video.0.u.video000003.mp4"
+EXCUSES = {
+    "mujoco": ("mujoco", "3.16.0", "3.17.0", RECORDING),
+    "major": ("mujoco", "3.17.0", "4.0.0", RECORDING),
+    "machine": ("machine", "x86_64 a", "x86_64 b", RECORDING),
+    "numpy": ("numpy", "2.3.0", "2.4.0", RECORDING),
+    "gymnasium": ("gymnasium", "1.3.0", "1.4.0", RECORDING),
+    "python": ("python", "3.12.1", "3.11.7", RECORDING),
+    "h100": ("gl", "NVIDIA H100", "llvmpipe", RECORDING),
+    "llvmpipe": ("gl", "llvmpipe (LLVM 17)", "llvmpipe (LLVM 15)", RECORDING),
+    "ffmpeg": ("ffmpeg", "7.0", "9.0", RECORDING),
+    "wrappers": ("wrappers", "mine.Wrapper", "", RECORDING),
+    "beginning": ("unseeded beginning", "", "", EPISODE),
+    "of another": ("mujoco", "3.16.0", "3.17.0", "recording 1.u"),
+}
+
+
+def difference(aspect: Aspect, size: float | None = None, **changes: Any) -> Difference:
+    usual: dict[str, Any] = {"topic": Topic.PHYSICS, "file": TRAJECTORY}
+    return Difference(**{**usual, **changes}, aspect=aspect, size=size)
+
+
+def frame(psnr: float, block: float, *, shadow: float = 0.0) -> Difference:
+    figures = {"psnr": psnr, "ssim": 0.99, "block": block, "shadow": shadow}
+    lit = {"psnr_lit": 40.0, "ssim_lit": 0.99, "block_lit": 9.0}
+    return difference(
+        Aspect.PICTURE, topic=Topic.PICTURES, file=VIDEO, figures={**figures, **lit}
+    )
+
+
+REWARD = {"topic": Topic.REWARDS}
+WITHIN, BELIEVED, NOTED, DIFFERENT = (
+    Outcome.WITHIN_TOLERANCE,
+    Outcome.BELIEVED,
+    Outcome.NOTED,
+    Outcome.DIFFERENT,
+)
+
+
+@pytest.mark.parametrize(
+    ("name", "found", "outcome"),
+    [
+        ("mujoco", difference(Aspect.STATE, 1e-7), WITHIN),
+        ("mujoco", difference(Aspect.STATE, 1e-5), DIFFERENT),
+        ("mujoco", difference(Aspect.SOLVER, 1.0), BELIEVED),
+        ("mujoco", difference(Aspect.EXACT), DIFFERENT),
+        ("major", difference(Aspect.STATE, 5e-3), WITHIN),
+        # A reward of one that is doubled.
+        ("major", difference(Aspect.DERIVED, 0.5, **REWARD), DIFFERENT),
+        ("machine", difference(Aspect.DERIVED, 0.5, **REWARD), DIFFERENT),
+        ("gymnasium", difference(Aspect.DERIVED, 0.5, **REWARD), DIFFERENT),
+        ("gymnasium", difference(Aspect.DERIVED, 1e-9, **REWARD), WITHIN),
+        ("numpy", difference(Aspect.STATE, 1e-7), DIFFERENT),
+        ("python", difference(Aspect.STATE, 1e-12), DIFFERENT),
+        ("python", difference(Aspect.CLAIM, claim="python"), NOTED),
+        ("python", difference(Aspect.CLAIM, claim="numpy"), DIFFERENT),
+        ("h100", frame(30.0, 30.0), WITHIN),
+        ("h100", frame(27.0, 30.0), DIFFERENT),
+        ("h100", frame(27.0, 100.0, shadow=0.02), WITHIN),
+        ("h100", frame(27.0, 100.0, shadow=0.2), DIFFERENT),
+        ("h100", difference(Aspect.STATE, 1e-12), DIFFERENT),
+        ("llvmpipe", frame(30.0, 30.0), DIFFERENT),
+        ("llvmpipe", frame(36.0, 12.0), WITHIN),
+        ("ffmpeg", frame(36.0, 12.0), WITHIN),
+        ("ffmpeg", difference(Aspect.HASH, topic=Topic.PICTURES), BELIEVED),
+        ("wrappers", difference(Aspect.EXACT, **REWARD), BELIEVED),
+        ("wrappers", frame(36.0, 12.0), DIFFERENT),
+        ("beginning", difference(Aspect.STATE, 1.0, topic=Topic.BEGINNING), BELIEVED),
+        ("beginning", difference(Aspect.STATE, 1e-12), DIFFERENT),
+        ("of another", difference(Aspect.STATE, 1e-12), DIFFERENT),
+    ],
+)
+def test_an_excuse_allows_what_it_states(
+    name: str, found: Difference, outcome: Outcome
+) -> None:
+    """In its own items, up to its tolerance, and nothing else."""
+    finding = Trial([excuse_of(*EXCUSES[name])]).judge(found)
+    assert finding is not None
+    assert finding.outcome is outcome
+
+
+def test_the_widest_excuse_decides() -> None:
+    """Each is asked, whatever the order."""
+    excuses = [excuse_of(*EXCUSES[name]) for name in ("numpy", "python", "mujoco")]
+    finding = Trial(excuses).judge(difference(Aspect.STATE, 1e-7))
+    assert finding is not None
+    assert (finding.outcome, finding.excuse) == (WITHIN, "mujoco")
+
+
+def test_excuses_that_nothing_needed_are_not_shown() -> None:
+    """Other versions that change nothing cost nothing."""
+    trial = Trial([excuse_of(*EXCUSES["python"]), excuse_of(*EXCUSES["mujoco"])])
+    trial.judge(difference(Aspect.CLAIM, claim="python"))
+    assert trial.excuses == ()
+
+
+def test_the_same_claim_of_two_recordings_is_one_excuse() -> None:
+    """And one of the whole archive takes in all."""
+    excuses = [excuse_of("numpy", "1", "2", item) for item in ("a", "b", "a")]
+    assert [each.items for each in merged(excuses)] == [("a", "b")]
+    assert [e.items for e in merged([*excuses, excuse_of("numpy", "1", "2")])] == [()]
+
+
+@pytest.mark.parametrize(
+    ("allow", "allowed"),
+    [
+        ("gl=nvidia h100", True),
+        ("gl=any", True),
+        ("gl=A100", False),
+        ("cpu=any", False),
+    ],
+)
+def test_a_reader_takes_an_excuse_with_its_value(allow: str, allowed: bool) -> None:
+    """For CI, which knows where its archives come from."""
+    [taken] = with_allowed([excuse_of(*EXCUSES["h100"])], [allow])
+    assert taken.allowed is allowed
+
+
+@pytest.mark.parametrize("allow", ["gl", "gl=", "=H100", ""])
+def test_no_excuse_is_taken_without_a_value(allow: str) -> None:
+    """Whatever came with it would be taken."""
+    with pytest.raises(InvalidArgument, match="gl=NVIDIA H100"):
+        with_allowed([], [allow])

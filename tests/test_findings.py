@@ -1,0 +1,59 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The verdict that findings and excuses come to."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+from verifications import excuse, finding, verification
+
+from mjrec.evidence.findings import Excuse, Finding, Level, Outcome, Topic, Verdict
+
+MADE, WITHIN = finding(), finding(Outcome.WITHIN_TOLERANCE, excuse="gl")
+BELIEVED = finding(Outcome.BELIEVED, reason="actions were not kept")
+DIFFERENT, NOTED = finding(Outcome.DIFFERENT), finding(Outcome.NOTED)
+OF_FILES = finding(topic=Topic.FILES)
+
+
+@pytest.mark.parametrize(
+    ("findings", "excuses", "level", "verdict"),
+    [
+        ((MADE, NOTED), (), Level.PIXELS, Verdict.PASS),
+        ((MADE, BELIEVED), (), Level.PIXELS, Verdict.PARTLY),
+        ((MADE,), (), Level.PHYSICS, Verdict.PARTLY),
+        ((MADE, WITHIN), (excuse(),), Level.PIXELS, Verdict.PARTLY),
+        ((MADE, WITHIN), (excuse(allowed=True),), Level.PIXELS, Verdict.PASS),
+        ((MADE, BELIEVED), (excuse(allowed=True),), Level.PIXELS, Verdict.PARTLY),
+        ((MADE, DIFFERENT), (), Level.PIXELS, Verdict.FAIL),
+        ((MADE,), (excuse(refuted=True, allowed=True),), Level.PIXELS, Verdict.FAIL),
+        # Nothing of what only a simulation gives was made again.
+        ((OF_FILES, BELIEVED), (), Level.PIXELS, Verdict.FAIL),
+        ((), (), Level.PIXELS, Verdict.FAIL),
+        ((OF_FILES,), (), Level.FILES, Verdict.PARTLY),
+    ],
+)
+def test_the_verdict_is_never_better_than_the_proof(
+    findings: tuple[Finding, ...],
+    excuses: tuple[Excuse, ...],
+    level: Level,
+    verdict: Verdict,
+) -> None:
+    """PASS only where all is equal or allowed; FAIL where nothing is proved."""
+    assert verification(*findings, excuses=excuses, level=level).verdict is verdict
+
+
+def test_exit_statuses_tell_verdicts_apart() -> None:
+    """As documented, for CI."""
+    statuses = [verdict.exit_status for verdict in Verdict]
+    assert statuses == [0, 3, 1]
+
+
+def test_all_of_it_is_json() -> None:
+    """The verdict, findings, excuses, inputs and facts."""
+    made = verification(MADE, excuses=(excuse(),), inputs={"a": 1}, facts={"b": 2})
+    said = json.loads(json.dumps(made.as_json()))
+    assert said["verdict"] == "PASS"
+    assert Finding.from_json(said["findings"][0]) == MADE
+    assert Excuse.from_json(said["excuses"][0]) == excuse()
+    assert (said["inputs"], said["facts"]) == ({"a": 1}, {"b": 2})

@@ -1,0 +1,132 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The inputs of a run: read from what it recorded, and nothing more."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+
+import mjrec
+from mjrec.evidence.inputs import ARRAYS_FILE, EpisodeInputs, Inputs
+from mjrec.evidence.play_actions import given_actions
+from mjrec.evidence.read_inputs import NotReadable, read_inputs
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What would be in a packed run: a recording with all that is unusual."""
+    place = tmp_path_factory.mktemp("inputs")
+    env = gymnasium.make("InvertedPendulum-v5", max_episode_steps=4, frame_skip=3)
+    with mjrec.Monitor(
+        env,
+        place / "recordings",
+        lambda episode: episode == 1,
+        mode="evaluation",
+        fps=29.97,
+        workers=0,
+    ) as monitor:
+        actions: list[Any] = [np.float32([0.1]), [0.25], np.zeros((2, 1)), np.ones(1)]
+        monitor.reset(seed=3, options={"a": 1})
+        for action in actions[:2]:
+            monitor.step(action)
+        with pytest.raises(ValueError, match="Action dimension"):
+            monitor.step(actions[2])
+        monitor.reset()
+        for action in (actions[0], actions[0], actions[3], actions[3]):
+            monitor.step(action)
+    return place
+
+
+def test_inputs_are_what_was_asked_for_and_done(data: Path) -> None:
+    """Environment, options, seeds, actions and what cut an episode off."""
+    inputs, arrays = read_inputs(data)
+    [recording] = inputs.recordings
+    assert recording.options == {"fps": "29.97"}
+    first, second = recording.episodes
+    assert (first.seed, first.options, first.cut) == (3, {"a": 1}, "exception")
+    assert (second.seed, second.cut, second.is_chosen) == (None, None, True)
+    assert [a.tolist() for a in arrays[str(second.actions)]][2:] == [[1.0], [1.0]]
+
+
+def test_actions_are_played_in_the_dtype_that_was_given(data: Path) -> None:
+    """Where float32 became float64 in mid-episode, and where one fits nowhere."""
+    inputs, arrays = read_inputs(data)
+    first, second = inputs.recordings[0].episodes
+    played = list(given_actions(second, arrays))
+    assert [each.dtype.name for each in played] == ["float32"] * 2 + ["float64"] * 2
+    assert played[0][0] == np.float32(0.1)
+    irregular = {"step": 1, "value": [[1.0], [2.0]], "dtype": "float32"}
+    odd = dataclasses.replace(first, irregular=(irregular,))
+    whole = list(given_actions(odd, arrays))[1]
+    assert (whole.dtype.name, whole.shape) == ("float32", (2, 1))
+
+
+def test_dictionaries_are_played_as_dictionaries() -> None:
+    """They are recorded as one vector."""
+    episode = EpisodeInputs(
+        episode_id=0, steps=1, actions="a", parts=[("x", [2]), ("y", [])]
+    )
+    [action] = given_actions(episode, {"a": np.array([[1.0, 2.0, 3.0]])})
+    assert action["x"].tolist() == [1.0, 2.0]
+    assert action["y"] == 3.0
+
+
+def test_inputs_go_through_a_folder_unchanged(data: Path, tmp_path: Path) -> None:
+    """Without pickles."""
+    inputs, arrays = read_inputs(data)
+    inputs.write(tmp_path, arrays)
+    again = Inputs.read(tmp_path)
+    assert again.unusual() == inputs.unusual()
+    assert json.loads(json.dumps(dataclasses.asdict(again))) == json.loads(
+        json.dumps(dataclasses.asdict(inputs))
+    )
+    with np.load(tmp_path / ARRAYS_FILE, allow_pickle=False) as read:
+        assert set(read) == set(arrays)
+
+
+def test_unusual_inputs_are_listed(data: Path) -> None:
+    """For the report: all that is not the default."""
+    inputs, _ = read_inputs(data)
+    packed = dataclasses.replace(inputs, packing={"anonymous": True, "name": "run"})
+    said = packed.unusual()
+    assert said["pack"] == {"anonymous": True}
+    [(_, recording)] = [item for item in said.items() if item[0] != "pack"]
+    assert recording["environment: frame_skip"] == 3
+    assert recording["max_episode_steps"] == 4
+    assert recording["fps"] == "29.97"
+    assert "lambda" in recording["schedule"]
+    assert recording["options of resets"] == 1
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda run: run["options"].update(no_such=1),
+        lambda run: run["options"].update(fps=30),
+        lambda run: run.update(first_episode_id=-1),
+        lambda run: run.update(first_episode_id="0"),
+    ],
+)
+def test_what_is_no_input_is_refused(
+    change: Callable[[dict[str, Any]], None], data: Path, tmp_path: Path
+) -> None:
+    """The list is closed, and each has its type."""
+    folder = tmp_path / "recordings"
+    folder.mkdir()
+    for path in (data / "recordings").iterdir():
+        content = path.read_bytes()
+        if path.suffix == ".jsonl":
+            first, _, rest = content.partition(b"\n")
+            said = json.loads(first)
+            change(said["run"])
+            content = json.dumps(said).encode() + b"\n" + rest
+        (folder / path.name).write_bytes(content)
+    with pytest.raises(NotReadable):
+        read_inputs(tmp_path)

@@ -1,0 +1,274 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which environments are made again from a recording, and that nothing else runs."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.wrappers import ClipAction, RescaleAction
+
+from mjrec.environments.recreate import (
+    NotRecreated,
+    Recreated,
+    checked_options,
+    recreate,
+)
+from mjrec.environments.scenes import generator_state
+from mjrec.environments.stand_ins import RecordedSteps
+from mjrec.environments.wrapping import around_gymnasium
+
+PENDULUM = "InvertedPendulum-v5"
+
+
+def facts(env_id: Any, *, framework: Any = "gymnasium", **said: Any) -> dict[str, Any]:
+    """Return what a recording says of its environment."""
+    known = {"framework": framework, "id": env_id, "kwargs": {}, "wrappers": []}
+    return {**known, "max_episode_steps": None, **said}
+
+
+def refusal(said: dict[str, Any], *trust: str) -> str:
+    """Return why an environment is not made."""
+    with pytest.raises(NotRecreated) as raised:
+        recreate(said, trust=frozenset(trust))
+    return str(raised.value)
+
+
+@pytest.fixture
+def pendulum() -> Recreated:
+    """One of Gymnasium's own."""
+    return recreate(facts(PENDULUM))
+
+
+def test_an_environment_is_made_with_its_arguments_limit_and_view() -> None:
+    """So that a recording of it says the same of it."""
+    kwargs = {"frame_skip": 3, "render_mode": "rgb_array", "width": 32, "height": 24}
+    env = recreate(facts(PENDULUM, kwargs=kwargs, max_episode_steps=2)).environment
+    env.reset(seed=1)
+    env.step(np.zeros(1))
+    assert env.unwrapped.data.time == pytest.approx(0.06)
+    assert env.step(np.zeros(1))[3]
+    assert env.unwrapped.spec.kwargs == kwargs
+
+
+@pytest.mark.parametrize(
+    "env_id",
+    ["subprocess:check_output", "os:system", f"../{PENDULUM}", "Nobody-v0", ""],
+)
+def test_other_ids_are_refused(env_id: str) -> None:
+    """Only ids of known packages are made, and the way out is named."""
+    reason = refusal(facts(env_id))
+    assert reason.startswith("would run code from the archive")
+    assert f"--trust {env_id}" in reason
+
+
+def test_no_module_is_imported_for_an_id(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What a recording names is text, though it could be imported or resolved."""
+    (tmp_path / "traps.py").write_text("raise SystemExit('it ran')")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.chdir(tmp_path)
+    refusal(facts("traps:Trap-v0"))
+    refusal(facts("traps:Trap-v0", framework="dm_control"))
+    said = {"entry_point": "traps:Trap", "kwargs": {"args": ["touch", "ran"]}}
+    refusal(facts(PENDULUM, **said, spec=said))
+    recreate(facts(PENDULUM, entry_point="traps:T", wrappers=["traps.T"]))
+    assert "traps" not in sys.modules
+    assert not (tmp_path / "ran").exists()
+
+
+@pytest.fixture
+def registered(monkeypatch: pytest.MonkeyPatch) -> str:
+    """Return the id of an environment that a user has registered."""
+    monkeypatch.setattr(gymnasium.envs.registration, "registry", {**gymnasium.registry})
+    gymnasium.register("Mine-v0", entry_point=f"{__name__}:mine")
+    return "Mine-v0"
+
+
+def mine(**kwargs: Any) -> gymnasium.Env[Any, Any]:
+    """Return an environment."""
+    return gymnasium.make(PENDULUM, **kwargs).unwrapped
+
+
+def test_a_registered_id_is_made_where_the_reader_trusts_it(registered: str) -> None:
+    """With its exact name, or that of the module before it."""
+    for trust in (registered, f"gymnasium:{registered}"):
+        recreate(facts(registered), trust=frozenset([trust]))
+    assert "--trust" in refusal(facts(registered))
+    assert "--trust" in refusal(facts(registered), registered[:-1])
+
+
+@pytest.mark.parametrize(
+    "kwargs",
+    [
+        {"xml_file": "/etc/passwd"},
+        {"xml_file": "ant.xml"},
+        {"frame_skip": "../x"},
+        {"reward": "a.b"},
+        {"max_episode_steps": 7},
+        {"disable_env_checker": False},
+        {"frame_skip": [0] * 20_000},
+        {"frame_skip": 10**6},
+        {"reset_noise_scale": 1e300},
+        {"width": 10**6},
+        {"default_camera_config": {"path": 1}},
+        {"render_mode": "human"},
+        {"no_such": 1},
+        None,
+        [1],
+    ],
+)
+def test_arguments_beyond_plain_values_and_bounds_are_refused(kwargs: Any) -> None:
+    """They name no files, hold no objects, and take no more than there is."""
+    refusal(facts(PENDULUM, kwargs=kwargs))
+
+
+@pytest.mark.parametrize(
+    "said",
+    [
+        {},
+        facts(7),
+        facts(PENDULUM, framework="pickle"),
+        facts(PENDULUM, framework="mjcf"),
+        facts(PENDULUM, max_episode_steps="many"),
+        facts(PENDULUM, max_episode_steps=-1),
+        facts(PENDULUM, wrappers=["a.B"], wrapper_arguments=[1, 2]),
+        *(facts(f"dm_control/{task}", framework="dm_control") for task in ("x", "x-y")),
+    ],
+)
+def test_what_cannot_be_is_refused(said: dict[str, Any]) -> None:
+    """With a reason, and no other error."""
+    refusal(said)
+
+
+def test_gymnasiums_own_wrappers_are_made_again() -> None:
+    """With their arguments, in their order."""
+    env = ClipAction(RescaleAction(gymnasium.make("HalfCheetah-v5"), -2, 2))
+    said = facts("HalfCheetah-v5", **around_gymnasium(env))
+    again = recreate(said).environment
+    assert isinstance(again, ClipAction)
+    assert around_gymnasium(again) == around_gymnasium(env)
+    action = np.full(6, 1.5, np.float32)
+    for each in (env, again):
+        each.reset(seed=1)
+    assert np.array_equal(env.step(action)[0], again.step(action)[0])
+
+
+def test_of_other_wrappers_there_are_stand_ins() -> None:
+    """They step with recorded controls, and hand on what else is recorded."""
+    recreated = recreate(facts("HalfCheetah-v5", wrappers=["a.B", "c.D"]))
+    env, stand_in = recreated.environment, recreated.stand_in
+    assert around_gymnasium(env)["wrappers"] == ["a.B", "c.D"]
+    bare = gymnasium.make("HalfCheetah-v5")
+    controls = np.full((2, 6), 0.5)
+    bare.reset(seed=1)
+    rewards = [float(bare.step(each)[1]) for each in controls]
+    recorded = RecordedSteps(
+        controls=controls,
+        rewards=np.array([rewards[0], 7.0]),
+        terminated=np.zeros(2, bool),
+        truncated=np.zeros(2, bool),
+    )
+    env.reset(seed=1)
+    assert stand_in is not None
+    stand_in.begin(recorded)
+    assert [env.step("anything")[1] for _ in range(2)] == [rewards[0], 7.0]
+    assert stand_in.differing == 1
+
+
+@pytest.mark.parametrize(
+    "state",
+    [
+        "MT19937",
+        {},
+        {"bit_generator": "PCG64", "state": 7},
+        {"bit_generator": "os", "state": {"state": 1, "inc": 2}},
+        {"bit_generator": "PCG64", "state": {"state": "x", "inc": 2}},
+    ],
+)
+def test_a_random_state_that_is_none_is_a_reason(
+    state: Any, pendulum: Recreated
+) -> None:
+    """Hostile random states end in a refusal."""
+    with pytest.raises(NotRecreated):
+        pendulum.set_random_state(state)
+
+
+def test_a_random_state_leads_to_the_same_beginning(pendulum: Recreated) -> None:
+    """As it was just before the reset."""
+    pendulum.environment.reset(seed=3)
+    before = pendulum.random_state()
+    first = pendulum.environment.reset()[0]
+    pendulum.set_random_state(before)
+    assert np.array_equal(pendulum.environment.reset()[0], first)
+
+
+def test_a_recorded_state_can_be_entered(pendulum: Recreated) -> None:
+    """Where no seed leads to it: the observation is that state's."""
+    env = pendulum.environment
+    env.reset(seed=3)
+    kind = [(n, "<f8", (1,)) for n in ("time",)] + [
+        (n, "<f8", (2,)) for n in ("qpos", "qvel", "warmstart")
+    ]
+    kind += [("ctrl", "<f8", (1,)), ("qfrc_applied", "<f8", (2,))]
+    kind += [("xfrc_applied", "<f8", (18,))]
+    row = np.zeros(1, kind)
+    row["qpos"] = [0.1, -0.2]
+    assert pendulum.enter(row, None).tolist() == [0.1, -0.2, 0.0, 0.0]
+
+
+def test_options_of_a_reset_are_plain() -> None:
+    """Options go to the reset only where they are numbers and words."""
+    assert checked_options(None) is None
+    assert checked_options({"a": [1, 2]}) == {"a": [1, 2]}
+    for options in ({"file": "x"}, {"a": "../x"}, {"a": {"path": 1}}, "no"):
+        with pytest.raises(NotRecreated):
+            checked_options(options)
+
+
+@pytest.mark.dm_control
+def test_a_task_of_the_suite_is_made_again() -> None:
+    """With its arguments; and the seed of its generator is known from its state."""
+    pytest.importorskip("dm_control.suite")
+    kwargs = {"task_kwargs": {"random": 5, "time_limit": 0.2}}
+    said = facts("dm_control/cartpole-balance", framework="dm_control", kwargs=kwargs)
+    recreated = recreate({**said, "max_episode_steps": 5})
+    assert recreated.seed_behind(recreated.random_state()) == 5
+    env = recreated.environment
+    env.reset()
+    assert recreated.seed_behind(recreated.random_state()) is None
+    assert [env.step(np.zeros(1)).last() for _ in range(5)] == [False] * 4 + [True]
+
+
+@pytest.mark.dm_control
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda said: said.update(wrappers=["a.B"]),
+        lambda said: said.update(kwargs={"random": 1}),
+        lambda said: said.update(kwargs={"task_kwargs": {"file": "x"}}),
+        lambda said: said.update(id="dm_control/lqr-lqr_2_1"),
+    ],
+)
+def test_what_a_task_cannot_be_made_with_is_refused(
+    change: Callable[[dict[str, Any]], None],
+) -> None:
+    """Wrappers, other arguments, and a model that is drawn from an unknown seed."""
+    pytest.importorskip("dm_control.suite")
+    said = facts("dm_control/cartpole-balance", framework="dm_control")
+    change(said)
+    refusal(said)
+
+
+def test_a_generator_that_drew_numbers_has_no_seed(pendulum: Recreated) -> None:
+    """And none of Gymnasium's has one that shows."""
+    pendulum.environment.reset(seed=1)
+    assert pendulum.seed_behind(pendulum.random_state()) is None
+    legacy = generator_state(np.random.RandomState(4))
+    assert Recreated(environment=None, is_dm_env=True).seed_behind(legacy) == 4

@@ -1,0 +1,375 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Verifying what may be anybody's: files, processes, and code that is not run."""
+
+from __future__ import annotations
+
+import gzip
+import json
+import os
+import re
+import select
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from packed_runs import edit_json, make_bag_fit, the, unpacked
+from parts import parametrize
+from processes import children
+
+import honest_runs
+import mjrec
+from forged_runs import ForgedRun
+from mjrec.evidence.findings import Verdict
+from mjrec.formats.locks import Lock
+
+EVIL = "evil_of_mjrec_tests"
+
+
+@pytest.fixture(scope="module")
+def packed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A packed run of two episodes with videos."""
+    place = tmp_path_factory.mktemp("packed")
+    honest_runs.pendulum(place / "recorded", episodes=2)
+    return mjrec.pack(place / "recorded", place / "run.zip")
+
+
+@pytest.fixture
+def bag(packed: Path, tmp_path: Path) -> Path:
+    """The same, unpacked, to be changed."""
+    return unpacked(packed, tmp_path / "bag")
+
+
+@pytest.fixture
+def temporary(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Where temporary folders are made."""
+    folder = tmp_path / "temporary"
+    folder.mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(folder))
+    return folder
+
+
+def failures(bag: Path, level: str = "files") -> str:
+    """Return what contradicts an archive, line by line."""
+    found = mjrec.verify(bag, level=level)
+    return "\n".join(f"{each.item}: {each.reason}" for each in found.failures)
+
+
+def test_honest_archive_is_whole(packed: Path, bag: Path) -> None:
+    """Zipped, or as `unzip` leaves it, by its own folder or by the one around it."""
+    for path in (packed, bag, bag.parent):
+        found = mjrec.verify(path, level="files")
+        assert found.failures == ()
+        # Nothing was made again.
+        assert found.verdict is Verdict.PARTLY
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda b: the(b, "*000000.mp4").unlink(), "000000.mp4"),
+        (lambda b: (b / "data/new.txt").write_text(""), "data/new.txt"),
+        (lambda b: (b / "new.txt").write_text(""), "new.txt"),
+        (lambda b: (b / "data/README.md").rename(b / "data/README.txt"), "README.md"),
+        (lambda b: (b / "data/README.md").write_text("new"), "README.md"),
+        (lambda b: (b / "bag-info.txt").write_text("new"), "bag-info.txt"),
+        (lambda b: (b / "fetch.txt").write_text("http://x/ 1 data/x\n"), "fetch.txt"),
+        (lambda b: (b / "manifest-sha512.txt").unlink(), "manifest-sha512"),
+    ],
+)
+def test_changed_bag_is_found(
+    change: Callable[[Path], object], said: str, bag: Path
+) -> None:
+    """Where the author of the change has not written the manifests anew."""
+    change(bag)
+    assert said in failures(bag)
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["../outside", "/etc/passwd", "data/../../outside", "C:/x", "data\\x", "bagit.txt"],
+)
+def test_bag_that_names_files_outside_is_found(name: str, bag: Path) -> None:
+    """None of them is opened."""
+    with (bag / "manifest-sha512.txt").open("a") as file:
+        file.write(f"{'0' * 128}  {name}\n")
+    assert re.search("leads out|absolute|backslash|bagit.txt", failures(bag))
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("bagit.txt", "BagIt-Version: 2.0\nTag-File-Character-Encoding: UTF-8\n"),
+        ("bag-info.txt", "Mjrec-Evidence-Version: 2\n"),
+        ("bag-info.txt", "Bagging-Date: 2026-01-01\n"),
+    ],
+)
+def test_unknown_version_is_found(name: str, text: str, bag: Path) -> None:
+    """What a newer version means, this one cannot know."""
+    (bag / name).write_text(text)
+    make_bag_fit(bag)
+    assert name in failures(bag)
+
+
+def test_link_in_an_unpacked_run_is_refused_or_found(bag: Path) -> None:
+    """It may lead anywhere."""
+    (bag / "data/link").symlink_to("README.md")
+    with pytest.raises(mjrec.UnreadableArchive, match="link"):
+        mjrec.verify(bag, level="files")
+
+
+@parametrize("suffix", [".mjb.gz", ".framehash"], default=[".mjb.gz"])
+def test_files_that_unpack_to_no_end_do_no_harm(suffix: str, bag: Path) -> None:
+    """Before they have filled anything."""
+    if suffix == ".mjb.gz":
+        bomb = gzip.compress(bytes(1 << 30), 9)
+        the(bag, "openaigym.model.*.mjb.gz").write_bytes(bomb)
+    else:
+        the(bag, "*000000.framehash").write_text("0, 0, 0, 1, 3, 00\n" * 1_000_000)
+    make_bag_fit(bag)
+    assert failures(bag, "pixels")
+
+
+def meddled(path: Path, meddle: Callable[[int], object], level: str = "stats") -> Any:
+    """Verify, and call `meddle` with the number of the first process that there is."""
+    before = children()
+    met: set[int] = set()
+
+    def look(_: object) -> None:
+        new = children() - before
+        if new and not met:
+            met.update(new)
+            meddle(next(iter(new)))
+
+    found = mjrec.verify(path, level=level, on_progress=look)
+    assert met
+    assert children() == before
+    return found
+
+
+def test_death_of_a_process_is_a_failure_with_its_reason(packed: Path) -> None:
+    """It is no error: nothing is proved."""
+    found = meddled(packed, lambda child: os.kill(child, signal.SIGKILL))
+    assert found.verdict is Verdict.FAIL
+    assert "SIGKILL" in found.failures[-1].reason
+
+
+def test_process_that_hangs_is_ended(
+    packed: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """After it was silent for so long."""
+    monkeypatch.setattr("mjrec.evidence.verify._TIMEOUT_S", 2.0)
+    found = meddled(packed, lambda child: os.kill(child, signal.SIGSTOP))
+    assert found.verdict is Verdict.FAIL
+    assert "2 seconds" in found.failures[-1].reason
+
+
+def test_processes_have_limits_and_no_trust(
+    packed: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The models that the user trusts are not what a stranger has packed."""
+    monkeypatch.setenv("MJREC_TRUST_MODELS", "1")
+    seen: dict[str, str] = {}
+
+    def look(child: int) -> None:
+        for name in ("limits", "environ"):
+            seen[name] = Path(f"/proc/{child}/{name}").read_text()
+
+    meddled(packed, look)
+    assert "MJREC_TRUST_MODELS" not in seen["environ"]
+    limits = dict(line.split("  ", 1) for line in seen["limits"].splitlines())
+    assert limits["Max data size"].split()[0] != "unlimited"
+    assert limits["Max core file size"].split()[0] == "0"
+
+
+@pytest.mark.usefixtures("default_signals")
+def test_interruption_leaves_nothing(packed: Path, temporary: Path) -> None:
+    """Ctrl-C: no process, no temporary folder."""
+    before = children()
+
+    def interrupt(_: object) -> None:
+        signal.raise_signal(signal.SIGINT)
+
+    with pytest.raises(KeyboardInterrupt):
+        mjrec.verify(packed, level="stats", on_progress=interrupt)
+    assert children() == before
+    assert list(temporary.iterdir()) == []
+
+
+def test_nothing_is_left_and_nothing_is_written_elsewhere(
+    bag: Path, temporary: Path
+) -> None:
+    """What was unpacked is removed, and what was given is as before."""
+    before = {path: path.stat().st_mtime_ns for path in bag.rglob("*")}
+    mjrec.verify(bag, level="stats")
+    assert {path: path.stat().st_mtime_ns for path in bag.rglob("*")} == before
+    assert list(temporary.iterdir()) == []
+
+
+@pytest.mark.thorough
+def test_folders_that_killed_verifications_left_are_removed(
+    packed: Path, temporary: Path
+) -> None:
+    """Not those of the living, nor those that may be anything else."""
+    names = ("killed", "living", "unknown")
+    killed, living, unknown = (temporary / f"mjrec-verify-{name}" for name in names)
+    for folder in (killed, living, unknown):
+        (folder / "unpacked").mkdir(parents=True)
+    (killed / "lock").touch()
+    lock = Lock(living / "lock", "")
+    for folder in (killed, living):
+        os.utime(folder / "lock", (0, 0))
+    mjrec.verify(packed, level="files")
+    assert set(temporary.iterdir()) == {living, unknown}
+    lock.release()
+
+
+def test_process_ends_with_its_parent(packed: Path, tmp_path: Path) -> None:
+    """However that one dies."""
+    program = tmp_path / "program.py"
+    program.write_text(
+        "import os, sys, mjrec\n"
+        "def told(progress):\n"
+        "    told = open(f'/proc/self/task/{os.getpid()}/children').read().split()\n"
+        "    if told:\n"
+        "        print(told[0], flush=True)\n"
+        "        sys.stdin.read()\n"
+        f"mjrec.verify({str(packed)!r}, on_progress=told)\n"
+    )
+    with subprocess.Popen(
+        [sys.executable, str(program)],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+        env={**os.environ, "TMPDIR": str(tmp_path)},
+    ) as parent:
+        assert parent.stdout is not None
+        child = os.pidfd_open(int(parent.stdout.readline()))
+        parent.kill()
+    ended, _, _ = select.select([child], [], [], 30)
+    os.close(child)
+    assert ended
+
+
+ENVIRONMENTS: list[dict[str, object]] = [
+    {"id": "Evil-v0", "entry_point": "subprocess:check_output"},
+    {"id": "subprocess:check_output"},
+    {"id": f"{EVIL}:Evil-v0"},
+    {"id": "InvertedPendulum-v5", "entry_point": f"{EVIL}:Evil"},
+    {"id": "InvertedPendulum-v5", "kwargs": {"xml_file": "MARKER"}},
+    {"id": "InvertedPendulum-v5", "wrappers": [f"{EVIL}.Wrapper"]},
+]
+
+
+@parametrize(
+    "environment",
+    ENVIRONMENTS,
+    default=[ENVIRONMENTS[2], ENVIRONMENTS[5]],
+    ids=lambda environment: str(sorted(environment.items()))[:60],
+)
+def test_code_that_an_archive_names_is_not_run(
+    environment: dict[str, object],
+    bag: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Neither an entry point nor a module of an id nor a wrapper."""
+    marker, modules = tmp_path / "marker", tmp_path / "modules"
+    modules.mkdir()
+    (modules / f"{EVIL}.py").write_text(f"open({str(marker)!r}, 'w')\n")
+    monkeypatch.setenv("PYTHONPATH", str(modules))
+    monkeypatch.syspath_prepend(modules)
+    said = json.loads(json.dumps(environment).replace("MARKER", str(marker)))
+
+    def edit(facts: dict[str, Any]) -> None:
+        if isinstance(facts.get("environment"), dict):
+            facts["environment"].update(said)
+
+    ForgedRun(bag / "data/recordings").say_everywhere(edit)
+    make_bag_fit(bag)
+    found = mjrec.verify(bag, level="physics")
+    assert not marker.exists()
+    assert found.verdict is not Verdict.PASS
+
+
+@pytest.mark.thorough
+def test_model_that_includes_files_from_outside_is_not_compiled(
+    tmp_path: Path,
+) -> None:
+    """A secret would be in what is drawn of it."""
+    secret = tmp_path / "secret.xml"
+    secret.write_text("<mujoco><option timestep='0.5'/></mujoco>")
+    honest_runs.mjcf(tmp_path / "run")
+    model = the(tmp_path / "run", "openaigym.model.*.zip")
+    include = f'<include file="{secret}"/></mujoco>'.encode()
+    ForgedRun(tmp_path / "run").rewrite_zip(
+        model, lambda content: content.replace(b"</mujoco>", include)
+    )
+    assert "0.5" not in failures(tmp_path / "run", "physics")
+    assert mjrec.verify(tmp_path / "run", level="physics").verdict is Verdict.FAIL
+
+
+@pytest.mark.parametrize(
+    ("options", "kind"),
+    [
+        ({"level": "all"}, mjrec.UnknownName),
+        ({"sample": 0}, mjrec.InvalidArgument),
+        ({"sample": True}, mjrec.InvalidArgument),
+        ({"allow": ["anything"]}, mjrec.InvalidArgument),
+        ({"report": "/nowhere/at/all.html"}, mjrec.DirectoryNotWritable),
+    ],
+)
+def test_options_are_checked_first(
+    options: dict[str, Any], kind: type[mjrec.Error], tmp_path: Path
+) -> None:
+    """Before the archive is looked for."""
+    with pytest.raises(kind):
+        mjrec.verify(tmp_path / "nothing.zip", **options)
+
+
+def test_what_is_no_packed_run_is_an_error(tmp_path: Path) -> None:
+    """It names what was given."""
+    for path in (tmp_path / "nothing.zip", tmp_path):
+        with pytest.raises(mjrec.UnreadableArchive, match=str(path)):
+            mjrec.verify(path)
+
+
+def test_files_beside_recordings_of_a_directory_do_not_matter(bag: Path) -> None:
+    """Of a directory that was not packed; what is called like ours does."""
+    recordings = Path(shutil.move(bag / "data/recordings", bag.parent / "own"))
+    (recordings / "notes.txt").write_text("mine")
+    assert failures(recordings, "stats") == ""
+    stray = the(recordings, "*000000.h5").name.replace("000000", "000007")
+    shutil.copy(the(recordings, "*000000.h5"), recordings / stray)
+    assert stray in failures(recordings, "stats")
+
+
+def test_facts_say_what_was_verified_with_what(packed: Path) -> None:
+    """The archive's hash, versions, and the seed of a sample."""
+    facts = mjrec.verify(packed, level="files", sample=1).facts
+    assert mjrec.__version__ == facts["versions"]["mjrec"]
+    assert len(facts["archive"]["sha256"]) == 64
+    assert facts["seed"] is not None
+
+
+def test_samples_are_drawn_anew_each_time(packed: Path) -> None:
+    """Nobody can know before which frames are looked at."""
+    seeds = {mjrec.verify(packed, level="files", sample=1).facts["seed"] for _ in "12"}
+    assert len(seeds) == 2
+
+
+def test_environment_file_is_not_believed(bag: Path) -> None:
+    """What cannot be read there is a failure, in the sandbox as all else."""
+    (bag / "data/environment.json").write_text("[" * 100_000)
+    make_bag_fit(bag)
+    assert "environment.json" in failures(bag, "stats")
+    edit = {"recordings": {}, "packed_with": {"options": 7}}
+    (bag / "data/environment.json").write_text("{}")
+    edit_json(bag / "data/environment.json", lambda said: said.update(edit))
+    make_bag_fit(bag)
+    assert failures(bag, "pixels")

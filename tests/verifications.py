@@ -1,0 +1,49 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Results of verifications, by hand: to be shown, summed up and judged."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from mjrec.evidence.findings import (
+    Excuse,
+    ExcuseKind,
+    Finding,
+    Level,
+    Outcome,
+    Topic,
+    Verification,
+)
+
+HOSTILE = (
+    "</li><script>alert(1)</script><img src=x onerror=alert(1)>\u202e\x00'\"{{7*7}}"
+)
+
+
+def finding(outcome: Outcome = Outcome.MADE_AGAIN, **changes: Any) -> Finding:
+    """Return a finding about physics."""
+    usual = {"topic": Topic.PHYSICS, "item": "a.h5", "count": 12, "unit": "step"}
+    return Finding(**{**usual, "outcome": outcome, **changes})
+
+
+def excuse(**changes: Any) -> Excuse:
+    """Return the excuse of another renderer."""
+    usual: dict[str, Any] = {
+        "kind": ExcuseKind.HARDWARE,
+        "name": "gl",
+        "claimed": "NVIDIA H100",
+        "here": "llvmpipe",
+        "costs": "frames are alike",
+    }
+    return Excuse(**{**usual, **changes})
+
+
+def verification(*findings: Finding, **changes: Any) -> Verification:
+    """Return the result of verifying `run.zip`."""
+    usual: dict[str, Any] = {
+        "path": Path("somewhere/run.zip"),
+        "level": Level.PIXELS,
+        "findings": findings,
+    }
+    return Verification(**{**usual, **changes})
