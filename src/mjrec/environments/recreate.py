@@ -152,6 +152,16 @@ class Recreated:
             state: a row of a trajectory's states.
             observation: that it gave before.
         """
+        self.put_into(state)
+        observe = getattr(self.environment.unwrapped, "_get_obs", None)
+        return observation if observe is None else observe()
+
+    def put_into(self, state: NDArray[Any]) -> None:
+        """Put the simulation into a recorded state, unless it is not known.
+
+        Args:
+            state: a row of a trajectory's states.
+        """
         # They load MuJoCo.
         import mujoco
 
@@ -160,12 +170,12 @@ class Recreated:
         simulated = simulation_below(self.environment)
         model, data = simulated.model, simulated.data
         row = state.view(np.float64).reshape(-1)
+        if not np.isfinite(row).all():
+            return
         set_state(model, data, columns_of(state.dtype), row)
         mujoco.mj_forward(model, data)
         # That may have changed the warm start.
         set_state(model, data, columns_of(state.dtype), row)
-        observe = getattr(self.environment.unwrapped, "_get_obs", None)
-        return observation if observe is None else observe()
 
     def _dm_generator(self) -> Any:
         from .dm_control_scenes import generator_of

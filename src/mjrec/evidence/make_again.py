@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..environments.recreate import NotRecreated, Recreated, checked_options, recreate
+from ..environments.scenes import simulation_below
 from ..environments.stand_ins import RecordedSteps
 from ..formats.journal import KILLED
 from ..recorder.ending_reasons import EXCEPTION, INTERRUPT, RESET
@@ -85,6 +86,14 @@ def play_recording(
         trust=trust,
         mjcf=mjcf,
     )
+
+    if _turns_by_rk4(recreated):
+        notes.add(
+            recording.name,
+            "rk4",
+            "MuJoCo 4.0 turns free bodies otherwise by the integrator RK4",
+            count=len(recording.episodes),
+        )
 
     def play() -> Mapping[str, NDArray[np.float64]]:
         playing = _Playing(
@@ -257,7 +266,10 @@ class _Playing:
         step, is_dm_env = self._monitor.step, self._recreated.is_dm_env
         self._begin_stand_in(episode)
         counted, rewards = 0, []
+        states = self._arrays.get(episode.states or "")
         for action in given_actions(episode, self._arrays):
+            if states is not None:
+                self._recreated.put_into(states[counted : counted + 1])
             result = step(action)
             counted += 1
             if self._only_counted:
@@ -332,6 +344,20 @@ class _Playing:
 
     def _note(self, episode: EpisodeInputs, excuse: str, reason: str) -> None:
         self._notes.add(self._recording.item(episode), excuse, reason)
+
+
+def _turns_by_rk4(recreated: Recreated) -> bool:
+    """Tell whether MuJoCo 4.0 steps a model otherwise than MuJoCo 3, on purpose."""
+    simulated = simulation_below(recreated.environment)
+    if simulated is None:
+        return False
+    # It is loaded: there is a simulation.
+    import mujoco
+
+    model = simulated.model
+    turning = (mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_BALL)
+    is_rk4 = model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4
+    return bool(is_rk4 and np.isin(model.jnt_type, [int(t) for t in turning]).any())
 
 
 def _exception_kind(name: str) -> type[BaseException]:
