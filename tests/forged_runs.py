@@ -84,6 +84,7 @@ class ForgedRun:
         self.edit_json(
             "*.stats.json",
             lambda stats: stats.update(
+                initial_reset_timestamp=complete[0]["start_time"],
                 timestamps=[line["end_time"] for line in complete],
                 episode_lengths=[line["length"] for line in complete],
                 episode_rewards=[line["reward"] for line in complete],

@@ -10,7 +10,6 @@ from __future__ import annotations
 import json
 import re
 import shutil
-import zlib
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -27,6 +26,8 @@ import lying_environments as lying
 import mjrec
 from forged_runs import ForgedRun
 from mjrec.evidence.findings import Outcome, Verdict, Verification
+from mjrec.formats.trajectory_file import open_trajectory
+from mjrec.formats.trajectory_hdf5 import write_hdf5
 from mjrec.formats.video_writer import VideoWriter
 
 FAIL, PARTLY, PASS = Verdict.FAIL, Verdict.PARTLY, Verdict.PASS
@@ -133,29 +134,6 @@ def cut(run: ForgedRun, episode: int, steps: int, **facts: Any) -> None:
         run.film(episode)
 
 
-def cut_by_reset(run: ForgedRun) -> None:
-    """As an early reset does: the episode is no part of the statistics."""
-    cut(run, 1, 2)
-
-    def edit(lines: list[Any]) -> None:
-        index = next(n for n, line in enumerate(lines) if line.get("episode_id") == 1)
-        known = {k: lines[index][k] for k in ("episode_id", "chosen", "recording")}
-        lines[index] = {"cut": {**known, "reason": "reset"}}
-
-    run.edit_journal(edit)
-    facts = {**run.content(1).facts, "complete": False, "reason": "reset"}
-    for name in ("terminated", "truncated"):
-        del facts[name]
-    run.edit_rows(1, all_facts=facts)
-
-    def change(said: dict[str, Any]) -> None:
-        said.update(complete=False, reason="reset")
-        for name in ("terminated", "truncated"):
-            said.pop(name, None)
-
-    run.edit_json("*000001.meta.json", change)
-
-
 def hide_the_fall(run: ForgedRun) -> None:
     run.film(1, run.frames(1)[:-2])
 
@@ -234,10 +212,10 @@ def copy_the_recording(run: ForgedRun) -> None:
                 content = content.replace(b".0.u.", b".0.v.")
             path.with_name(path.name.replace(".0.u.", ".0.v.")).write_bytes(content)
     for path in run.directory.glob("*.0.v.*.h5"):
-        with h5py.File(path, "r+") as file:
-            text = bytes(file.attrs["facts"]).replace(b"0.u", b"0.v")
-            file.attrs["facts"] = np.bytes_(text)
-            file.attrs["crc32"] = np.int64(zlib.crc32(text))
+        with open_trajectory(path) as reader:
+            text = json.dumps(dict(reader.facts)).replace("0.u", "0.v")
+            reader.facts = json.loads(text)
+            write_hdf5(reader, path)
 
 
 # Lies about videos.
@@ -638,6 +616,7 @@ def claim_wrapper(run: ForgedRun) -> None:
     def edit(facts: dict[str, Any]) -> None:
         if facts.get("wrappers") == []:
             facts["wrappers"] = ["mylab.wrappers.Shaping"]
+            facts["wrapper_arguments"] = [None]
 
     run.say_everywhere(edit)
 
@@ -690,6 +669,27 @@ FORGERIES = (
     *(
         Forgery(f"rewards doubled, with {name} claimed", both(double_rewards, claim))
         for name, claim in CLAIMS.items()
+        if name != "a wrapper"
+    ),
+    # It could have been there: this is what a wrapper may do.
+    Forgery(
+        "rewards doubled, with a wrapper claimed",
+        both(double_rewards, claim_wrapper),
+        r"rewards .* \[wrappers\]",
+        verdict=PARTLY,
+    ),
+    *(
+        Forgery(f"{lie.__name__}, with a wrapper claimed", both(lie, claim_wrapper))
+        for lie in (edit_a_state, edit_an_action, name_another_seed, hide_the_fall)
+    ),
+    Forgery(
+        "last states called unknown, with a wrapper claimed",
+        both(repeat_last_states, claim_wrapper),
+    ),
+    Forgery(
+        "cut before the fall, with a wrapper claimed",
+        both(lambda run: cut(run, 1, 2, truncated=True), claim_wrapper),
+        verdict=PARTLY,
     ),
     Forgery(
         "rewards doubled, states left out",
@@ -718,20 +718,14 @@ FORGERIES = (
     Forgery("every episode a success", of=doctored(lying.always_succeed)),
     Forgery("success added to the journal", call_it_successful, "success"),
     Forgery("last states called unknown", repeat_last_states, "state", quick=True),
-    Forgery("cut before the fall", lambda run: cut(run, 1, 2), quick=True),
+    Forgery("cut before the fall", lambda run: cut(run, 1, 2)),
     Forgery(
         "cut before the fall, called a limit",
         lambda run: cut(run, 1, 2, truncated=True),
     ),
-    Forgery(
-        "cut before the fall, called an early reset",
-        cut_by_reset,
-        "reset",
-        verdict=PARTLY,
-    ),
     Forgery("a state of an ulp", edit_a_state, r"qpos|qvel|states"),
     Forgery("an action edited", edit_an_action, "", quick=True),
-    Forgery("another seed", name_another_seed, "", quick=True),
+    Forgery("another seed", name_another_seed, ""),
     Forgery("a beginning of one's own, its seed forgotten", forget_the_seed),
     Forgery("two episodes in the other order", swap_episodes),
     Forgery("one episode shown as two", show_one_as_two),
@@ -754,7 +748,7 @@ FORGERIES = (
         packing={"anonymous": True},
     ),
     Forgery("the worst left out, the others renumbered", leave_the_worst_out),
-    Forgery("the first left out", leave_the_first_out, verdict=PARTLY),
+    Forgery("the first left out", leave_the_first_out, "begins with episode 1"),
     Forgery("one recording shown as two", copy_the_recording, "same", verdict=PARTLY),
     Forgery("fall called a limit of time", swap_the_ending, "terminated|truncated"),
     Forgery("actions called float64", call_it_double, of=honest.cheetah),
@@ -764,14 +758,14 @@ FORGERIES = (
         Forgery(f"one pixel changed, with {name} claimed", both(one_pixel, claim))
         for name, claim in CLAIMS.items()
     ),
-    Forgery("the fall not shown", hide_the_fall, "frames", quick=True),
+    Forgery("the fall not shown", hide_the_fall, "frames"),
     Forgery("a frame doubled", double_a_frame, "frames"),
     Forgery("a frame replaced", replace_a_frame, "frame 2"),
     Forgery("videos swapped", swap_videos),
     Forgery("a negative called a clip", negative_as_clip),
     Forgery("a negative called live", live_and_doctored),
     Forgery("a body made invisible", of=doctored(lying.hide_the_pole), quick=True),
-    Forgery("twice the speed, as the metadata says", swift, quick=True),
+    Forgery("twice the speed, as the metadata says", swift),
     Forgery("twice the speed, called real time", swift_in_real_time),
     Forgery("a frame that stands", slow_start),
     Forgery("a second track on top", second_track, "track", quick=True),
@@ -796,8 +790,8 @@ FORGERIES = (
     Forgery("videos swapped, with another GPU claimed", both(swap_videos, claim_gpu)),
     Forgery("small frames called large", small_called_large),
     Forgery("draft called full", draft_called_full),
-    Forgery("a close-up added", add_a_close_up, quick=True),
-    Forgery("a video called broken", call_it_broken, verdict=PARTLY),
+    Forgery("a close-up added", add_a_close_up),
+    Forgery("a video called broken", call_it_broken, "no such file"),
     Forgery("the worst's video called pending", bag=pending_worst),
     Forgery("a video called made smaller", bag=say_it_was_made_smaller),
     # What was chosen.
@@ -811,10 +805,14 @@ FORGERIES = (
     Forgery("called gym's", pretend_to_be_gym),
     Forgery("another model's sources", swap_the_model, of=honest.mjcf),
     Forgery("evaluation called training", call_it_trained),
-    # Claims without a lie: where nothing differs that ought to.
+    # Claims without a lie. Where nothing need differ, nothing was excused.
     *(
-        Forgery(f"{name} claimed", claim, "refuted|nothing differs")
-        for name, claim in CLAIMS.items()
+        Forgery(f"{name} claimed", CLAIMS[name], verdict=PASS)
+        for name in ("another Gymnasium", "another machine", "another ffmpeg")
+    ),
+    *(
+        Forgery(f"{name} claimed", CLAIMS[name], "is claimed to be")
+        for name in ("another MuJoCo", "another GPU")
     ),
     # Additions.
     Forgery("a dataset added", add_to_hdf5, "success", quick=True),

@@ -162,20 +162,20 @@ class Recreated:
         Args:
             state: a row of a trajectory's states.
         """
-        # They load MuJoCo.
-        import mujoco
-
-        from ..simulation.states import set_state
+        from ..simulation.states import enter_state  # It loads MuJoCo.
 
         simulated = simulation_below(self.environment)
-        model, data = simulated.model, simulated.data
         row = state.view(np.float64).reshape(-1)
-        if not np.isfinite(row).all():
-            return
-        set_state(model, data, columns_of(state.dtype), row)
-        mujoco.mj_forward(model, data)
-        # That may have changed the warm start.
-        set_state(model, data, columns_of(state.dtype), row)
+        if np.isfinite(row).all():
+            parts = columns_of(state.dtype)
+            enter_state(simulated.model, simulated.data, parts, row)
+
+    def turns_by_rk4(self) -> bool:
+        """Tell whether MuJoCo 4 steps its model otherwise than MuJoCo 3, on purpose."""
+        from ..simulation.states import turns_by_rk4  # It loads MuJoCo.
+
+        simulated = simulation_below(self.environment)
+        return simulated is not None and turns_by_rk4(simulated.model)
 
     def _dm_generator(self) -> Any:
         from .dm_control_scenes import generator_of

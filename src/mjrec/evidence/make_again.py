@@ -22,7 +22,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..environments.recreate import NotRecreated, Recreated, checked_options, recreate
-from ..environments.scenes import simulation_below
 from ..environments.stand_ins import RecordedSteps
 from ..formats.journal import KILLED
 from ..recorder.ending_reasons import EXCEPTION, INTERRUPT, RESET
@@ -87,7 +86,7 @@ def play_recording(
         mjcf=mjcf,
     )
 
-    if _turns_by_rk4(recreated):
+    if recreated.turns_by_rk4():
         notes.add(
             recording.name,
             "rk4",
@@ -344,20 +343,6 @@ class _Playing:
 
     def _note(self, episode: EpisodeInputs, excuse: str, reason: str) -> None:
         self._notes.add(self._recording.item(episode), excuse, reason)
-
-
-def _turns_by_rk4(recreated: Recreated) -> bool:
-    """Tell whether MuJoCo 4.0 steps a model otherwise than MuJoCo 3, on purpose."""
-    simulated = simulation_below(recreated.environment)
-    if simulated is None:
-        return False
-    # It is loaded: there is a simulation.
-    import mujoco
-
-    model = simulated.model
-    turning = (mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_BALL)
-    is_rk4 = model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4
-    return bool(is_rk4 and np.isin(model.jnt_type, [int(t) for t in turning]).any())
 
 
 def _exception_kind(name: str) -> type[BaseException]:
