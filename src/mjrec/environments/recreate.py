@@ -148,13 +148,30 @@ class Recreated:
             state: a row of a trajectory's states.
             observation: that it gave before.
         """
+        self.put_into(state)
+        observe = getattr(self.environment.unwrapped, "_get_obs", None)
+        return observation if observe is None else observe()
+
+    def put_into(self, state: NDArray[Any]) -> None:
+        """Put the simulation into a recorded state, unless it is not known.
+
+        Args:
+            state: a row of a trajectory's states.
+        """
         from ..simulation.states import enter_state  # It loads MuJoCo.
 
         simulated = simulation_below(self.environment)
         row = state.view(np.float64).reshape(-1)
-        enter_state(simulated.model, simulated.data, columns_of(state.dtype), row)
-        observe = getattr(self.environment.unwrapped, "_get_obs", None)
-        return observation if observe is None else observe()
+        if np.isfinite(row).all():
+            parts = columns_of(state.dtype)
+            enter_state(simulated.model, simulated.data, parts, row)
+
+    def turns_by_rk4(self) -> bool:
+        """Tell whether MuJoCo 4 steps its model otherwise than MuJoCo 3, on purpose."""
+        from ..simulation.states import turns_by_rk4  # It loads MuJoCo.
+
+        simulated = simulation_below(self.environment)
+        return simulated is not None and turns_by_rk4(simulated.model)
 
     def _dm_generator(self) -> Any:
         from .dm_control_scenes import generator_of
