@@ -25,7 +25,7 @@ from mjrec.environments.dm_control_environments import (
     make_dm_control,
 )
 from mjrec.environments.dm_control_scenes import dm_control_scenes
-from mjrec.environments.dm_env_episodes import (
+from mjrec.environments.named_environment import (
     is_terminated,
     is_truncated,
 )

@@ -168,6 +168,35 @@ def test_workers_and_engines_change_nothing(tmp_path: Path, engine: Any) -> None
     assert listed == {path.name for path in there.videos}
 
 
+def test_what_mujoco_warns_of_is_said_once(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    """In a run, whatever the number of workers; and no file of its own is left."""
+    monkeypatch.chdir(tmp_path)
+    evaluation = run(tmp_path / "e", env_kwargs={"reset_noise_scale": 1e12})
+    assert evaluation.summaries[0].warnings["BADQPOS"] > 1
+    assert len([text for text in caplog.messages if text.startswith("MuJoCo")]) == 1
+    assert [path.name for path in tmp_path.iterdir()] == ["e"]
+
+
+@pytest.mark.thorough
+def test_a_dask_cluster_changes_nothing(tmp_path: Path) -> None:
+    """Results, trajectories and videos are those of one worker here."""
+    import distributed
+
+    with distributed.LocalCluster(
+        n_workers=2, threads_per_worker=1, dashboard_address=":0"
+    ) as cluster:
+        address = f"dask:{cluster.scheduler_address}"
+        there = run(tmp_path / "there", keep="best", engine=address, workers=None)
+    here = run(tmp_path / "here", keep="best", workers=1)
+    assert contents(there.directory) == contents(here.directory)
+    assert recorded_in(there) == recorded_in(here)
+    assert len(recorded_in(there)) == 4 + 1
+
+
 class Wandering(Executor):
     """An executor whose worker does each job as on a machine with another home.
 

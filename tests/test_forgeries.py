@@ -616,6 +616,7 @@ def claim_wrapper(run: ForgedRun) -> None:
     def edit(facts: dict[str, Any]) -> None:
         if facts.get("wrappers") == []:
             facts["wrappers"] = ["mylab.wrappers.Shaping"]
+            facts["wrapper_arguments"] = [None]
 
     run.say_everywhere(edit)
 
@@ -668,6 +669,27 @@ FORGERIES = (
     *(
         Forgery(f"rewards doubled, with {name} claimed", both(double_rewards, claim))
         for name, claim in CLAIMS.items()
+        if name != "a wrapper"
+    ),
+    # It could have been there: this is what a wrapper may do.
+    Forgery(
+        "rewards doubled, with a wrapper claimed",
+        both(double_rewards, claim_wrapper),
+        r"rewards .* \[wrappers\]",
+        verdict=PARTLY,
+    ),
+    *(
+        Forgery(f"{lie.__name__}, with a wrapper claimed", both(lie, claim_wrapper))
+        for lie in (edit_a_state, edit_an_action, name_another_seed, hide_the_fall)
+    ),
+    Forgery(
+        "last states called unknown, with a wrapper claimed",
+        both(repeat_last_states, claim_wrapper),
+    ),
+    Forgery(
+        "cut before the fall, with a wrapper claimed",
+        both(lambda run: cut(run, 1, 2, truncated=True), claim_wrapper),
+        verdict=PARTLY,
     ),
     Forgery(
         "rewards doubled, states left out",
@@ -783,10 +805,14 @@ FORGERIES = (
     Forgery("called gym's", pretend_to_be_gym),
     Forgery("another model's sources", swap_the_model, of=honest.mjcf),
     Forgery("evaluation called training", call_it_trained),
-    # Claims without a lie: where nothing differs that ought to.
+    # Claims without a lie. Where nothing need differ, nothing was excused.
     *(
-        Forgery(f"{name} claimed", claim, "refuted|nothing differs")
-        for name, claim in CLAIMS.items()
+        Forgery(f"{name} claimed", CLAIMS[name], verdict=PASS)
+        for name in ("another Gymnasium", "another machine", "another ffmpeg")
+    ),
+    *(
+        Forgery(f"{name} claimed", CLAIMS[name], "is claimed to be")
+        for name in ("another MuJoCo", "another GPU")
     ),
     # Additions.
     Forgery("a dataset added", add_to_hdf5, "success", quick=True),

@@ -20,7 +20,7 @@ ROWS = (
         *("errors", "json_text", "rates", "frames", "schedules", "atomic_files"),
         *("worker_thread", "gl", "machine", "blank_frames", "patience", "signals"),
         *("annotation", "provenance"),
-        *("child_python", "messages", "parent", "sandbox"),
+        *("child_python", "messages", "parent", "sandbox", "confined"),
     },
     {"engines"},
     {"formats"},

@@ -12,10 +12,15 @@ from dm_control import suite
 from ..errors import UnknownName
 from ..simulation.cameras import default_camera, resolve_camera
 from .dm_control_scenes import MADE_WITH, dm_control_scenes, generator_of
-from .dm_env_episodes import is_terminated, is_truncated
 from .episode_seeds import EpisodeSeeds
 from .known_names import dm_control_failure
-from .named_environment import EnvironmentOptions, NamedEnvironment, Step
+from .named_environment import (
+    EnvironmentOptions,
+    NamedEnvironment,
+    Step,
+    is_terminated,
+    is_truncated,
+)
 from .names import DmControlName
 from .scenes import Scenes
 

@@ -85,6 +85,19 @@ class Step(NamedTuple):
     truncated: bool
 
 
+def is_terminated(timestep: Any) -> bool:
+    """Tell whether the task itself ended the episode: LAST with a discount of 0."""
+    return bool(timestep.last() and not timestep.discount)
+
+
+def is_truncated(timestep: Any) -> bool:
+    """Tell whether a limit from outside ended the episode.
+
+    That is LAST with another discount than 0: rewards would have followed.
+    """
+    return bool(timestep.last() and timestep.discount)
+
+
 class NamedEnvironment(abc.ABC):
     """An environment, and how its episodes are run whatever its framework.
 

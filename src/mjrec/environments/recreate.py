@@ -25,7 +25,7 @@ from gymnasium.envs import registration
 from numpy.typing import NDArray
 
 from ..formats.trajectory import columns_of
-from .gymnasium_scenes import drawn_part, set_own_camera
+from .gymnasium_scenes import drawn_part, random_state, set_own_camera
 from .names import DmControlName
 from .scenes import (
     class_name,
@@ -92,11 +92,7 @@ class Recreated:
         """Return the state of its random generators now, as a recording has it."""
         if self.is_dm_env:
             return generator_state(self._dm_generator())
-        base: Any = self.environment.unwrapped
-        own, shown = generator_state(base._np_random), drawn_part(base)
-        if shown is base:
-            return own
-        return {"env": own, "inner": generator_state(shown._np_random)}
+        return random_state(self.environment.unwrapped)
 
     def set_random_state(self, state: Any) -> None:
         """Put its random generators into a recorded state.
@@ -152,20 +148,30 @@ class Recreated:
             state: a row of a trajectory's states.
             observation: that it gave before.
         """
-        # They load MuJoCo.
-        import mujoco
-
-        from ..simulation.states import set_state
-
-        simulated = simulation_below(self.environment)
-        model, data = simulated.model, simulated.data
-        row = state.view(np.float64).reshape(-1)
-        set_state(model, data, columns_of(state.dtype), row)
-        mujoco.mj_forward(model, data)
-        # That may have changed the warm start.
-        set_state(model, data, columns_of(state.dtype), row)
+        self.put_into(state)
         observe = getattr(self.environment.unwrapped, "_get_obs", None)
         return observation if observe is None else observe()
+
+    def put_into(self, state: NDArray[Any]) -> None:
+        """Put the simulation into a recorded state, unless it is not known.
+
+        Args:
+            state: a row of a trajectory's states.
+        """
+        from ..simulation.states import enter_state  # It loads MuJoCo.
+
+        simulated = simulation_below(self.environment)
+        row = state.view(np.float64).reshape(-1)
+        if np.isfinite(row).all():
+            parts = columns_of(state.dtype)
+            enter_state(simulated.model, simulated.data, parts, row)
+
+    def turns_by_rk4(self) -> bool:
+        """Tell whether MuJoCo 4 steps its model otherwise than MuJoCo 3, on purpose."""
+        from ..simulation.states import turns_by_rk4  # It loads MuJoCo.
+
+        simulated = simulation_below(self.environment)
+        return simulated is not None and turns_by_rk4(simulated.model)
 
     def _dm_generator(self) -> Any:
         from .dm_control_scenes import generator_of

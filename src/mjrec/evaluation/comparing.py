@@ -370,8 +370,12 @@ def _conditions(results: ReadResults) -> Mapping[str, object]:
 def _choices(results: ReadResults) -> Mapping[str, object]:
     """Return what chooses which episodes are seen, and what ran them."""
     plan = results.plan
-    chosen = {name: getattr(plan, name) for name in ("protocol", "seeds", "episodes")}
-    return {**chosen, **results.versions}
+    return {
+        "protocol": plan.protocol,
+        "seeds": tuple(sorted(plan.seeds)),
+        "episodes": plan.episodes,
+        **results.versions,
+    }
 
 
 def _different(

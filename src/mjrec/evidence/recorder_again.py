@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from ..environments.recreate import NotRecreated, Recreated
+from ..environments.scenes import simulation_below
 from ..errors import Error
 from ..formats.monitor_directory import Infix
 from ..monitors.base import EnvironmentMonitor
@@ -90,7 +91,7 @@ def monitor_again(
             recreated.environment,
             directory,
             options,
-            camera=_camera(given.get("camera")),
+            camera=_camera(given.get("camera"), recreated),
             height=given.get("height"),
             width=given.get("width"),
             env_id=recording.env_id,
@@ -194,16 +195,15 @@ def _rate(text: str | None) -> float | Fraction | None:
     return float(text) if is_float else Fraction(text)
 
 
-def _camera(said: Any) -> Any:
+def _camera(said: Any, recreated: Recreated) -> Any:
     if isinstance(said, list):
-        return [_camera(each) for each in said]
+        return [_camera(each, recreated) for each in said]
     if not isinstance(said, dict):
         return said
-    import mujoco  # It settles the OpenGL backend.
+    # Loads MuJoCo, which not every recording needs.
+    from ..simulation.cameras import resolve_camera
 
-    camera = mujoco.MjvCamera()
-    for name, value in said.items():
-        if name.startswith("_") or not hasattr(camera, name):
-            raise ValueError(f"a camera has no {name!r:.80}")
-        setattr(camera, name, value)
-    return camera
+    simulated = simulation_below(recreated.environment)
+    if simulated is None:
+        raise ValueError("it has no cameras")
+    return resolve_camera(simulated.model, said)

@@ -10,7 +10,7 @@ from typing import Any
 
 import dm_env
 
-from ..environments.dm_env_episodes import is_terminated, is_truncated
+from ..environments.named_environment import is_terminated, is_truncated
 from ..environments.scenes import NoPictureSource, Scenes
 from ..errors import InvalidArgument
 from ..recorder.options import RecorderOptions

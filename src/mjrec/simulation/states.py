@@ -176,6 +176,36 @@ def set_state(
     mujoco.mj_setState(model, data, values[columns], STATE_SPEC)
 
 
+def enter_state(
+    model: mujoco.MjModel,
+    data: mujoco.MjData,
+    parts: Mapping[str, slice],
+    row: NDArray[np.float64],
+) -> None:
+    """Put a recorded state of a reset into `data`, and compute what follows from it.
+
+    Args:
+        model: as of `set_state`, like all of these.
+        data: likewise.
+        parts: likewise.
+        row: likewise.
+
+    Raises:
+        InvalidArgument: the row is not a state of this model.
+    """
+    set_state(model, data, parts, row)
+    mujoco.mj_forward(model, data)
+    # That may have changed the warm start.
+    set_state(model, data, parts, row)
+
+
+def turns_by_rk4(model: mujoco.MjModel) -> bool:
+    """Tell whether quaternions are integrated by the method of Runge and Kutta."""
+    kinds = (mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_BALL)
+    is_rk4 = model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4
+    return bool(is_rk4 and np.isin(model.jnt_type, [int(k) for k in kinds]).any())
+
+
 class PreservedState:
     """Puts a simulation back as it was before a block.
 
