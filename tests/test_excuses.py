@@ -9,7 +9,7 @@ import pytest
 
 from mjrec.errors import InvalidArgument
 from mjrec.evidence.differences import Aspect, Difference
-from mjrec.evidence.excuses import Trial, excuse_of, merged, with_allowed
+from mjrec.evidence.excuses import Trial, applicable, excuse_of, merged, with_allowed
 from mjrec.evidence.findings import Outcome, Topic
 
 RECORDING = "recording 0.u"
@@ -109,6 +109,13 @@ def test_excuses_that_nothing_needed_are_not_shown() -> None:
     trial = Trial([excuse_of(*EXCUSES["python"]), excuse_of(*EXCUSES["mujoco"])])
     trial.judge(difference(Aspect.CLAIM, claim="python"))
     assert trial.excuses == ()
+
+
+def test_turns_by_rk4_differ_between_major_versions_only() -> None:
+    """Where both are MuJoCo 3, a model that integrates so excuses nothing."""
+    note = excuse_of("rk4", "quaternions", "", RECORDING)
+    for name, kept in (("major", True), ("mujoco", False), ("numpy", False)):
+        assert (note in applicable([note, excuse_of(*EXCUSES[name])])) is kept
 
 
 def test_the_same_claim_of_two_recordings_is_one_excuse() -> None:

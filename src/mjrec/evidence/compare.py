@@ -43,7 +43,7 @@ from .compare_rows import compare_rewards, compare_trajectories, same_trajectory
 from .compare_text import compare_frame_hashes, compare_tables, compare_texts
 from .compare_video import compare_sampled, compare_videos
 from .differences import Aspect, Difference, Same, short
-from .excuses import Trial, believed, merged, with_allowed
+from .excuses import Trial, applicable, believed, merged, with_allowed
 from .findings import Excuse, Finding, Level, Outcome, Topic
 from .layout import CRATE, ENVIRONMENT, PAYLOAD, RECORDINGS, STATISTICS
 from .notes import REWARDS_FILE, read_notes
@@ -141,7 +141,7 @@ class Comparison:
         """Yield what differs as it is found; then what is equal, in sums."""
         noted = [believed(note) for note in self._notes]
         claims = claimed_excuses(self._given, self._made)
-        excuses = merged([*(excuse for excuse, _ in noted), *claims])
+        excuses = applicable(merged([*claims, *(excuse for excuse, _ in noted)]))
         trial = Trial(with_allowed(excuses, self._allow))
         sums = _Sums()
         for _, finding in noted:

@@ -72,6 +72,12 @@ _BY_NAME: Final[Mapping[str, _Rule]] = {
         costs=f"{_STEPS}, compiled models are believed",
         allows={**_ALIKE, **_RECOMPILED, **_NEAR},
     ),
+    # Its quaternions are other by up to 0.1 in Gymnasium's Ant.
+    "rk4": _Rule(
+        kind=ExcuseKind.VERSION,
+        costs="turns of free bodies are compared within a wide tolerance",
+        allows={Aspect.STATE: 0.25, Aspect.DERIVED: 0.25},
+    ),
     "machine": _Rule(
         kind=ExcuseKind.HARDWARE,
         costs=_STEPS,
@@ -203,6 +209,18 @@ def merged(excuses: Iterable[Excuse]) -> tuple[Excuse, ...]:
         dataclasses.replace(each, items=() if key in of_all else tuple(items[key]))
         for key, each in found.items()
     )
+
+
+def applicable(excuses: Iterable[Excuse]) -> tuple[Excuse, ...]:
+    """Return excuses without those that only another major MuJoCo gives reason to."""
+    known = tuple(excuses)
+    others = {
+        item
+        for each in known
+        if each.name == "mujoco" and _major(each.claimed) != _major(each.here)
+        for item in each.items
+    }
+    return tuple(e for e in known if e.name != "rk4" or not others.isdisjoint(e.items))
 
 
 def with_allowed(excuses: Iterable[Excuse], allow: Iterable[str]) -> tuple[Excuse, ...]:
@@ -343,8 +361,8 @@ def believed(note: Note) -> tuple[Excuse, Finding | None]:
     name, item, reason = note.excuse, note.item, note.reason
     rule = _BY_NAME.get(name)
     # Of code the reason says whose.
-    is_code = rule is not None and rule.kind is ExcuseKind.CODE
-    excuse = excuse_of(name, reason if is_code else "", "", item)
+    is_told = rule is not None and rule.kind is not ExcuseKind.EVENT
+    excuse = excuse_of(name, reason if is_told else "", "", item)
     if rule is not None and not rule.is_fed:
         return excuse, None
     if rule is None:

@@ -56,6 +56,9 @@ class EpisodeInputs:
             archive has it. It is used only where no seed leads to it.
         first_state: the name of the array with the state after the reset. It is used
             only where neither a seed nor a random state leads there.
+        states: the name of the array of all states, where another MuJoCo or machine is
+            claimed: each step is then made from the recorded state before it, so that
+            differences of the last bits do not grow; None else.
         steps: how many were taken.
         actions: the name of the array of actions, be they in it or irregular; None
             where they were not kept.
@@ -84,6 +87,7 @@ class EpisodeInputs:
     options: Any = None
     random_state: Any = None
     first_state: str | None = None
+    states: str | None = None
     steps: int = 0
     actions: str | None = None
     steps_taken: str | None = None

@@ -86,6 +86,14 @@ def play_recording(
         mjcf=mjcf,
     )
 
+    if recreated.turns_by_rk4():
+        notes.add(
+            recording.name,
+            "rk4",
+            "MuJoCo 4.0 turns free bodies otherwise by the integrator RK4",
+            count=len(recording.episodes),
+        )
+
     def play() -> Mapping[str, NDArray[np.float64]]:
         playing = _Playing(
             recording,
@@ -257,7 +265,10 @@ class _Playing:
         step, is_dm_env = self._monitor.step, self._recreated.is_dm_env
         self._begin_stand_in(episode)
         counted, rewards = 0, []
+        states = self._arrays.get(episode.states or "")
         for action in given_actions(episode, self._arrays):
+            if states is not None:
+                self._recreated.put_into(states[counted : counted + 1])
             result = step(action)
             counted += 1
             if self._only_counted:

@@ -22,6 +22,8 @@ from ..formats.monitor_directory import FILE_PREFIX, Infix
 from ..formats.regular_files import open_regular
 from ..formats.trajectory import TrajectoryReader
 from ..formats.trajectory_hdf5 import open_hdf5
+from ..machine import machine_fingerprint
+from ..provenance import versions
 from ..results.monitor_files import MonitorFiles, monitors_of
 from ..results.run import EVALUATION
 from .inputs import OPTIONS, EpisodeInputs, Inputs, RecordingInputs
@@ -256,11 +258,16 @@ def _with_trajectory(
         if facts.get("seed") is None and facts.get("random_state") is None:
             first = reader.read("state", 0, 1) if reader.kind("state") else None
         taken = _steps_taken(reader) if is_wrapped else {}
+        states = None
+        if _is_elsewhere(facts) and reader.kind("state") is not None:
+            states = reader.read("state", 0, reader.row_count)
     arrays.update({f"{name}.{part}": values for part, values in taken.items()})
     if given is not None:
         arrays[name] = given
     if first is not None:
         arrays[f"{name}.state"] = first
+    if states is not None:
+        arrays[f"{name}.states"] = states
     parts = facts.get("action_parts")
     exception = facts.get("exception")
     # Where no action fits into an array, each of them is in the journal.
@@ -272,6 +279,7 @@ def _with_trajectory(
         options=facts.get("options"),
         random_state=facts.get("random_state"),
         first_state=None if first is None else f"{name}.state",
+        states=None if states is None else f"{name}.states",
         steps=steps,
         steps_taken=name if taken else None,
         actions=name if is_whole else None,
@@ -283,6 +291,15 @@ def _with_trajectory(
         has_trajectory=facts.get("kept") is not False,
         start_time=_time(facts.get("start_time")),
         end_time=_time(facts.get("end_time")),
+    )
+
+
+def _is_elsewhere(facts: Mapping[str, Any]) -> bool:
+    """Tell whether another MuJoCo, or another machine, is claimed."""
+    said = facts.get("versions")
+    version = said.get("mujoco") if isinstance(said, Mapping) else None
+    return version != versions().get("mujoco") or (
+        facts.get("machine") != machine_fingerprint()
     )
 
 

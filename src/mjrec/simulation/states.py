@@ -199,6 +199,13 @@ def enter_state(
     set_state(model, data, parts, row)
 
 
+def turns_by_rk4(model: mujoco.MjModel) -> bool:
+    """Tell whether quaternions are integrated by the method of Runge and Kutta."""
+    kinds = (mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_BALL)
+    is_rk4 = model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4
+    return bool(is_rk4 and np.isin(model.jnt_type, [int(k) for k in kinds]).any())
+
+
 class PreservedState:
     """Puts a simulation back as it was before a block.
 
