@@ -179,6 +179,8 @@ class _Playing:
             self._cut_off(episode)
             if episode.cut == KILLED:
                 break
+        if self._recording.has_sources:
+            recorder.finish_models()
         if self._recording.was_killed:
             self._notes.write(self._directory.parent)
             os.kill(os.getpid(), signal.SIGKILL)
