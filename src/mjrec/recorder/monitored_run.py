@@ -111,6 +111,8 @@ class MonitoredRun:
         self._faults: set[tuple[int | None, What, str]] = set()
         self._policy = _policy_facts(options)
         self._statements = options.statements
+        # In the journal, after the first.
+        self._lines = 0
         self._surroundings = None if options.statements else look_around()
         self._environment_facts = {
             "infix": str(self.infix),
@@ -159,6 +161,7 @@ class MonitoredRun:
             FileNotWritten: the disk is full.
         """
         self.events.add(entry)
+        self._lines += 1
         self._write(lambda: self._journal.append(entry))
         self.note_surroundings()
 
@@ -169,6 +172,7 @@ class MonitoredRun:
             FileNotWritten: the disk is full.
         """
         self.events.note(kind, facts)
+        self._lines += 1
         self._write(lambda: self._journal.note(kind, facts))
 
     def note_surroundings(self, *, wait: bool = False) -> None:
@@ -247,7 +251,7 @@ class MonitoredRun:
 
     def _found(self, *, wait: bool) -> Mapping[str, Any] | None:
         if (stated := self._statements) is not None:
-            is_time = wait or self.events.count >= stated.surroundings_after
+            is_time = wait or self._lines >= stated.surroundings_after
             return stated.surroundings if is_time else None
         found = (
             None if self._surroundings is None else self._surroundings.found(wait=wait)

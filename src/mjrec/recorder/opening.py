@@ -54,7 +54,7 @@ class Statements:
         infix: what the names of its files have in the middle; nobody has claimed it.
         first_episode_id: the number of its first episode.
         surroundings: its provenance; None where that was not known.
-        surroundings_after: how many episodes were completed before it was.
+        surroundings_after: how many lines the journal had before, after its first.
         clock: returns the time, in seconds since the epoch.
         only_counted: episodes without a video keep no trajectory: it is only asked
             what rewards and ends there were.

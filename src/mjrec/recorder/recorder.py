@@ -586,13 +586,25 @@ class Recorder:
         if self._kept is not None:
             with failures, self._tolerating_lost():
                 self._kept.decide()
-        for states in self._states:
-            # A trajectory without its model is worth nothing, and what stores it may
-            # end with the process.
-            with failures, self.run.tolerating("model", Error, of_episode=False):
-                states.finish()
+        with failures:
+            self.finish_models()
         with failures, self._tolerating_lost():
             self.run.close_logs()
+        failures.raise_first()
+
+    def finish_models(self) -> None:
+        """Wait until every model is stored.
+
+        A trajectory without its model is worth nothing, and what stores it may end with
+        the process.
+
+        Raises:
+            FileNotWritten: one could not be, and that is not tolerated.
+        """
+        failures = _Failures()
+        for states in self._states:
+            with failures, self.run.tolerating("model", Error, of_episode=False):
+                states.finish()
         failures.raise_first()
 
     def _tolerating_lost(self) -> AbstractContextManager[None]:
