@@ -90,4 +90,5 @@ def ray_processes(mark: str) -> list[str]:
             if mark.encode() in (process / "environ").read_bytes():
                 command = (process / "cmdline").read_bytes().replace(b"\0", b" ")
                 found.append(command.decode(errors="replace"))
-    return [command for command in found if not AGENT.match(command)]
+    # Nor Python's own, which Dask's processes start.
+    return [c for c in found if not AGENT.match(c) and "resource_tracker" not in c]

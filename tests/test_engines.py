@@ -267,7 +267,7 @@ def test_cancelling_ends_what_is_at_work(begin: Begin, tmp_path: Path) -> None:
     run.cancel()
     run.cancel()
     wait_for_end(pid)
-    assert lines(tmp_path / "left") == [str(pid)]
+    assert lines(tmp_path / "left").count(str(pid)) == 1
 
 
 @on_each

@@ -84,7 +84,7 @@ def state():
 before = state()
 for _ in range(2):
     engine = RayEngine(1)
-    with Run(engine, odd_work(shared=place / "shared")) as run:
+    with Run(engine, odd_work(shared=place)) as run:
         submit(run, "a", do="echo")
         assert len(values(run)) == 1
         assert state() == before
@@ -105,10 +105,11 @@ def test_a_ray_of_our_own_without_a_gpu(tmp_path: Path) -> None:
 import logging
 from mjrec.errors import GLError
 logging.basicConfig(stream=sys.stdout, format="%(message)s")
-with Run(RayEngine(1, gpus=0.5), odd_work(shared=place)) as run:
+engine = RayEngine(1, gpus=0.5)
+with Run(engine, odd_work(shared=place)) as run:
     submit(run, "a", "b", do="echo")
     assert len(values(run)) == 2
-run.engine.shutdown()
+engine.shutdown()
 try:
     RayEngine(1, gpus=0.5, require_gpu=True).submit(len, "abc")
 except GLError as error:

@@ -29,6 +29,7 @@ import os
 import queue
 import signal
 import sys
+import threading
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, cast
@@ -42,6 +43,7 @@ from . import worker
 logger = logging.getLogger("mjrec.engines.child")
 
 _SECONDS_BETWEEN_LOOKS = 1.0
+_SECONDS_TO_LEAVE = 2.0
 
 
 def main() -> None:
@@ -51,9 +53,11 @@ def main() -> None:
     cast("io.TextIOWrapper", sys.stdout).reconfigure(line_buffering=True)
     parent.send_warnings()
     handler: Any = None
+    is_leaving = threading.Lock()
 
     def leave(*_: object) -> None:
-        if hasattr(handler, "leave"):
+        # Once: both a signal and the pipe's end may come. The second waits for the end.
+        if is_leaving.acquire(timeout=_SECONDS_TO_LEAVE) and hasattr(handler, "leave"):
             handler.leave()
         # Not `sys.exit`, which would wait for a driver.
         os._exit(0)

@@ -230,6 +230,8 @@ def _start(ray: Any, cpus: int) -> None:
         "RAY_USAGE_STATS_ENABLED": "0",
         # Workers that were given no GPU see what they would without Ray.
         "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",
+        # Processes of jobs end by themselves, when they have said so.
+        "RAY_kill_child_processes_on_worker_exit": "0",
     }
     is_token_known = (
         {"RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH"}
