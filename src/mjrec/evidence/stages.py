@@ -35,6 +35,10 @@ _SECONDS_BETWEEN_COUNTS = 0.2
 _Say = Callable[..., None]
 
 
+class _Failed(Exception):
+    """A process could not do its part; its text is a clause that says why."""
+
+
 class _Counter:
     """Says how much is done, not too often."""
 
@@ -60,6 +64,9 @@ def main() -> int:
         return 1
     except FileNotWritten as error:
         say(error=str(error))
+        return 1
+    except _Failed as error:
+        say(failure=str(error))
         return 1
     except MemoryError:
         say(failure="it needs more memory than it may use")
@@ -91,8 +98,7 @@ def _open(request: Mapping[str, Any], say: _Say) -> None:
     try:
         inputs, arrays = read_inputs(given / PAYLOAD)
     except NotReadable as error:
-        say(failure=f"its inputs cannot be read: {error}")
-        return
+        raise _Failed(f"its inputs cannot be read: {error}") from error
     folder = Path(request["inputs"])
     folder.mkdir()
     inputs.write(folder, arrays)
