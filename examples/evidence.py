@@ -8,8 +8,8 @@ import mjrec
 
 directory, archive = Path("recordings/evidence"), Path("recordings/evidence.zip")
 
-# In evaluation every episode keeps its states, so that all of them can be checked.
-# The seeds are stated: a reader can begin each episode again.
+# In evaluation every episode keeps its actions and its seed, so that a reader can make
+# all of them again.
 env = gymnasium.make("HalfCheetah-v5", max_episode_steps=20)
 with mjrec.Monitor(
     env,
@@ -33,6 +33,7 @@ archive.unlink(missing_ok=True)
 mjrec.pack(directory, archive, title="A random cheetah", license="CC0-1.0")
 
 verification = mjrec.verify(archive, report="recordings/evidence.html")
-for check in verification.checks:
-    print(f"{check.verdict:13} {check.subject:24} {check.claim}: {check.reason}")
-print("passed" if verification.passed else "FAILED")
+for finding in verification.findings:
+    if finding.outcome != "made again":
+        print(f"{finding.outcome}: {finding.topic}, {finding.item}: {finding.reason}")
+print(verification.verdict)
