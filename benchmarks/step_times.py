@@ -4,14 +4,15 @@
 On a machine with other work whole runs differ more from each other than a monitor
 costs. Here every step is timed, in rounds that take turns, and the quantiles of all
 steps tell what the others hide. Writing, and what begins and ends an episode, is in the
-times of the episodes. Beside the monitor is what a prototype takes that only saves the
-state of each step (`prototype`).
+times of the episodes, and in the CPU time of whole runs, divided by their steps.
+Beside the monitor is what a prototype takes that only saves the state of each step
+(`prototype`).
 """
 
 from __future__ import annotations
 
 import tempfile
-from time import perf_counter_ns
+from time import perf_counter_ns, thread_time_ns
 from typing import Any
 
 import gymnasium
@@ -47,10 +48,13 @@ def is_over(result: Any) -> bool:
     return bool(result[2] or result[3] if len(result) == 5 else result.last())
 
 
-def times(env: Any, actions: list[Any]) -> tuple[list[int], list[int]]:
-    """Return the nanoseconds of every step, and of every episode with its reset."""
+def times(env: Any, actions: list[Any]) -> tuple[list[int], list[int], list[float]]:
+    """Return the nanoseconds of every step, and of every episode with its reset.
+
+    And this thread's of all, by the step.
+    """
     steps, episodes, seed = [], [], 0
-    began = perf_counter_ns()
+    began, started = perf_counter_ns(), thread_time_ns()
     reset(env, seed)
     for action in actions:
         start = perf_counter_ns()
@@ -61,7 +65,7 @@ def times(env: Any, actions: list[Any]) -> tuple[list[int], list[int]]:
             reset(env, seed)
             episodes.append(perf_counter_ns() - began)
             began = perf_counter_ns()
-    return steps, episodes
+    return steps, episodes, [(thread_time_ns() - started) / len(actions)]
 
 
 def measure(env_id: str, count: int) -> None:
@@ -79,9 +83,7 @@ def measure(env_id: str, count: int) -> None:
         }
         if not env_id.startswith(SUITE):
             variants["prototype"] = PrototypeRecorder(make(env_id))
-        found: dict[str, tuple[list[int], list[int]]] = {
-            name: ([], []) for name in variants
-        }
+        found: dict[str, Any] = {name: ([], [], []) for name in variants}
         for _ in range(ROUNDS):
             for name, env in variants.items():
                 for total, part in zip(found[name], times(env, actions), strict=True):
@@ -90,7 +92,7 @@ def measure(env_id: str, count: int) -> None:
         variants["captured"].close(wait=False)
     for name in variants.keys() - {"counted", "captured"}:
         variants[name].close()
-    for index, unit in enumerate(("step", "episode")):
+    for index, unit in enumerate(("step", "episode", "CPU")):
         for quantile in QUANTILES:
             values = [np.percentile(found[name][index], quantile) for name in variants]
             print(

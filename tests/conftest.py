@@ -24,7 +24,7 @@ from processes import children
 from trajectories_by_hand import Painter
 
 from mjrec.formats.ffmpeg import ffmpeg_executable
-from mjrec.rendering import finisher as finishing
+from mjrec.rendering import engine_jobs, finisher
 
 _HAS_DM_CONTROL = importlib.util.find_spec("dm_control") is not None
 
@@ -221,7 +221,8 @@ def stuck_encoder(
 def painter(monkeypatch: pytest.MonkeyPatch) -> Painter:
     """Draw without processes and without OpenGL; the encoder is the real one."""
     painter = Painter()
-    monkeypatch.setattr(finishing, "WorkerPool", lambda count, **rest: painter)
+    for module in (finisher, engine_jobs):
+        monkeypatch.setattr(module, "WorkerPool", lambda count, **rest: painter)
     return painter
 
 

@@ -77,7 +77,8 @@ def suite(directory: Path, **options: Any) -> None:
     """Record a task of dm_control's suite."""
     from dm_control import suite as tasks
 
-    env = tasks.load("cartpole", "balance", task_kwargs={"random": 3})
+    given = {"random": 3, "time_limit": 0.04}
+    env = tasks.load("cartpole", "balance", task_kwargs=given)
     options = {"mode": "evaluation", "env_id": "dm_control/cartpole-balance", **options}
     monitor: Any = mjrec.Monitor(
         env, directory, workers=1, width=32, height=32, **options
@@ -88,7 +89,6 @@ def suite(directory: Path, **options: Any) -> None:
             monitor.reset()
             for _ in range(4):
                 monitor.step(generator.uniform(-1, 1, monitor.action_spec().shape))
-    # The last one was cut off by closing.
 
 
 def vector(directory: Path, **options: Any) -> None:
@@ -174,7 +174,7 @@ def early(directory: Path) -> None:
 def wrapped(directory: Path) -> None:
     """Record with wrappers of Gymnasium's own between monitor and environment."""
     env: Any = gymnasium.make("HalfCheetah-v5", max_episode_steps=4, **_SMALL)
-    env = gymnasium.wrappers.RescaleAction(env, -1.0, 1.0)
+    env = gymnasium.wrappers.RescaleAction(env, np.float32(-1), np.float32(1))
     play(mjrec.Monitor(env, directory, mode="evaluation", workers=1), 2)
 
 

@@ -18,6 +18,7 @@ import numpy as np
 import mjrec
 from mjrec.formats.trajectory_file import open_trajectory
 from mjrec.formats.trajectory_hdf5 import write_hdf5
+from mjrec.json_text import dumps
 
 
 def record_pendulum(
@@ -82,10 +83,12 @@ def the(folder: Path, pattern: str) -> Path:
 
 
 def edit_json(path: Path, edit: Callable[[Any], object]) -> None:
-    """Change what a file of JSON holds."""
-    content = json.loads(path.read_text())
+    """Change what a file of JSON holds, and write it as it was written."""
+    text = path.read_text()
+    content = json.loads(text)
     edit(content)
-    path.write_text(json.dumps(content))
+    indent = 2 if text.startswith("{\n") else None
+    path.write_text(dumps(content, indent=indent) + "\n" * text.endswith("\n"))
 
 
 def edit_trajectory(

@@ -51,11 +51,6 @@ def videos(directory: Path) -> dict[str, list[int]]:
     }
 
 
-def metadata_of_one(directory: Path) -> dict[str, Any]:
-    [path] = directory.glob("*.meta.json")
-    return dict(json.loads(path.read_text()))
-
-
 def begins(at: Collection[int]) -> dict[str, Any]:
     """Return the option to begin at these steps."""
     return {"step_trigger": lambda step: step in at}
@@ -76,6 +71,18 @@ def begins(at: Collection[int]) -> dict[str, Any]:
         (
             *(100, 8, {**begins(range(0, 9, 2)), "video_length": 3}),
             {"000000.step000000": [0, 1, 2, 3], "000000.step000004": [4, 5, 6, 7]},
+        ),
+        # Across resets: steps 3 and 6 end an episode.
+        (
+            *(3, 12, {**begins((2,)), "video_length": 5}),
+            {"000000.step000002": [2, 3, 3, 4, 5, 6, 6, 7]},
+        ),
+        # At close it is shorter.
+        (
+            9,
+            4,
+            {**begins((1,)), "video_length": 50},
+            {"000000.step000001": [1, 2, 3, 4]},
         ),
         # Without a length it ends with its episode.
         (5, 15, begins((3,)), {"000000.step000003": [3, 4, 5]}),
@@ -100,21 +107,19 @@ def test_a_clip_is_its_first_frame_and_n_steps(
     assert listed == [path.name for path in sorted(tmp_path.glob("*.mp4"))]
 
 
-def test_a_clip_goes_on_across_resets(tmp_path: Path) -> None:
-    """Steps 3 and 6 end an episode; the frame after each is that of the reset."""
-    with mjrec.Monitor(Counting(3), tmp_path, video_length=5, **begins((2,))) as env:
+@pytest.mark.parametrize(
+    ("length", "expected"),
+    [
+        (5, {"length": 5, "complete": True, "last_episode_id": 2}),
+        (50, {"length": 10, "complete": False, "reason": "close"}),
+    ],
+)
+def test_what_the_metadata_of_a_clip_says(
+    length: int, expected: dict[str, Any], tmp_path: Path
+) -> None:
+    """How long it is, which episodes it is of, and whether it was cut off."""
+    options = {**begins((2,)), "video_length": length}
+    with mjrec.Monitor(Counting(3), tmp_path, **options) as env:
         ride(env, 12)
-    assert videos(tmp_path) == {"000000.step000002": [2, 3, 3, 4, 5, 6, 6, 7]}
-    metadata = metadata_of_one(tmp_path)
-    assert (metadata["length"], metadata["complete"]) == (5, True)
-    assert (metadata["episode_id"], metadata["last_episode_id"]) == (0, 2)
-
-
-def test_a_clip_that_runs_at_close_is_kept_and_marked(tmp_path: Path) -> None:
-    """It is shorter than asked for, and says so."""
-    with mjrec.Monitor(Counting(9), tmp_path, video_length=50, **begins((1,))) as env:
-        ride(env, 4)
-    assert videos(tmp_path) == {"000000.step000001": [1, 2, 3, 4]}
-    metadata = metadata_of_one(tmp_path)
-    assert (metadata["complete"], metadata["reason"]) == (False, "close")
-    assert metadata["length"] == 3
+    [path] = tmp_path.glob("*.meta.json")
+    assert json.loads(path.read_text()).items() >= {"episode_id": 0, **expected}.items()

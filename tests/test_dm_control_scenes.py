@@ -22,7 +22,6 @@ from dm_control.suite.wrappers import pixels
 
 from mjrec.environments.dm_control_contexts import ContextsOnDemand
 from mjrec.environments.dm_control_scenes import dm_control_scenes
-from mjrec.environments.dm_env_episodes import StepLimit
 from mjrec.errors import UnknownName
 
 pytestmark = pytest.mark.dm_control
@@ -57,7 +56,7 @@ def test_shown_as_by_physics(tmp_path: Path) -> None:
     assert scene["fresh"] is True
     assert scene["max_geom"] == 1000
     assert scene["option"]["flags"][int(mujoco.mjtVisFlag.mjVIS_RANGEFINDER)] == 0
-    named = begun(StepLimit(load(), 3), tmp_path, camera="side", height=32)
+    named = begun(load(), tmp_path, camera="side", height=32)
     assert (named["camera"]["fixedcamid"], named["label"]) == (0, "side")
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""dm_control's environments by their names, and dm_env's limit of steps."""
+"""dm_control's environments by their names."""
 
 from __future__ import annotations
 
@@ -17,109 +17,39 @@ from mjrec.environments.episode_seeds import episode_seeds
 from mjrec.environments.from_name import environment_from_name
 from mjrec.environments.named_environment import EnvironmentOptions
 
-dm_env = pytest.importorskip("dm_env")
 pytest.importorskip("dm_control")
 
-from absl.testing import absltest  # noqa: E402  after importorskip
-from dm_control import suite  # noqa: E402  likewise
-from dm_env import specs, test_utils  # noqa: E402  after importorskip
+from dm_control import suite
 
-from mjrec.environments.dm_control_environments import (  # noqa: E402  likewise
+from mjrec.environments.dm_control_environments import (
     make_dm_control,
 )
-from mjrec.environments.dm_control_scenes import dm_control_scenes  # noqa: E402
-from mjrec.environments.dm_env_episodes import (  # noqa: E402  likewise
-    StepLimit,
+from mjrec.environments.dm_control_scenes import dm_control_scenes
+from mjrec.environments.named_environment import (
     is_terminated,
     is_truncated,
 )
 
 
-class Countdown(dm_env.Environment):  # type: ignore[misc]  # untyped
-    """Ends by itself after `length` steps, with a discount of 0."""
-
-    def __init__(self, length: int, discount: float = 0.5) -> None:
-        self._length = length
-        self._discount = discount
-        self._left = 0
-        self.closed = False
-        self.physics = "a physics"
-
-    def reset(self) -> Any:
-        self._left = self._length
-        return dm_env.restart(np.zeros(1))
-
-    def step(self, action: Any) -> Any:
-        if not self._left:
-            return self.reset()
-        self._left -= 1
-        if not self._left:
-            return dm_env.termination(1.0, np.zeros(1))
-        return dm_env.transition(1.0, np.ones(1), self._discount)
-
-    def observation_spec(self) -> Any:
-        return specs.Array((1,), np.float64)
-
-    def action_spec(self) -> Any:
-        return specs.BoundedArray((1,), np.float64, -1, 1)
-
-    def close(self) -> None:
-        self.closed = True
-
-
-class StepLimitContract(test_utils.EnvironmentTestMixin, absltest.TestCase):  # type: ignore[misc]  # untyped
-    """dm_env's own checks of an environment."""
-
-    def make_object_under_test(self) -> Any:
-        return StepLimit(Countdown(100), 3)
-
-
-def test_the_last_step_is_truncated_and_counts() -> None:
-    """It keeps reward, observation and discount; the next step begins an episode."""
-    env = StepLimit(Countdown(100), 3)
-    assert env.step(None).first()
-    steps = [env.step(None) for _ in range(3)]
-    assert [step.last() for step in steps] == [False, False, True]
-    assert (steps[2].reward, steps[2].discount) == (1.0, 0.5)
-    assert is_truncated(steps[2])
-    assert not is_terminated(steps[2])
-    assert env.step(None).first()
-
-
-def test_an_end_of_the_tasks_own_stays_one() -> None:
-    """Also when it falls on the limit."""
-    env = StepLimit(Countdown(3), 3)
-    env.reset()
-    for _ in range(2):
-        assert not is_terminated(env.step(None))
-    last = env.step(None)
-    assert is_terminated(last)
-    assert not is_truncated(last)
-
-
-def test_everything_else_is_the_environments_own() -> None:
-    """Monitors look for the physics."""
-    inner = Countdown(3)
-    env = StepLimit(inner, 2)
-    assert env.physics == "a physics"
-    assert not hasattr(env, "no_such_thing")
-    env.close()
-    assert inner.closed
-
-
 def test_a_task_is_made_with_its_own_limit() -> None:
     """All but lqr have one; max_steps lowers it; lqr gets 1000."""
-    env = make_dm_control("ball_in_cup", "catch", EnvironmentOptions())
-    assert not isinstance(env, StepLimit)
-    assert env.control_timestep() == 0.02
+
+    def limit(name: str, **options: Any) -> int:
+        made = EnvironmentOptions(pictures=False, **options)
+        return environment_from_name(f"dm_control/{name}", made).step_limit
+
+    assert limit("pendulum-swingup") == limit("lqr-lqr_2_1") == 1000
+    assert limit("pendulum-swingup", max_steps=5000) == 1000
+    assert limit("lqr-lqr_2_1", max_steps=5000) == 5000
+    assert limit("pendulum-swingup", max_steps=5) == 5
     limited = make_dm_control("ball_in_cup", "catch", EnvironmentOptions(max_steps=4))
     limited.reset()
-    action = np.zeros(2)
-    steps = [limited.step(action) for _ in range(4)]
+    steps = [limited.step(np.zeros(2)) for _ in range(4)]
     assert [step.last() for step in steps] == [False, False, False, True]
     assert is_truncated(steps[-1])
-    endless = make_dm_control("lqr", "lqr_2_1", EnvironmentOptions())
-    assert isinstance(endless, StepLimit)
+    assert not is_terminated(steps[-1])
+    assert steps[-1].reward is not None
+    assert limited.step(np.zeros(2)).first()
 
 
 def test_the_run_seeds_what_is_drawn_when_a_task_is_made() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 import contextlib
 import csv
 import hashlib
+import importlib
 import importlib.util
 import json
 import math
@@ -37,7 +38,6 @@ from mjrec.evaluation.evaluation import Evaluation, EvaluationProgress
 from mjrec.evaluation.plan import EvaluationPlan
 from mjrec.evaluation.planning import chunks_of
 from mjrec.evaluation.results_files import read_results
-from mjrec.evaluation.worker import EvaluationWorker
 from mjrec.formats.locks import try_lock
 from mjrec.formats.video_metadata import metadata_path
 
@@ -168,6 +168,35 @@ def test_workers_and_engines_change_nothing(tmp_path: Path, engine: Any) -> None
     assert listed == {path.name for path in there.videos}
 
 
+def test_what_mujoco_warns_of_is_said_once(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    """In a run, whatever the number of workers; and no file of its own is left."""
+    monkeypatch.chdir(tmp_path)
+    evaluation = run(tmp_path / "e", env_kwargs={"reset_noise_scale": 1e12})
+    assert evaluation.summaries[0].warnings["BADQPOS"] > 1
+    assert len([text for text in caplog.messages if text.startswith("MuJoCo")]) == 1
+    assert [path.name for path in tmp_path.iterdir()] == ["e"]
+
+
+@pytest.mark.thorough
+def test_a_dask_cluster_changes_nothing(tmp_path: Path) -> None:
+    """Results, trajectories and videos are those of one worker here."""
+    import distributed
+
+    with distributed.LocalCluster(
+        n_workers=2, threads_per_worker=1, dashboard_address=":0"
+    ) as cluster:
+        address = f"dask:{cluster.scheduler_address}"
+        there = run(tmp_path / "there", keep="best", engine=address, workers=None)
+    here = run(tmp_path / "here", keep="best", workers=1)
+    assert contents(there.directory) == contents(here.directory)
+    assert recorded_in(there) == recorded_in(here)
+    assert len(recorded_in(there)) == 4 + 1
+
+
 class Wandering(Executor):
     """An executor whose worker does each job as on a machine with another home.
 
@@ -177,19 +206,21 @@ class Wandering(Executor):
 
     def __init__(self, homes: Path) -> None:
         self.homes = homes
-        self.worker: EvaluationWorker | None = None
+        self.workers: dict[str, Any] = {}
 
     def submit(
         self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any
     ) -> Future[Any]:
         place, job = json.loads(json.dumps(args))
-        if self.worker is None:
+        if place not in self.workers:
             work = json.loads(Path(place, "work.json").read_bytes())
-            self.worker = EvaluationWorker(work["settings"])
+            module, _, name = work["entry"].partition(":")
+            make = getattr(importlib.import_module(module), name)
+            self.workers[place] = make(work["settings"])
         future: Future[Any] = Future()
         with pytest.MonkeyPatch.context() as patch:
             patch.setenv("XDG_STATE_HOME", str(self.homes / job["key"]))
-            future.set_result({"value": self.worker(job["arguments"])})
+            future.set_result({"value": self.workers[place](job["arguments"])})
         return future
 
 

@@ -680,7 +680,14 @@ FORGERIES = (
     ),
     *(
         Forgery(f"{lie.__name__}, with a wrapper claimed", both(lie, claim_wrapper))
-        for lie in (edit_a_state, edit_an_action, name_another_seed, hide_the_fall)
+        for lie in (edit_a_state, name_another_seed, hide_the_fall)
+    ),
+    Forgery(
+        "an action edited, with a wrapper claimed",
+        both(edit_an_action, claim_wrapper),
+        r"not its controls.* \[wrappers\]",
+        verdict=PARTLY,
+        quick=True,
     ),
     Forgery(
         "last states called unknown, with a wrapper claimed",
@@ -768,8 +775,8 @@ FORGERIES = (
     Forgery("twice the speed, as the metadata says", swift),
     Forgery("twice the speed, called real time", swift_in_real_time),
     Forgery("a frame that stands", slow_start),
-    Forgery("a second track on top", second_track, "track", quick=True),
-    Forgery("a commentary", sound, "track"),
+    Forgery("a second track on top", second_track, "track|tables", quick=True),
+    Forgery("a commentary", sound, "track|tables"),
     Forgery("a title in the file", title),
     Forgery("a video turned", rotation),
     Forgery("wide pixels", wide_pixels),
@@ -823,7 +830,12 @@ FORGERIES = (
     Forgery("a key in the manifest", add_to_manifest, "award"),
     Forgery("a line in the journal", add_a_line, "note"),
     Forgery("a key in a line of the journal", add_to_a_line, "judged"),
-    Forgery("a note beside the data", bag=add_a_file("notes.txt"), line="notes.txt"),
+    Forgery(
+        "a note beside the data",
+        bag=add_a_file("notes.txt"),
+        line="notes.txt",
+        quick=True,
+    ),
     Forgery("a note in the data", bag=add_a_file("data/notes.txt"), line="notes.txt"),
     Forgery(
         "a note in the recordings",

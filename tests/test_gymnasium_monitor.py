@@ -105,23 +105,6 @@ def test_frame_collections_lose_and_double_nothing(
         assert shown(tmp_path, episode) == BAR
 
 
-def test_schedule_is_asked_once_for_each_episode(
-    corridor: Any, tmp_path: Path, play: Any
-) -> None:
-    """With its number; what it returns counts by its truth."""
-    asked: list[int] = []
-
-    def odd(episode_id: int) -> Any:
-        asked.append(episode_id)
-        return episode_id % 2
-
-    with mjrec.Monitor(corridor, tmp_path, odd) as env:
-        play(env, 4)
-    assert asked == [0, 1, 2, 3]
-    assert videos_in(tmp_path) == [1, 3]
-    assert manifest_of(tmp_path)["mjrec"]["schedule"]["name"].endswith("odd")
-
-
 def test_write_upon_reset_writes_at_each_reset(
     make_corridor: Any, tmp_path: Path, play: Any
 ) -> None:
@@ -172,24 +155,27 @@ def test_gyms_questions_have_gyms_answers(
     assert env.get_episode_rewards() == [1.5, 1.5]
 
 
-def test_reset_before_any_step_replaces_the_picture(
+def test_the_schedule_is_asked_once_for_each_number(
     corridor: Any, tmp_path: Path, play: Any
 ) -> None:
-    """The number stays, and the schedule is asked for it once."""
+    """A reset before any step keeps it and replaces the picture; truth counts."""
     asked: list[int] = []
 
-    def always(episode_id: int) -> bool:
+    def even(episode_id: int) -> Any:
         asked.append(episode_id)
-        return True
+        return (episode_id + 1) % 2
 
-    with mjrec.Monitor(corridor, tmp_path, always) as env:
+    with mjrec.Monitor(corridor, tmp_path, even) as env:
         env.reset()
         env.reset()
         assert env.episode_id == 1
-        play(env, 2)
-    assert asked == videos_in(tmp_path) == [0, 1]
-    assert len(frames_in(tmp_path, 0)) == 4
-    assert manifest_of(tmp_path)["mjrec"]["schedule"]["recorded"] == [0, 1]
+        play(env, 3)
+    assert asked == [0, 1, 2]
+    assert videos_in(tmp_path) == [0, 2]
+    assert shown(tmp_path, 0) == BAR
+    schedule = manifest_of(tmp_path)["mjrec"]["schedule"]
+    assert schedule["name"].endswith("even")
+    assert schedule["recorded"] == [0, 2]
 
 
 def test_check_env_passes(tmp_path: Path) -> None:
@@ -358,24 +344,6 @@ print(sorted(os.listdir(env.directory)))
     assert done.stdout.count("forked from it") == 3
     assert "manifest" not in done.stdout.splitlines()[-1]
     assert len(manifest_of(tmp_path)["videos"]) == 1
-
-
-def test_own_size_and_camera(halfcheetah: Any, tmp_path: Path) -> None:
-    """Frames larger than the offscreen buffer, while env.render() stays as it was."""
-    buffer = halfcheetah.unwrapped.model.vis.global_
-    before = (buffer.offheight, buffer.offwidth)
-    wide = before[1] + 64
-    with mjrec.Monitor(
-        halfcheetah, tmp_path, camera="track", width=wide, height=48
-    ) as env:
-        env.reset(seed=0)
-        env.step(env.action_space.sample())
-        assert env.render().shape == (48, 64, 3)
-    metadata = metadata_of(tmp_path, 0)
-    assert (metadata["width"], metadata["height"]) == (wide, 48)
-    assert (metadata["camera"], metadata["pictures"]) == ("track", "scene")
-    assert (buffer.offheight, buffer.offwidth) == before
-    assert frames_in(tmp_path, 0)[0].std() > 10
 
 
 def test_users_exception_is_not_hidden_by_a_failing_close(

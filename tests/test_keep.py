@@ -27,7 +27,6 @@ from recordings import (
 from waiting import wait_until
 
 import mjrec
-from mjrec.formats import spans
 from mjrec.formats.trajectory_file import open_trajectory
 from mjrec.recorder.tracking import FinishedVideo, Tracker
 from mjrec.rendering.finish import finish
@@ -200,31 +199,28 @@ def test_failures_are_what_the_environment_calls_so(tmp_path: Path, way: Any) ->
     assert manifest_of(tmp_path)["mjrec"]["keep"]["chosen"] == [1, 3]
 
 
-def test_median_holds_all_states_and_says_so(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    """Once."""
-    caplog.set_level(logging.INFO, "mjrec")
-    with mjrec.Monitor(pendulum(), tmp_path, keep="median", workers=0) as env:
-        run(env, 7)
-        assert logs_of(tmp_path) == [*range(7)]
-    assert caplog.text.count("stay on the disk") == 1
-    # 1 2 2 3 4 4 5: the middle is episode 6.
-    assert h5_of(tmp_path) == [6]
-
-
 def longest_two(episodes: Sequence[Any]) -> list[int]:
     """Choose by length."""
     return [e.episode_id for e in sorted(episodes, key=lambda e: -e.length)[:2]]
 
 
-def test_a_function_chooses_among_finished_episodes(tmp_path: Path) -> None:
-    """Live as well; its name stands in the manifest."""
-    with mjrec.Monitor(pendulum(), tmp_path, keep=longest_two, render="live") as env:
+@pytest.mark.parametrize(
+    # 1 2 2 3 4 4 5 6: the lower middle is episode 6.
+    ("keep", "way", "kept"),
+    [("median", "deferred", [6]), (longest_two, "live", [0, 7])],
+)
+def test_what_is_decided_at_the_end_holds_all(
+    keep: Any, way: str, kept: list[int], tmp_path: Path, caplog: Any
+) -> None:
+    """It says so once; the rule or the function's name stands in the manifest."""
+    caplog.set_level(logging.INFO, "mjrec")
+    with mjrec.Monitor(pendulum(), tmp_path, keep=keep, render=way, workers=1) as env:
         run(env, 8)
-        assert videos_in(tmp_path) == [*range(8)]
-    assert videos_in(tmp_path) == [0, 7]
-    assert manifest_of(tmp_path)["mjrec"]["schedule"]["name"] == "keep:longest_two"
+        assert (logs_of if way == "deferred" else videos_in)(tmp_path) == [*range(8)]
+    assert caplog.text.count("stay on the disk") == 1
+    assert videos_in(tmp_path) == kept
+    name = getattr(keep, "__name__", keep)
+    assert manifest_of(tmp_path)["mjrec"]["schedule"]["name"] == f"keep:{name}"
 
 
 @pytest.mark.parametrize(
@@ -406,33 +402,3 @@ def test_a_killed_run_leaves_its_candidates(
     assert metadata_of(tmp_path, 1)["selection"] == selection
     listed = {name[-10:-4] for name, _ in manifest_of(tmp_path)["videos"]}
     assert listed >= {"000001", "000003"}
-
-
-# --- what cannot be ------------------------------------------------------------------
-
-
-def test_deciding_costs_each_candidate_the_same(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """No list is looked for among those of all the others."""
-    read: list[Path] = []
-    original = spans.read_list
-    monkeypatch.setattr(spans, "read_list", lambda p: read.append(p) or original(p))
-    monitor = mjrec.Monitor(
-        pendulum([1] * 20), tmp_path, keep="median", env_id="Pole-v0", workers=0
-    )
-    run(monitor, 20)
-    read.clear()
-    monitor.close(wait=False)
-    assert 0 < len(read) <= 3 * 20
-
-
-def test_nothing_was_finished(tmp_path: Path) -> None:
-    """The manifest says that it was decided among none."""
-    mjrec.Monitor(pendulum(), tmp_path, keep="median").close()
-    assert manifest_of(tmp_path)["mjrec"]["keep"] == {
-        "rule": "median",
-        "decided": True,
-        "chosen": [],
-        "finished": 0,
-    }

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import gc
 import os
+import re
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -55,8 +56,9 @@ def held() -> Held:
 
 def _file(descriptor: Path) -> str:
     try:
-        # Pipes and sockets have numbers of their own.
-        return str(descriptor.readlink()).split(":")[0]
+        # Pipes and sockets have numbers of their own, and so has each log.
+        name = str(descriptor.readlink()).split(":")[0]
+        return re.sub(r"\.\d{6}\.(log|spans|looks|tail)$", "", name)
     except FileNotFoundError:  # of the listing itself
         return ""
 

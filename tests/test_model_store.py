@@ -272,43 +272,6 @@ def foreign(directory: Path, members: dict[str, str | bytes]) -> Any:
     return from_source(directory, facts)
 
 
-SECRET = "<mujoco><include file='{}'/></mujoco>"
-
-
-@parametrize(
-    ("members", "said"),
-    [
-        ({"source/main.xml": SECRET.format("/secret.xml")}, "plain relative"),
-        (
-            {
-                "source/main.xml": SECRET.format("a/part"),
-                "source/a/part": SECRET.format("/secret.xml"),
-            },
-            "plain relative",
-        ),
-        (
-            {"source/main.xml": "<mujoco><extension>< plugin/></extension></mujoco>"},
-            "plugin",
-        ),
-        ({"source/main.xml": SECRET.format("../" * 9 + "secret.xml")}, "outside"),
-        ({"source/main.xml": SECRET.format("../secret.xml")}, "secret.xml"),
-        ({"source/main.xml": SECRET.format("..\\\\secret.xml")}, "plain relative"),
-        ({"source/main.xml": "<robot name='r'/>"}, "not MJCF"),
-        ({"source/main.xml": SPHERE.encode("utf-16")}, "utf-8"),
-        ({"source/other.xml": SPHERE}, "main.xml"),
-        ({"contents.json": '{"format": 2}'}, "format"),
-    ],
-    default=4,
-)
-def test_a_hostile_zip_reads_and_writes_nothing_elsewhere(
-    directory: Path, members: dict[str, str | bytes], said: str
-) -> None:
-    """One clear error that names the file."""
-    assert foreign(directory, {"source/main.xml": SPHERE}).ngeom == 1
-    with pytest.raises(UnreadableFile, match=said):
-        foreign(directory, members)
-
-
 @parametrize(
     ("name", "value", "said"),
     [

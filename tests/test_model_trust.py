@@ -32,11 +32,9 @@ from mjrec.simulation.model_trust import (
     TRUST_VARIABLE,
     directory_digest,
     is_stored,
-    is_trusted,
     note_models,
     noting_models,
     stored_models,
-    trusting_models,
 )
 
 DIGEST = hashlib.sha256(b"a model").hexdigest()
@@ -288,18 +286,13 @@ def test_trust_is_said_by_an_argument_or_a_variable(
     facts = {**stored(directory), "xml": None}
     assert load_model(directory, facts).ngeom == 1
     become_another_user(monkeypatch, tmp_path)
-    for said in ("0", "", f"sha256:{OTHER}"):
+    for said in ("0", ""):
         monkeypatch.setenv(TRUST_VARIABLE, said)
         with pytest.raises(UntrustedModel, match="not written by this user"):
             load_model(directory, facts)
     assert load_model(directory, facts, trust_models=True).ngeom == 1
     monkeypatch.setenv(TRUST_VARIABLE, "1")
     assert load_model(directory, facts).ngeom == 1
-    with trusting_models([DIGEST]):
-        assert is_trusted(DIGEST)
-        assert not is_trusted(OTHER)
-        assert not is_trusted(None)
-    assert is_trusted(OTHER)
     (directory / facts["mjb"]).write_bytes(gzip.compress(bytes(facts["bytes"])))
     with pytest.raises(UnreadableFile, match="not what was recorded"):
         load_model(directory, facts)

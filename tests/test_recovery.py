@@ -414,7 +414,7 @@ def test_an_episode_whose_last_row_is_there_is_complete(
     journaled: bool, tmp_path: Path
 ) -> None:
     """Its last words were cut off in the log, and perhaps in the journal too."""
-    write_log(tmp_path, 0, ended=False, over=True, start_time=99.5)
+    write_log(tmp_path, 0, ended=False, over=True, start_time=4e9)
     line = entry(0, length=4, reward=2.0, terminated=False, truncated=True)
     journal = write_journal(tmp_path, str(INFIX), *([line] * journaled))
     with journal.open("ab") as file:
@@ -427,6 +427,8 @@ def test_an_episode_whose_last_row_is_there_is_complete(
     facts = mjrec.load_trajectory(episode.trajectory or "").facts
     assert "reason" not in facts
     assert facts["complete"]
+    # Episodes are in the order of their ends.
+    assert facts["end_time"] >= 4e9
     assert_in_order(tmp_path)
 
 

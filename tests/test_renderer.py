@@ -181,18 +181,6 @@ def test_frames_are_the_same_on_osmesa() -> None:
     assert run_script(script, MUJOCO_GL="osmesa").strip()
 
 
-def test_a_frame_is_the_callers_with_the_top_row_first(
-    renderer: SceneRenderer, table: Simulation
-) -> None:
-    """A new array each time; the sky is above."""
-    first = renderer.render(table[1])
-    kept = first.copy()
-    table[1].geom_xpos[-1] += (0.3, 0, 0.2)
-    assert not np.array_equal(first, renderer.render(table[1]))
-    assert np.array_equal(first, kept)
-    assert first[0].max() == 0 < first[-1].max()
-
-
 def test_a_frame_may_be_larger_than_the_models_buffer(table: Simulation) -> None:
     """The buffer grows on a copy: not one byte of the user's model changes."""
     model, data = table
@@ -218,39 +206,6 @@ def test_a_draft_is_the_model_with_less(
     model.vis.quality.shadowsize = drawn
     model.vis.quality.offsamples = 0
     assert np.array_equal(draft, drawn_anew(model, data))
-
-
-def test_frames_in_any_order_have_the_same_infinite_planes() -> None:
-    """Which are drawn around the camera of the frame before."""
-    model = mujoco.MjModel.from_xml_string(TABLE.format(floor="0 0"))
-    moments = []
-    for position in (0, 9.3, 17, 30):
-        data = mujoco.MjData(model)
-        data.qpos[0] = position
-        mujoco.mj_forward(model, data)
-        moments.append(data)
-
-    def rider(**options: Any) -> SceneRenderer:
-        return SceneRenderer(model, camera="rider", **options, **SIZE)
-
-    with rider() as one:
-        in_order = [one.render(data) for data in moments]
-    with rider() as other:
-        cold = other.render(moments[2])
-        assert not np.array_equal(cold, in_order[2])
-        other.look(moments[1])
-        assert np.array_equal(other.render(moments[2]), in_order[2])
-        other.begin()
-        assert np.array_equal(other.render(moments[2]), cold)
-    with rider(fresh=True) as fresh:
-        fresh.render(moments[0])
-        assert np.array_equal(fresh.render(moments[2]), cold)
-    with mujoco.Renderer(model, 50, 70) as seen:
-        seen.update_scene(moments[1], "rider")
-        begins_at = np.array([camera.pos for camera in seen.scene.camera])
-    with rider(begins_at=begins_at) as begun:
-        begun.begin()
-        assert np.array_equal(begun.render(moments[2]), in_order[2])
 
 
 # --- what changes in the model -------------------------------------------------------

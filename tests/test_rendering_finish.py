@@ -155,18 +155,6 @@ def test_what_another_process_has_is_left_to_it(
     assert not list(tmp_path.glob(".*"))
 
 
-def test_what_a_killed_renderer_left_goes_with_the_next_try(tmp_path: Path) -> None:
-    """Only what has the name of an unfinished file."""
-    write_finished(tmp_path, 0)
-    others = [".openaigym.video.0.7.video000001.mp4"]
-    left = [f".{VIDEO}.{end}.0123abcd.part" for end in ENDS]
-    for name in [*others, *left]:
-        (tmp_path / name).touch()
-    assert not [each for each in finish(tmp_path) if each.failures]
-    assert all((tmp_path / name).exists() for name in others)
-    assert not any((tmp_path / name).exists() for name in left)
-
-
 def test_one_whose_model_is_still_being_written_waits(tmp_path: Path) -> None:
     """And no other comes before it."""
     write_finished(tmp_path, 0, model={"mjb": "m.mjb.gz", "xml": None})

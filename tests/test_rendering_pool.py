@@ -32,8 +32,6 @@ from mjrec.errors import (
     UnknownName,
     UnreadableFile,
 )
-from mjrec.formats.locks import try_lock
-from mjrec.formats.monitor_directory import render_lock_name
 from mjrec.gl import Probe, choice
 from mjrec.rendering import pool as pool_module
 from mjrec.rendering.pool import WorkerPool
@@ -294,18 +292,6 @@ def test_ctrl_c_while_a_picture_is_drawn(ride: Ride, one: WorkerPool) -> None:
     assert os.getsid(another) == another
 
 
-def test_a_worker_ends_with_its_input_in_mid_drawing(
-    ride: Ride, one: WorkerPool
-) -> None:
-    """Nobody is left to want what it draws."""
-    frames = one.frames(ride.path, [0] * 1000, View(height=1000, width=1000))
-    child = one._workers[0].child
-    assert child is not None
-    child._orders.close()
-    wait_for_end(child.pid)
-    del frames
-
-
 # Wherever the caller is
 
 CALLER = """
@@ -518,24 +504,3 @@ def test_the_cpus_of_another_process_are_waited_for(tmp_path: Path) -> None:
     assert time.monotonic() - began >= 0.3
     assert len(pids(shared)) == 1
     shared.close()
-
-
-@pytest.mark.usefixtures("two_cpus")
-def test_workers_stay_while_cpus_come_and_go(tmp_path: Path) -> None:
-    """Others take one between two videos; nobody starts the workers anew."""
-    ride = record(tmp_path)
-    before = children()
-    shared = WorkerPool(None, directory=tmp_path)
-    list(shared.frames(ride.path, range(4)))
-    both = children() - before
-    assert len(both) == 2
-    shared.rest()
-    other = try_lock(tmp_path / render_lock_name(0))
-    assert other is not None
-    alone = list(shared.frames(ride.path, range(4)))
-    other.release()
-    together = list(shared.frames(ride.path, range(4)))
-    assert children() - before == both
-    assert np.array_equal(alone, together)
-    shared.close()
-    assert children() == before

@@ -170,23 +170,6 @@ def test_states_are_told_by_component(tmp_path: Path) -> None:
         trajectory.component("qqpos")
 
 
-@pytest.mark.parametrize("form", [as_is, finished])
-@pytest.mark.parametrize("name", MODELS)
-def test_each_state_follows_from_the_one_before(
-    tmp_path: Path, name: str, form: Any
-) -> None:
-    """Bit for bit, replayed as `Trajectory` says, in data that held something else."""
-    trajectory = mjrec.load_trajectory(form(Recording(tmp_path, model_of(name))))
-    model = trajectory.model()
-    data = mujoco.MjData(model)
-    for k in reversed(range(len(trajectory))):
-        trajectory.set_state(data, k)
-        np.testing.assert_array_equal(state(model, data), trajectory.states[k])
-        data.ctrl[:] = trajectory.component("ctrl")[k + 1]
-        mujoco.mj_step(model, data, nstep=SUBSTEPS)
-        np.testing.assert_array_equal(state(model, data), trajectory.states[k + 1])
-
-
 def test_the_model_is_that_of_the_step(tmp_path: Path) -> None:
     """Step 0 is what the reset set; later changes hold from their steps on.
 

@@ -5,10 +5,7 @@ from __future__ import annotations
 
 import math
 import re
-import shutil
 import signal
-import subprocess
-import sys
 import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
@@ -250,38 +247,6 @@ def test_ctrl_c_leaves_the_log_and_nothing_else(
     monkeypatch.undo()
     assert not [name for name in path.parent.iterdir() if ".states." not in name.name]
     finish_trajectory(path)
-
-
-KILLED = """
-import os, signal, sys
-from pathlib import Path
-import mjrec.formats.trajectory_file as trajectory_file
-where, path = sys.argv[1], Path(sys.argv[2])
-die = lambda *_, **__: os.kill(os.getpid(), signal.SIGKILL)
-if where == "before the name":
-    os.fsync = die
-else:
-    Path.unlink = die
-trajectory_file.finish_trajectory(path)
-"""
-
-
-@pytest.mark.parametrize("where", ["before the name", "before the removal"])
-def test_a_killed_finish_is_done_again(path: Path, where: str) -> None:
-    """There is always the log or the whole file; it is the same file each time."""
-    record(path)
-    other = shutil.copytree(path.parent, path.parent / "copy") / path.name
-    whole = finish_trajectory(other).read_bytes()
-    process = subprocess.run(
-        [sys.executable, "-c", KILLED, where, str(path)], check=False
-    )
-    assert process.returncode == -signal.SIGKILL
-    assert len(list(list_paths(path.parent))) == 1
-    assert path.exists() == (where == "before the removal")
-    for _ in range(2):
-        assert finish_trajectory(path).read_bytes() == whole
-    check(read(path), 40)
-    assert list(list_paths(path.parent)) == []
 
 
 def attribute(name: str, value: Any) -> Callable[[h5py.File], None]:

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from .evaluation.comparing import compare as compare
     from .evaluation.evaluating import evaluate as evaluate
     from .evaluation.evaluation import Evaluation as Evaluation
+    from .evaluation.statistics import Bootstrap as Bootstrap
     from .evidence.findings import Finding as Finding
     from .evidence.findings import Verdict as Verdict
     from .evidence.findings import Verification as Verification
@@ -69,6 +70,7 @@ _NAMES = {
     "evaluation.comparing": "Comparison compare",
     "evaluation.evaluating": "evaluate",
     "evaluation.evaluation": "Evaluation",
+    "evaluation.statistics": "Bootstrap",
     "evidence.findings": "Finding Verdict Verification",
     "evidence.pack": "pack",
     "evidence.verify": "verify",

@@ -41,7 +41,7 @@ _PACKAGES = (
 )
 # What extras bring, and engines: name, distributions, and what installs them.
 _EXTRAS = (
-    ("SciPy", ("scipy",), "mjrec[evaluation]"),
+    ("SciPy", ("scipy",), "mjrec"),
     ("report", ("jinja2", "pillow"), "mjrec[report]"),
     ("evidence", ("bagit", "jinja2"), "mjrec[evidence]"),
     ("robotics", ("gymnasium-robotics",), "mjrec[robotics]"),

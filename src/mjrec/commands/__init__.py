@@ -35,6 +35,7 @@ COMMANDS = {
 }
 
 _FAILED = 1
+_TRACEBACK = "Traceback (most recent call last)"
 _INTERRUPTED = 130  # what shells say of a process that Ctrl-C ended
 
 
@@ -131,9 +132,12 @@ class _OnceInARun(logging.Filter):
 
     def filter(self, record: logging.LogRecord) -> bool:
         text = record.getMessage()
-        if not text.startswith(("MuJoCo:", "Traceback")):
+        if _TRACEBACK in text:
+            kind = _TRACEBACK
+        elif text.startswith("MuJoCo:"):
+            kind = re.sub(r"[\d.]+", "", text)
+        else:
             return True
-        kind = "Traceback" if text[0] == "T" else re.sub(r"[\d.]+", "", text)
         is_new = kind not in self._said
         self._said.add(kind)
         return is_new

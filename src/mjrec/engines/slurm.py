@@ -275,7 +275,6 @@ class SlurmEngine(Executor):
         most = free if self._elements else self._most_jobs * _ELEMENTS_PER_WORKER
         place = self._waiting[0].place
         tasks = [task for task in self._waiting if task.place == place]
-        self._waiting = [task for task in self._waiting if task.place != place]
         count = min(len(tasks), most)
         shares = [tasks[first::count] for first in range(count)]
         (place / "outcomes").mkdir(parents=True, exist_ok=True)
@@ -289,6 +288,7 @@ class SlurmEngine(Executor):
         except (OSError, RuntimeError, subprocess.SubprocessError) as error:
             said = " ".join(str(error).split())
             raise Error(f"No job could be submitted: {said}") from error
+        self._waiting = [task for task in self._waiting if task.place != place]
         for job, share in zip(jobs, shares, strict=True):
             self._elements[job.job_id] = share
             self._processes[job.job_id] = job

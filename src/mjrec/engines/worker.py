@@ -54,11 +54,10 @@ def do_job(place: str, job: Mapping[str, Any]) -> dict[str, Any]:
         child = idle.pop() if idle else None
     try:
         child = child or _JobChild(*kind)
-    except FileNotFoundError:
-        how = f"sees no {place}: all machines must see it under the same name"
-        return {"died": how, "begun": False}
     except OSError as error:
         how = f"cannot be started: {sys.executable!r}: {error}"
+        if not Path(place, WORK).exists():
+            how = f"sees no {place}: all machines must see it under the same name"
         return {"died": how, "begun": False}
     answer = child.do(job)
     if "died" in answer or "error" in answer:

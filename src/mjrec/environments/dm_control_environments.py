@@ -3,24 +3,26 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import dm_env
 import numpy as np
 from dm_control import suite
 
 from ..errors import UnknownName
 from ..simulation.cameras import default_camera, resolve_camera
-from .dm_control_contexts import ContextsOnDemand
 from .dm_control_scenes import MADE_WITH, dm_control_scenes, generator_of
-from .dm_env_episodes import StepLimit, is_terminated, is_truncated
 from .episode_seeds import EpisodeSeeds
 from .known_names import dm_control_failure
-from .named_environment import EnvironmentOptions, NamedEnvironment, Step
+from .named_environment import (
+    EnvironmentOptions,
+    NamedEnvironment,
+    Step,
+    is_terminated,
+    is_truncated,
+)
 from .names import DmControlName
-from .scenes import Scenes, set_generator_state
+from .scenes import Scenes
 
 _ARGUMENTS = ("task_kwargs", "environment_kwargs", "visualize_reward")
 
@@ -31,9 +33,7 @@ def tasks_of(domain: str) -> Sequence[str]:
     return tasks
 
 
-def make_dm_control(
-    domain: str, task: str, options: EnvironmentOptions
-) -> dm_env.Environment:
+def make_dm_control(domain: str, task: str, options: EnvironmentOptions) -> Any:
     """Return a task of the suite.
 
     Camera and size are not the environment's but of each picture: whoever draws it
@@ -64,30 +64,33 @@ def make_dm_control(
         raise UnknownName(f"task of dm_control's {domain}", task, tasks_of(domain))
     arguments = _arguments(options.kwargs)
     arguments["task_kwargs"] = {"random": options.seed, **arguments["task_kwargs"]}
+    name = DmControlName(domain, task)
     try:
-        environment = suite.load(domain, task, **arguments)
+        environment = load_task(name, arguments)
     except Exception as error:
-        raise dm_control_failure(f"dm_control/{domain}-{task}", error) from error
-    # Nothing in an environment says with which arguments it was made.
-    setattr(environment.task, MADE_WITH, arguments)
-    return _limited(environment, options)
+        raise dm_control_failure(str(name), error) from error
+    environment._step_limit = options.limit(environment._step_limit)
+    return environment
 
 
 def load_task(
-    name: DmControlName, kwargs: Mapping[str, Any] | None
-) -> dm_env.Environment:
-    """Return a task as a recording says that it was made, with its own limit.
+    name: DmControlName, kwargs: Mapping[str, Any] | None, *, limit: int | None = None
+) -> Any:
+    """Return a task as `suite.load` makes it.
 
     Args:
         name: of the task.
-        kwargs: of `suite.load`; None where the recording does not know them: then
-            neither does a recording of what is returned.
+        kwargs: of `suite.load`; None where a recording does not know them: then neither
+            does a recording of what is returned.
+        limit: ends an episode as truncated, where the task does not end it before.
     """
-    if kwargs is None:
-        return suite.load(name.domain, name.task)
-    arguments = _arguments(kwargs)
-    environment = suite.load(name.domain, name.task, **arguments)
-    setattr(environment.task, MADE_WITH, arguments)
+    environment = suite.load(name.domain, name.task, **(kwargs or {}))
+    if kwargs is not None:
+        # Nothing in an environment says with which arguments it was made.
+        setattr(environment.task, MADE_WITH, kwargs)
+    if limit is not None:
+        # Nothing public tells, or sets, the limit that a task's time makes.
+        environment._step_limit = min(limit, environment._step_limit)
     return environment
 
 
@@ -111,17 +114,12 @@ class DmControlEnvironment(NamedEnvironment):
                 camera = default_camera(environment.physics.model)
             resolve_camera(environment.physics.model, camera)
             view = {"camera": camera, **options.size}
-        limited = isinstance(environment, StepLimit)
         super().__init__(
             environment,
             env_id=str(name),
-            # Nothing public tells it, and what is not limited by us has one.
-            step_limit=int(
-                environment.max_steps if limited else environment._step_limit
-            ),
+            step_limit=int(environment._step_limit),
             view=view,
         )
-        self._contexts = ContextsOnDemand(environment)
         self._made_with = getattr(environment.task, MADE_WITH)["task_kwargs"]["random"]
         self._draws_when_made = not _is_fresh(self._generator(), self._made_with)
         self._was_reset = False
@@ -165,17 +163,6 @@ class DmControlEnvironment(NamedEnvironment):
         """Return what is known of its pictures and its states."""
         return dm_control_scenes(self.environment)
 
-    def begin_again(self, seed: int | None, state: Any, options: Any) -> Any:
-        """Begin an episode as a recording says; of two, the state is what counts."""
-        if options:
-            raise ValueError("dm_control's resets take no options")
-        if state is not None:
-            set_generator_state(self._generator(), state)
-        else:
-            self._generator().seed(seed)
-        with self._contexts.resetting():
-            return self.environment.reset().observation
-
     def _generator(self) -> Any:
         return generator_of(self.environment)
 
@@ -197,12 +184,3 @@ def _arguments(kwargs: Mapping[str, Any]) -> dict[str, Any]:
             )
     # suite.load takes None for both, and so may the person who asks.
     return {**kwargs, "task_kwargs": kwargs.get("task_kwargs") or {}}
-
-
-def _limited(
-    environment: dm_env.Environment, options: EnvironmentOptions
-) -> dm_env.Environment:
-    # Nothing public tells the limit that time_limit and control_timestep make.
-    own = getattr(environment, "_step_limit", math.inf)
-    limit = options.limit(own)
-    return environment if limit >= own else StepLimit(environment, limit)

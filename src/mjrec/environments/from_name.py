@@ -49,7 +49,7 @@ def environment_from_name(
             from .gymnasium_environments import GymnasiumEnvironment
             from .mjcf_environments import make_mjcf
 
-            return GymnasiumEnvironment(make_mjcf(path, options), is_random=False)
+            return GymnasiumEnvironment(make_mjcf(path, options))
 
 
 def _gymnasium(env_id: str, options: EnvironmentOptions) -> NamedEnvironment:

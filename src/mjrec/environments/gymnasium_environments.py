@@ -24,11 +24,11 @@ from ..errors import (
 )
 from ..simulation.find_simulation import simulation_in
 from .episode_seeds import EpisodeSeeds
-from .gymnasium_scenes import drawn_part, gymnasium_scenes
+from .gymnasium_scenes import gymnasium_scenes
 from .known_names import newest_versions
 from .named_environment import EnvironmentOptions, NamedEnvironment, Step
 from .names import working_directory_importable
-from .scenes import Scenes, set_generator_state
+from .scenes import Scenes
 
 # What records as a video, before what records as text.
 _PREFERRED_MODES = ("rgb_array", "ansi")
@@ -77,7 +77,6 @@ class GymnasiumEnvironment(NamedEnvironment):
     Args:
         environment: as `make_gymnasium` made it, or an MJCF file's.
         no_pictures: why it was made without pictures though they were asked for.
-        is_random: whether anything in it is.
     """
 
     def __init__(
@@ -85,7 +84,6 @@ class GymnasiumEnvironment(NamedEnvironment):
         environment: gymnasium.Env[Any, Any],
         *,
         no_pictures: Error | None = None,
-        is_random: bool = True,
     ) -> None:
         # Environments that are made from names always have one, and a limit.
         spec: Any = environment.spec
@@ -94,7 +92,6 @@ class GymnasiumEnvironment(NamedEnvironment):
             env_id=spec.id,
             step_limit=spec.max_episode_steps,
             no_pictures=no_pictures,
-            is_random=is_random,
         )
 
     def begin(self, around: Any, seeds: EpisodeSeeds, seed: int | None) -> Any:
@@ -109,16 +106,6 @@ class GymnasiumEnvironment(NamedEnvironment):
     def scenes(self) -> Scenes:
         """Return what is known of its pictures and its states."""
         return gymnasium_scenes(self.environment)
-
-    def begin_again(self, seed: int | None, state: Any, options: Any) -> Any:
-        """Begin an episode as a recording says; of two, the seed is what counts."""
-        base: Any = self.environment.unwrapped
-        if seed is None and state is not None:
-            parts = state if "inner" in state else {"env": state, "inner": None}
-            for holder, part in ((base, "env"), (drawn_part(base), "inner")):
-                if parts[part] is not None:
-                    set_generator_state(holder.np_random, parts[part])
-        return self.environment.reset(seed=seed, options=options)[0]
 
 
 def _make_known(

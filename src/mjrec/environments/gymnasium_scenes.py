@@ -146,7 +146,7 @@ def _scenes(env: gymnasium.Env[Any, Any], base: Any, view: dict[str, Any]) -> Sc
         states=None if simulated is None else _states(simulated, view),
         obstacle=_obstacle(base, shown),
         environment=_environment(base),
-        random_state=lambda: _random_state(base, shown),
+        random_state=lambda: random_state(base),
     )
 
 
@@ -293,8 +293,13 @@ def _environment(base: gymnasium.Env[Any, Any]) -> dict[str, Any] | None:
     }
 
 
-def _random_state(base: Any, shown: Any) -> Any:
-    """Return the state of the environment's generator, and of one inside it."""
+def random_state(base: Any) -> Any:
+    """Return the state of an environment's generator, and of one inside it.
+
+    Args:
+        base: an environment without its wrappers.
+    """
+    shown = drawn_part(base)
     # Gymnasium's own property would make one.
     own = generator_state(base._np_random)
     if shown is base:

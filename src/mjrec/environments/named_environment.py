@@ -85,6 +85,19 @@ class Step(NamedTuple):
     truncated: bool
 
 
+def is_terminated(timestep: Any) -> bool:
+    """Tell whether the task itself ended the episode: LAST with a discount of 0."""
+    return bool(timestep.last() and not timestep.discount)
+
+
+def is_truncated(timestep: Any) -> bool:
+    """Tell whether a limit from outside ended the episode.
+
+    That is LAST with another discount than 0: rewards would have followed.
+    """
+    return bool(timestep.last() and timestep.discount)
+
+
 class NamedEnvironment(abc.ABC):
     """An environment, and how its episodes are run whatever its framework.
 
@@ -97,7 +110,6 @@ class NamedEnvironment(abc.ABC):
         view: `camera`, `height` and `width` as far as the monitor is to be given them;
             empty where the environment itself shows what was asked for.
         no_pictures: why it cannot be drawn though pictures were asked for.
-        is_random: whether anything in it is.
     """
 
     def __init__(
@@ -108,14 +120,12 @@ class NamedEnvironment(abc.ABC):
         step_limit: int,
         view: Mapping[str, Any] | None = None,
         no_pictures: Error | None = None,
-        is_random: bool = True,
     ) -> None:
         self.environment = environment
         self.env_id = env_id
         self.step_limit = step_limit
         self.view = view or {}
         self.no_pictures = no_pictures
-        self.is_random = is_random
 
     @property
     def draws_when_made(self) -> bool:
@@ -143,22 +153,6 @@ class NamedEnvironment(abc.ABC):
     @abc.abstractmethod
     def scenes(self) -> Scenes:
         """Return what is known of its pictures and its states."""
-
-    @abc.abstractmethod
-    def begin_again(self, seed: int | None, state: Any, options: Any) -> Any:
-        """Begin an episode of the bare environment as a recording says.
-
-        Args:
-            seed: that was given to the reset; None for none.
-            state: of its random generators just before the reset; None if unknown.
-            options: given to the reset.
-
-        Returns:
-            The first observation.
-
-        Raises:
-            Exception: the state is none of its generators, or the reset failed.
-        """
 
     def has_deferrable_pictures(self) -> bool:
         """Tell whether what it shows can be drawn from its states."""

@@ -25,7 +25,7 @@ from gymnasium.envs import registration
 from numpy.typing import NDArray
 
 from ..formats.trajectory import columns_of
-from .gymnasium_scenes import drawn_part, set_own_camera
+from .gymnasium_scenes import drawn_part, random_state, set_own_camera
 from .names import DmControlName
 from .scenes import (
     class_name,
@@ -92,11 +92,7 @@ class Recreated:
         """Return the state of its random generators now, as a recording has it."""
         if self.is_dm_env:
             return generator_state(self._dm_generator())
-        base: Any = self.environment.unwrapped
-        own, shown = generator_state(base._np_random), drawn_part(base)
-        if shown is base:
-            return own
-        return {"env": own, "inner": generator_state(shown._np_random)}
+        return random_state(self.environment.unwrapped)
 
     def set_random_state(self, state: Any) -> None:
         """Put its random generators into a recorded state.
@@ -350,19 +346,15 @@ def _dm_control(
                 "within bounds"
             )
     from .dm_control_environments import load_task
-    from .dm_env_episodes import StepLimit
 
     with _failures(env_id):
-        env = load_task(name, kwargs)
         task_kwargs = (kwargs or {}).get("task_kwargs") or {}
         if name.domain == "lqr" and "random" not in task_kwargs:
             raise NotRecreated(
                 f"{name} draws its model at random when it is made, and from which "
                 "seed is not recorded"
             )
-        own = getattr(env, "_step_limit", np.inf)
-        if limit is not None and limit < own:
-            env = StepLimit(env, limit)
+        env = load_task(name, kwargs, limit=limit)
         return Recreated(environment=env, is_dm_env=True)
 
 

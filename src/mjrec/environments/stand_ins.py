@@ -3,7 +3,8 @@
 
 The simulation underneath is stepped with the recorded controls in place of what a
 wrapper made of an action. Its own rewards and ends count, unless others are recorded:
-those may be the wrapper's, and are handed on and counted.
+those may be the wrapper's, and are handed on and counted. So are actions that are not
+the controls: nothing says that they led to these.
 """
 
 from __future__ import annotations
@@ -40,15 +41,17 @@ class StandIn(gymnasium.Wrapper[Any, Any, Any, Any]):
 
     Attributes:
         differing: of how many steps of this episode another reward or end is recorded.
+        translated: in how many the action is not what was controlled.
     """
 
-    differing = 0
+    differing = translated = 0
     _steps: RecordedSteps | None = None
     _taken = 0
 
     def begin(self, steps: RecordedSteps) -> None:
         """Take the recorded steps of the episode that has just begun."""
-        self._steps, self._taken, self.differing = steps, 0, 0
+        self._steps, self._taken = steps, 0
+        self.differing = self.translated = 0
 
     def step(
         self, action: Any
@@ -58,7 +61,10 @@ class StandIn(gymnasium.Wrapper[Any, Any, Any, Any]):
         if steps is None:
             return self.env.step(action)
         self._taken += 1
-        observation, *own, info = self.env.step(steps.controls[taken])
+        controls = steps.controls[taken]
+        if not np.array_equal(np.ravel(action), np.ravel(controls)):
+            self.translated += 1
+        observation, *own, info = self.env.step(controls)
         recorded = (
             float(steps.rewards[taken]),
             bool(steps.terminated[taken]),

@@ -25,12 +25,11 @@ _TRANSPARENT = frozenset(
         "gymnasium.wrappers.common.RecordEpisodeStatistics",
         "gymnasium.wrappers.common.TimeLimit",
         "gymnasium.wrappers.rendering.RecordVideo",
-        "mjrec.environments.dm_env_episodes.StepLimit",
         "mjrec.monitors.dm_env_monitor.DmEnvMonitor",
         "mjrec.monitors.gymnasium_monitor.GymnasiumMonitor",
     }
 )
-# Where dm_env's wrappers, dm_control's and ours, keep what they wrap.
+# Where dm_env's wrappers, and dm_control's, keep what they wrap.
 _INSIDE = ("_env", "_environment", "environment")
 
 
@@ -56,7 +55,7 @@ def around_gymnasium(env: gymnasium.Env[Any, Any]) -> dict[str, Any]:
 
 
 def around_dm_env(env: Any) -> dict[str, Any]:
-    """Return the same of a dm_env environment; limits are dm_control's own, and ours.
+    """Return the same of a dm_env environment; limits are dm_control's own.
 
     What a wrapper keeps under a name of its own is not found, and then the wrapper
     counts as the environment; `wrappers` names it all the same, because it is none of
@@ -69,7 +68,7 @@ def around_dm_env(env: Any) -> dict[str, Any]:
         env = next((each for each in inside if each is not None), None)
         if env is None:
             break
-    return _facts(layers, map(_dm_env_limit, [*layers, env]))
+    return _facts(layers, (_own(each, "_step_limit") for each in [*layers, env]))
 
 
 def _facts(layers: list[Any], limits: Iterable[Any]) -> dict[str, Any]:
@@ -95,10 +94,6 @@ def _arguments_of(wrapper: Any) -> dict[str, Any] | None:
     return plain_arguments(saved)
 
 
-def _dm_env_limit(env: Any) -> Any:
-    return _own(env, "_max_steps", _own(env, "_step_limit"))
-
-
 def _is_limit(limit: Any) -> bool:
     return isinstance(limit, int | float) and math.isfinite(limit)
 
@@ -110,7 +105,7 @@ def _is_innermost(env: Any) -> bool:
     )
 
 
-def _own(env: Any, name: str, default: Any = None) -> Any:
+def _own(env: Any, name: str) -> Any:
     """Return an attribute that an object has, without asking what it wraps.
 
     Not by its `__dict__`, for the reason that `has_own_method` gives.
@@ -118,4 +113,4 @@ def _own(env: Any, name: str, default: Any = None) -> Any:
     try:
         return object.__getattribute__(env, name)
     except AttributeError:
-        return default
+        return None

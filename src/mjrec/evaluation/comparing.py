@@ -18,7 +18,7 @@ from typing import Final, Literal, TypeAlias
 
 import numpy as np
 
-from ..errors import InvalidArgument, MissingDependency
+from ..errors import InvalidArgument
 from . import statistics
 from .plan import SEEDED
 from .result_tables import ResultColumns
@@ -128,7 +128,6 @@ def compare(
         UnreadableFile: there is no finished evaluation in a directory, or it is
             damaged.
         InvalidArgument: no task is in all of them, or a directory is there twice.
-        MissingDependency: scipy is not installed.
     """
     how = Bootstrap(resamples=resamples, seed=seed, confidence=confidence)
     sides = of_a, of_b = _Side("A", a), _Side("B", b)
@@ -145,7 +144,9 @@ def compare(
         for task, why in unknown.items()
         if why is None
     }
-    p_values = holm_adjusted({task: _p_value(*both) for task, both in samples.items()})
+    p_values = holm_adjusted(
+        {task: statistics.two_sided_p_value(*both) for task, both in samples.items()}
+    )
     tasks = []
     for task in common:
         pairs = np.empty(0)
@@ -306,26 +307,6 @@ def _overall_figures(
     return {name: figure.estimate(how) for name, figure in figures.items()}
 
 
-def _p_value(x: FloatArray, y: FloatArray) -> float:
-    """Return that of the two-sided Mann-Whitney test.
-
-    It is exact for small samples without equal values.
-    """
-    try:
-        # Here, because it takes longer to import than all else, and is optional.
-        from scipy.stats import mannwhitneyu  # type: ignore[import-untyped] # no stubs
-    except ImportError as error:
-        raise MissingDependency(
-            "scipy",
-            purpose="Comparing evaluations",
-            install='pip install "mjrec[evaluation]"',
-        ) from error
-    if np.ptp(np.concatenate([x, y])) == 0:
-        # SciPy would divide zero by zero.
-        return 1.0
-    return float(mannwhitneyu(y, x, alternative="two-sided").pvalue)
-
-
 def _paired_differences(task: str, a: ReadResults, b: ReadResults) -> FloatArray:
     """Return B - A of the episodes that began in the same state in both."""
     if not (
@@ -389,8 +370,12 @@ def _conditions(results: ReadResults) -> Mapping[str, object]:
 def _choices(results: ReadResults) -> Mapping[str, object]:
     """Return what chooses which episodes are seen, and what ran them."""
     plan = results.plan
-    chosen = {name: getattr(plan, name) for name in ("protocol", "seeds", "episodes")}
-    return {**chosen, **results.versions}
+    return {
+        "protocol": plan.protocol,
+        "seeds": tuple(sorted(plan.seeds)),
+        "episodes": plan.episodes,
+        **results.versions,
+    }
 
 
 def _different(

@@ -161,9 +161,8 @@ def evaluate(
         confidence: the share of intervals that hold the true value.
         on_progress: called several times a second with how far it is.
         engine: where the work runs, instead of processes of this one: an executor, or
-            `"local"`, `"ray"` or `"slurm"`. Its workers draw the videos, too, those of
-            a task as soon as its episodes are over. All of them see the directory
-            under the same name. The results do not depend on it.
+            `"local"`, `"ray"` or `"slurm"`. Its workers draw the videos, too. All of
+            them see the directory under the same name. The results do not depend on it.
 
     Returns:
         The results, which stand in the directory too: `results.json`, `results.csv`

@@ -51,6 +51,7 @@ class ChunkRun:
         folder: its monitor directory.
         known: what is done of it.
         rounds: how often it was handed out.
+        size: how much was done of it when it was handed out last.
         reason: why episodes of it have no result.
         is_over: nothing more comes.
     """
@@ -60,6 +61,7 @@ class ChunkRun:
     folder: Path
     known: ChunkResults
     rounds: int = 0
+    size: int = 0
     reason: str = "nothing is known of it"
     is_over: bool = False
 
@@ -146,11 +148,10 @@ def run_chunks(run: Run, chunks: Sequence[ChunkRun], tell: _Tell) -> EvaluationP
     for outcome in run.results(patience_s=_SECONDS_BETWEEN_REPORTS):
         if outcome is not None:
             each = by_key.pop(outcome.key)
-            size = each.known.size
             each.known = read_chunk(each.folder, each.task.name)
             # This user's, though it was done elsewhere: by workers of this process.
             note_models((outcome.value or {}).get("models", ()))
-            if not each.is_complete and each.known.size > size:
+            if not each.is_complete and each.known.size > each.size:
                 # It came nearer to its end, and a poisoned episode fails alone.
                 by_key[_submit(run, each)] = each
                 continue
@@ -305,6 +306,7 @@ def draw_videos(
 
 def _submit(run: Run, each: ChunkRun) -> str:
     each.rounds += 1
+    each.size = each.known.size
     folder = f"{each.task.folder}/{each.chunk.folder}"
     key = f"{folder}/{each.rounds}"
     chunk: dict[str, Any] = dataclasses.asdict(each.chunk)

@@ -1,11 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The figures that are said of returns and scores, and their confidence intervals.
 
-A *resample* draws from each sample as many values as there are, with replacement: it
-says how often each one was drawn. Every figure is written down once, as a function of
-such counts. The figure itself is that of counts that are all 1, and its bootstrap
-interval comes from those of thousands of resamples. `docs/statistics.md` has the
-formulas and their sources; the tests compare them with SciPy, rliable, and figures by
+Every figure is written down once, as a function of samples along their last axis, so
+that SciPy's bootstrap can give it thousands of resamples at once. `docs/statistics.md`
+has the formulas and their sources; the tests compare them with rliable, and figures by
 hand.
 
 All of it takes finite numbers: `summaries` and `comparing` decide what becomes of
@@ -14,8 +12,8 @@ others.
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+import importlib
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from statistics import NormalDist
 from typing import Any, Final, TypeAlias
@@ -26,7 +24,6 @@ import numpy.typing as npt
 from ..errors import InvalidArgument
 
 FloatArray: TypeAlias = npt.NDArray[np.float64]
-Counts: TypeAlias = npt.NDArray[np.int64]
 
 PERCENTILE_BOOTSTRAP: Final = "percentile bootstrap"
 LARGE_SAMPLE: Final = "large-sample normal interval"
@@ -36,7 +33,7 @@ MOST_RESAMPLED: Final = 3000
 
 _MOST_RESAMPLES: Final = 1_000_000
 
-# The values of a block of resamples: 2 MB of counts stay in a CPU's cache.
+# The values of a block of resamples: 2 MB of them stay in a CPU's cache.
 _BLOCK: Final = 1 << 18
 
 
@@ -107,22 +104,21 @@ class Figure:
     """A figure of one sample or several.
 
     Attributes:
-        sizes: of the samples, which are drawn from independently of each other.
-        of: returns the figure of each resample, `(rows,)` or, of a figure that is many
-            numbers, `(rows, k)`. It takes the counts of each sample's values,
-            `(rows, size)`.
+        samples: which are drawn from independently of each other, along their last
+            axis.
+        of: returns the figure of samples, `(...)` or, of a figure that is many numbers,
+            `(k, ...)`.
         error: returns the standard error of the figure, where the samples are large.
     """
 
-    sizes: tuple[int, ...]
-    of: Callable[[Sequence[Counts]], FloatArray]
+    samples: tuple[npt.NDArray[Any], ...]
+    of: Callable[[Sequence[FloatArray]], FloatArray]
     error: Callable[[], FloatArray]
 
     @property
     def values(self) -> FloatArray:
         """The figure, if it is many numbers."""
-        ones = [np.ones((1, size), np.int64) for size in self.sizes]
-        return np.asarray(self.of(ones)[0])
+        return np.asarray(self.of(self.samples))
 
     @property
     def value(self) -> float:
@@ -135,22 +131,29 @@ class Figure:
 
         An interval of no width would say that all is known.
         """
-        if min(self.sizes) < 2:
+        sizes = [len(sample) for sample in self.samples]
+        if min(sizes) < 2:
             return None
-        few = sum(self.sizes) <= MOST_RESAMPLED
-        return PERCENTILE_BOOTSTRAP if few else LARGE_SAMPLE
+        return PERCENTILE_BOOTSTRAP if sum(sizes) <= MOST_RESAMPLED else LARGE_SAMPLE
 
     def ends(self, how: Bootstrap) -> tuple[FloatArray, FloatArray] | None:
         """Return the lower and upper ends of the intervals of a figure."""
         if self.interval_method is None:
             return None
         if self.interval_method == LARGE_SAMPLE:
-            reach = _normal_quantile(how.confidence) * self.error()
+            reach = NormalDist().inv_cdf(0.5 + how.confidence / 2) * self.error()
             return self.values - reach, self.values + reach
-        figures = np.concatenate([self.of(c) for c in _resamples(self.sizes, how)])
-        outside = (1 - how.confidence) / 2
-        low, high = np.quantile(figures, (outside, 1 - outside), axis=0)
-        return low, high
+        found = _stats().bootstrap(
+            self.samples,
+            lambda *samples, axis: self.of(samples),
+            vectorized=True,
+            method="percentile",
+            n_resamples=how.resamples,
+            batch=max(1, _BLOCK // sum(map(len, self.samples))),
+            confidence_level=how.confidence,
+            rng=np.random.default_rng(how.seed),
+        )
+        return found.confidence_interval.low, found.confidence_interval.high
 
     def interval(self, how: Bootstrap) -> Interval | None:
         """Return the interval of a figure that is one number."""
@@ -163,10 +166,10 @@ class Figure:
 
     def __sub__(self, other: Figure) -> Figure:
         """Return the difference of the figures of independent samples."""
-        split = len(self.sizes)
+        split = len(self.samples)
         return Figure(
-            self.sizes + other.sizes,
-            lambda counts: self.of(counts[:split]) - other.of(counts[split:]),
+            self.samples + other.samples,
+            lambda samples: self.of(samples[:split]) - other.of(samples[split:]),
             lambda: np.hypot(self.error(), other.error()),
         )
 
@@ -175,30 +178,25 @@ def average(figures: Iterable[Figure]) -> Figure:
     """Return the mean of the figures of independent samples: of tasks, each alike."""
     parts = list(figures)
 
-    def of(counts: Sequence[Counts]) -> FloatArray:
-        total: FloatArray = np.zeros(1)
-        begin = 0
-        for part in parts:
-            end = begin + len(part.sizes)
-            total = total + part.of(counts[begin:end])
-            begin = end
-        return total / len(parts)
+    def of(samples: Sequence[FloatArray]) -> FloatArray:
+        rest = iter(samples)
+        total = sum(part.of([next(rest) for _ in part.samples]) for part in parts)
+        return np.asarray(total / len(parts))
 
     def error() -> FloatArray:
         variance = sum(part.error() ** 2 for part in parts)
         return np.sqrt(variance) / len(parts)
 
-    return Figure(tuple(size for part in parts for size in part.sizes), of, error)
+    return Figure(tuple(s for part in parts for s in part.samples), of, error)
 
 
 def mean(sample: FloatArray) -> Figure:
     """Return the mean of a sample."""
-    # So that it does not depend on the order in which episodes are given.
-    values, size = np.sort(sample), len(sample)
     return Figure(
-        (size,),
-        lambda counts: _summed(counts[0] * values) / size,
-        lambda: np.asarray(np.std(values, ddof=1) / math.sqrt(size)),
+        # So that it does not depend on the order in which episodes are given.
+        (np.sort(sample),),
+        lambda samples: samples[0].mean(axis=-1),
+        lambda: _stats().sem(sample),
     )
 
 
@@ -208,26 +206,22 @@ def interquartile_mean(samples: Iterable[FloatArray]) -> Figure:
     floor(n / 4) of all n values are cut off at each end. Where samples have different
     sizes, a larger one weighs more.
     """
-    strata = [np.sort(sample) for sample in samples]
-    pooled = np.concatenate(strata)
-    order = np.argsort(pooled, kind="stable")
-    values = pooled[order]
-    first = len(values) // 4
-    end = len(values) - first
+    strata = tuple(np.sort(sample) for sample in samples)
 
-    def of(counts: Sequence[Counts]) -> FloatArray:
-        reached = np.concatenate(counts, axis=1)[:, order].cumsum(axis=1)
-        middle = np.diff(np.clip(reached, first, end), axis=1, prepend=first)
-        return _summed(middle * values) / (end - first)
+    def of(samples: Sequence[FloatArray]) -> FloatArray:
+        pooled = np.concatenate(samples, axis=-1)
+        return np.asarray(_stats().trim_mean(pooled, 0.25, axis=-1))
 
     def error() -> FloatArray:
         # Each value moves it by its winsorised self; what varies inside a stratum
         # varies.
-        low, high = values[first], values[end - 1]
+        values = np.sort(np.concatenate(strata))
+        first = len(values) // 4
+        low, high = values[first], values[-1 - first]
         variance = sum(len(s) * np.var(np.clip(s, low, high), ddof=1) for s in strata)
-        return np.asarray(np.sqrt(variance) / (end - first))
+        return np.asarray(np.sqrt(variance) / (len(values) - 2 * first))
 
-    return Figure(tuple(map(len, strata)), of, error)
+    return Figure(strata, of, error)
 
 
 def optimality_gap(scores: Iterable[FloatArray]) -> Figure:
@@ -239,21 +233,34 @@ def optimality_gap(scores: Iterable[FloatArray]) -> Figure:
 
 
 def performance_profile(scores: Iterable[FloatArray], thresholds: FloatArray) -> Figure:
-    """Return for each threshold the share of scores above it, averaged over tasks."""
-    return average(_shares_above(values, thresholds) for values in scores)
+    """Return for each threshold the share of scores above it, averaged over tasks.
+
+    Args:
+        scores: of each task.
+        thresholds: rising.
+    """
+    # How many thresholds each score is above says all that is needed of it.
+    return average(
+        _shares_above(np.searchsorted(thresholds, values), len(thresholds))
+        for values in scores
+    )
 
 
-def _shares_above(sample: FloatArray, thresholds: FloatArray) -> Figure:
-    size = len(sample)
-    not_above = np.searchsorted(np.sort(sample), thresholds, side="right")
+def _shares_above(places: npt.NDArray[np.int64], count: int) -> Figure:
+    size = len(places)
+
+    def of(samples: Sequence[npt.NDArray[Any]]) -> FloatArray:
+        rows = np.atleast_2d(samples[0])
+        cells = rows + (count + 1) * np.arange(len(rows))[:, None]
+        counts = np.bincount(cells.ravel(), minlength=len(rows) * (count + 1))
+        up_to = counts.reshape(len(rows), -1).cumsum(axis=1)[:, :-1]
+        return (1 - up_to.T / size).reshape(count, *samples[0].shape[:-1])
 
     def error() -> FloatArray:
-        share = not_above / size
+        share = of([places])
         return np.sqrt(share * (1 - share) / (size - 1))
 
-    return Figure(
-        (size,), lambda counts: 1 - _reached(counts[0])[:, not_above] / size, error
-    )
+    return Figure((places,), of, error)
 
 
 def improvement(x: FloatArray, y: FloatArray) -> Figure:
@@ -262,78 +269,43 @@ def improvement(x: FloatArray, y: FloatArray) -> Figure:
     #{(i, j) : x_i > y_j} / (n_x n_y), where equal ones count half: the Mann-Whitney
     statistic U of `x`, divided by the number of pairs.
     """
-    x, y = np.sort(x), np.sort(y)
-    below, up_to = (np.searchsorted(y, x, side=side) for side in ("left", "right"))
-    pairs = len(x) * len(y)
 
-    def of(counts: Sequence[Counts]) -> FloatArray:
-        # Whole numbers, so that it is 1/2 where it should be.
-        reached = _reached(counts[1])
-        doubled = counts[0] * (reached[:, below] + reached[:, up_to])
-        return _summed(doubled) / (2 * pairs)
+    def of(samples: Sequence[FloatArray]) -> FloatArray:
+        size, others = (each.shape[-1] for each in samples)
+        ranks = _stats().rankdata(np.concatenate(samples, axis=-1), axis=-1)
+        # Ranks are whole or half, so that it is 1/2 where it should be.
+        above = ranks[..., :size].sum(axis=-1) - size * (size + 1) / 2
+        return np.asarray(above / (size * others))
 
     def error() -> FloatArray:
-        of_x = (below + up_to) / (2 * len(y))
-        lower, upper = (np.searchsorted(x, y, side=side) for side in ("left", "right"))
-        of_y = (lower + upper) / (2 * len(x))
-        return np.hypot(mean(of_x).error(), mean(of_y).error())
+        return np.hypot(
+            mean(_placements(x, y)).error(), mean(_placements(y, x)).error()
+        )
 
-    return Figure((len(x), len(y)), of, error)
+    return Figure((np.sort(x), np.sort(y)), of, error)
+
+
+def _placements(x: FloatArray, y: FloatArray) -> FloatArray:
+    """Return for each value of `x` which share of `y` is below it."""
+    y = np.sort(y)
+    below, up_to = (np.searchsorted(y, x, side=side) for side in ("left", "right"))
+    return np.asarray((below + up_to) / (2 * len(y)))
 
 
 def wilson_interval(successes: int, n: int, confidence: float) -> Interval:
-    """Return Wilson's score interval, without correction for continuity, of a share.
-
-    The values p with |k/n - p| <= z sqrt(p (1 - p) / n). Where all or none succeeded,
-    one end is exactly 1 or 0.
-    """
-    z = _normal_quantile(confidence)
-    middle = successes + z * z / 2
-    reach = z * math.sqrt(successes * (n - successes) / n + z * z / 4)
-    # Rounding would leave 1e-18 of them.
-    return Interval(
-        0.0 if successes == 0 else (middle - reach) / (n + z * z),
-        1.0 if successes == n else (middle + reach) / (n + z * z),
-    )
+    """Return Wilson's score interval, without correction for continuity, of a share."""
+    found = _stats().binomtest(successes, n).proportion_ci(confidence, method="wilson")
+    return Interval(float(found.low), float(found.high))
 
 
-def _normal_quantile(confidence: float) -> float:
-    """Return how many standard errors a two-sided interval reaches to each side."""
-    return NormalDist().inv_cdf(0.5 + confidence / 2)
+def two_sided_p_value(x: FloatArray, y: FloatArray) -> float:
+    """Return that of the Mann-Whitney test, exact for small samples without ties."""
+    if np.ptp(np.concatenate([x, y])) == 0:
+        # SciPy would divide zero by zero.
+        return 1.0
+    return float(_stats().mannwhitneyu(y, x, alternative="two-sided").pvalue)
 
 
-def _summed(rows: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    return np.asarray(rows.sum(axis=1))
-
-
-def _reached(counts: Counts) -> Counts:
-    """Return how many were drawn of the first k values, for k from 0 on."""
-    return np.pad(counts.cumsum(axis=1), ((0, 0), (1, 0)))
-
-
-def _resamples(sizes: Sequence[int], how: Bootstrap) -> Iterator[list[Counts]]:
-    """Yield blocks of resamples: of each sample, how often each value was drawn."""
-    raw = np.random.PCG64(np.random.SeedSequence(how.seed)).random_raw
-    rows = max(1, _BLOCK // sum(sizes))
-    for begin in range(0, how.resamples, rows):
-        count = min(rows, how.resamples - begin)
-        yield [
-            _row_counts(_drawn(raw(count * size), size).reshape(count, size))
-            for size in sizes
-        ]
-
-
-def _drawn(raw: npt.NDArray[np.uint64], size: int) -> Counts:
-    """Return numbers below `size`, all equally likely to 1 part in 2^32 / size.
-
-    Of raw output, which is the same with every version of NumPy.
-    """
-    half = np.uint64(32)
-    return ((raw >> half) * np.uint64(size) >> half).astype(np.int64)
-
-
-def _row_counts(drawn: Counts) -> Counts:
-    """Return how often each number below the length of a row stands in it."""
-    rows, size = drawn.shape
-    cells = drawn + size * np.arange(rows)[:, None]
-    return np.bincount(cells.ravel(), minlength=rows * size).reshape(rows, size)
+def _stats() -> Any:
+    # Not at the top, because it takes longer to import than all else.
+    return importlib.import_module("scipy.stats")

@@ -35,9 +35,8 @@ from typing import Any
 from ..atomic_files import replacing
 from ..errors import FileNotWritten, InvalidArgument
 from ..formats.json_fields import unreadable
-from ..formats.monitor_directory import FILE_PREFIX, Infix, infix_of
+from ..formats.monitor_directory import FILE_PREFIX, Infix, infix_of, is_second_name
 from ..formats.trajectory_file import amend_trajectory
-from ..formats.video_names import is_second_name
 from ..json_text import dumps, loads
 from .anonymous_models import anonymous_sources, compiled_model
 from .identity import Identity

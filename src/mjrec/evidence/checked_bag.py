@@ -70,6 +70,10 @@ def _objections(bag: Path, on_progress: _OnProgress) -> Iterator[tuple[str, str]
     there = {path.relative_to(bag).as_posix(): path.stat().st_size for path in paths}
     for name in sorted(said.keys() - there.keys()):
         yield name, "it is missing"
+    known = {BAG_DECLARATION, _INFO, *_MANIFESTS}
+    for name in sorted(said.keys() - known):
+        if not name.startswith(f"{PAYLOAD}/"):
+            yield name, "no packed run has such a file beside its data"
     # No manifest can hold its own digest.
     for name in sorted(there.keys() - said.keys() - {_MANIFESTS[1]}):
         yield name, "nothing says that it belongs there"

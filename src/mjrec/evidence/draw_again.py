@@ -12,9 +12,13 @@ import numpy as np
 
 from ..errors import Error
 from ..formats.manifest import read_manifest
-from ..formats.monitor_directory import is_manifest, iter_monitor_files
+from ..formats.monitor_directory import (
+    further_parts,
+    is_manifest,
+    iter_monitor_files,
+    with_part,
+)
 from ..formats.trajectory_file import open_trajectory
-from ..formats.video_names import further_parts, with_part
 from ..rendering.pool import WorkerPool
 from ..rendering.render_videos import render_videos
 from ..rendering.views import View

@@ -113,7 +113,7 @@ _BY_NAME: Final[Mapping[str, _Rule]] = {
     ),
     "wrappers": _Rule(
         kind=ExcuseKind.CODE,
-        costs="rewards and ends that differ without it are believed",
+        costs="what it made of actions, rewards and ends is believed",
         excludes=(Topic.REWARDS,),
         is_fed=True,
     ),

@@ -179,6 +179,8 @@ class _Playing:
             self._cut_off(episode)
             if episode.cut == KILLED:
                 break
+        if self._recording.has_sources:
+            recorder.finish_models()
         if self._recording.was_killed:
             self._notes.write(self._directory.parent)
             os.kill(os.getpid(), signal.SIGKILL)
@@ -297,13 +299,23 @@ class _Playing:
 
     def _note_stand_in(self, episode: EpisodeInputs) -> None:
         stand_in = self._recreated.stand_in
-        if stand_in is not None and stand_in.differing:
-            names = (self._recording.environment or {}).get("wrappers") or ()
+        if stand_in is None:
+            return
+        names = (self._recording.environment or {}).get("wrappers") or ()
+        without = f"without {', '.join(map(str, names)):.300}"
+        if stand_in.differing:
             self._note(
                 episode,
                 "wrappers",
-                f"without {', '.join(map(str, names)):.300} the rewards or the end of "
-                f"{stand_in.differing} of its steps are others: they are believed",
+                f"{without} the rewards or the end of {stand_in.differing} of its "
+                "steps are others: they are believed",
+            )
+        if stand_in.translated:
+            self._note(
+                episode,
+                "wrappers",
+                f"{without} the actions of {stand_in.translated} of its steps are not "
+                "its controls: that they led to these is believed",
             )
 
     def _believe(self, episode: EpisodeInputs) -> None:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from .. import json_text
 from ..errors import UnreadableFile
 from ..formats.journal import JournalEntry, JournalReader
-from ..formats.json_fields import read_object
+from ..formats.json_fields import read_object, unreadable
 from ..formats.monitor_directory import FILE_PREFIX, Infix
 from ..formats.regular_files import open_regular
 from ..formats.trajectory import TrajectoryReader
@@ -76,7 +76,8 @@ def _begun(recording: RecordingInputs) -> tuple[float, str]:
 def _packing(path: Path) -> Mapping[str, Any]:
     if not path.exists():
         return {}
-    packed_with = read_object(path).get("packed_with")
+    with unreadable(path):
+        packed_with = read_object(path).get("packed_with")
     said = packed_with.get("options") if isinstance(packed_with, Mapping) else None
     if not isinstance(said, Mapping):
         return {}
@@ -122,6 +123,10 @@ def _recording(files: MonitorFiles, arrays: dict[str, NDArray[Any]]) -> Recordin
         surroundings=journal.surroundings,
         surroundings_after=journal.surroundings_after,
         was_killed=journal.was_killed,
+        has_sources=any(
+            path.suffix == ".zip"
+            for path in (files.journal or Path()).parent.glob("openaigym.model.*")
+        ),
         is_closed=journal.is_closed,
     )
 
@@ -145,7 +150,7 @@ class _Journal:
     def __init__(self, path: Path | None) -> None:
         self.run: Mapping[str, Any] = {}
         self.surroundings: Mapping[str, Any] | None = None
-        self.surroundings_after = 0
+        self.surroundings_after = self._lines = 0
         self.entries: dict[int, JournalEntry] = {}
         self.cuts: dict[int, Mapping[str, Any]] = {}
         self.irregular: dict[int, list[Mapping[str, Any]]] = {}
@@ -156,6 +161,7 @@ class _Journal:
         if path is None:
             return
         for entry in JournalReader(path, on_event=self._note):
+            self._lines += 1
             self.entries[entry.episode_id] = entry
             if len(self.entries) > _MOST_EPISODES:
                 raise NotReadable(f"more than {_MOST_EPISODES} episodes")
@@ -169,12 +175,16 @@ class _Journal:
                 yield int(digits)
 
     def _note(self, kind: str, facts: Any) -> None:
+        self._note_facts(kind, facts)
+        self._lines += kind != "run"
+
+    def _note_facts(self, kind: str, facts: Any) -> None:
         match kind, facts:
             case "run", dict():
                 self.run = facts
             case "surroundings", dict():
                 self.surroundings = facts
-                self.surroundings_after = len(self.entries)
+                self.surroundings_after = self._lines
             case "cut", {"episode_id": int(number)}:
                 self.cuts[number] = facts
             case "action", {"episode_id": int(number), "step": int()}:

@@ -91,8 +91,7 @@ def _open(request: Mapping[str, Any], say: _Say) -> None:
     try:
         inputs, arrays = read_inputs(given / PAYLOAD)
     except NotReadable as error:
-        say(failure=f"its inputs cannot be read: {error}")
-        return
+        raise Error(f"its inputs cannot be read: {error}") from error
     folder = Path(request["inputs"])
     folder.mkdir()
     inputs.write(folder, arrays)

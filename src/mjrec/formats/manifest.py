@@ -14,6 +14,7 @@ the other lists; they are read as they stand.
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -33,6 +34,7 @@ from .json_fields import (
     text,
     unreadable,
 )
+from .regular_files import read_regular
 
 # What stands for gym's version in what this package writes.
 GYM_VERSION = "mjrec-1"
@@ -72,10 +74,18 @@ def read_manifest(path: Path) -> Manifest:
         )
 
 
-def write_manifest(path: Path, manifest: Manifest) -> None:
-    """Write the manifest, whole or not at all."""
+def write_manifest(path: Path, manifest: Manifest) -> bool:
+    """Write the manifest, whole or not at all, unless it is there; tell whether."""
     content = {key: value for key, value in vars(manifest).items() if value is not None}
-    write_text(path, dumps(content))
+    return _write_new(path, dumps(content))
+
+
+def _write_new(path: Path, text: str) -> bool:
+    with contextlib.suppress(OSError, ValueError):
+        if read_regular(path, limit=len(text)) == text.encode():
+            return False
+    write_text(path, text)
+    return True
 
 
 def _pair(value: Any) -> tuple[str, str]:
@@ -146,12 +156,12 @@ def read_stats_file(path: Path) -> StatsFile:
     return stats
 
 
-def write_stats_file(path: Path, stats: StatsFile) -> None:
-    """Write the file, whole or not at all."""
+def write_stats_file(path: Path, stats: StatsFile) -> bool:
+    """Write the file, whole or not at all, unless it is there; tell whether."""
     values = vars(stats)
     if stats.episode_types is None:
         values = {k: v for k, v in values.items() if k != "episode_types"}
-    write_text(path, dumps(values))
+    return _write_new(path, dumps(values))
 
 
 def _check_lengths(stats: StatsFile) -> None:

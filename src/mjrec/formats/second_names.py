@@ -19,9 +19,14 @@ import os
 from collections.abc import Iterator
 from pathlib import Path
 
-from .monitor_directory import episode_of, iter_monitor_files
+from .monitor_directory import (
+    episode_of,
+    is_second_name,
+    iter_monitor_files,
+    second_name_of,
+    without_part,
+)
 from .video_metadata import finished_videos, metadata_of, metadata_path
-from .video_names import is_second_name, second_name_of, without_part
 
 logger = logging.getLogger(__name__)
 

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -107,6 +107,17 @@ def amend_trajectory(finished: Path, change: Callable[[Any], Any]) -> None:
         write_hdf5(reader, finished)
 
 
+def _end_time(facts: Mapping[str, Any], recording: Recording | None) -> float:
+    """Return about when an episode ended, and not before it began.
+
+    What is written into a mapped file may change its time much later, or never.
+    """
+    start, last = facts.get("start_time"), 0.0
+    if recording is not None:
+        last = recording.spans.last_write
+    return max(start, last) if isinstance(start, float) else last
+
+
 def _how_it_ended(
     reader: TrajectoryReader, recording: Recording | None
 ) -> dict[str, Any]:
@@ -125,7 +136,7 @@ def _how_it_ended(
             "complete": True,
             "terminated": bool(reader.terminated[-1]),
             "truncated": bool(reader.truncated[-1]),
-            "end_time": 0.0 if recording is None else recording.spans.last_write,
+            "end_time": _end_time(facts, recording),
         }
     else:
         known["reason"] = KILLED

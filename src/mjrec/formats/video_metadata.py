@@ -26,7 +26,7 @@ _FAILED = ".failed.json"
 _LONGEST_REASON = 1000
 _CUT = " [...] "
 
-# Of a file's name, as `video_names` makes them.
+# Of a file's name, as `camera_part` makes them.
 _PART = re.compile(r"[A-Za-z0-9_%-]{1,200}", re.ASCII)
 
 

@@ -6,7 +6,6 @@ from __future__ import annotations
 import os
 import re
 import sys
-import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -20,8 +19,6 @@ from .egl import EglDevice
 # Drivers of machines with many GPUs take ten seconds and more to wake up.
 TIMEOUT = 60.0
 
-# How long after its own end of patience the child is killed.
-_GRACE = 5.0
 _END_OF_OUTPUT = 4000
 _SAID = ("renders", "gl_renderer", "gl_vendor", "gl_version", "frames_per_second")
 _SOFTWARE = re.compile(r"llvmpipe|softpipe|swrast|SwiftShader|software", re.IGNORECASE)
@@ -154,18 +151,21 @@ def _ask_child(
     environ: Mapping[str, str], *, measure: bool, timeout: float
 ) -> tuple[dict[str, Any], str]:
     """Return what the child reported, and in words all that points to a failure."""
-    arguments = [f"--seconds={timeout}", *(["--measure"] if measure else [])]
     facts: dict[str, Any] = {}
-    start = time.monotonic()
+    is_silent = False
     try:
+        arguments = ["--measure"] if measure else []
         child = Child("mjrec.simulation.gl_probe", *arguments, environ=environ)
     except OSError as error:
         return {}, f"{sys.executable} could not be started: {error}"
     with child:
-        for said in child.messages(timeout + _GRACE):
+        for said in child.messages(timeout):
+            is_silent = said is None
             facts |= said or {}
-        if time.monotonic() - start >= timeout:
+        if is_silent:
+            child.stacks()
             end = f"no answer within {timeout:g} seconds"
+            child.kill()
         else:
             end = f"The child process {child.how_it_ended()}."
         words = [child.printed(), *facts.get("notes", [])]

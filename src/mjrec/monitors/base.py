@@ -24,10 +24,10 @@ from ..recorder.options import (
     RecorderOptions,
     RenderingChoice,
 )
+from ..recorder.recorded_environment import RecordedEnvironment
 from ..recorder.recorder import Recorder
 from ..recorder.states import DeferredVideo
 from ..recorder.stats_recorder import StatsRecorder
-from ..recorder.subject import Subject
 from ..recorder.video_recorder import VideoRecorder, declared_rate
 from ..rendering.background import Background
 from ..simulation.find_simulation import simulation_time
@@ -250,7 +250,7 @@ class EnvironmentMonitor(MonitorBase):
             close_environment: closes `env`.
             no_simulation: why there are no states, where there are none.
             rendering: makes what renders; a service of this monitor's own if None.
-            **subject: `env_id` and others of `Subject`.
+            **subject: `env_id` and others of `RecordedEnvironment`.
         """
         known = scenes()
         # Clips run beside episodes, and a source of states has one reader only.
@@ -267,7 +267,7 @@ class EnvironmentMonitor(MonitorBase):
         self._options = options
         self._recorder = Recorder(
             directory,
-            subject=Subject(
+            env=RecordedEnvironment(
                 clock=functools.partial(simulation_time, env),
                 declared=functools.partial(declared_rate, env),
                 rendering=choice,

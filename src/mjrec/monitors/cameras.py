@@ -7,9 +7,9 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from ..errors import InvalidArgument
-from ..formats.video_names import further_parts
+from ..formats.monitor_directory import further_parts
 from ..frames import Frame, check_frame, grid_frame, grid_shape
-from ..recorder.subject import EpisodePictures
+from ..recorder.recorded_environment import EpisodePictures
 from ..recorder.video_recorder import can_give_pictures
 from ..rendering.views import plain_camera
 
@@ -29,7 +29,7 @@ def camera_pictures(
 
     Returns:
         The only camera, or the first, the one that scenes are recorded with; and what
-        `Subject` is told: `pictures`, `further_pictures` and `cameras`.
+        `RecordedEnvironment` gets: `pictures`, `further_pictures` and `cameras`.
 
     Raises:
         InvalidArgument: the list is empty, or has one camera twice, or None in another

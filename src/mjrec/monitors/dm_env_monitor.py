@@ -10,7 +10,7 @@ from typing import Any
 
 import dm_env
 
-from ..environments.dm_env_episodes import is_terminated, is_truncated
+from ..environments.named_environment import is_terminated, is_truncated
 from ..environments.scenes import NoPictureSource, Scenes
 from ..errors import InvalidArgument
 from ..recorder.options import RecorderOptions
@@ -38,7 +38,7 @@ class DmEnvMonitor(EnvironmentMonitor, dm_env.Environment):  # type: ignore[misc
 
     Attributes:
         seed: what the journal and the metadata say of the next episode's seed.
-            dm_env's `reset` takes none, so whoever seeds the environment says so here.
+            dm_env's `reset` takes none, so say here what you seeded it with.
     """
 
     allows_early_reset = True

@@ -73,8 +73,8 @@ def Monitor(  # noqa: N802  named as the class that it was in gym
     Other environments are drawn while they step, through their own `render()`.
 
     Args:
-        env: a Gymnasium environment, one of its vector environments, of which each
-            sub-environment is recorded (`VectorMonitor` says how), or a dm_env
+        env: a Gymnasium environment, a vector environment, whose sub-environments are
+            each recorded (`VectorMonitor` says how), or a dm_env
             environment such as `dm_control.suite.load(...)`. Where pictures are drawn
             live it must be made with `render_mode="rgb_array"` (or `"rgb_array_list"`,
             `"ansi"`); deferred rendering needs no `render_mode`, and no OpenGL in this
@@ -169,9 +169,9 @@ def Monitor(  # noqa: N802  named as the class that it was in gym
             pictures. They are then not those of `env.render()` any more.
         tiled: one video of all `camera`s side by side, instead of one for each. Of a
             vector environment: also a video of all sub-environments side by side.
-        trackers: who is told of finished episodes and videos, see `mjrec.trackers`.
+        trackers: are notified of finished episodes and videos, see `mjrec.trackers`.
         policy_file: the file in which the policy is, such as a checkpoint. Its sha256
-            goes into the manifest, for whoever packs the recording as evidence.
+            goes into the manifest, for packing the recording as evidence.
         env_id: the environment's name in the recordings. None is the name in its
             spec; dm_env environments have none, so theirs is worth giving, as
             `dm_control/<domain>-<task>`.

@@ -21,7 +21,7 @@ ShowProgress: TypeAlias = Callable[[str, int, int | None, str], None]
 
 @contextlib.contextmanager
 def progress_bar(console: rich.console.Console | None = None) -> Iterator[ShowProgress]:
-    """Yield a function that shows a bar for each thing that it is told of.
+    """Yield a function that shows a bar for each thing that it gets.
 
     The bars vanish at the end: what a program prints is its own business.
 
@@ -74,7 +74,7 @@ def render_progress(
     with progress_bar(console) as show:
 
         def show_rendering(progress: Progress) -> None:
-            """Count frames, or videos where nobody knows how many frames there are."""
+            """Count frames, or videos where the number of frames is not known."""
             videos, frames = progress.videos_done, progress.frames_done
             words = f"{videos}/{progress.videos} videos, {frames}"
             if progress.frames is None:

@@ -6,12 +6,11 @@ from __future__ import annotations
 import functools
 import logging
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 from ..environments.gymnasium_pictures import gymnasium_pictures
 from ..errors import InvalidArgument, NoPictures
-from ..formats.monitor_directory import Infix, video_prefix
+from ..formats.monitor_directory import video_prefix
 from ..recorder.ending_reasons import CLOSE, RESET, ending
 from ..recorder.live_videos import LiveVideos
 from ..recorder.options import OFF, WARN, RecorderOptions
@@ -89,7 +88,7 @@ class TiledVideo:
         self._tiles = tiles
         self._options = options
         self._env = env
-        self._video: VideoRecorder | None = None
+        self._live: LiveVideos | None = None
         # The episode that the frames are of.
         self._episode_id = -1
         self._ending: dict[str, Any] | None = None
@@ -97,20 +96,20 @@ class TiledVideo:
     @property
     def is_recording(self) -> bool:
         """Whether a video is running."""
-        return self._video is not None
+        return self._live is not None
 
     def take_last(self) -> None:
         """Take the frame of the last step, if it was left out."""
-        if self._video is not None and self._ending is None:
-            self._live(self._video).take_last()
+        if self._live is not None and self._ending is None:
+            self._live.take_last()
 
     def after_reset(self) -> None:
         """Follow the first sub-environment, which has just been reset."""
         episode_id = self._first.episode_id - 1
-        if self._video is not None and episode_id == self._episode_id:
+        if self._live is not None and episode_id == self._episode_id:
             # Reset before any step: the number stays, the frame is another.
-            self._video.discard()
-            self._video = None
+            self._live.discard()
+            self._live = None
         self._end_early(RESET)
         self._begin(episode_id)
 
@@ -124,16 +123,16 @@ class TiledVideo:
         episode_id = self._first.episode_id - 1
         is_over = terminated or truncated
         self._ending = None
-        if self._video is not None:
-            stats, said = self._first.stats_recorder, self._video.metadata
-            said.update(length=stats.steps, reward=stats.rewards)
+        if self._live is not None:
+            stats = self._first.stats_recorder
+            length, reward = stats.steps, stats.rewards
             if is_over:
-                said["length"] = stats.episode_lengths[-1]
-                said["reward"] = stats.episode_rewards[-1]
+                length, reward = stats.episode_lengths[-1], stats.episode_rewards[-1]
+            self._live.say(length=length, reward=reward)
             if episode_id != self._episode_id:
                 # SAME_STEP: the first tile shows the next episode already.
-                said["final_frame"] = "missing"
-            self._live(self._video).take(is_there=True, last=is_over)
+                self._live.say(final_frame="missing")
+            self._live.take(is_there=True, last=is_over)
         if is_over:
             self._end(complete=True, terminated=terminated, truncated=truncated)
         if episode_id != self._episode_id:
@@ -151,16 +150,14 @@ class TiledVideo:
     def _begin(self, episode_id: int) -> None:
         self._episode_id = episode_id
         self._ending = None
-        of_first = self._first.video_recorder
-        infix = Infix.parse(self._first.infix)
-        if of_first is None or not of_first.enabled or infix is None:
+        of_first, run = self._first.video_recorder, self._first.recorder.run
+        if of_first is None or not of_first.enabled:
             return
-        name = f"{video_prefix(infix, episode_id)}.tiled"
-        self._video = VideoRecorder(
+        video = VideoRecorder(
             self._tiles,
-            base_path=self._first.directory / name,
+            base_path=run.directory / f"{video_prefix(run.infix, episode_id)}.tiled",
             metadata={
-                **self._first._recorder.run.live_facts(),
+                **run.live_facts(),
                 "tiled": True,
                 "sub_environments": len(self._tiles.sources),
                 "length": 0,
@@ -174,24 +171,22 @@ class TiledVideo:
             facts=self._tiles.facts,
             strict=self._options.strict,
         )
-        self._live(self._video).begin()
-
-    def _live(self, video: VideoRecorder) -> LiveVideos:
-        return LiveVideos([video], tolerates=self._tolerates)
+        self._live = LiveVideos([video], tolerates=self._tolerates)
+        self._live.begin()
 
     def _tolerates(self, error: Exception) -> bool:
-        if self._options.on_error != WARN or self._video is None:
+        if self._options.on_error != WARN:
             return False
-        logger.warning("The tiled video %s: %s", self._video.path, error)
+        logger.warning("A tiled video of %s: %s", self._first.directory, error)
         return True
 
     def _end_early(self, reason: str) -> None:
         self._end(complete=False, **(self._ending or {"reason": reason}))
 
     def _end(self, **facts: Any) -> None:
-        video, self._video = self._video, None
-        if video is not None:
+        live, self._live = self._live, None
+        if live is not None:
             try:
-                LiveVideos([video], tolerates=self._tolerates).end(facts)
+                live.end(facts)
             finally:
-                self._first._recorder.run.trackers.expect(Path(str(video.path)))
+                self._first.recorder.run.trackers.expect(live.path)

@@ -18,6 +18,7 @@ import numpy as np
 from ..environments.gymnasium_pictures import close_environment, free_viewers
 from ..errors import Error, ResetNeeded, ResetNotAllowed
 from ..formats.monitor_directory import infix_of, iter_monitor_files
+from ..recorder.opening import made_directory
 from ..recorder.options import RecorderOptions
 from ..rendering.background import Background
 from .base import NO_SIMULATION, MonitorBase, call_all
@@ -60,8 +61,8 @@ class VectorMonitor(MonitorBase, gymnasium.vector.VectorWrapper):
     All others (`AsyncVectorEnv`, environments that are vectorised by themselves) are
     recorded by what goes into them and comes out: pictures are drawn live, through
     `render()`, and trajectories hold no states. Where such an environment resets
-    itself in the step that ends an episode (SAME_STEP), nobody outside sees the last
-    frame: the metadata says `final_frame: missing`. With a Monitor inside the
+    itself in the step that ends an episode (SAME_STEP), its last frame is not seen from
+    outside: the metadata says `final_frame: missing`. With a Monitor inside the
     environment functions, instead of this one, all is as for one environment.
 
     A reset in mid-episode is allowed unless `allow_early_reset=False`: sub-environments
@@ -432,25 +433,21 @@ def _all_or_none(
     Their files are removed, and the directories made for them.
     """
     path = Path(directory).absolute()
-    missing = [each for each in (path, *path.parents) if not each.exists()]
     opened: list[GymnasiumMonitor] = []
-    try:
-        for open_one in opens:
-            opened.append(open_one())
-    except BaseException:
-        for monitor in opened:
-            # What was raised first is what the user needs to see.
-            with contextlib.suppress(Exception):
-                monitor._guard.close()
-        infixes = {monitor.infix for monitor in opened}
-        for file in iter_monitor_files(path, hidden=True):
-            if infix_of(file.name) in infixes:
-                file.unlink(missing_ok=True)
-        for made in missing:
-            # Other files may have come into it meanwhile.
-            with contextlib.suppress(OSError):
-                made.rmdir()
-        raise
+    with made_directory(path):
+        try:
+            for open_one in opens:
+                opened.append(open_one())
+        except BaseException:
+            for monitor in opened:
+                # What was raised first is what the user needs to see.
+                with contextlib.suppress(Exception):
+                    monitor._guard.close()
+            infixes = {monitor.infix for monitor in opened}
+            for file in iter_monitor_files(path, hidden=True):
+                if infix_of(file.name) in infixes:
+                    file.unlink(missing_ok=True)
+            raise
     return tuple(opened)
 
 

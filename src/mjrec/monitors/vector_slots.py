@@ -120,7 +120,7 @@ class Frames:
 class SubEnvironment(Env):
     """A sub-environment that is seen from outside, as if it stood alone.
 
-    Its monitor is told what the vector environment was given and returned, and calls
+    Its monitor gets what the vector environment was given and returned, and calls
     only `render`.
     """
 

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The recorder: told reset, step and close; knows no framework."""
+"""The recorder: follows reset, step and close of any framework."""

@@ -38,7 +38,7 @@ class Clips:
     each. Without a length it ends with the episode.
 
     Args:
-        run: of which they are. `video_length` is theirs in steps, None until the end of
+        run: the monitored run. `video_length` is theirs in steps, None until the end of
             the episode; `step_trigger` tells by the number of steps taken so far
             whether one begins before the next, None where only episodes begin them.
     """
@@ -64,12 +64,9 @@ class Clips:
         """Begin a video, if it is its time."""
         taken = self._run.stats.total_steps
         if self._clip is None and self._trigger is not None:
-            try:
+            is_chosen: Any = False
+            with self._run.tolerating("video", Exception):
                 is_chosen = self._trigger(taken)
-            except Exception as error:
-                if not self._run.tolerates("video", error):
-                    raise
-                return
             if is_chosen:
                 self._start(taken)
 
@@ -116,7 +113,7 @@ class _Clip:
     """One video, drawn live, or recorded in parts of one episode each.
 
     Args:
-        run: of which it is.
+        run: the monitored run.
         taken: the steps so far, where a step began it; None where it begins with an
             episode.
 
@@ -139,12 +136,14 @@ class _Clip:
         self._part: StateRecorder | None = None
         self._parts = 0
         start = None
-        if run.subject.rendering.mode == DEFERRED:
-            assert run.subject.clip_states is not None
-            start = run.subject.clip_states.begin_episode()
+        if run.env.rendering.mode == DEFERRED:
+            assert run.env.clip_states is not None
+            start = run.env.clip_states.begin_episode()
             start = start if run.can_be_deferred(start) else None
         if start is not None:
-            self._promise = run.promise(path.name, DEFERRED, second_name=second_name)
+            self._pending_video = run.pending_video(
+                path.name, DEFERRED, second_name=second_name
+            )
             self._video = path.with_name(f"{path.name}.mp4")
             self._begin_part(start)
         else:
@@ -163,7 +162,7 @@ class _Clip:
         if self.live is not None:
             self.live.say(last_episode_id=self._last_episode_id)
             self.live.begin()
-        part, capture = self._part, self._run.subject.clip_states
+        part, capture = self._part, self._run.env.clip_states
         if part is None or part.broken_reason is not None:
             return
         assert capture is not None
@@ -210,7 +209,7 @@ class _Clip:
                 last = {"last_episode_id": self._last_episode_id}
                 self._part.end({**known, **last, "end_time": run.clock()})
             finally:
-                # Else the disk was too full for a single row: nothing is promised.
+                # Else the disk was too full for a single row: no video will come.
                 if self._parts > 1 or self._part.is_there:
                     run.note("clip", {**said, "clip": self._name(0)})
                     run.trackers.expect(self._video)
@@ -226,14 +225,14 @@ class _Clip:
             "reward_before": run.stats.rewards or 0.0,
             "reset_time": run.episode.reset_clock,
         }
-        facts = {"kept": False, "video": self._promise, "clip": clip}
+        facts = {"kept": False, "video": self._pending_video, "clip": clip}
         self._part = StateRecorder(
             run,
             self._name(self._parts),
             logs=run.clip_logs,
             what="video",
             facts={**run.recording_facts(start), **facts},
-            capture=run.subject.clip_states,
+            capture=run.env.clip_states,
             start=start,
             # What was done is of no use to a picture. Which frames are wanted is chosen
             # when they are drawn, because they are counted over all parts: so `max_fps`

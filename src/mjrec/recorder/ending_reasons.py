@@ -61,5 +61,5 @@ def _name(kind: type) -> str:
 def _message(error: BaseException) -> str:
     try:
         return str(error)[:_LONGEST_MESSAGE]
-    except Exception:  # whatever somebody's __str__ does
+    except Exception:  # a user's __str__ may do anything
         return ""

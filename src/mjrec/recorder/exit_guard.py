@@ -14,7 +14,7 @@ _OWN_THREADS = "mjrec-"
 
 
 class ExitGuard:
-    """Calls `close` once: when told to, when `owner` is collected, or at exit.
+    """Calls `close` once: when called, when `owner` is collected, or at exit.
 
     In a forked child nothing is called: the files belong to the process that made
     them.

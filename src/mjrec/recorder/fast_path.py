@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Recording the steps of which nothing but the state is new.
+"""Recording steps after which nothing but the state is new.
 
 A fast simulation's step takes as long as some hundred lines of Python. Nearly all steps
 are alike: no error, no end, the same model, the same view. A `FastPath` stands in place
@@ -38,7 +38,7 @@ class Step(Protocol):
 
 
 class FastPath(NamedTuple):
-    """What usual steps are recorded with.
+    """What nearly all steps are recorded with.
 
     Attributes:
         before_step: notes the action, and tells whether a step may be taken.
@@ -89,7 +89,7 @@ def gathering(
             not like those before.
         is_current: tells, after the step, whether nothing but the state is new.
         is_on_pace: tells, after the first step, whether it lasted as long as supposed.
-        stride: only steps of which this is a factor have a frame.
+        stride: only its multiples have a frame.
     """
     log, bodies = span.log.rows, span.log.bodies
     take, pack_into = WORDS.take, ROW_HEAD.pack_into

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Which episodes get a video, decided after they ended: `Monitor(..., keep=...)`.
 
-A selection is told of every finished episode, one after the other, and says of each
+A selection gets every finished episode, one after the other, and says of each
 how it stands. It knows nothing of files.
 """
 
@@ -52,7 +52,7 @@ class Selection:
 
     Attributes:
         name: as given.
-        finished: how many episodes it was told of.
+        finished: how many episodes it got.
         holds_all: every episode is a candidate until `close`.
     """
 
@@ -86,7 +86,7 @@ class Selection:
             self._last_id = episode.episode_id
 
     def standing(self, episode_id: int) -> Standing:
-        """Return how an episode stands that it was told of."""
+        """Return how an episode stands that it got."""
         if episode_id in self._chosen:
             return Standing.CHOSEN
         is_candidate = episode_id in self._candidates

@@ -2,8 +2,8 @@
 """The recordings of a run whose videos are chosen after the episodes have ended.
 
 Every episode is recorded as if it got a video. What is not decided yet is held: its
-log calls it a candidate, which nobody else touches while the monitor is open, and which
-anybody may render once the monitor is gone. What falls out is deleted at once.
+log calls it a candidate, which no other process touches while the monitor is open, and
+any may render once the monitor is gone. What falls out is deleted at once.
 """
 
 from __future__ import annotations

@@ -10,9 +10,9 @@ from typing import Any
 
 from ..errors import DirectoryNotWritable, Error
 from ..formats.frame_hashes import frame_hash_path
+from ..formats.monitor_directory import second_name_of
 from ..formats.second_names import give_second_names
 from ..formats.video_metadata import amend_metadata
-from ..formats.video_names import second_name_of
 from .monitored_run import MonitoredRun
 from .video_recorder import VideoRecorder
 
@@ -170,13 +170,13 @@ def live_videos(
     """Return what draws videos of the running episode, of each camera.
 
     Args:
-        run: of which they are.
+        run: the monitored run.
         path: of the first camera's, without its ending.
         second_name: as `MonitoredRun.second_name`.
         on_picture_error: as of `LiveVideos`.
     """
-    options, subject = run.options, run.subject
-    sources = {"": subject.pictures, **subject.further_pictures}
+    options, env = run.options, run.env
+    sources = {"": env.pictures, **env.further_pictures}
     recorders = [
         VideoRecorder(
             pictures,
@@ -185,8 +185,8 @@ def live_videos(
             fps=options.fps,
             max_fps=options.max_fps,
             frame_hashes=True,
-            clock=subject.clock,
-            declared=subject.declared,
+            clock=env.clock,
+            declared=env.declared,
             facts=pictures.facts,
             strict=options.strict,
             caption=run.caption if options.annotate else None,

@@ -3,9 +3,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -23,9 +24,9 @@ from . import tracking
 from .finishers import Finisher
 from .opening import OpenDirectory
 from .options import LIVE, WARN, RecorderOptions
+from .recorded_environment import RecordedEnvironment, check_refusal
 from .stats_recorder import StatsRecorder
 from .step_arrays import RowLayout
-from .subject import Subject, check_refusal
 from .tracking import Trackers
 from .video_recorder import VideoRecorder
 
@@ -70,7 +71,7 @@ class MonitoredRun:
 
     Args:
         place: the open directory.
-        subject: what is recorded.
+        env: what is recorded.
         options: what was asked for.
         stats: counts steps and rewards.
         finisher: takes over recordings that have ended.
@@ -78,12 +79,12 @@ class MonitoredRun:
             where it is chosen before.
 
     Attributes:
-        subject, options, stats, finisher, selection: as given.
+        env, options, stats, finisher, selection: as given.
         directory: the monitor directory.
         infix: what its files have in the middle.
         clock: returns the time, in seconds since the epoch.
         events: what the journal says so far, also what the disk was too full for.
-        trackers: are told of episodes and finished videos.
+        trackers: get episodes and finished videos.
         logs: of the episodes' rows.
         clip_logs: of the clips'.
         layouts, paces: of the last recording in each of these.
@@ -94,14 +95,14 @@ class MonitoredRun:
         self,
         place: OpenDirectory,
         *,
-        subject: Subject,
+        env: RecordedEnvironment,
         options: RecorderOptions,
         stats: StatsRecorder,
         finisher: Finisher,
         selection: Mapping[str, Any],
     ) -> None:
         self.directory, self.infix = place.path, place.infix
-        self.subject, self.options, self.stats = subject, options, stats
+        self.env, self.options, self.stats = env, options, stats
         self.clock = options.clock
         self.finisher, self.selection = finisher, selection
         self.events = Run(place.run)
@@ -110,11 +111,13 @@ class MonitoredRun:
         self._faults: set[tuple[int | None, What, str]] = set()
         self._policy = _policy_facts(options)
         self._statements = options.statements
+        # In the journal, after the first.
+        self._lines = 0
         self._surroundings = None if options.statements else look_around()
         self._environment_facts = {
             "infix": str(self.infix),
-            "env_id": subject.env_id,
-            "environment": subject.environment,
+            "env_id": env.env_id,
+            "environment": env.environment,
             "versions": dict(versions()),
             "machine": dict(machine_fingerprint()),
         }
@@ -122,8 +125,8 @@ class MonitoredRun:
             tracking.Run(
                 directory=self.directory,
                 infix=str(self.infix),
-                env_id=subject.env_id,
-                env_index=subject.env_index,
+                env_id=env.env_id,
+                env_index=env.env_index,
             ),
             options.all_trackers,
             on_fault=lambda name, error, number: self.note_fault(
@@ -144,7 +147,7 @@ class MonitoredRun:
         self.paces: dict[SpanLogs, Mapping[str, Any]] = {}
         # Recordings whose ends are not in their lists yet: the disk was full.
         self._late: list[Path] = []
-        self.no_video = VideoRecorder(subject.pictures, enabled=False)
+        self.no_video = VideoRecorder(env.pictures, enabled=False)
         self._episode: BegunEpisode | None = None
         # Why videos are drawn live, as far as it was said.
         self._said: set[str] = set()
@@ -158,6 +161,7 @@ class MonitoredRun:
             FileNotWritten: the disk is full.
         """
         self.events.add(entry)
+        self._lines += 1
         self._write(lambda: self._journal.append(entry))
         self.note_surroundings()
 
@@ -168,6 +172,7 @@ class MonitoredRun:
             FileNotWritten: the disk is full.
         """
         self.events.note(kind, facts)
+        self._lines += 1
         self._write(lambda: self._journal.note(kind, facts))
 
     def note_surroundings(self, *, wait: bool = False) -> None:
@@ -198,6 +203,17 @@ class MonitoredRun:
             of = "" if episode_id is None else f" of episode {episode_id}"
             logger.warning("Not recorded whole: %s%s. %s", what, of, error)
         return is_warned
+
+    @contextlib.contextmanager
+    def tolerating(
+        self, what: What, *kinds: type[Exception], of_episode: bool = True
+    ) -> Iterator[None]:
+        """Go on after an error of these kinds, where it is tolerated."""
+        try:
+            yield
+        except kinds as error:
+            if not self.tolerates(what, error, of_episode=of_episode):
+                raise
 
     def note_fault(self, what: What, reason: str, *, episode_id: int | None) -> bool:
         """Write a fault down; return whether it is a new one."""
@@ -235,7 +251,7 @@ class MonitoredRun:
 
     def _found(self, *, wait: bool) -> Mapping[str, Any] | None:
         if (stated := self._statements) is not None:
-            is_time = wait or self.events.count >= stated.surroundings_after
+            is_time = wait or self._lines >= stated.surroundings_after
             return stated.surroundings if is_time else None
         found = (
             None if self._surroundings is None else self._surroundings.found(wait=wait)
@@ -265,7 +281,7 @@ class MonitoredRun:
 
     def caption(self) -> Caption:
         """Return what is written on the frame of this moment."""
-        began, now = self.episode.reset_clock, self.subject.clock()
+        began, now = self.episode.reset_clock, self.env.clock()
         return Caption(
             episode_id=self.episode.episode_id,
             step=self.stats.steps or 0,
@@ -284,15 +300,15 @@ class MonitoredRun:
         refusal = start.refusal
         if refusal is None:
             return True
-        check_refusal(self.subject, refusal)
+        check_refusal(self.env, refusal)
         if refusal not in self._said:
             self._said.add(refusal)
             logger.warning(
-                "The videos of %s are drawn live: %s.", self.subject.env_id, refusal
+                "The videos of %s are drawn live: %s.", self.env.env_id, refusal
             )
         return False
 
-    def promise(
+    def pending_video(
         self, name: str, recording: str, *, second_name: Mapping[str, str]
     ) -> dict[str, Any]:
         """Return what a trajectory, or a clip, says of its video.
@@ -302,23 +318,23 @@ class MonitoredRun:
             recording: when it is drawn, `DEFERRED` or `LIVE`.
             second_name: as of `second_name`.
         """
-        options, subject = self.options, self.subject
-        promise: dict[str, Any] = {
+        options, env = self.options, self.env
+        pending: dict[str, Any] = {
             "name": f"{name}.mp4",
             "quality": options.quality,
             "fps": None if options.fps is None else str(options.fps),
             "max_fps": None if options.max_fps is None else str(options.max_fps),
             "recording": recording,
-            "reason": subject.rendering.reason if recording == LIVE else None,
+            "reason": env.rendering.reason if recording == LIVE else None,
         }
-        if subject.cameras:
-            promise["cameras"] = list(subject.cameras)
-            promise["tiled"] = options.tiled
+        if env.cameras:
+            pending["cameras"] = list(env.cameras)
+            pending["tiled"] = options.tiled
         if options.annotate:
-            promise["annotate"] = True
+            pending["annotate"] = True
         if self.selection:
-            promise["selection"] = self.selection
-        return {**promise, **second_name}
+            pending["selection"] = self.selection
+        return {**pending, **second_name}
 
     def second_name(self, what: str, number: int) -> dict[str, str]:
         """Return what a video is called besides, for its metadata.
@@ -355,7 +371,7 @@ class MonitoredRun:
         """Return what the metadata of a live video says of the running episode."""
         known = self.recording_facts(None)
         keys = ("episode_id", "type", "env_id", "seed", "options")
-        reason = self.subject.rendering.reason
+        reason = self.env.rendering.reason
         return {
             **{key: known[key] for key in (*keys, "versions", "machine")},
             "recording": LIVE,

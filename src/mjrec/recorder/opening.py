@@ -11,7 +11,6 @@ from __future__ import annotations
 import contextlib
 import itertools
 import os
-import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
@@ -43,19 +42,8 @@ from ..results.monitor_files import MonitorFiles, monitors_of
 JOIN = "join"
 
 
-class _MonitorIds:
-    """Counts the monitors of this process; no number is given twice."""
-
-    def __init__(self) -> None:
-        self._next = itertools.count()
-        self._guard = threading.Lock()
-
-    def take(self) -> int:
-        with self._guard:
-            return next(self._next)
-
-
-_monitor_ids = _MonitorIds()
+# Counts the monitors of this process.
+_monitor_ids = itertools.count()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,7 +54,7 @@ class Statements:
         infix: what the names of its files have in the middle; nobody has claimed it.
         first_episode_id: the number of its first episode.
         surroundings: its provenance; None where that was not known.
-        surroundings_after: how many episodes were completed before it was.
+        surroundings_after: how many lines the journal had before, after its first.
         clock: returns the time, in seconds since the epoch.
         only_counted: episodes without a video keep no trajectory: it is only asked
             what rewards and ends there were.
@@ -117,7 +105,7 @@ def open_directory(
         resume: add to the recordings that are there. Episodes are numbered on from
             the highest number of the monitors with this `uid` that closed or died
             (without `uid`: of all of them); monitors that are still open do not count.
-            `JOIN` looks at nobody else's files, however many there are: the caller
+            `JOIN` looks at no other monitor's files, however many there are: the caller
             knows that they are of the same environment, and episodes are numbered
             from 0.
         uid: stands in the file names instead of the process id.
@@ -136,7 +124,7 @@ def open_directory(
     wanted_uid = None if uid is None else check_uid(uid)
     # Absolute, so that a later chdir does not scatter the files.
     path = Path(directory).absolute()
-    with _made(path):
+    with made_directory(path):
         _check_existing(path, force=force, resume=resume, env_id=env_info["env_id"])
         joins = resume == JOIN and not force
         numbers_on = not (force or joins)
@@ -154,8 +142,12 @@ def open_directory(
 
 
 @contextlib.contextmanager
-def _made(path: Path) -> Iterator[None]:
-    """Make `path` and its parents; remove those made if the block raises."""
+def made_directory(path: Path) -> Iterator[None]:
+    """Make `path` and its parents; remove those made if the block raises.
+
+    Raises:
+        DirectoryNotWritable: it cannot be made or written to.
+    """
     try:
         missing = [p for p in (path, *path.parents) if not p.exists()]
         path.mkdir(parents=True, exist_ok=True)
@@ -167,7 +159,7 @@ def _made(path: Path) -> Iterator[None]:
         yield
     except BaseException:
         for made in missing:
-            # Somebody else's files may have come into it meanwhile.
+            # Other files may have come into it meanwhile.
             with contextlib.suppress(OSError):
                 made.rmdir()
         raise
@@ -241,12 +233,12 @@ def _claim(
             directory, so that names are the same whichever process records.
         run: what is known of the run.
         looks: also for stray files with it. Without that, a manifest, a journal or a
-            lock say that it was somebody's: each monitor leaves one of them.
+            lock say that it was a monitor's: each monitor leaves one of them.
     """
     content = json_text.dumps({"pid": os.getpid(), "since": time.time(), "run": run})
     of_directory = itertools.count()
     while True:
-        number = _monitor_ids.take() if uid is None else next(of_directory)
+        number = next(_monitor_ids if uid is None else of_directory)
         infix = Infix(number, uid or str(os.getpid()))
         if _is_taken(path, infix, looks=looks):
             continue

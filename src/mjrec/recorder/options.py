@@ -183,7 +183,7 @@ class RecorderOptions:
                 )
         if len(set(map(id, self.all_trackers))) < len(self.all_trackers):
             raise InvalidArgument(
-                f"A tracker is there twice in {given!r}, and would be told all twice."
+                f"A tracker is there twice in {given!r}, and would get all twice."
             )
 
     def _check_policy_file(self) -> None:
@@ -230,7 +230,7 @@ class RecorderOptions:
 
     @property
     def all_trackers(self) -> tuple[Tracker, ...]:
-        """The trackers, be it one or several."""
+        """The trackers, one or several."""
         if isinstance(self.trackers, Tracker):
             return (self.trackers,)
         return tuple(self.trackers)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The recorder: told reset, step and close, it fills a monitor directory."""
+"""The recorder: follows reset, step and close, and fills a monitor directory."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import weakref
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from ..errors import DirectoryNotWritable, Error, FileNotWritten
 from ..formats.journal import JournalEntry
@@ -34,15 +34,12 @@ from .kept_videos import KeptVideos
 from .monitored_run import BegunEpisode, MonitoredRun
 from .opening import open_directory
 from .options import LIVE, RecorderOptions, type_of_mode
+from .recorded_environment import RecordedEnvironment, check_pictures
 from .recording import EpisodeRecording
 from .states import DeferredVideo
 from .stats_recorder import StatsRecorder, reward_to_float
-from .subject import Subject, check_pictures
 from .tracking import FinishedEpisode
 from .video_recorder import VideoRecorder
-
-if TYPE_CHECKING:
-    from ..simulation.capture import Capture
 
 logger = logging.getLogger(__name__)
 
@@ -50,14 +47,14 @@ logger = logging.getLogger(__name__)
 class Recorder:
     """Drives statistics, journal, trajectories, videos and manifest of one monitor.
 
-    It is told what happens to an environment and never calls it, except for frames and
+    It follows what happens to an environment and never calls it, except for frames and
     states: `before_reset`, the environment's reset inside `resetting`, `reset`;
     `before_step`, the environment's step, `step`, or, while there is a `fast` path,
     what that has instead; `close`. It belongs to the process that made it.
 
     Args:
         directory: the monitor directory.
-        subject: what is recorded.
+        env: what is recorded.
         options: what was asked for.
         finisher: makes what finishes recordings, for the directory; None where nothing
             is to be rendered now.
@@ -79,15 +76,15 @@ class Recorder:
         self,
         directory: str | os.PathLike[str],
         *,
-        subject: Subject,
+        env: RecordedEnvironment,
         options: RecorderOptions,
         finisher: Callable[[Path], Finisher] | None = None,
     ) -> None:
-        self._choice = EpisodeChoice(options, mode=subject.rendering.mode)
+        self._choice = EpisodeChoice(options, mode=env.rendering.mode)
         draws = self._choice.has_videos or options.has_clips
-        if subject.rendering.mode == LIVE and draws:
-            check_pictures(subject)
-        self._subject = subject
+        if env.rendering.mode == LIVE and draws:
+            check_pictures(env)
+        self._env = env
         self._options = options
         self._pid = os.getpid()
         self._is_forked = False
@@ -106,14 +103,14 @@ class Recorder:
             force=options.force,
             resume=options.resume,
             uid=options.uid,
-            env_info={"gym_version": GYM_VERSION, "env_id": subject.env_id},
+            env_info={"gym_version": GYM_VERSION, "env_id": env.env_id},
             facts={
                 "schedule": self._choice.schedule_name,
                 "keep": keep,
                 "versions": dict(versions()),
-                "views": [*subject.further_views],
-                "environment": subject.environment,
-                "options": {**options.recorded(), **subject.view},
+                "views": [*env.further_views],
+                "environment": env.environment,
+                "options": {**options.recorded(), **env.view},
             },
             statements=options.statements,
         )
@@ -121,21 +118,21 @@ class Recorder:
         self.infix = str(infix)
         self.episode_id = self._place.first_episode_id
         self._states = [
-            each for each in (subject.states, subject.clip_states) if each is not None
+            each for each in (env.states, env.clip_states) if each is not None
         ]
         for states in self._states:
             states.open(self.directory)
         self.stats_recorder = StatsRecorder(
             str(self.directory),
             stats_prefix(infix),
-            env_id=subject.env_id,
+            env_id=env.env_id,
             allow_early_reset=options.allow_early_reset,
         )
         self.stats_recorder.type = type_of_mode(options.mode)
         self.stats_recorder.clock = options.clock
         self.run = MonitoredRun(
             self._place,
-            subject=subject,
+            env=env,
             options=options,
             stats=self.stats_recorder,
             finisher=LaterFinisher() if finisher is None else finisher(self.directory),
@@ -179,8 +176,8 @@ class Recorder:
 
     def resetting(self) -> AbstractContextManager[None]:
         """Return what to put around the reset of the environment."""
-        states = self._subject.states
-        if states is None or self._subject.rendering.mode == LIVE:
+        states = self._env.states
+        if states is None or self._env.rendering.mode == LIVE:
             return contextlib.nullcontext()
         return states.resetting()
 
@@ -200,7 +197,7 @@ class Recorder:
         self._reset_time = now
         self._random_state = None
         if self._choice.may_keep_trajectory(self.stats_recorder.type):
-            self._random_state = self._subject.random_state()
+            self._random_state = self._env.random_state()
 
     def reset(
         self, *, seed: Any = None, options: Any = None, observation: Any = None
@@ -234,7 +231,7 @@ class Recorder:
                 seed=seed,
                 options=options,
                 random_state=self._random_state,
-                reset_clock=self._subject.clock() if self._options.annotate else None,
+                reset_clock=self._env.clock() if self._options.annotate else None,
             )
         )
         self.episode_id += 1
@@ -252,11 +249,8 @@ class Recorder:
         if self._clips is None:
             self.fast = recording.fast_path()
         if self._options.write_upon_reset:
-            try:
+            with self.run.tolerating("statistics", FileNotWritten, of_episode=False):
                 self._write_results()
-            except FileNotWritten as error:
-                if not self.run.tolerates("statistics", error, of_episode=False):
-                    raise
 
     def note_event(self, kind: str, facts: Any) -> None:
         """Write an event of an evaluation into the journal; see `formats.journal`.
@@ -372,17 +366,14 @@ class Recorder:
 
         Raises:
             EncoderError: the running video could not be finished.
-            Error: whoever renders has failed.
+            Error: rendering has failed.
         """
         if self.closed:
             return
         with self._leaving_if_interrupted():
             self._end_recordings()
-        try:
+        with self.run.tolerating("trajectory", Error, of_episode=False):
             self.run.finisher.wait(on_progress)
-        except Error as error:
-            if not self.run.tolerates("trajectory", error, of_episode=False):
-                raise
 
     def close(self) -> None:
         """End the episode, write statistics and manifest, and let go. Idempotent.
@@ -405,7 +396,7 @@ class Recorder:
                 self._end_recordings()
             self.run.trackers.end()
             pending = self._write_last_results()
-        self._leave()
+            self._leave()
         self._say_what_is_left(pending)
         failures.raise_first()
         logger.info("Finished writing results. They are in %s.", self.directory)
@@ -526,8 +517,9 @@ class Recorder:
                         recording.hand_on()
                     else:
                         kept.hold(recording)
-            with failures:
-                self._settle(None if kept is None else kept.settle)
+            if kept is not None:
+                with failures, self._tolerating_lost():
+                    kept.settle()
         except BaseException:
             recording.leave()
             # It may go on to the last row there, and the next one is another.
@@ -591,32 +583,32 @@ class Recorder:
             self._take_last_frame()
         with failures:
             self._cut_episode(CLOSE)
+        if self._kept is not None:
+            with failures, self._tolerating_lost():
+                self._kept.decide()
         with failures:
-            self._settle(None if self._kept is None else self._kept.decide)
-        for states in self._states:
-            # A trajectory without its model is worth nothing, and what stores it may
-            # end with the process.
-            with failures:
-                self._finish_models(states)
-        with failures:
-            self._settle(self.run.close_logs)
+            self.finish_models()
+        with failures, self._tolerating_lost():
+            self.run.close_logs()
         failures.raise_first()
 
-    def _finish_models(self, states: Capture) -> None:
-        try:
-            states.finish()
-        except Error as error:
-            if not self.run.tolerates("model", error, of_episode=False):
-                raise
+    def finish_models(self) -> None:
+        """Wait until every model is stored.
 
-    def _settle(self, do: Callable[[], None] | None) -> None:
-        """Do something about recordings that are not decided."""
-        try:
-            if do is not None:
-                do()
-        except (DirectoryNotWritable, FileNotWritten) as error:
-            if not self.run.tolerates("trajectory", error):
-                raise
+        A trajectory without its model is worth nothing, and what stores it may end with
+        the process.
+
+        Raises:
+            FileNotWritten: one could not be, and that is not tolerated.
+        """
+        failures = _Failures()
+        for states in self._states:
+            with failures, self.run.tolerating("model", Error, of_episode=False):
+                states.finish()
+        failures.raise_first()
+
+    def _tolerating_lost(self) -> AbstractContextManager[None]:
+        return self.run.tolerating("trajectory", DirectoryNotWritable, FileNotWritten)
 
     @contextlib.contextmanager
     def _leaving_if_interrupted(self) -> Iterator[None]:
@@ -645,7 +637,7 @@ class Recorder:
         self._place.lock.release()
 
     def _say_what_is_left(self, pending: int) -> None:
-        """Say aloud what nobody does unless somebody asks for it."""
+        """Name the command for what is not rendered or finished."""
         if pending:
             videos = "video" if pending == 1 else "videos"
             logger.warning(
@@ -690,7 +682,7 @@ class Recorder:
             stats=self.stats_recorder.stats(),
             is_own=True,
         )
-        assert listing is not None, "nobody else has this monitor's lock"
+        assert listing is not None, "no other process has this monitor's lock"
         return len(listing.pending)
 
 

@@ -3,10 +3,12 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from ..errors import FileNotWritten
 from ..formats.monitor_directory import trajectory_prefix, video_prefix
 from .fast_path import FastPath, counting
 from .live_videos import LiveVideos, live_videos
@@ -23,7 +25,7 @@ class EpisodeRecording:
     """Records one episode, from its reset to its end, and knows what is left of it.
 
     Args:
-        run: of which it is.
+        run: the monitored run.
         on_picture_error: called with an error that is raised while a frame of a step
             is drawn live: it may be the environment's own.
 
@@ -50,7 +52,7 @@ class EpisodeRecording:
         self._run = run
         self._on_picture_error = on_picture_error
         # What the log says of the video; None where there is none.
-        self._promise: Mapping[str, Any] | None = None
+        self._pending_video: Mapping[str, Any] | None = None
 
     @property
     def mode(self) -> str | None:
@@ -70,8 +72,8 @@ class EpisodeRecording:
             keeps: its trajectory is kept.
             stays: it is kept also where its video is not.
         """
-        run, capture = self._run, self._run.subject.states
-        deferred = wants_video and run.subject.rendering.mode == DEFERRED
+        run, capture = self._run, self._run.env.states
+        deferred = wants_video and run.env.rendering.mode == DEFERRED
         start = None
         if capture is not None and (keeps or deferred):
             start = capture.begin_episode()
@@ -81,7 +83,9 @@ class EpisodeRecording:
         if keeps or deferred:
             if wants_video:
                 mode = DEFERRED if deferred else LIVE
-                self._promise = run.promise(name, mode, second_name=second_name)
+                self._pending_video = run.pending_video(
+                    name, mode, second_name=second_name
+                )
             self.stays = keeps and stays
             self.states = self._new_states(start, observation, name, is_kept=keeps)
         if deferred:
@@ -101,7 +105,7 @@ class EpisodeRecording:
                 live.begin()
 
     def fast_path(self) -> FastPath | None:
-        """Return what the coming steps may be recorded with, if they are usual."""
+        """Return the fast path of the coming steps, if there is one."""
         if self.live is not None:
             return None
         if self.states is None:
@@ -121,7 +125,9 @@ class EpisodeRecording:
             self.live.discard()
             self.live = None
         if self.states is not None:
-            self.states.drop()
+            # On a full disk it is said later.
+            with contextlib.suppress(FileNotWritten):
+                self.states.drop()
             self.states = None
 
     def leave(self) -> None:
@@ -172,8 +178,8 @@ class EpisodeRecording:
         try:
             if self.live is not None:
                 self.live.amend({"selection": dict(selection)})
-            if self.states is not None and self._promise is not None:
-                video = {**self._promise, "selection": selection}
+            if self.states is not None and self._pending_video is not None:
+                video = {**self._pending_video, "selection": selection}
                 self.states.amend({"candidate": False, "video": video})
         finally:
             self.hand_on()
@@ -206,12 +212,12 @@ class EpisodeRecording:
             **run.recording_facts(start),
             "random_state": run.episode.random_state,
             "kept": is_kept,
-            "video": self._promise,
+            "video": self._pending_video,
         }
-        if self._promise is None and run.subject.rendering.mode == DEFERRED:
+        if self._pending_video is None and run.env.rendering.mode == DEFERRED:
             # For those who choose later, among the episodes of several monitors.
-            facts["possible_video"] = run.promise(name, DEFERRED, second_name={})
-        is_candidate = bool(run.selection) and self._promise is not None
+            facts["possible_video"] = run.pending_video(name, DEFERRED, second_name={})
+        is_candidate = bool(run.selection) and self._pending_video is not None
         if run.selection:
             facts["candidate"] = is_candidate
         return StateRecorder(
@@ -220,7 +226,7 @@ class EpisodeRecording:
             logs=run.logs,
             what="trajectory",
             facts=facts,
-            capture=None if start is None else run.subject.states,
+            capture=None if start is None else run.env.states,
             start=start,
             max_fps=run.options.max_fps,
             observation=observation if run.options.observations else None,

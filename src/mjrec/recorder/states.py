@@ -42,7 +42,7 @@ class StateRecorder:
     there: an error, unless `on_error` has it that the simulation goes on.
 
     Args:
-        run: of which it is.
+        run: the monitored run.
         name: of the file that it becomes, without suffix.
         logs: where its rows go.
         what: is lost where they cannot be written.
@@ -103,7 +103,7 @@ class StateRecorder:
         self._first_state = np.full(_words(self._state), np.nan)
         self._first_snapshot = np.empty(_words(self._snapshot), np.uint64)
         self._first_change: Mapping[str, NDArray[Any]] | None = None
-        self._first_time = run.subject.clock()
+        self._first_time = run.env.clock()
         if capture is not None:
             capture.capture_state(self._first_state)
             if self._takes_frames:
@@ -224,7 +224,7 @@ class StateRecorder:
         self._try(take)
 
     def fast_path(self) -> FastPath | None:
-        """Return what usual steps can be recorded with; None where there are none."""
+        """Return the fast path, if there is one."""
         if self.is_stopped or not self._takes_frames or self._observation is not None:
             return None
         if self._fast is None and self._span is not None:
@@ -266,7 +266,7 @@ class StateRecorder:
         try:
             if self._span is None and not self.is_stopped:
                 # No step was taken; there is the reset.
-                self._begin(_pace(self._run.subject.declared(), None, self._max_fps))
+                self._begin(_pace(self._run.env.declared(), None, self._max_fps))
             if self._span is not None:
                 self._span.end(facts)
         except FileNotWritten as error:
@@ -280,7 +280,7 @@ class StateRecorder:
         Args:
             recording: of which it is the last part, if it is one.
         """
-        # Else the disk was too full for a single row: there is nothing to promise.
+        # Else the disk was too full for a single row: there is no video to come.
         if self._span is not None or recording is not None:
             log = None if self._span is None else self._span.log
             self._run.submit(recording or self.path, log)
@@ -298,7 +298,9 @@ class StateRecorder:
         """Give up the row of the reset; the first step will write it anew."""
         self._fast = None
         if self._span is not None:
-            self._span.drop()
+            # On a full disk it is said later.
+            with contextlib.suppress(FileNotWritten):
+                self._span.drop()
             self._span = None
 
     def _try(self, take: Callable[[], None]) -> None:
@@ -378,7 +380,7 @@ class StateRecorder:
             span.commit(0, is_frame=self._takes_frames)
             self._span = span
         except BaseException:
-            # Without its first frame it would promise a video of nothing.
+            # Without its first frame its video would show nothing.
             span.drop()
             raise
 
@@ -484,9 +486,9 @@ class StateRecorder:
 
     def _measured_pace(self) -> Mapping[str, Any]:
         """Return the time of a step, measured over the first one, and the stride."""
-        began, now = self._first_time, self._run.subject.clock()
+        began, now = self._first_time, self._run.env.clock()
         if began is None or now is None or now <= began:
-            return _pace(self._run.subject.declared(), None, self._max_fps)
+            return _pace(self._run.env.declared(), None, self._max_fps)
         return _measured(now - began, self._max_fps)
 
 

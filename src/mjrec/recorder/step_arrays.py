@@ -112,7 +112,7 @@ def step_array(example: Any) -> StepArray | None:
 def action_array(example: Any) -> StepArray | None:
     """Return memory for actions like `example`; None where it is nothing like an array.
 
-    As `step_array`, but for arrays of integers, which become float64: whoever begins
+    As `step_array`, but for arrays of integers, which become float64: who begins
     with `[0, 0]` may go on with `[0.5, 0.1]`. A single integer is a choice and stays.
     """
     if isinstance(example, list | tuple | np.ndarray):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Who wants to be told of finished episodes and videos: experiment trackers.
+"""Experiment trackers: they are notified of finished episodes and videos.
 
 A tracker is called in the process of the simulation, between two steps, and so should
 be quick. It is given facts and names of files, never pictures.
@@ -14,14 +14,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ..formats.monitor_directory import episode_of
+from ..formats.monitor_directory import episode_of, view_of
 from ..formats.video_metadata import (
     finished_videos,
     is_broken,
     is_done,
     metadata_path,
 )
-from ..formats.video_names import view_of
 
 logger = logging.getLogger(__name__)
 
@@ -100,12 +99,12 @@ class FinishedVideo:
 
 
 class Tracker:
-    """Told what a monitor records; `mjrec.Monitor(..., trackers=...)` takes them.
+    """Follows what a monitor records; `mjrec.Monitor(..., trackers=...)` takes them.
 
     To be subclassed; each method does nothing. One tracker may serve several runs at
     the same time, those of a vector environment for instance: each call says which.
     What a method raises is logged and noted in the manifest, the run is ended for that
-    tracker, which is told nothing more of it, and the recording goes on.
+    tracker, which is notified no more, and the recording goes on.
     """
 
     def begin(self, run: Run) -> None:
@@ -117,12 +116,12 @@ class Tracker:
     def video(self, run: Run, video: FinishedVideo) -> None:
         """Take note of a video that is finished.
 
-        Deferred videos finish beside the simulation and are told of when the next
+        Deferred videos finish beside the simulation and are reported when the next
         episode ends, or in `close`.
         """
 
     def end(self, run: Run) -> None:
-        """Take note of the end of a run; nothing more of it is told."""
+        """Take note of the end of a run; nothing more of it is reported."""
 
 
 class Trackers:
@@ -132,10 +131,10 @@ class Trackers:
     is no reason to lose a simulation.
 
     Args:
-        run: what they are told of.
-        trackers: who is told.
+        run: what they are notified of.
+        trackers: all of them.
         on_fault: called with the class name of one that has raised, what, and the
-            number of the episode that it was told of, or None.
+            number of the episode that was reported, or None.
     """
 
     def __init__(
@@ -152,19 +151,19 @@ class Trackers:
         self._awaited: dict[Path, None] = {}
         # Of episodes whose videos are still to come.
         self._episodes: dict[int, FinishedEpisode] = {}
-        self._tell(None, "begin")
+        self._notify(None, "begin")
 
     def __bool__(self) -> bool:
-        """Whether anybody listens."""
+        """Whether there is any."""
         return bool(self._trackers)
 
     def expect(self, video: Path) -> None:
-        """Watch for the first video of an episode or a clip, whoever makes it."""
+        """Watch for the first video of an episode or a clip."""
         if self._trackers:
             self._awaited[video] = None
 
     def episode(self, episode: FinishedEpisode, *, has_video: bool) -> None:
-        """Tell of an episode that has just ended, and of what is finished by now.
+        """Report an episode that has just ended, and what is finished by now.
 
         Args:
             episode: the episode.
@@ -173,16 +172,16 @@ class Trackers:
         if self._trackers:
             if has_video:
                 self._episodes[episode.episode_id] = episode
-            self._tell(episode.episode_id, "episode", episode)
-            self._tell_of_videos()
+            self._notify(episode.episode_id, "episode", episode)
+            self._report_videos()
 
     def end(self) -> None:
-        """Tell of the end of the run; nobody is called any more after it."""
-        self._tell_of_videos()
-        self._tell(None, "end")
+        """Report the end of the run; none is called after it."""
+        self._report_videos()
+        self._notify(None, "end")
         self._trackers = ()
 
-    def _tell_of_videos(self) -> None:
+    def _report_videos(self) -> None:
         # A video counts as soon as its metadata is there, which is written last.
         done = [video for video in self._awaited if is_done(video)]
         for video in done:
@@ -198,15 +197,15 @@ class Trackers:
                     episode=self._episodes.get(number),
                     view=view_of(name),
                 )
-                self._tell(number, "video", finished)
+                self._notify(number, "video", finished)
 
-    def _tell(self, episode_id: int | None, what: str, *facts: Any) -> None:
+    def _notify(self, episode_id: int | None, what: str, *facts: Any) -> None:
         for tracker in self._trackers:
             try:
                 getattr(tracker, what)(self._run, *facts)
-            except Exception as error:  # whatever somebody's tracker does
+            except Exception as error:  # a user's tracker may do anything
                 name = type(tracker).__name__
-                logger.exception("%s has failed and is told nothing more.", name)
+                logger.exception("%s has failed and is notified no more.", name)
                 others = (each for each in self._trackers if each is not tracker)
                 self._trackers = tuple(others)
                 self._on_fault(name, error, episode_id)

@@ -421,7 +421,7 @@ def declared_rate(env: object) -> Fraction:
 
     The control timestep of a dm_control environment, `dt` of a MuJoCo environment of
     Gymnasium, else `render_fps` of the metadata; 30, with a warning, where nothing is
-    said.
+    said of what can be drawn.
 
     Raises:
         InvalidArgument: `render_fps` is no rate.
@@ -432,12 +432,14 @@ def declared_rate(env: object) -> Fraction:
     fps = (getattr(env, "metadata", None) or {}).get("render_fps")
     if fps is not None:
         return to_rate(fps, name=f'metadata["render_fps"] of {type(env).__name__}')
-    logger.warning(
-        "%s does not say how fast its videos are to play (no control timestep, no "
-        "render_fps): %d frames a second are taken. Give fps= to choose.",
-        type(env).__name__,
-        _DEFAULT_RATE,
-    )
+    can_be_drawn = getattr(env, "render_mode", None) is not None
+    if can_be_drawn or simulation_in(env) is not None:
+        logger.warning(
+            "%s does not say how fast its videos are to play (no control timestep, no "
+            "render_fps): %d frames a second are taken. Give fps= to choose.",
+            type(env).__name__,
+            _DEFAULT_RATE,
+        )
     return _DEFAULT_RATE
 
 

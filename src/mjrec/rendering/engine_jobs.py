@@ -45,7 +45,8 @@ def do_on_engine(
         Error: the engine cannot do any work.
     """
     by_name = {
-        f"video/{_name_of(job)}": job
+        # Of several directories, which may have files of one name.
+        job.name: job
         for job in jobs
         if job.variant is not None or may_be_left(job.directory, job.key)
     }

@@ -38,12 +38,14 @@ from ..formats.monitor_directory import (
     Infix,
     clip_video_prefix,
     episode_of,
+    further_parts,
     infix_of,
+    is_second_name,
     video_prefix,
+    with_part,
 )
 from ..formats.trajectory import TrajectoryReader
 from ..formats.trajectory_file import open_trajectory
-from ..formats.video_names import further_parts, is_second_name, with_part
 from ..frames import QUALITIES
 from ..rates import stride_for, to_rate
 from ..simulation.foreign_files import open_vetted_trajectory

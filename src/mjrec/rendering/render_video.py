@@ -20,9 +20,9 @@ from typing import Any
 from ..annotation import Caption, check_annotation
 from ..errors import BlankVideo, EncoderError, NoPictures
 from ..formats.journal import KILLED
+from ..formats.monitor_directory import second_name_of
 from ..formats.second_names import give_second_names, take_second_names
 from ..formats.video_metadata import StepRuns, timing_facts, write_metadata
-from ..formats.video_names import second_name_of
 from ..formats.video_sink import VideoSink
 from ..frames import Frame, grid_shape
 from ..machine import machine_fingerprint

@@ -15,9 +15,13 @@ from typing import Any
 from ..annotation import check_annotation
 from ..engines.choice import given_engine
 from ..errors import InvalidArgument
-from ..formats.monitor_directory import iter_monitor_files, where_recordings_are
+from ..formats.monitor_directory import (
+    camera_part,
+    iter_monitor_files,
+    name_part,
+    where_recordings_are,
+)
 from ..formats.spans import is_in_flight
-from ..formats.video_names import camera_part, name_part
 from ..machine import check_workers, usable_cpus
 from ..simulation.model_trust import trusting_models
 from .engine_jobs import do_on_engine

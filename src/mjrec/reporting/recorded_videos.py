@@ -11,10 +11,9 @@ from typing import Any, Final, TypeVar
 
 from ..errors import UnreadableFile
 from ..formats.json_fields import field, integer, rate, read_object
-from ..formats.monitor_directory import episode_of
+from ..formats.monitor_directory import episode_of, view_of
 from ..formats.regular_files import regular_path
 from ..formats.video_metadata import finished_videos, is_broken, metadata_path
-from ..formats.video_names import view_of
 from ..results.journal_or_stats import MonitorResults
 from .contents import ReportVideo
 from .provenance import spaced

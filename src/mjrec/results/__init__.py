@@ -7,20 +7,10 @@ gym from 0.7.4 to 0.22 wrote.
 
 from __future__ import annotations
 
-from .episodes import Episode, iter_episodes
-from .merging import load_results, merge_stats_files
-from .monitor_files import (
-    clear_monitor_files,
-    detect_monitor_files,
-    detect_training_manifests,
-)
-
-__all__ = [
-    "Episode",
-    "clear_monitor_files",
-    "detect_monitor_files",
-    "detect_training_manifests",
-    "iter_episodes",
-    "load_results",
-    "merge_stats_files",
-]
+from .episodes import Episode as Episode
+from .episodes import iter_episodes as iter_episodes
+from .merging import load_results as load_results
+from .merging import merge_stats_files as merge_stats_files
+from .monitor_files import clear_monitor_files as clear_monitor_files
+from .monitor_files import detect_monitor_files as detect_monitor_files
+from .monitor_files import detect_training_manifests as detect_training_manifests

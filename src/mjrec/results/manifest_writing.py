@@ -8,14 +8,13 @@ some of its videos, by one that puts a dead monitor in order.
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from .. import json_text
 from ..errors import UnreadableFile
-from ..formats.locks import is_locked, wait_for_lock
+from ..formats.locks import Lock, is_locked, wait_for_lock
 from ..formats.manifest import (
     GYM_VERSION,
     Manifest,
@@ -36,8 +35,10 @@ from ..formats.monitor_directory import (
     manifest_lock_name,
     manifest_name,
     stats_prefix,
+    tiled_name,
     trajectory_prefix,
     video_prefix,
+    with_part,
 )
 from ..formats.spans import FINISHED, is_in_flight
 from ..formats.video_metadata import (
@@ -48,7 +49,6 @@ from ..formats.video_metadata import (
     metadata_path,
     reason_of,
 )
-from ..formats.video_names import tiled_name, with_part
 from .journal_or_stats import MonitorResults
 from .monitor_files import MonitorFiles
 from .run import Run
@@ -139,8 +139,7 @@ def write_manifest_and_stats(
         names = (manifest_name(infix), name, journal_name(infix))
         paths = [directory / each for each in names if (directory / each).exists()]
         results = MonitorResults(MonitorFiles(str(infix), paths))
-        old = results.manifest
-        name = name if old is None else old.stats
+        name = name if results.manifest is None else results.manifest.stats
         is_new_stats = False
         if stats is None:
             try:
@@ -150,30 +149,20 @@ def write_manifest_and_stats(
                 if results.files.journal is not None:
                     raise
             else:
-                is_new_stats = stats != results.saved
-                if is_new_stats:
-                    write_stats_file(directory / name, stats)
+                if stats is not results.saved:
+                    is_new_stats = write_stats_file(directory / name, stats)
         manifest = _manifest(directory, infix, run or results.run, stats_name=name)
-        is_new_manifest = old is None or _as_read(manifest) != old
-        if is_new_manifest:
-            write_manifest(directory / manifest_name(infix), manifest)
+        is_new_manifest = write_manifest(directory / manifest_name(infix), manifest)
     return Written(manifest, stats, is_new_manifest, is_new_stats)
 
 
-@contextlib.contextmanager
-def manifest_lock(directory: Path, infix: Infix) -> Iterator[None]:
-    """Hold the lock for writing a monitor's manifest, or its journal once it is closed.
+def manifest_lock(directory: Path, infix: Infix) -> Lock:
+    """Return the lock for writing a manifest, or a journal once its monitor is closed.
 
     Raises:
         DirectoryNotWritable: there can be no lock in the directory.
     """
-    with wait_for_lock(directory / manifest_lock_name(infix)):
-        yield
-
-
-def _as_read(manifest: Manifest) -> Manifest:
-    """Return a manifest as it comes back from a file: tuples are lists there."""
-    return replace(manifest, mjrec=json_text.loads(json_text.dumps(manifest.mjrec)))
+    return wait_for_lock(directory / manifest_lock_name(infix))
 
 
 def _manifest(directory: Path, infix: Infix, run: Run, *, stats_name: str) -> Manifest:

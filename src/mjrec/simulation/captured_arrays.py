@@ -12,7 +12,6 @@ from typing import Any
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
 from ..formats.trajectory import packed
 from .raw_memory import address_of
@@ -122,16 +121,6 @@ def needs_constraints(model: mujoco.MjModel, option: mujoco.MjvOption) -> str | 
         f"{' and '.join(shown)} of the visual options show constraints (contacts, "
         "joints at their limits), which are gone once the step is over"
     )
-
-
-def drawn_readings(model: mujoco.MjModel) -> NDArray[np.bool_]:
-    """Return which numbers of `sensordata` frames may show."""
-    drawn = np.zeros(model.nsensordata, bool)
-    for index in range(model.nsensor):
-        if int(model.sensor_type[index]) in _drawn_sensors():
-            first = model.sensor_adr[index]
-            drawn[first : first + model.sensor_dim[index]] = True
-    return drawn
 
 
 def _shows_more(option: mujoco.MjvOption) -> bool:

@@ -7,7 +7,6 @@ Names are those of `MjModel`'s arrays (`geom_rgba`) and of the members of its st
 
 from __future__ import annotations
 
-import copy
 import functools
 import re
 from collections.abc import Iterable, Iterator, Mapping
@@ -189,42 +188,6 @@ def differing_fields(
     if fixed:
         raise ValueError(f"{', '.join(fixed)} differ, which only compiling can set")
     return changed
-
-
-def differing_from(
-    model: mujoco.MjModel, fields: Mapping[str, NDArray[Any]]
-) -> list[str]:
-    """Return the names of those fields of which a model has another value, or none.
-
-    What is of the view and not of the model is left out.
-    """
-    # Names come from a file: nothing else is looked up.
-    known = {*array_names(), *struct_names()}
-    return [
-        name
-        for name, value in fields.items()
-        if not name.startswith(VIEW_PREFIXES)
-        and not (name in known and np.array_equal(read_member(model, name), value))
-    ]
-
-
-def changed_model(
-    model: mujoco.MjModel, changes: Mapping[str, NDArray[Any]]
-) -> mujoco.MjModel:
-    """Return a copy of a model with other values in some fields.
-
-    Raises:
-        InvalidArgument: it has no such fields.
-    """
-    changed = copy.copy(model)
-    apply_fields(changed, changes)
-    return changed
-
-
-def keeps_paths(model: mujoco.MjModel) -> bool:
-    """Tell whether a model holds the places of files, on which its hash depends."""
-    names = (name for name in array_names() if name.endswith("_pathadr"))
-    return any((getattr(model, name) >= 0).any() for name in names)
 
 
 @functools.cache

@@ -16,12 +16,11 @@ crashes afterwards.
 
 from __future__ import annotations
 
-import argparse
 import ctypes
 import dataclasses
-import faulthandler
 import json
 import os
+import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -133,21 +132,13 @@ def draw_test_scene(
 
 def main() -> None:
     """Try the backend that `MUJOCO_GL` names."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--measure", action="store_true", help="measure the speed too")
-    parser.add_argument(
-        "--seconds", type=float, required=True, help="give up, with a traceback, after"
-    )
-    arguments = parser.parse_args()
     parent = Parent()
-    # A driver may hang inside a call, where no Python code can end it.
-    faulthandler.dump_traceback_later(arguments.seconds, exit=True)
     backend = os.environ.get("MUJOCO_GL", "")
     facts: dict[str, Any] = {}
     try:
         draw, facts = draw_test_scene(_SIZE)
         parent.send(renders=True, **facts)
-        if arguments.measure:
+        if "--measure" in sys.argv:
             parent.send(frames_per_second=_frames_per_second(draw))
     except Exception as error:  # Whatever it is, it is the answer.
         parent.send(notes=list(_notes(backend)), error=_text_of(error))

@@ -139,10 +139,12 @@ class _Piece:
 
     def look_from_stored(self) -> list[str]:
         """Return the names of what is other than at first."""
-        names = [] if self.stored == self.raw else self.differing(self.stored)
-        if self.seen != self.raw:
+        # Once: it may be megabytes of textures.
+        is_same = self.stored == self.raw
+        is_one = self.seen is self.stored
+        if not (is_one and is_same) and self.seen != self.raw:
             self.see()
-        return names
+        return [] if is_same else self.differing(self.stored)
 
     def see(self) -> None:
         """Remember what is there, in place: `Looks` has given `seen` away."""

@@ -195,11 +195,6 @@ def saved_model(model: mujoco.MjModel) -> NDArray[np.uint8]:
     return buffer
 
 
-def model_digest(model: mujoco.MjModel) -> str:
-    """Return the sha256 of a saved model, as recordings say it."""
-    return hashlib.sha256(saved_model(model).data).hexdigest()
-
-
 def _write(path: Path, write: Callable[[Path], None]) -> None:
     if not path.exists():
         with replacing(path) as temporary:
@@ -237,7 +232,7 @@ def _load_compiled(
     digest = facts.get("sha256")
     if path is None or facts.get("mujoco") != mujoco.__version__:
         raise _not_loadable(directory, facts)
-    if not (trust_models or is_stored(digest) or is_trusted(digest)):
+    if not (trust_models or is_stored(digest) or is_trusted()):
         raise _untrusted(path, "is not there")
     content = _read_gzip(path, _recorded_size(path, facts))
     # MuJoCo trusts the sizes and addresses in such a file.

@@ -47,7 +47,6 @@ logger = logging.getLogger(__name__)
 TRUST_VARIABLE = "MJREC_TRUST_MODELS"
 ALL_MODELS = "1"
 
-_ONE_BY_ONE = "sha256:"
 _DIGEST = re.compile("[0-9a-f]{64}")
 _DIGITS_IN_NAME = 16
 # A task may compile a model for each episode. So many are 4.3 MB, read in milliseconds.
@@ -138,35 +137,19 @@ def stored_models(directories: Iterable[Path]) -> list[str]:
     return sorted(digest for digest in listed if digest[:_DIGITS_IN_NAME] in found)
 
 
-def is_trusted(digest: object) -> bool:
-    """Tell whether the environment variable says that a model is to be loaded.
-
-    `1` says it of all models, `sha256:<hex>,sha256:<hex>` of those with these hashes.
-
-    Args:
-        digest: the sha256 of the compiled model, as a file says; anything. Whoever
-            loads it looks whether that is true.
-    """
-    said = os.environ.get(TRUST_VARIABLE, "")
-    if not said.startswith(_ONE_BY_ONE):
-        return said not in ("", "0")
-    return isinstance(digest, str) and f"{_ONE_BY_ONE}{digest}" in said.split(",")
+def is_trusted() -> bool:
+    """Tell whether the environment variable says that all models are to be loaded."""
+    return os.environ.get(TRUST_VARIABLE, "") not in ("", "0")
 
 
 @contextlib.contextmanager
-def trusting_models(digests: Iterable[str] | None = None) -> Iterator[None]:
-    """Let this process, and those that it starts in the block, load some models.
+def trusting_models() -> Iterator[None]:
+    """Let this process, and those that it starts in the block, load all models.
 
-    For whoever knows that nothing crafted has these hashes, in a program's own main
-    thread: environment variables belong to the process. What was trusted before is
-    not, in the block.
-
-    Args:
-        digests: the sha256 of the compiled models, in hex; None is all models.
+    In a program's own main thread: environment variables belong to the process.
     """
     before = os.environ.get(TRUST_VARIABLE)
-    said = (_ONE_BY_ONE + digest for digest in digests or ())
-    os.environ[TRUST_VARIABLE] = ALL_MODELS if digests is None else ",".join(said)
+    os.environ[TRUST_VARIABLE] = ALL_MODELS
     try:
         yield
     finally:

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Telling experiment trackers of finished episodes and videos.
+"""Notifying experiment trackers of finished episodes and videos.
 
 `mjrec.Monitor(..., trackers=...)` takes one of these, or several. To make one for
-another service, subclass `Tracker` and override what it is to be told. Importing this
+another service, subclass `Tracker` and override what it is to hear of. Importing this
 package imports none of the services' packages.
 """
 

@@ -18,7 +18,7 @@ class AppendOnlyFile:
     read. What is added outlives this process.
 
     Args:
-        names: of these, the first that is not there yet; nobody else gets the same.
+        names: of these, the first that is not there yet; each is given once.
             Their directory is made.
 
     Raises:

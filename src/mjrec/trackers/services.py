@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the services are told of an episode, and under which names."""
+"""What the services get of an episode, and under which names."""
 
 from __future__ import annotations
 

@@ -25,7 +25,7 @@ class WandbTracker(Tracker):
     that follow its own.
 
     Nothing is logged at a step of W&B's own, which must never go back; each call takes
-    the next one. Whoever logs to the same run with `step=` should say
+    the next one. Code that logs to the same run with `step=` should say
     `run.define_metric` instead too: W&B drops what comes with a lower step.
 
     Args:

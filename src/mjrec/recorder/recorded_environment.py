@@ -9,7 +9,7 @@ from fractions import Fraction
 from typing import TYPE_CHECKING, Any, Protocol
 
 from ..errors import NoPictures, PicturesDiffer
-from ..formats.video_names import further_parts
+from ..formats.monitor_directory import further_parts
 from .options import RenderingChoice
 from .video_recorder import PictureSource, can_give_pictures
 
@@ -25,7 +25,7 @@ class EpisodePictures(PictureSource, Protocol):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Subject:
+class RecordedEnvironment:
     """What is recorded, as far as a recorder knows it.
 
     Attributes:
@@ -69,43 +69,43 @@ class Subject:
         return further_parts(self.cameras) or list(self.further_pictures)
 
 
-def check_pictures(subject: Subject) -> None:
+def check_pictures(env: RecordedEnvironment) -> None:
     """Check that live pictures can be had.
 
     Raises:
         NoPictures: they cannot.
     """
-    if can_give_pictures(subject.pictures):
+    if can_give_pictures(env.pictures):
         return
-    why = "" if subject.rendering.reason is None else f" ({subject.rendering.reason})"
+    why = "" if env.rendering.reason is None else f" ({env.rendering.reason})"
     raise NoPictures(
-        f"Videos were asked for, and {subject.env_id} gives no pictures{why}: "
-        f"{what_is_missing(subject.pictures)}, or record statistics only with "
+        f"Videos were asked for, and {env.env_id} gives no pictures{why}: "
+        f"{what_is_missing(env.pictures)}, or record statistics only with "
         "video_callable=False."
     )
 
 
-def check_refusal(subject: Subject, refusal: str) -> None:
+def check_refusal(env: RecordedEnvironment, refusal: str) -> None:
     """Check that videos can be drawn live that cannot be rendered later.
 
     Args:
-        subject: what is recorded.
+        env: what is recorded.
         refusal: why they cannot be rendered later.
 
     Raises:
         PicturesDiffer: nothing else was asked for.
         NoPictures: they cannot be drawn live either.
     """
-    if subject.rendering.is_forced:
+    if env.rendering.is_forced:
         raise PicturesDiffer(
-            f"The videos of {subject.env_id} were to be rendered later, from recorded "
+            f"The videos of {env.env_id} were to be rendered later, from recorded "
             f'states, and cannot be: {refusal}. Use render="live".'
         )
-    if not can_give_pictures(subject.pictures):
+    if not can_give_pictures(env.pictures):
         raise NoPictures(
-            f"The videos of {subject.env_id} cannot be rendered from its states: "
+            f"The videos of {env.env_id} cannot be rendered from its states: "
             f"{refusal}. They cannot be drawn live either: "
-            f"{what_is_missing(subject.pictures)}."
+            f"{what_is_missing(env.pictures)}."
         )
 
 
