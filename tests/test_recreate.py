@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from gymnasium.wrappers import ClipAction, RescaleAction
 
+import mjrec
 from mjrec.environments.recreate import (
     NotRecreated,
     Recreated,
@@ -22,6 +23,7 @@ from mjrec.environments.recreate import (
 from mjrec.environments.scenes import generator_state
 from mjrec.environments.stand_ins import RecordedSteps
 from mjrec.environments.wrapping import around_gymnasium
+from mjrec.formats.trajectory_hdf5 import open_hdf5
 
 PENDULUM = "InvertedPendulum-v5"
 
@@ -221,6 +223,34 @@ def test_a_recorded_state_can_be_entered(pendulum: Recreated) -> None:
     row = np.zeros(1, kind)
     row["qpos"] = [0.1, -0.2]
     assert pendulum.enter(row, None).tolist() == [0.1, -0.2, 0.0, 0.0]
+
+
+def test_steps_from_recorded_states_are_the_recorded_steps(
+    pendulum: Recreated, tmp_path: Path
+) -> None:
+    """Bit for bit here; on another machine differences then do not grow."""
+    env = gymnasium.make("InvertedPendulum-v5")
+    with mjrec.Monitor(
+        env, tmp_path, video_callable=False, trajectory_callable=True
+    ) as monitor:
+        monitor.reset(seed=3)
+        monitor.action_space.seed(3)
+        for _ in range(3):
+            monitor.step(monitor.action_space.sample())
+    with open_hdf5(next(tmp_path.glob("*.h5"))) as reader:
+        states, actions = reader.read("state", 0, 4), reader.actions(0, 3)
+        rewards = reader.rewards
+    assert actions is not None
+    pendulum.environment.reset(seed=99)
+    unknown = np.full_like(states.view(np.float64), np.nan).view(states.dtype)
+    for number, action in enumerate(actions):
+        pendulum.put_into(states[number : number + 1])
+        # Of a state that nobody recorded nothing is known.
+        pendulum.put_into(unknown[:1])
+        _, reward, *_ = pendulum.environment.step(action)
+        assert reward == rewards[number]
+        data = pendulum.environment.unwrapped.data
+        assert np.array_equal(data.qpos, states["qpos"][number + 1])
 
 
 def test_options_of_a_reset_are_plain() -> None:
