@@ -232,9 +232,7 @@ def checked_options(options: Any) -> dict[str, Any] | None:
     """
     if options is None:
         return None
-    if not isinstance(options, Mapping) or not all(
-        _is_plain_item(*item) for item in options.items()
-    ):
+    if not isinstance(options, Mapping) or not _are_plain(options):
         raise NotRecreated(
             f"the options of a reset ({options!r:.100}) are more than plain values"
         )
@@ -300,9 +298,7 @@ def _known_wrapper(name: str, given: Any) -> Callable[..., Any] | None:
     kind = getattr(gymnasium.wrappers, name.rpartition(".")[2], None)
     if not isinstance(kind, type) or class_name(kind) != name:
         return None
-    is_plain = isinstance(given, Mapping) and all(
-        _is_plain_item(*item) for item in given.items()
-    )
+    is_plain = isinstance(given, Mapping) and _are_plain(given)
     return kind if is_plain else None
 
 
@@ -338,9 +334,7 @@ def _dm_control(
         )
     for key, value in (kwargs or {}).items():
         parts = value if isinstance(value, Mapping) else {key: value}
-        if key not in _SUITE_ARGUMENTS or not all(
-            _is_plain_item(*item) for item in parts.items()
-        ):
+        if key not in _SUITE_ARGUMENTS or not _are_plain(parts):
             raise NotRecreated(
                 f"its argument {key!r:.80} ({value!r:.80}) is more than plain values "
                 "within bounds"
@@ -356,6 +350,11 @@ def _dm_control(
             )
         env = load_task(name, kwargs, limit=limit)
         return Recreated(environment=env, is_dm_env=True)
+
+
+def _are_plain(arguments: Mapping[str, Any]) -> bool:
+    """Tell whether all arguments are plain values within bounds, and name no file."""
+    return all(_is_plain_item(*item) for item in arguments.items())
 
 
 def _is_plain_item(name: Any, value: Any) -> bool:

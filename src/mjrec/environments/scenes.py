@@ -78,6 +78,14 @@ def simulation_below(env: Any) -> Any:
     return simulation_in(base) or simulation_in(getattr(base, "simulation", None))
 
 
+def new_warnings(before: Mapping[str, int], after: Mapping[str, int]) -> dict[str, int]:
+    """Return which of MuJoCo's warnings have come, of two `warning_counts`."""
+    # An unstable simulation may be set back, and its counts with it.
+    counts = {name: n - before.get(name, 0) for name, n in after.items()}
+    counts = {name: n if n >= 0 else after[name] for name, n in counts.items()}
+    return {name: n for name, n in counts.items() if n}
+
+
 def is_defined_by(function: object, module: str, qualified_name: str) -> bool:
     """Tell whether a function is the one that a module's own source defines.
 

@@ -209,7 +209,8 @@ def choose_videos(
         by_task[result.task].append(result)
     for task, own in by_task.items():
         chosen: dict[str, dict[RecordingKey, list[ChosenEpisode]]] = {}
-        for result, role in keep_rule(plan.keep).choose(own):
+        kept = list(keep_rule(plan.keep).choose(own))
+        for result, role in kept:
             chunk = plan.chunk_of(result.unit)
             infix = Infix.parse(result.monitor or "")
             if chunk and infix and result.episode_id is not None:
@@ -235,7 +236,7 @@ def choose_videos(
         # In the order of the rule.
         selection[task] = [
             episode
-            for result, role in keep_rule(plan.keep).choose(own)
+            for result, role in kept
             if (episode := ChosenEpisode(*result.unit, role)) in drawable
         ]
     return Choice(selection, videos, impossible)

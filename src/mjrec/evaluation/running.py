@@ -30,6 +30,7 @@ from ..environments.from_name import environment_from_name
 from ..environments.named_environment import EnvironmentOptions, NamedEnvironment
 from ..environments.names import working_directory_importable
 from ..environments.policies import Policy, load_policy, policy_file, policy_from
+from ..environments.scenes import new_warnings
 from ..errors import Error, InvalidArgument, PolicyError
 from ..formats.monitor_directory import Infix, journal_name
 from ..json_text import dumps
@@ -313,11 +314,7 @@ class _ChunkRun:
             return first
 
         def facts() -> Mapping[str, Any]:
-            after = _warnings(acting.named.environment)
-            # An unstable simulation may be set back, and its counts with it.
-            counts = {name: n - before.get(name, 0) for name, n in after.items()}
-            counts = {name: n if n >= 0 else after[name] for name, n in counts.items()}
-            warnings = {name: n for name, n in counts.items() if n}
+            warnings = new_warnings(before, _warnings(acting.named.environment))
             return {"seed": unit[0], "episode": unit[1], "warnings": warnings}
 
         monitor.recorder.evaluation_facts = facts

@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
 import glob
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Final
 
@@ -25,6 +26,7 @@ from .layout import ENVIRONMENT, RECORDINGS
 
 _LONGEST_LINE: Final = 1 << 24
 _COMPILING: Final = ("mujoco", "machine")
+_RECORDING: Final = "recording "
 _GL: Final = ("gl_vendor", "gl_renderer", "gl_version")
 
 
@@ -44,7 +46,7 @@ def claimed_excuses(given: Path, made: Path) -> list[Excuse]:
                 continue
             looked_at.add(infix)
         try:
-            found += _claims(path, other, f"recording {infix}")
+            found += _claims(path, other, f"{_RECORDING}{infix}")
         except (Error, OSError, ValueError):
             # Whatever cannot be read is found when it is compared.
             continue
@@ -52,20 +54,30 @@ def claimed_excuses(given: Path, made: Path) -> list[Excuse]:
     if all(path.is_file() for path in files):
         packed, here = (read_object(path).get("packed_with") for path in files)
         found += _versions(packed, here)
-    return [_with_models(excuse, recordings) for excuse in found]
+    # Several excuses reach one recording, which may have thousands of trajectories.
+    models_of = functools.cache(functools.partial(_models, recordings))
+    return [_with_models(excuse, models_of) for excuse in found]
 
 
-def _with_models(excuse: Excuse, recordings: Path) -> Excuse:
+def _with_models(excuse: Excuse, models_of: Callable[[str], Iterable[str]]) -> Excuse:
     """Return an excuse that reaches the compiled models of its recordings, too."""
     if excuse.name not in _COMPILING:
         return excuse
     models: dict[str, None] = {}
     for item in excuse.items:
-        infix = item.removeprefix("recording ")
-        for path in recordings.glob(f"openaigym.trajectory.{glob.escape(infix)}.*.h5"):
-            with contextlib.suppress(Error), open_trajectory(path) as reader:
-                models[str(_mapping(reader.facts.get("model")).get("mjb"))] = None
+        if item.startswith(_RECORDING):
+            infix = item.removeprefix(_RECORDING)
+            models.update(dict.fromkeys(models_of(infix)))
     return dataclasses.replace(excuse, items=(*excuse.items, *models))
+
+
+def _models(recordings: Path, infix: str) -> tuple[str, ...]:
+    """Return the names of the compiled models of a recording."""
+    names: dict[str, None] = {}
+    for path in recordings.glob(f"openaigym.trajectory.{glob.escape(infix)}.*.h5"):
+        with contextlib.suppress(Error), open_trajectory(path) as reader:
+            names[str(_mapping(reader.facts.get("model")).get("mjb"))] = None
+    return tuple(names)
 
 
 def _claims(given: Path, made: Path, recording: str) -> Iterator[Excuse]:

@@ -17,7 +17,7 @@ from typing import Any, BinaryIO, Final, NamedTuple, TypeAlias
 
 from ..formats.json_fields import json_object, read_object, unreadable
 from ..formats.regular_files import open_regular, read_regular
-from .differences import Aspect, Difference, Same, short
+from .differences import Aspect, Difference, Same, relative_error, short
 from .findings import Topic
 
 _LONGEST_LINE: Final = 1 << 24
@@ -120,8 +120,7 @@ def compare_objects(
     Raises:
         UnreadableFile: one is damaged.
     """
-    with unreadable(given):
-        one = json_object(rules.translated(read_regular(given, limit=_LONGEST_FILE)))
+    one = _translated_object(given, rules)
     yield from _or_bytes(json_differences(one, read_object(made), file, rules), file)
 
 
@@ -133,10 +132,16 @@ def compare_crates(
     Raises:
         UnreadableFile: one is damaged.
     """
+    one = _translated_object(given, rules)
     with unreadable(given):
-        one = json_object(rules.translated(read_regular(given, limit=_LONGEST_FILE)))
         view, again = _crate_view(one), _crate_view(read_object(made))
     yield from _or_bytes(json_differences(view, again, file, rules), file)
+
+
+def _translated_object(given: Path, rules: Rules) -> Mapping[str, Any]:
+    """Return an object of the archive, with the names that were made again."""
+    with unreadable(given):
+        return json_object(rules.translated(read_regular(given, limit=_LONGEST_FILE)))
 
 
 def _crate_view(crate: Mapping[str, Any]) -> dict[str, Any]:
@@ -305,7 +310,7 @@ def _leaf(
 ) -> Difference:
     size = None
     if isinstance(given, int | float) and isinstance(made, int | float):
-        error = abs(given - made) / (1 + abs(given))
+        error = relative_error(given, made)
         size = error if math.isfinite(error) else None
     aspect = rule.aspect
     is_gone = given is _ABSENT or made is _ABSENT

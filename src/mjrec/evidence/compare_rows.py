@@ -6,7 +6,6 @@ Rows are read in blocks, so that memory does not grow with an episode.
 
 from __future__ import annotations
 
-import hashlib
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import replace
@@ -17,6 +16,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from ..atomic_files import file_sha256
 from ..errors import UnreadableFile
 from ..formats.json_fields import json_object
 from ..formats.trajectory_hdf5 import open_hdf5
@@ -76,8 +76,8 @@ def compare_trajectories(
             file=file,
             aspect=Aspect.STORED,
             where="its bytes",
-            given=_digest(given),
-            made=_digest(made),
+            given=f"sha256 {file_sha256(given)[:16]}",
+            made=f"sha256 {file_sha256(made)[:16]}",
         )
 
 
@@ -330,8 +330,3 @@ def _difference(
     topic: Topic, file: str, where: str, given: str, made: str
 ) -> Difference:
     return Difference(topic=topic, file=file, where=where, given=given, made=made)
-
-
-def _digest(path: Path) -> str:
-    with path.open("rb") as file:
-        return f"sha256 {hashlib.file_digest(file, 'sha256').hexdigest()[:16]}"

@@ -16,7 +16,7 @@ from typing import Any, BinaryIO, Final
 from ..formats.json_fields import unreadable
 from ..formats.regular_files import open_regular
 from .compare_json import KEYS, Own, Rule, Rules
-from .differences import Aspect, Difference, Same, short
+from .differences import Aspect, Difference, Same, relative_error, short
 from .findings import Topic
 from .layout import STATISTICS_COLUMNS
 
@@ -146,7 +146,7 @@ def _line_difference(
 
 def _error(a: str, b: str) -> float:
     pairs = zip(*(map(float, _NUMBER.findall(each)) for each in (a, b)), strict=True)
-    return max((abs(x - y) / (1 + abs(x)) for x, y in pairs), default=0.0)
+    return max((relative_error(x, y) for x, y in pairs), default=0.0)
 
 
 def _text(line: bytes | None) -> str:

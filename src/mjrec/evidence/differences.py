@@ -125,6 +125,11 @@ class Difference(Place):
         return f"{place}the archive has {self.given}, made again it is {self.made}"
 
 
+def relative_error(given: float, made: float) -> float:
+    """Return the `size` of a difference between two numbers."""
+    return abs(given - made) / (1 + abs(given))
+
+
 def short(value: Any) -> str:
     """Return a value as one short line of text."""
     text = value if isinstance(value, str) else repr(value)

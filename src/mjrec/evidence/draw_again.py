@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import imageio.v3
 import numpy as np
@@ -22,8 +22,6 @@ from ..formats.trajectory_file import open_trajectory
 from ..rendering.pool import WorkerPool
 from ..rendering.render_videos import render_videos
 from ..rendering.views import View
-
-SAMPLED: Final = "sampled"
 
 _OnProgress = Callable[[int, int], object]
 
@@ -64,30 +62,28 @@ def draw_sample(
         NotDrawn: one could not be drawn.
     """
     chosen = np.random.default_rng(seed)
-    pool = WorkerPool(1)
     videos = list(_pending(directory))
     done = 0
-    try:
-        for name, trajectory, camera in videos:
-            with open_trajectory(trajectory) as reader:
-                total = reader.frame_count
+    with WorkerPool(1) as pool:
+        for name, trajectory, total, camera in videos:
             picked = chosen.choice(total, min(count, total), replace=False)
             numbers = sorted(map(int, picked))
             folder = into / name
             folder.mkdir(parents=True)
-            frames = pool.frames(trajectory, numbers, View(camera=camera))
-            for number, frame in zip(numbers, frames, strict=True):
-                imageio.v3.imwrite(folder / f"{number}.png", frame)
-                done += 1
-                on_progress(done, count * len(videos))
-    except Error as error:
-        raise NotDrawn(f"the video {name} could not be drawn: {error}") from error
-    finally:
-        pool.close()
+            try:
+                frames = pool.frames(trajectory, numbers, View(camera=camera))
+                for number, frame in zip(numbers, frames, strict=True):
+                    imageio.v3.imwrite(folder / f"{number}.png", frame)
+                    done += 1
+                    on_progress(done, count * len(videos))
+            except Error as error:
+                raise NotDrawn(
+                    f"the video {name} could not be drawn: {error}"
+                ) from error
 
 
-def _pending(directory: Path) -> Iterator[tuple[str, Path, Any]]:
-    """Yield names of videos, what each is drawn from, and its camera."""
+def _pending(directory: Path) -> Iterator[tuple[str, Path, int, Any]]:
+    """Yield names of videos, what each is drawn from, how many frames, its camera."""
     for path in iter_monitor_files(directory):
         if not is_manifest(path.name):
             continue
@@ -97,10 +93,11 @@ def _pending(directory: Path) -> Iterator[tuple[str, Path, Any]]:
             trajectory = directory / f"{entry['trajectory']}.h5"
             with open_trajectory(trajectory) as reader:
                 promise: Mapping[str, Any] = reader.facts.get("video") or {}
+                count = reader.frame_count
             if promise.get("annotate") or promise.get("tiled"):
                 continue
-            yield entry["video"], trajectory, None
+            yield entry["video"], trajectory, count, None
             cameras = promise.get("cameras", ())
             parts = further_parts(cameras)
             for part, camera in zip(parts, cameras[1:], strict=False):
-                yield with_part(entry["video"], part), trajectory, camera
+                yield with_part(entry["video"], part), trajectory, count, camera

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the inputs of a run say of its author: reproducible is not yet honest.
 
-Whoever chooses seeds, or shows one episode as two, or leaves episodes out, has a run
-that can be made again all the same.
+A run whose author chose the seeds, showed one episode as two or left episodes out can
+be made again all the same.
 """
 
 from __future__ import annotations

@@ -60,7 +60,7 @@ class EpisodeInputs:
             claimed: each step is then made from the recorded state before it, so that
             differences of the last bits do not grow; None else.
         steps: how many were taken.
-        actions: the name of the array of actions, be they in it or irregular; None
+        actions: the name of the array of actions, also where some are irregular; None
             where they were not kept.
         steps_taken: the name of the arrays `<name>.<part>` of `RecordedSteps`, where
             wrappers are not here; None else.
@@ -198,7 +198,6 @@ class Inputs:
     @classmethod
     def read(cls, folder: Path) -> Inputs:
         """Return the inputs that were written into a folder."""
-        # Not json_text, which bounds the values: it was written by us.
         said = json_text.loads((folder / INPUTS_FILE).read_text())
         recordings = [
             RecordingInputs(

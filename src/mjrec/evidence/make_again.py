@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..environments.recreate import NotRecreated, Recreated, checked_options, recreate
+from ..environments.scenes import new_warnings
 from ..environments.stand_ins import RecordedSteps
 from ..formats.journal import KILLED
 from ..recorder.ending_reasons import EXCEPTION, INTERRUPT, RESET
@@ -189,11 +190,8 @@ class _Playing:
             choose_for_evaluation(self._recording, self._directory, self._notes)
 
     def _evaluation_facts(self, said: Mapping[str, Any]) -> Mapping[str, Any]:
-        before, after = self._warned, self._recreated.warnings()
-        # An unstable simulation may be set back, and its counts with it.
-        counts = {name: n - before.get(name, 0) for name, n in after.items()}
-        counts = {name: n if n >= 0 else after[name] for name, n in counts.items()}
-        return {**said, "warnings": {name: n for name, n in counts.items() if n}}
+        warnings = new_warnings(self._warned, self._recreated.warnings())
+        return {**said, "warnings": warnings}
 
     def _begin(self, episode: EpisodeInputs) -> None:
         """Reset the environment, with the random state that leads to the beginning."""

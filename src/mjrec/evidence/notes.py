@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a maker could not make again, and had to believe.
 
-It is written down beside what was made, for whoever compares the two.
+It is written down beside what was made, for the process that compares the two.
 """
 
 from __future__ import annotations

@@ -26,7 +26,7 @@ from ..errors import Error, FileNotWritten, UnreadableArchive
 from ..sandbox import enter
 from .findings import Level
 from .inputs import ARRAYS_FILE, Inputs
-from .layout import PAYLOAD, RECORDINGS
+from .layout import PAYLOAD, RECORDINGS, SAMPLED
 from .notes import REWARDS_FILE, Notes
 
 MODULE: Final = "mjrec.evidence.stages"
@@ -110,7 +110,7 @@ def _make(request: Mapping[str, Any], say: _Say) -> None:
 
     from ..environments.recreate import NotRecreated
     from ..rendering.recovery import recover
-    from .draw_again import SAMPLED, draw_all, draw_sample
+    from .draw_again import draw_all, draw_sample
     from .make_again import play_recording
     from .model_sources import unpack_sources
     from .pack import pack_folder
@@ -119,8 +119,8 @@ def _make(request: Mapping[str, Any], say: _Say) -> None:
     level, folder = Level(request["level"]), Path(request["inputs"])
     made, place = Path(request["made"]), Path(request["place"])
     inputs, counter, notes = Inputs.read(folder), _Counter(say), Notes()
-    is_packed = bool(inputs.packing) and level is Level.PIXELS
-    is_packed = is_packed and request["sample"] is None
+    draws_all = level is Level.PIXELS and request["sample"] is None
+    is_packed = bool(inputs.packing) and draws_all
     played = (place / "played" if is_packed else made / PAYLOAD) / RECORDINGS
     played.mkdir(parents=True)
     steps = sum(e.steps for each in inputs.recordings for e in each.episodes)
@@ -156,7 +156,7 @@ def _make(request: Mapping[str, Any], say: _Say) -> None:
     say(phase="drawing")
     if not any(played.iterdir()):
         is_packed = False
-    elif level is Level.PIXELS and request["sample"] is None:
+    elif draws_all:
         draw_all(played, counter)
     elif level is Level.PIXELS:
         sampled = made / SAMPLED

@@ -78,9 +78,9 @@ def verify(
             (rewards, ends, statistics and the selection of episodes are made again),
             `"physics"` (and all states) or `"pixels"` (and all frames and files).
         sample: how many frames of each video are drawn; None is all of them.
-        seed: of the random choice of these; None is one that nobody knows before.
-        trust: ids of environments that may be made though they are in nobody's
-            registry: this runs code that you have installed, and nobody has looked at.
+        seed: of the random choice of these; None is one that cannot be foreseen.
+        trust: ids of environments that may be made though they are in no registry
+            that mjrec trusts: this runs code that you have installed.
         allow: excuses that are taken, by name and value: `"gl=NVIDIA H100"`.
         report: where to write a page about it, HTML in one file.
         on_progress: told how far it is.
