@@ -41,7 +41,7 @@ from ..formats.monitor_directory import (
     where_recordings_are,
 )
 from ..formats.regular_files import regular_path
-from ..rendering.leftovers import leftovers_of
+from ..rendering.leftovers import has_leftovers
 from ..rendering.recorded_facts import open_for_rendering
 from ..rendering.recordings import look_at, recordings
 from ..results import iter_episodes
@@ -154,7 +154,7 @@ def _check_nobody_writes(directory: Path) -> None:
 
 def _check_all_is_done(directory: Path) -> None:
     closed = [files for files in monitors_of(directory) if not files.is_open]
-    killed = [each.infix for each in closed if leftovers_of(directory, each)]
+    killed = [each.infix for each in closed if has_leftovers(each)]
     if killed:
         raise UnfinishedRecordings(directory, killed, advice=_RECOVER.format(directory))
     visible = [

@@ -47,7 +47,7 @@ from ..results.manifest_writing import manifest_lock, write_manifest_and_stats
 from ..results.monitor_files import MonitorFiles, files_of
 from .cut_videos import finish_text, finish_video
 from .jobs import key_of
-from .leftovers import Leftover, leftovers_of
+from .leftovers import Kind, lacks_results, leftovers
 from .recorded_facts import open_for_rendering, video_path
 from .recordings import claim, parts_of
 
@@ -111,7 +111,7 @@ def finish_dead_monitor(directory: Path, infix: Infix, report: Report) -> None:
         was_killed = path.exists()
         monitor = _DeadMonitor(directory, infix, report)
         # Before there is a lock, which is what a killed monitor leaves.
-        is_behind = bool(monitor.left("results"))
+        is_behind = lacks_results(files_of(directory, infix))
         lock = try_lock(path)
         if lock is None:
             return
@@ -137,10 +137,9 @@ class _DeadMonitor:
         self._infix = infix
         self._report = report
 
-    def left(self, kind: str) -> list[Leftover]:
+    def _left(self, kind: Kind) -> list[Path]:
         """Return what is left to do now, of one kind."""
-        left = leftovers_of(self._directory, self._files())
-        return [each for each in left if each.kind == kind]
+        return leftovers(self._files(), kind)
 
     def finish(self, *, is_behind: bool) -> None:
         """Do it, with the monitor's lock held.
@@ -149,27 +148,27 @@ class _DeadMonitor:
             is_behind: its results may be older than the rest.
         """
         report = self._report
-        for leftover in self.left("spans"):
-            with report.attempt(leftover.path.name):
-                self._finish_spans(leftover.path)
+        for spans in self._left("spans"):
+            with report.attempt(spans.name):
+                self._finish_spans(spans)
         # Of logs a manifest says nothing that is not so of trajectories.
         before = len(report.files)
         # The first video's metadata names those of further cameras.
-        for video in sorted(self.left("video"), key=_is_first):
-            path = video.path.with_name(final_name(video.path.name) or "")
+        for note in sorted(self._left("video"), key=_is_first):
+            path = note.with_name(final_name(note.name) or "")
             with report.attempt(path.name):
                 known = self._known(episode_of(path.name))
                 self._note_all(finish_video(path, known, deadline=report.deadline))
-        for text in self.left("text"):
-            path = text.path.with_name(final_name(text.path.name) or "")
+        for text in self._left("text"):
+            path = text.with_name(final_name(text.name) or "")
             number = episode_of(path.name)
             with report.attempt(path.name):
                 facts, known = self._facts(number), self._known(number)
-                self._note_all(finish_text(text.path, path, facts, known))
-        for stale in self.left("stale"):
-            with self._claimed(stale.path) as is_ours:
+                self._note_all(finish_text(text, path, facts, known))
+        for stale in self._left("stale"):
+            with self._claimed(stale) as is_ours:
                 if is_ours:
-                    report.remove(stale.path)
+                    report.remove(stale)
         has_news = is_behind or len(report.files) > before
         now = self._files()
         if has_news and any(not path.name.startswith(".") for path in now.paths):
@@ -379,8 +378,8 @@ def _finish_log(path: Path) -> str:
     return f"{steps}, incomplete: killed" if is_cut else steps
 
 
-def _is_first(note: Leftover) -> bool:
-    name = VideoName.parse(final_name(note.path.name) or "")
+def _is_first(note: Path) -> bool:
+    name = VideoName.parse(final_name(note.name) or "")
     return name is not None and not name.view
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Literal
 
 from ..errors import UnreadableFile
 from ..formats.locks import is_locked
@@ -28,39 +28,23 @@ from ..results.monitor_files import MonitorFiles, monitors_of
 
 _SHARED_LOCK = re.compile(r"\.openaigym\.(recover|render\.\d+)\.lock")
 
-
-class Leftover(NamedTuple):
-    """One thing to do.
-
-    Attributes:
-        kind: a list of spans with ended episodes, or without any use; the note of a
-            live video; the frames of a text recording; an unfinished file that no
-            process will finish, or the lock of a dead one; results that may be older
-            than the rest.
-        path: of that file; of the results the directory.
-    """
-
-    kind: Literal["spans", "video", "text", "stale", "results"]
-    path: Path
+# A list of spans with ended episodes, or without any use; the note of a live video; the
+# frames of a text recording; an unfinished file that no process will finish, or a dead
+# one's lock. What is left is done in this order.
+Kind = Literal["spans", "video", "text", "stale"]
 
 
-def leftovers_of(directory: Path, files: MonitorFiles) -> list[Leftover]:
-    """Return what is left to do of a monitor, in the order in which it is to be done.
+def leftovers(files: MonitorFiles, kind: Kind) -> list[Path]:
+    """Return the files of one kind that are left of a monitor."""
+    # Lists of spans are read for their own kind only.
+    are_spans = kind == "spans"
+    paths = [path for path in files.paths if (path.suffix == SPANS) == are_spans]
+    return [path for path in paths if _kind_of(path, files) == kind]
 
-    Args:
-        directory: where it recorded.
-        files: of the monitor.
-    """
-    found = [Leftover("spans", path) for path in files.paths if _has_work(path)]
-    found += [
-        Leftover(kind, path)
-        for kind in ("video", "text", "stale")
-        for path in files.paths
-        if _kind_of_part(path, files) == kind
-    ]
-    if _lacks_results(files):
-        found.append(Leftover("results", directory))
-    return found
+
+def has_leftovers(files: MonitorFiles) -> bool:
+    """Tell whether anything is left to do of a monitor."""
+    return any(_kind_of(path, files) for path in files.paths) or lacks_results(files)
 
 
 def stale_shared_files(directory: Path) -> list[Path]:
@@ -77,10 +61,15 @@ def stale_shared_files(directory: Path) -> list[Path]:
     return models + [path for path in locks if not is_locked(path)]
 
 
+def _kind_of(path: Path, files: MonitorFiles) -> Kind | None:
+    """Return what is to be done about a file; None where nothing is."""
+    if path.suffix == SPANS:
+        return "spans" if _has_work(path) else None
+    return _kind_of_part(path, files)
+
+
 def _has_work(path: Path) -> bool:
-    """Tell whether a file is a list of spans that is to be finished or removed."""
-    if path.suffix != SPANS:
-        return False
+    """Tell whether a list of spans is to be finished or removed."""
     try:
         spans = read_list(path)
     except UnreadableFile:
@@ -90,7 +79,7 @@ def _has_work(path: Path) -> bool:
     return is_idle or any(each.path.suffix == ".h5" for each in in_flight)
 
 
-def _kind_of_part(path: Path, files: MonitorFiles) -> str | None:
+def _kind_of_part(path: Path, files: MonitorFiles) -> Kind | None:
     """Return what is to be done about a hidden file; None where nothing is."""
     if path.suffix == ".lock" and path != files.lock:
         return None if is_locked(path) else "stale"
@@ -119,7 +108,7 @@ def _lock_of(video: Path) -> Path:
     return video.with_name(f".{video.stem}.lock")
 
 
-def _lacks_results(files: MonitorFiles) -> bool:
+def lacks_results(files: MonitorFiles) -> bool:
     """Tell whether statistics or manifest are missing, or may be older than the rest.
 
     A monitor that has closed wrote both, and removed its lock.

@@ -15,7 +15,7 @@ from ..formats.locks import is_locked, wait_for_lock
 from ..formats.monitor_directory import Infix
 from ..formats.second_names import give_all_second_names
 from ..results.monitor_files import monitors_of
-from .leftovers import leftovers_of, stale_shared_files
+from .leftovers import has_leftovers, stale_shared_files
 
 # One recovery of a directory at a time.
 _LOCK = ".openaigym.recover.lock"
@@ -147,7 +147,7 @@ def _dead_and_open(directory: Path) -> tuple[list[Infix], tuple[str, ...]]:
                 continue
             if files.is_open:
                 still_open.append(files.infix)
-            elif leftovers_of(directory, files):
+            elif has_leftovers(files):
                 dead.append(infix)
         except OSError as error:
             raise DirectoryNotWritable(directory, error.strerror) from error
