@@ -79,7 +79,7 @@ def table(names: Iterable[str], *, left: Iterable[str] = ("task",)) -> rich.tabl
 def print_rows(
     names: Sequence[str], rows: Iterator[Sequence[str]], *, left: Sequence[str]
 ) -> bool:
-    """Print a table of any length, of which only the beginning is kept in memory.
+    """Print a table of any length; only its beginning is kept in memory.
 
     Args:
         names: of the columns.

@@ -46,7 +46,7 @@ def verify(
             statistics and the selection of episodes again; physics all states too;
             pixels all frames and files too.
         sample: how many frames of each video to draw; all, if left out.
-        seed: of the random choice of these frames; one that nobody knows before, if
+        seed: of the random choice of these frames; one that cannot be foreseen, if
             left out. It is printed.
         trust: the id of an environment that may be made though it is in no registry of
             Gymnasium's or dm_control's. This runs code that you have installed. May be

@@ -196,7 +196,7 @@ def _csv_lines(data: bytes, texts: _Texts) -> Iterator[bytes]:
 
 
 def _general(key: str, value: Any) -> Any:
-    """Return what may be said under a key of JSON, whoever made the recording."""
+    """Return what may be said under a key of JSON in any recording."""
     if key == "surroundings" and isinstance(value, dict):
         return {k: _general_surrounding(k, item) for k, item in value.items()}
     if key == "gl_device" and isinstance(value, dict):

@@ -167,7 +167,7 @@ def compare_sampled(
 
 
 class Worst:
-    """Is told of pairs of frames, and says how far the worst of them are apart."""
+    """Compares pairs of frames, and says how far the worst are apart."""
 
     def __init__(self, file: str) -> None:
         self._file = file

@@ -3,7 +3,7 @@
 
 Of each monitor: the manifest and what it names (statistics, finished videos, those
 that broke), the journal, the frame hashes, the trajectories, and the models of these.
-Locks, unfinished files, logs that nobody can read, second names of videos, and videos
+Locks, unfinished files, unreadable logs, second names of videos, and videos
 that were rendered again another way are left out: no manifest knows them.
 
 Where episodes are chosen, the trajectories of all others are packed without states and
@@ -109,13 +109,13 @@ def look_for_contents(directory: Path, episodes: Iterable[int] | None) -> Conten
     Raises:
         InvalidArgument: it is no monitor directory, or an episode is no number.
         UnknownName: there is no such episode.
-        DirectoryInUse: a monitor is open, or somebody renders.
+        DirectoryInUse: a monitor is open, or a process renders.
         UnfinishedRecordings: videos are pending, or a monitor was killed.
         PackError: a file that is to be packed is gone, or has a name that archives
             cannot hold everywhere.
         UnreadableFile: a file is damaged, or a link that leads out of the directory.
     """
-    _check_nobody_writes(directory)
+    _check_is_idle(directory)
     files = list(iter_monitor_files(directory))
     if not files:
         raise InvalidArgument(
@@ -134,7 +134,7 @@ def look_for_contents(directory: Path, episodes: Iterable[int] | None) -> Conten
     return contents
 
 
-def _check_nobody_writes(directory: Path) -> None:
+def _check_is_idle(directory: Path) -> None:
     for path in iter_monitor_files(directory, hidden=True):
         try:
             is_held = path.suffix == ".lock" and is_locked(path)

@@ -182,7 +182,7 @@ class _Verbatim(str):
 
 
 def _markdown(value: object) -> str:
-    """Return what somebody else may have written, such that it is text and no more."""
+    """Return a text of a stranger, such that it is text and no more."""
     if isinstance(value, _Verbatim):
         return value
     line = " ".join(str(value).split())

@@ -114,7 +114,7 @@ class Finding:
 
     @classmethod
     def from_json(cls, said: Mapping[str, Any]) -> Finding:
-        """Return the finding of which `as_json` made this."""
+        """Return the finding that `as_json` turned into this."""
         kinds = {"topic": Topic(said["topic"]), "outcome": Outcome(said["outcome"])}
         return cls(**{**said, **kinds})
 
@@ -151,7 +151,7 @@ class Excuse:
 
     @classmethod
     def from_json(cls, said: Mapping[str, Any]) -> Excuse:
-        """Return the excuse of which `as_json` made this."""
+        """Return the excuse that `as_json` turned into this."""
         kinds = {"kind": ExcuseKind(said["kind"]), "items": tuple(said["items"])}
         return cls(**{**said, **kinds})
 

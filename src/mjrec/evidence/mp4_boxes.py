@@ -102,7 +102,7 @@ def shown_times(boxes: Sequence[Box]) -> tuple[int, Fraction] | str:
         duration, offsets = _table(boxes, "stts"), _table(boxes, "ctts")
         [scale] = struct.unpack(">I", _one(boxes, "mdhd").content[12:16])
         sizes = np.frombuffer(_one(boxes, "stsz").content[12:], ">u4")
-        # Beyond ours nobody writes: 64-bit times, several edits.
+        # Written by others only: 64-bit times, several edits.
         edits, _, begin, rate = struct.unpack(">4xIIiI", _one(boxes, "elst").content)
     except (KeyError, struct.error) as error:
         raise ValueError(

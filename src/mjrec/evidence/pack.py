@@ -110,7 +110,7 @@ def pack(
         InvalidArgument: a value that cannot be, no monitor directory, or a file that
             is there already.
         UnknownName: there is no such episode.
-        DirectoryInUse: a monitor is open, or somebody renders.
+        DirectoryInUse: a monitor is open, or a process renders.
         UnfinishedRecordings: videos are pending, or a monitor was killed.
         ArchiveTooLarge: `max_size` cannot be kept.
         IdentityLeft: `anonymous`, and a name could not be taken out.

@@ -51,7 +51,7 @@ class Statements:
     """What of a run can never come out again: given where a run is made again.
 
     Attributes:
-        infix: what the names of its files have in the middle; nobody has claimed it.
+        infix: what the names of its files have in the middle; it is not claimed yet.
         first_episode_id: the number of its first episode.
         surroundings: its provenance; None where that was not known.
         surroundings_after: how many lines the journal had before, after its first.

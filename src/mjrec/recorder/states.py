@@ -278,7 +278,7 @@ class StateRecorder:
         """Hand it on to what finishes it, after its end.
 
         Args:
-            recording: of which it is the last part, if it is one.
+            recording: the clip that it is the last part of, if it is one.
         """
         # Else the disk was too full for a single row: there is no video to come.
         if self._span is not None or recording is not None:

@@ -220,7 +220,7 @@ class _DeadMonitor:
 
     @functools.cached_property
     def _entries(self) -> dict[int, JournalEntry | None]:
-        """Episodes with files of which the journal has a line; None where it was cut.
+        """Episodes with files and a line in the journal; None where it was cut.
 
         Of the others there may be millions.
         """

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Finishing a directory: whatever is over and not finished yet.
 
-One operation, of which everything else is a part. It does what is left of each
+One operation; everything else is a part of it. It does what is left of each
 recording (the process beside a simulation does that for its monitor's), keeps manifests
 and second names true, and puts dead monitors in order (`recover`, and `resume=True`,
 are all of it but the drawing). It may be interrupted or killed at any point and run

@@ -30,7 +30,7 @@ _DRAWN = (
 )
 
 # How far a camera and an option reach before their first and behind their last array.
-# Nothing beyond is looked at: it belongs to somebody else, and may change any time.
+# Nothing beyond is looked at: it belongs to others, and may change at any time.
 _REACH = {mujoco.MjvCamera: (16, 32), mujoco.MjvOption: (8, 8)}
 
 _Arrays = list[tuple[str, NDArray[Any]]]
