@@ -35,7 +35,7 @@ from mjrec.formats.locks import Lock, is_locked, try_lock
 from mjrec.formats.monitor_directory import (
     Infix,
     lock_name,
-    states_name,
+    log_name,
     video_lock_name,
     video_prefix,
 )
@@ -136,7 +136,7 @@ def assert_in_order(directory: Path) -> None:
     assert not again
     assert str(again) == f"Nothing to recover in {directory}."
     assert {path.name: path.read_bytes() for path in directory.iterdir()} == before
-    ends = (".spans", ".log", ".tail")
+    ends = (".log", ".tail", ".looks")
     assert not [name for name in before if name.startswith(".") or name.endswith(ends)]
 
 
@@ -432,20 +432,20 @@ def test_an_episode_whose_last_row_is_there_is_complete(
     assert_in_order(tmp_path)
 
 
-def test_an_unreadable_list_stays_and_is_reported(tmp_path: Path) -> None:
-    """With its rows; an empty one is removed."""
+def test_a_log_of_unknown_rows_stays_and_is_reported(tmp_path: Path) -> None:
+    """Of which no journal has a line; without rows it is removed."""
     write_log(tmp_path, 0)
-    [headless] = tmp_path.glob("*.spans")
-    headless.write_bytes(b"")
-    empty, garbage = (tmp_path / states_name(INFIX, number) for number in (1, 2))
+    [journal] = tmp_path.glob("*.jsonl")
+    journal.write_bytes(b"")
+    unknown, empty, stray = (tmp_path / log_name(INFIX, number) for number in range(3))
     empty.touch()
-    garbage.write_bytes(b'{"format": "else"}\n' + bytes(203))
+    stray.with_suffix(".tail").touch()
     recovery = mjrec.recover(tmp_path)
-    assert f"{empty.name}: nothing in flight, removed" in str(recovery)
-    assert not empty.exists()
-    assert [file.name for file in recovery.failures] == [headless.name, garbage.name]
-    assert headless.with_suffix(".log").stat().st_size
-    assert garbage.stat().st_size == 222
+    for log in (empty, stray):
+        assert f"{log.name}: nothing in flight, removed" in str(recovery)
+    assert [path.name for path in tmp_path.glob("*.states.*")] == [unknown.name]
+    assert [file.name for file in recovery.failures] == [unknown.name]
+    assert unknown.stat().st_size
     mjrec.clear_monitor_files(tmp_path)
     assert not list(tmp_path.iterdir())
 

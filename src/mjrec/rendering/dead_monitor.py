@@ -17,7 +17,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from ..errors import Error, FileNotWritten, UnreadableFile
+from ..errors import Error, UnreadableFile
 from ..formats.journal import (
     KILLED,
     JournalEntry,
@@ -35,19 +35,23 @@ from ..formats.monitor_directory import (
     lock_name,
     manifest_name,
 )
-from ..formats.spans import drop_recording, read_list, remove_list
+from ..formats.spans import (
+    files_beside,
+    recordings_in,
+    recordings_in_flight,
+    remove_log,
+)
 from ..formats.trajectory_file import (
     find_trajectory,
     finish_trajectory,
     open_trajectory,
 )
-from ..formats.video_metadata import is_done
 from ..results.journal_or_stats import MonitorResults, locked_run
 from ..results.manifest_writing import manifest_lock, write_manifest_and_stats
 from ..results.monitor_files import MonitorFiles, files_of
 from .cut_videos import finish_text, finish_video
 from .jobs import key_of
-from .leftovers import Kind, lacks_results, leftovers
+from .leftovers import Kind, lacks_results, leftovers, logs_left
 from .recorded_facts import open_for_rendering, video_path
 from .recordings import claim, parts_of
 
@@ -148,9 +152,9 @@ class _DeadMonitor:
             is_behind: its results may be older than the rest.
         """
         report = self._report
-        for spans in self._left("spans"):
-            with report.attempt(spans.name):
-                self._finish_spans(spans)
+        for log in logs_left(self._files()):
+            with report.attempt(log.name):
+                self._finish_log(log)
         # Of logs a manifest says nothing that is not so of trajectories.
         before = len(report.files)
         # The first video's metadata names those of further cameras.
@@ -182,24 +186,22 @@ class _DeadMonitor:
         for name, what in done:
             self._report.note(name, what)
 
-    def _finish_spans(self, path: Path) -> None:
-        """Make trajectories of the episodes of a list; remove it where it is idle.
+    def _finish_log(self, log: Path) -> None:
+        """Make trajectories of the episodes of a log; remove it where it is idle.
 
         Raises:
-            UnreadableFile: it cannot be read; it stays with its rows.
+            UnreadableFile: the journal does not say what is in it; it stays.
         """
-        spans = read_list(path)
-        if spans.is_headless:
-            raise UnreadableFile(path, "it does not say what its rows are")
-        for recording in spans.in_flight():
-            log = recording.path
-            if log.suffix == ".h5":
-                with self._report.attempt(log.name), self._claimed(log) as is_ours:
-                    if is_ours and not log.exists():
-                        self._report.note(log.name, _finish_log(log))
-        if path.exists() and not read_list(path).in_flight():
-            remove_list(path)
-            self._report.note(path.name, "nothing in flight, removed")
+        for recording in recordings_in(log):
+            path = recording.path
+            if path.suffix == ".h5" and recording.is_in_flight:
+                with self._report.attempt(path.name), self._claimed(path) as is_ours:
+                    if is_ours and recording.is_in_flight:
+                        self._report.note(path.name, _finish_episode(path))
+        is_idle = not any(each.is_in_flight for each in recordings_in(log))
+        if is_idle and any(map(Path.exists, files_beside(log))):
+            remove_log(log)
+            self._report.note(log.name, "nothing in flight, removed")
 
     @contextlib.contextmanager
     def _claimed(self, path: Path) -> Iterator[bool]:
@@ -291,12 +293,8 @@ class _DeadMonitor:
 
         One that cannot be read is left out; rendering the directory reports it.
         """
-        spans = [path for path in now.paths if path.suffix == ".spans"]
-        keys = set()
-        for path in spans:
-            with contextlib.suppress(UnreadableFile):
-                keys |= {key_of(each.name) for each in read_list(path).in_flight()}
-        for key in keys:
+        in_flight = recordings_in_flight(self._directory, self._infix)
+        for key in {key_of(each.name) for each in in_flight}:
             if key is None or not key.is_clip:
                 continue
             with contextlib.suppress(UnreadableFile, IndexError):
@@ -323,17 +321,12 @@ class _DeadMonitor:
         lines = [*self._missing_episodes(now), *self._missing_clips(now)]
         path = self._directory / journal_name(self._infix)
         writer = JournalWriter(path, run=self._run_facts(now))
-        try:
-            with manifest_lock(self._directory, self._infix):
-                for kind, facts in (*lines, ("recovered", {})):
-                    if kind == "episode":
-                        writer.append(entry_of(facts))
-                    else:
-                        writer.note(kind, facts)
-        except OSError as error:
-            raise FileNotWritten(path, error.strerror or error) from error
-        finally:
-            writer.close()
+        with contextlib.closing(writer), manifest_lock(self._directory, self._infix):
+            for kind, facts in (*lines, ("recovered", {})):
+                if kind == "episode":
+                    writer.append(entry_of(facts))
+                else:
+                    writer.note(kind, facts)
         added = sum(kind == "episode" for kind, _ in lines)
         if added:
             self._report.note(path.name, f"{_counted(added, 'episode')} added")
@@ -365,14 +358,10 @@ class _DeadMonitor:
             note(manifest_name(self._infix), what)
 
 
-def _finish_log(path: Path) -> str:
+def _finish_episode(path: Path) -> str:
     """Give a recording in flight its final form; return what was done."""
     with open_trajectory(path) as reader:
         facts, steps = reader.facts, _counted(reader.step_count, "step")
-    if not facts.get("kept", True) and is_done(video_path(path, facts)):
-        # Its renderer died between the two.
-        drop_recording(path)
-        return "its video is there, removed"
     finish_trajectory(path)
     is_cut = "complete" not in facts and _facts_of(path).get("reason") == KILLED
     return f"{steps}, incomplete: killed" if is_cut else steps
