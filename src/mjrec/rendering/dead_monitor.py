@@ -11,7 +11,6 @@ from __future__ import annotations
 import contextlib
 import functools
 import logging
-import time
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -57,8 +56,6 @@ from .recordings import claim, parts_of
 
 logger = logging.getLogger(__name__)
 
-_MOMENT = 0.05
-
 _Line = tuple[str, Mapping[str, Any]]
 
 
@@ -67,12 +64,10 @@ class Report:
     """What was done, and what failed.
 
     Attributes:
-        deadline: until when to wait for others, by `time.monotonic`.
         files: names, and what was done.
         failures: names, and why it could not be.
     """
 
-    deadline: float
     files: list[tuple[str, str]] = field(default_factory=list)
     failures: list[tuple[str, str]] = field(default_factory=list)
 
@@ -162,7 +157,7 @@ class _DeadMonitor:
             path = note.with_name(final_name(note.name) or "")
             with report.attempt(path.name):
                 known = self._known(episode_of(path.name))
-                self._note_all(finish_video(path, known, deadline=report.deadline))
+                self._note_all(finish_video(path, known))
         for text in self._left("text"):
             path = text.with_name(final_name(text.name) or "")
             number = episode_of(path.name)
@@ -210,11 +205,7 @@ class _DeadMonitor:
         if key is None:
             yield True
             return
-        # A renderer that outlived its monitor is about to end.
-        while (lock := claim(self._directory, key)) is None:
-            if time.monotonic() >= self._report.deadline:
-                break
-            time.sleep(_MOMENT)
+        lock = claim(self._directory, key)
         with contextlib.nullcontext() if lock is None else lock:
             yield lock is not None
 

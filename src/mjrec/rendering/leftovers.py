@@ -14,6 +14,7 @@ from typing import Literal
 from ..errors import UnreadableFile
 from ..formats.locks import is_locked
 from ..formats.monitor_directory import (
+    Infix,
     VideoName,
     final_name,
     is_note,
@@ -24,7 +25,7 @@ from ..formats.spans import recordings_in
 from ..formats.unfinished_video import note_path
 from ..formats.video_metadata import is_broken, metadata_path
 from ..results.journal_or_stats import MonitorResults
-from ..results.monitor_files import MonitorFiles, monitors_of
+from ..results.monitor_files import MonitorFiles, files_of, monitors_of
 
 _SHARED_LOCK = re.compile(r"\.openaigym\.(recover|render\.\d+)\.lock")
 
@@ -48,6 +49,13 @@ def has_leftovers(files: MonitorFiles) -> bool:
     """Tell whether anything is left to do of a monitor."""
     is_left = bool(logs_left(files)) or any(_kind_of(p, files) for p in files.paths)
     return is_left or lacks_results(files)
+
+
+def is_at_work(directory: Path, infix: Infix) -> bool:
+    """Tell whether an encoder or a renderer is at a file of a monitor that is gone."""
+    files = files_of(directory, infix)
+    hidden = [path for path in files.paths if path.name.startswith(".")]
+    return any(is_locked(path) for path in hidden if path != files.lock)
 
 
 def stale_shared_files(directory: Path) -> list[Path]:
