@@ -639,6 +639,14 @@ def test_files_that_are_removed_while_they_are_written_cost_one_recording(
     check(read(episode(tmp_path, 2)), 3)
 
 
+def test_facts_that_no_line_holds_are_cut_off(logs: SpanLogs, path: Path) -> None:
+    """Of the options; what comes behind is read as ever."""
+    write(logs, 3, facts={"options": "x" * (1 << 24), "seed": 7})
+    write(logs, 3, episode=28, facts={"seed": 8})
+    assert len(read(path).facts["options"]["repr"]) == 1000
+    assert read(episode(path.parent, 28)).facts == {"seed": 8}
+
+
 def test_rows_of_a_newer_version_are_no_rows(logs: SpanLogs, path: Path) -> None:
     """They stay, and are told of where they are asked for."""
     write(logs, 3)

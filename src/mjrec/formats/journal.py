@@ -141,7 +141,7 @@ class JournalWriter:
         self._run = run
         self._descriptor: int | None = None
         self._unwritten = b""
-        self._closed = False
+        self._is_empty = self._closed = False
 
     def append(self, entry: JournalEntry) -> None:
         """Write down a completed episode.
@@ -160,9 +160,7 @@ class JournalWriter:
         values = {k: v for k, v in vars(entry).items() if k not in left_out}
         line = dumps(values)
         if len(line) >= _LONGEST_LINE:
-            for key in ("seed", "options"):
-                values[key] = {"repr": repr(values[key])[:_LONGEST_REPR]}
-            line = dumps(values)
+            line = dumps(_shortened(values))
         self._append(f"{line}\n".encode())
 
     def note(self, kind: str, facts: Any, *, later: bool = True) -> None:
@@ -176,7 +174,10 @@ class JournalWriter:
         Raises:
             ClosedError, FileNotWritten: as `append`.
         """
-        self._append(f"{dumps({kind: facts})}\n".encode(), later=later)
+        line = dumps({kind: facts})
+        if len(line) >= _LONGEST_LINE and kind in ("rows", "begin"):
+            line = dumps({kind: {**facts, "facts": _shortened(facts["facts"])}})
+        self._append(f"{line}\n".encode(), later=later)
 
     @property
     def is_behind(self) -> bool:
@@ -205,16 +206,27 @@ class JournalWriter:
     def _write(self, lines: bytes) -> None:
         if self._descriptor is None:
             self._descriptor = open_for_appending(self.path)
-        if self._run is not None and not os.fstat(self._descriptor).st_size:
+            self._is_empty = not os.fstat(self._descriptor).st_size
+        if self._run is not None and self._is_empty:
             lines = f"{dumps({'run': self._run})}\n".encode() + lines
         try:
             append_whole(self._descriptor, lines, torn=b"\n")
+            self._is_empty = False
         except FileNotFoundError:
             # The next event begins another file.
             os.close(self._descriptor)
             self._descriptor = None
             self.lost += 1
             raise
+
+
+def _shortened(values: Mapping[str, Any]) -> dict[str, Any]:
+    cut = {
+        key: {"repr": repr(values[key])[:_LONGEST_REPR]}
+        for key in ("seed", "options")
+        if key in values
+    }
+    return {**values, **cut}
 
 
 def is_of_spans(line: bytes) -> bool:
