@@ -25,12 +25,13 @@ A recording is called by the path of the file that it will become.
 from __future__ import annotations
 
 import contextlib
+import functools
 import os
 import threading
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple
+from typing import Any, BinaryIO
 
 import numpy as np
 
@@ -61,20 +62,6 @@ _LONGEST_LINE = 1 << 24
 _SEAM = 128
 
 
-class Rows(NamedTuple):
-    """What rows are.
-
-    Attributes:
-        dtype: of a row; None where that cannot be read.
-        reason: why not.
-        facts: of every recording with such rows.
-    """
-
-    dtype: np.dtype[Any] | None
-    reason: str
-    facts: Mapping[str, Any]
-
-
 @dataclass
 class Recording:
     """A recording whose rows are in a log, as far as the journal was read.
@@ -82,7 +69,7 @@ class Recording:
     Attributes:
         name: of its file without suffix.
         log: its row log.
-        rows: what its rows are.
+        rows: what the journal says of its rows.
         facts: all that is known of it.
         row: its first.
         look: where to look for its changes of the model.
@@ -93,7 +80,7 @@ class Recording:
 
     name: str
     log: Path
-    rows: Rows
+    rows: Mapping[str, Any]
     facts: dict[str, Any]
     row: int
     look: int
@@ -107,16 +94,18 @@ class Recording:
         is_episode = episode_of(f"{self.name}{FINISHED}") is not None
         return self.log.with_name(f"{self.name}{FINISHED * is_episode}")
 
-    @property
+    @functools.cached_property
     def dtype(self) -> np.dtype[Any]:
         """Of its rows.
 
         Raises:
-            UnreadableFile: the journal does not say it.
+            UnreadableFile: the journal does not say it, or is of a newer version.
         """
-        if self.rows.dtype is None:
-            raise UnreadableFile(_journal_of(self.log), self.rows.reason)
-        return self.rows.dtype
+        with unreadable(_journal_of(self.log)):
+            if not self.rows:
+                raise ValueError("it does not say what the rows of its logs are")
+            check_version(integer(self.rows.get("version")))
+            return dtype_from_json(self.rows.get("dtype"))
 
     @property
     def is_gone(self) -> bool:
@@ -160,7 +149,7 @@ class _Spans:
     logs: dict[Path, list[Recording]] = field(default_factory=dict)
     recordings: dict[str, Recording] = field(default_factory=dict)
     full: set[Path] = field(default_factory=set)
-    _rows: dict[int, Rows] = field(default_factory=dict)
+    _rows: dict[int, Mapping[str, Any]] = field(default_factory=dict)
     _status: os.stat_result | None = None
     _offset: int = 0
     _seam: bytes = b""
@@ -200,7 +189,7 @@ class _Spans:
     def _take(self, values: Mapping[str, Any]) -> None:
         [(kind, said)] = values.items()
         if kind == "rows":
-            self._rows[integer(said["number"])] = _rows_of(said)
+            self._rows[integer(said["number"])] = mapping(said)
         elif kind == "begin":
             self._begin(said)
         elif kind == "full":
@@ -218,19 +207,12 @@ class _Spans:
         name, log = base_name(said["name"]), self._log(said["log"])
         if infix_of_recording(name) != infix_of(self.journal.name):
             raise ValueError(f"{name!r:.100} is no recording of its monitor")
-        rows = self._rows.get(integer(said["rows"]))
-        if rows is None:
-            rows = Rows(None, "it does not say what the rows of its logs are", {})
-        without = said.get("without", ())
-        facts = {k: v for k, v in rows.facts.items() if k not in without}
-        recording = Recording(
-            name,
-            log,
-            rows,
-            {**facts, **mapping(said["facts"])},
-            _count(said["row"]),
-            _count(said["look"]),
-        )
+        rows, without = self._rows.get(said["rows"], {}), said.get("without", ())
+        common = mapping(rows.get("facts", {})).items()
+        facts = {k: v for k, v in common if k not in without}
+        facts.update(mapping(said["facts"]))
+        first, look = _count(said["row"]), _count(said["look"])
+        recording = Recording(name, log, rows, facts, row=first, look=look)
         others = self.logs.setdefault(log, [])
         if others:
             others[-1].following = recording.row
@@ -243,14 +225,6 @@ class _Spans:
     def _log(self, number: Any) -> Path:
         infix = infix_of(self.journal.name)
         return self.journal.with_name(log_name(infix or "", _count(number)))
-
-
-def _rows_of(said: Mapping[str, Any]) -> Rows:
-    try:
-        check_version(integer(said["version"]))
-        return Rows(dtype_from_json(said["dtype"]), "", mapping(said["facts"]))
-    except (ValueError, LookupError) as error:
-        return Rows(None, str(error), {})
 
 
 # A journal only grows, and each recording is looked for by itself.
@@ -336,19 +310,8 @@ def find_recording(path: Path) -> Recording | None:
     if infix is None:
         return None
     recording = _read(path.with_name(journal_name(infix))).recordings.get(name)
-    is_there = recording is not None and recording.log.exists()
-    return recording if is_there and recording and not recording.is_gone else None
-
-
-def get_recording(path: Path) -> Recording:
-    """Return a recording whose rows are of use, by the path of its file.
-
-    Raises:
-        UnreadableFile: there is none, or the journal cannot be read.
-    """
-    recording = find_recording(path)
-    if recording is None:
-        raise UnreadableFile(path, "there is no such file, and no log of it")
+    if recording is None or recording.is_gone or not recording.log.exists():
+        return None
     return recording
 
 

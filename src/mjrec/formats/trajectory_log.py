@@ -18,11 +18,11 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import InvalidArgument
+from ..errors import InvalidArgument, UnreadableFile
 from .json_fields import unreadable
 from .regular_files import open_regular
 from .row_log import RowLogReader
-from .spans import LOOKS, Recording, find_recording, get_recording
+from .spans import LOOKS, Recording, find_recording
 from .trajectory import (
     FRAME,
     STEP,
@@ -56,7 +56,9 @@ def open_recording(path: Path) -> TrajectoryReader:
         UnreadableFile: there is no such recording, or its log is damaged, or of a newer
             version.
     """
-    recording = get_recording(path)
+    recording = find_recording(path)
+    if recording is None:
+        raise UnreadableFile(path, "there is no such file, and no log of it")
     with unreadable(recording.log), contextlib.ExitStack() as opened:
         rows = opened.enter_context(
             contextlib.closing(RowLogReader(recording.log, recording.dtype.itemsize))
