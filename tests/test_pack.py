@@ -29,6 +29,7 @@ import mjrec
 from mjrec.evidence.layout import STATISTICS_COLUMNS
 from mjrec.evidence.pack import pack_folder
 from mjrec.evidence.packed_run import PackingOptions
+from mjrec.formats.journal import is_of_spans
 
 STATED: dict[str, Any] = {
     "title": "Pendulums: «five» of them",
