@@ -397,7 +397,7 @@ def _environ() -> dict[str, str]:
     environ = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}
     # Beside a simulation a single worker, too, has one CPU to itself and no more: the
     # threads of Mesa's rasteriser would get in the way of the steps.
-    environ.setdefault("LP_NUM_THREADS", "1")
+    environ.setdefault("LP_NUM_THREADS", "0")
     return environ
 
 

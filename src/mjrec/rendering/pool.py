@@ -481,6 +481,7 @@ def _environment(environ: Mapping[str, str], *, alone: bool) -> dict[str, str]:
         )
         del changed["LP_NATIVE_VECTOR_WIDTH"]
     if not alone:
-        # Mesa's rasteriser would start as many threads as there are CPUs, in each.
-        changed.setdefault("LP_NUM_THREADS", "1")
+        # Mesa's rasteriser would start as many threads as there are CPUs, in each. One
+        # of its own would only be waited for.
+        changed.setdefault("LP_NUM_THREADS", "0")
     return changed

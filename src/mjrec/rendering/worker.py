@@ -61,6 +61,10 @@ class Drawing:
         # The frame whose cameras the renderers have in mind.
         self._last: int | None = None
         self._canvas_is_old = False
+        # Whether a frame depends on the one before, at any time.
+        self._looks_back = not scene.is_constant or any(
+            camera.shows_frame_before for camera in cameras
+        )
 
     @property
     def size(self) -> tuple[int, int]:
@@ -88,7 +92,7 @@ class Drawing:
                 "from 0."
             )
         last, self._last = self._last, None
-        if last is None or index != last + 1:
+        if self._looks_back and (last is None or index != last + 1):
             self._prepare(index, last)
         self._bring_to(index)
         if self._canvas_is_old:
@@ -200,7 +204,7 @@ def main() -> None:
     parent.send_warnings()
     parent.listen()
     os.setpriority(os.PRIO_PROCESS, 0, max(_NICE, os.getpriority(os.PRIO_PROCESS, 0)))
-    canvas = Canvas()
+    canvas = Canvas(is_alone=True)
     while True:
         order = parent.receive()
         if "tries" not in order:
