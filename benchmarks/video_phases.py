@@ -185,7 +185,9 @@ def _draw(
     with open_trajectory(trajectory) as reader:
         count = reader.frame_count
     try:
-        frames = timed("drawing", lambda: [drawing.draw(i) for i in range(count)])
+        frames: list[Any] = timed(
+            "drawing", lambda: [drawing.draw(index) for index in range(count)]
+        )
     finally:
         mujoco.mjr_readPixels = read
         drawing.close()
