@@ -76,7 +76,9 @@ class EpisodeRecording:
         deferred = wants_video and run.env.rendering.mode == DEFERRED
         if deferred:
             # What draws begins while the model is looked at.
-            run.finisher.expect()
+            run.finisher.expect(
+                run.logs.path_of(trajectory_prefix(run.infix, self.episode_id))
+            )
         start = None
         if capture is not None and (keeps or deferred):
             start = capture.begin_episode()

@@ -5,10 +5,11 @@ Its parent sends::
 
     {"tries": true}                         it makes its context and, if true, looks at
                                             a frame of its own
+    {"prepares": {...}}                     it loads what that will be drawn with
     {"drawing": {...}, "indices": [1, 3, 5]}
 
-`drawing` is what `open_drawing` takes; `indices` are the frames. It sends the bytes of
-frames, `(height, width, 3) uint8`, and::
+`drawing` and `prepares` are what `open_drawing` takes; `indices` are the frames. It
+sends the bytes of frames, `(height, width, 3) uint8`, and::
 
     {"size": [48, 64], "gl": {...}}         before the frames of a job
     {"error": {...}}                        instead of a frame and all that would follow
@@ -23,6 +24,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -39,6 +41,8 @@ from .recorded_facts import check_has_frames, open_for_rendering
 from .views import PlainCamera, View
 
 _NICE = 10
+_LOOKS_FOR_RECORDING = 100
+_SECONDS_BETWEEN_LOOKS = 0.02
 
 
 class Drawing:
@@ -207,7 +211,9 @@ def main() -> None:
     canvas = Canvas(is_alone=True)
     while True:
         order = parent.receive()
-        if "tries" not in order:
+        if "prepares" in order:
+            _prepare(order["prepares"], canvas, parent)
+        elif "drawing" in order:
             try:
                 _draw(order, canvas, parent)
             except Exception as error:
@@ -223,6 +229,19 @@ def main() -> None:
             # What is in the way is said when there is something to draw.
             with contextlib.suppress(Error):
                 canvas.open()
+
+
+def _prepare(drawing: Mapping[str, Any], canvas: Canvas, parent: Parent) -> None:
+    """Load the model into the canvas, where it is there before there is more to do."""
+    for _ in range(_LOOKS_FOR_RECORDING):
+        if parent.has_said_something:
+            return
+        # A recording is there from its first step on, its model a moment later. What
+        # else is in the way is said when there is something to draw.
+        with contextlib.suppress(Exception):
+            open_drawing(drawing, canvas).close()
+            return
+        time.sleep(_SECONDS_BETWEEN_LOOKS)
 
 
 def _draw(order: Mapping[str, Any], canvas: Canvas, parent: Parent) -> None:
