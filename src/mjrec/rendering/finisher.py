@@ -141,6 +141,13 @@ class Finisher:
         with contextlib.suppress(Error):
             self._pool.start()
 
+    def prepare(self, recording: Path) -> None:
+        """Let the workers load what a recording will be drawn with, once it is there.
+
+        It may be running still.
+        """
+        self._pool.prepare(recording)
+
     def rest(self) -> None:
         """Let others use the CPUs: there is nothing to do."""
         self._pool.rest()
