@@ -33,7 +33,7 @@ EXCUSES = {
 
 
 def difference(aspect: Aspect, size: float | None = None, **changes: Any) -> Difference:
-    usual: dict[str, Any] = {"topic": Topic.PHYSICS, "file": TRAJECTORY}
+    usual: dict[str, Any] = {"topic": Topic.PHYSICS, "file": TRAJECTORY, "how": ""}
     return Difference(**{**usual, **changes}, aspect=aspect, size=size)
 
 

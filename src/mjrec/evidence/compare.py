@@ -83,8 +83,8 @@ _TOPICS: Final = {
     "text": Topic.PICTURES,
 }
 _OF_MANIFEST: Final = (Topic.SELECTION, Topic.IDENTITY)
+_NOT_MADE: Final = "nothing made this file again"
 _NO_DIFFERENCES: Final = (Aspect.CLAIM, Aspect.STATEMENT)
-_NOTHING: Final = "nothing made it"
 # Excuses of what was not played.
 _UNPLAYED: Final = ("environment", "wrappers", "actions not kept")
 _MOST_FAILURES: Final = 100
@@ -217,8 +217,7 @@ class Comparison:
             topic=_TOPICS.get(kind, Topic.FILES),
             file=file,
             aspect=Aspect.MODEL if kind == "model" else Aspect.EXACT,
-            given="this file" if is_given else "no such file",
-            made="one" if is_made else _NOTHING,
+            how=_NOT_MADE if is_given else "no such file, but one was made again",
         )
 
     def _compare_file(self, file: str) -> Iterator[Same | Difference | Finding]:
@@ -289,7 +288,7 @@ class Comparison:
             case _ if Path(file).suffix in (".md", ".cff"):
                 yield from compare_texts(given, made, file, rules)
             case _:
-                yield Difference(topic=Topic.FILES, file=file, where="its bytes")
+                yield Difference(topic=Topic.FILES, file=file, how="its bytes differ")
 
     def _compare_manifests(
         self, given: Path, made: Path, file: str, rules: Rules
@@ -515,8 +514,7 @@ def _compare_sources(given: Path, made: Path, file: str) -> _Found:
         file=file,
         # The name of the main file is a statement.
         aspect=Aspect.STATEMENT if is_equal else Aspect.EXACT,
-        given="these sources",
-        made="others",
+        how="its sources are not those of the model that was made again",
     )
 
 
@@ -534,17 +532,24 @@ def _compare_models(given: Path, made: Path, file: str) -> _Found:
     if contents[0] != contents[1]:
         yield _recompiled(file)
     else:
-        yield Difference(topic=Topic.FILES, file=file, aspect=Aspect.STORED)
+        yield Difference(
+            topic=Topic.FILES,
+            file=file,
+            aspect=Aspect.STORED,
+            how="the same model, compressed otherwise",
+        )
 
 
 def _damaged(file: str, error: Error) -> Difference:
+    # Without the path, which is that of a temporary folder.
+    reason = error.reason if isinstance(error, UnreadableFile) else str(error)
     topic = _TOPICS.get(_kind(file), Topic.FILES)
-    return Difference(topic=topic, file=file, given=str(error), made="a whole file")
+    return Difference(topic=topic, file=file, how=f"it cannot be read: {reason}")
 
 
 def _not_made(file: str) -> Difference:
     topic = _TOPICS.get(_kind(file), Topic.FILES)
-    return Difference(topic=topic, file=file, given="this file", made=_NOTHING)
+    return Difference(topic=topic, file=file, how=_NOT_MADE)
 
 
 def _recompiled(file: str) -> Difference:
@@ -553,8 +558,7 @@ def _recompiled(file: str) -> Difference:
         file=file,
         aspect=Aspect.MODEL,
         unit="compiled model",
-        given="one compiled model",
-        made="another",
+        how="it was compiled otherwise",
     )
 
 
@@ -577,8 +581,8 @@ def _other_choice(given: set[int], made: set[int], file: str) -> Difference:
         topic=Topic.SELECTION,
         file=file,
         where="episodes with a video",
-        given=f"{_listed(given - made)} that nothing chose",
-        made=f"{_listed(made - given)} besides",
+        how=f"only the archive has {_listed(given - made)}, only what was made again "
+        f"has {_listed(made - given)}",
     )
 
 

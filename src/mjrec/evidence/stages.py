@@ -79,7 +79,7 @@ def _open(request: Mapping[str, Any], say: _Say) -> None:
     from .archive import bring_in
     from .checked_bag import check_bag
     from .honesty import remarks
-    from .read_inputs import NotReadable, read_inputs
+    from .read_inputs import read_inputs
 
     given, counter = Path(request["given"]), _Counter(say)
     say(facts=dict(bring_in(Path(request["path"]), given)))
@@ -88,10 +88,7 @@ def _open(request: Mapping[str, Any], say: _Say) -> None:
             say(finding=finding.as_json())
     if request["level"] == Level.FILES:
         return
-    try:
-        inputs, arrays = read_inputs(given / PAYLOAD)
-    except NotReadable as error:
-        raise Error(f"its inputs cannot be read: {error}") from error
+    inputs, arrays = read_inputs(given / PAYLOAD)
     folder = Path(request["inputs"])
     folder.mkdir()
     inputs.write(folder, arrays)

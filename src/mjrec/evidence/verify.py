@@ -195,6 +195,8 @@ class _Verifying:
                     return True
                 failure = said.get("failure", failure)
             failure = failure or f"its process {sandbox.last_words()}"
+        # The reader knows nothing of the folder that they worked in.
+        failure = failure.replace(f"{self._folder}{os.sep}", "")
         self.findings.append(
             Finding(
                 topic=Topic.FILES,
