@@ -43,7 +43,7 @@ from .compare_rows import compare_rewards, compare_trajectories, same_trajectory
 from .compare_text import compare_frame_hashes, compare_tables, compare_texts
 from .compare_video import compare_sampled, compare_videos
 from .differences import Aspect, Difference, Same, short
-from .excuses import Trial, applicable, believed, merged, with_allowed
+from .excuses import NUMERIC, Trial, applicable, believed, merged, with_allowed
 from .findings import Excuse, Finding, Level, Outcome, Topic
 from .layout import CRATE, ENVIRONMENT, PAYLOAD, RECORDINGS, SAMPLED, STATISTICS
 from .notes import REWARDS_FILE, read_notes
@@ -140,7 +140,7 @@ class Comparison:
         claims = claimed_excuses(self._given, self._made)
         excuses = applicable(merged([*claims, *(excuse for excuse, _ in noted)]))
         trial = Trial(with_allowed(excuses, self._allow))
-        sums = _Sums()
+        sums, is_other_code = _Sums(), False
         for _, finding in noted:
             if finding is not None:
                 trial.use(str(finding.excuse))
@@ -154,13 +154,17 @@ class Comparison:
                     continue
                 if finding.outcome is not Outcome.DIFFERENT:
                     sums.add(finding)
-                elif sums.fail(finding):
+                    continue
+                is_other_code |= found.aspect in (Aspect.STATE, Aspect.DERIVED)
+                if sums.fail(finding):
                     yield finding
             elif not trial.same(found):
                 sums.same(found)
         yield from trial.refutations()
         yield from sums
         self.excuses = trial.excuses
+        if is_other_code and not any(e.name in NUMERIC for e in self.excuses):
+            yield _other_code()
 
     def _compare(self) -> Iterator[Same | Difference | Finding]:
         self._renamed = _renamed_models(self._given, self._made)
@@ -216,7 +220,8 @@ class Comparison:
         yield Difference(
             topic=_TOPICS.get(kind, Topic.FILES),
             file=file,
-            aspect=Aspect.MODEL if kind == "model" else Aspect.EXACT,
+            # A compiled model that is not there is none that was compiled elsewhere.
+            aspect=Aspect.MODEL if kind == "model" and is_given else Aspect.EXACT,
             how=_NOT_MADE if is_given else "no such file, but one was made again",
         )
 
@@ -550,6 +555,18 @@ def _damaged(file: str, error: Error) -> Difference:
 def _not_made(file: str) -> Difference:
     topic = _TOPICS.get(_kind(file), Topic.FILES)
     return Difference(topic=topic, file=file, how=_NOT_MADE)
+
+
+def _other_code() -> Finding:
+    return Finding(
+        topic=Topic.PHYSICS,
+        item="",
+        outcome=Outcome.NOTED,
+        reason="it claims the versions and the machine that are here, so other code or "
+        "other numbers were at work",
+        unit="verification",
+        is_headline=True,
+    )
 
 
 def _recompiled(file: str) -> Difference:

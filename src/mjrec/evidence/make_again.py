@@ -121,6 +121,10 @@ def play_recording(
     if os.waitstatus_to_exitcode(status) != -signal.SIGKILL:
         raise NotRecreated("the recording that was killed could not be played")
     notes.all = list(read_notes(directory.parent))
+    if not recording.has_sources:
+        # A thread may have stored them just before.
+        for path in directory.glob("openaigym.model.*.zip"):
+            path.unlink()
     return {}
 
 

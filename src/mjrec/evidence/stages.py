@@ -76,17 +76,20 @@ def main() -> int:
 
 
 def _open(request: Mapping[str, Any], say: _Say) -> None:
-    from .archive import bring_in
-    from .checked_bag import check_bag
+    from .archive import BAG_DECLARATION, bring_in
+    from .checked_bag import check_bag, unchanged
     from .honesty import remarks
     from .read_inputs import read_inputs
 
     given, counter = Path(request["given"]), _Counter(say)
     say(facts=dict(bring_in(Path(request["path"]), given)))
-    if (given / "bagit.txt").exists():
-        for finding in check_bag(given, counter):
-            say(finding=finding.as_json())
+    is_bag = (given / BAG_DECLARATION).exists()
+    objections = list(check_bag(given, counter)) if is_bag else []
+    for finding in objections:
+        say(finding=finding.as_json())
     if request["level"] == Level.FILES:
+        if is_bag and not objections:
+            say(finding=unchanged(given).as_json())
         return
     inputs, arrays = read_inputs(given / PAYLOAD)
     folder = Path(request["inputs"])
