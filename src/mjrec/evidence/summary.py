@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 from .. import json_text
+from ..formats.monitor_directory import FILE_PREFIX
 from .findings import Excuse, Finding, Level, Outcome, Topic, Verdict, Verification
 
 _MOST_ITEMS: Final = 3
@@ -171,13 +172,25 @@ def _said(finding: Finding) -> str:
 def _excuse(excuse: Excuse, verification: Verification) -> str:
     if excuse.refuted:
         return f"{_claim(excuse)}: refuted, what it claims would show"
-    found = [each for each in verification.findings if each.excuse == excuse.name]
-    costs = [
-        f"{counted(each.count, each.unit)} {each.outcome}{_worst(each)}"
-        for each in found
-        if each.outcome is not Outcome.NOTED and each.unit != "value"
+    found = [
+        each
+        for each in verification.findings
+        if each.excuse == excuse.name
+        and each.outcome is not Outcome.NOTED
+        and each.unit != "value"
     ]
-    of = "" if not excuse.items else f" of {_some(excuse.items)}"
+    counts: Counter[tuple[str, str]] = Counter()
+    for each in found:
+        counts[each.unit, each.outcome] += each.count
+    costs = [
+        f"{counted(count, unit)} {outcome}"
+        + max(_worst(each) for each in found if (each.unit, each.outcome) == key)
+        for key, count in counts.items()
+        for unit, outcome in (key,)
+    ]
+    # Of a recording that it reaches it need not name the files.
+    items = tuple(i for i in excuse.items if not i.startswith(FILE_PREFIX))
+    of = f" of {_some(items or excuse.items)}" if excuse.items else ""
     allowed = ", allowed" if excuse.allowed else ""
     told = f"; {', '.join(costs)}" if costs else ""
     return f"{_claim(excuse)}{of}{allowed}: {excuse.costs}{told}"
