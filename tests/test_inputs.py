@@ -15,8 +15,7 @@ import pytest
 
 import mjrec
 from mjrec.errors import Error
-from mjrec.evidence.inputs import ARRAYS_FILE, EpisodeInputs, Inputs
-from mjrec.evidence.play_actions import given_actions
+from mjrec.evidence.inputs import ARRAYS_FILE, EpisodeInputs, Inputs, given_actions
 from mjrec.evidence.read_inputs import read_inputs
 
 

@@ -45,9 +45,9 @@ from .compare_video import compare_sampled, compare_videos
 from .differences import Aspect, Difference, Same, short
 from .excuses import NUMERIC, Trial, applicable, believed, merged, with_allowed
 from .findings import Excuse, Finding, Level, Outcome, Topic
+from .honesty import read_metadata, remarks_on_video
 from .layout import CRATE, ENVIRONMENT, PAYLOAD, RECORDINGS, SAMPLED, STATISTICS
 from .notes import REWARDS_FILE, read_notes
-from .videos_shown import read_metadata, remarks_on_video
 
 _TAGS: Final = ("bagit.txt", "bag-info.txt")
 # What stands in the middle or at the end of a file's name, and what kind it is then.
