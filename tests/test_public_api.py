@@ -19,7 +19,7 @@ ROWS = (
     {
         *("errors", "json_text", "rates", "frames", "schedules", "atomic_files"),
         *("worker_thread", "gl", "machine", "blank_frames", "patience", "signals"),
-        *("annotation", "provenance"),
+        *("annotation", "plain_text", "provenance"),
         *("child_python", "messages", "parent", "sandbox", "confined"),
     },
     {"engines"},
