@@ -32,7 +32,7 @@ _SOFT = """
   <worldbody>
     <geom type="plane" size="2 2 .1"/>
     <site name="above" pos="0 0 1"/>
-    <geom name="pulley" type="cylinder" size=".1 .1" pos="0 0 .7" euler="90 0 0"/>
+    <geom name="pulley" type="cylinder" size=".1 .1" pos=".15 0 .7" euler="90 0 0"/>
     <body pos=".3 0 .4">
       <freejoint/> <geom size=".05"/> <site name="below"/>
     </body>
