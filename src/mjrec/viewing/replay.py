@@ -146,6 +146,8 @@ def replay_page(
         f'{controls}<script type="application/json" id="replay-data">{data}</script>'
         f"<script>{_file('replay.js')}</script>"
     )
+    if additions:
+        body += f"<script>{_file('live.js')}</script>"
     scene = scene_page(stage, motion)
     # Our title and policy come first, ours being the ones that count.
     begin, _, rest = scene.partition("<head>")
@@ -153,16 +155,20 @@ def replay_page(
     return f"{begin}<head>{head}{before_end}{body}{end}{after}"
 
 
-def motion_chunk(stage: Stage, motion: Motion) -> dict[str, Any]:
+def motion_chunk(motion: Motion, *, keep_all: bool = False) -> dict[str, Any]:
     """Return a motion as the page's script reads it.
 
     A row is a state, in float32: step, time, reward and return; the tracking camera's
-    target; cameras; poses; scales. What does not move in any state is left out.
+    target; cameras; poses; scales; vertices.
+
+    Args:
+        motion: the states.
+        keep_all: also what does not move in any of them, which is left out otherwise.
     """
     still = {
         name
         for name, poses in motion.poses.items()
-        if name not in motion.scales and (poses == poses[:1]).all()
+        if not keep_all and name not in motion.scales and (poses == poses[:1]).all()
     }
     names = [name for name in motion.poses if name not in still]
     count = len(motion.steps)
@@ -230,7 +236,7 @@ def _about(trajectory: Trajectory, stage: Stage, motion: Motion) -> dict[str, An
             if name.startswith("bone/")
         },
         "notes": ["A view of the recorded states, not evidence.", *stage.notes],
-        "chunk": motion_chunk(stage, motion),
+        "chunk": motion_chunk(motion),
     }
 
 

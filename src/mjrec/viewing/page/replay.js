@@ -8,7 +8,6 @@
   const frames = []; // one for each state: views of the chunks' arrays
   const colours = new Map(); // by name: [[state, [r, g, b, a]], ...]
   const shown = new Map(); // by name: the colour that its node has
-  let names = [], scaled = [], cameraCount = 0;
   let current = 0, playing = false, clock = 0, followed = null, viewer = null;
   const free = { position: null };
 
@@ -22,12 +21,11 @@
 
   async function append(chunk) {
     const data = await unpack(chunk.data);
-    names = chunk.names;
-    scaled = chunk.scaled;
-    cameraCount = about.cameras.length;
+    const { names, scaled } = chunk;
+    const index = new Map(names.map((name, place) => [name, place]));
     const soft = Object.entries(chunk.vertices).map(([name, count]) => [name, 3 * count]);
     const sizes = [
-      4, 3, 7 * cameraCount, 7 * names.length, 3 * scaled.length,
+      4, 3, 7 * about.cameras.length, 7 * names.length, 3 * scaled.length,
       ...soft.map(([, size]) => size),
     ];
     const width = sizes.reduce((sum, size) => sum + size, 0);
@@ -39,8 +37,9 @@
         return data.subarray(at - size, at);
       });
       const [step, time, reward, total] = numbers;
-      const vertices = Object.fromEntries(soft.map(([name], index) => [name, rest[index]]));
-      frames.push({ step, time, reward, total, target, cameras, poses, scales, vertices });
+      const vertices = Object.fromEntries(soft.map(([name], place) => [name, rest[place]]));
+      const moved = { target, cameras, poses, scales, vertices };
+      frames.push({ names, scaled, index, step, time, reward, total, ...moved });
     }
     for (const [state, name, rgba] of chunk.colours) {
       if (!colours.has(name)) colours.set(name, [[-1, about.rgba[name]]]);
@@ -54,12 +53,12 @@
   function show(state) {
     current = Math.max(0, Math.min(frames.length - 1, state));
     const frame = frames[current];
-    names.forEach((name, index) => {
+    frame.names.forEach((name, index) => {
       const [x, y, z, ...wxyz] = frame.poses.subarray(7 * index, 7 * index + 7);
       if (name.startsWith("bone/")) return;
       viewer.nodePoseData[name] = { wxyz, position: [x, y, z], poseUpdateState: "needsUpdate" };
     });
-    scaled.forEach((name, index) => {
+    frame.scaled.forEach((name, index) => {
       const node = viewer.nodeRefFromName[name];
       const size = frame.scales.subarray(3 * index, 3 * index + 3);
       if (node) {
@@ -107,7 +106,7 @@
       skin.bones.forEach((bone, index) => {
         const pose = poseOf(frame, bone), bind = skin.bind.subarray(7 * index, 7 * index + 7);
         const [w, x, y, z] = bind.subarray(3);
-        const turn = product(pose.subarray(3), [w, -x, -y, -z]);
+        const turn = product(pose.slice(3), [w, -x, -y, -z]);
         const columns = [[1, 0, 0], [0, 1, 0], [0, 0, 1]].map((axis) => rotated(turn, axis));
         const moved = rotated(turn, bind);
         for (const end = at + skin.counts[index]; at < end; at++) {
@@ -123,8 +122,10 @@
   }
 
   function poseOf(frame, name) {
-    const index = names.indexOf(name);
-    return index < 0 ? about.still[name] : frame.poses.subarray(7 * index, 7 * index + 7);
+    const place = frame.index.get(name);
+    return place === undefined
+      ? about.still[name]
+      : frame.poses.subarray(7 * place, 7 * place + 7);
   }
 
   function paint(name, changes) {
@@ -283,7 +284,7 @@
       let state = current;
       while (state < frames.length - 1 && frames[state + 1].time <= clock) state++;
       if (state !== current) show(state);
-      if (state === frames.length - 1 && !about.live) play(false);
+      if (state === frames.length - 1) play(false);
     }
     requestAnimationFrame(tick);
   }
@@ -367,6 +368,31 @@
     addEventListener("hashchange", restore);
   }
 
+  // --- Another episode, and more of it: for live.js --------------------------------
+
+  function begin({ rgba, start }) {
+    frames.length = 0;
+    colours.clear();
+    for (const [name, each] of Object.entries(rgba)) {
+      if (String(each) !== String(shown.get(name) ?? about.rgba[name])) {
+        colours.set(name, [[-1, each]]);
+      }
+    }
+    about.rgba = rgba;
+    about.start = start ?? about.start;
+    followed = null;
+  }
+
+  function tell(steps, ending) {
+    about.steps = steps;
+    about.ending = ending;
+  }
+
+  function newest(isWanted) {
+    if (isWanted) playing = false;
+    if (frames.length) show(isWanted ? frames.length - 1 : current);
+  }
+
   // --- Start -------------------------------------------------------------------
 
   function isThere() {
@@ -385,6 +411,7 @@
     listen();
     restore();
     requestAnimationFrame(tick);
+    window.mjrecReplay = { append, begin, tell, newest };
     document.documentElement.dataset.replay = "ready";
   }
   start();
