@@ -1,12 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Evaluations that were never run: their files, from returns by hand."""
 
-from __future__ import annotations
-
-from collections.abc import Mapping, Sequence
-from pathlib import Path
-from typing import Any
-
 from mjrec.evaluation.episode_results import EpisodeResult
 from mjrec.evaluation.plan import EvaluatedTask, EvaluationPlan
 from mjrec.evaluation.results_files import write_results
@@ -14,14 +8,7 @@ from mjrec.evaluation.statistics import Bootstrap
 from mjrec.evaluation.summaries import default_score_range, summarize_results
 
 
-def write_evaluation(
-    directory: Path,
-    returns: Mapping[str, Sequence[Sequence[float | None]]],
-    *,
-    score_ranges: Mapping[str, tuple[float, float]] | None = None,
-    versions: Mapping[str, str] | None = None,
-    **plan: Any,
-) -> Path:
+def write_evaluation(directory, returns, *, score_ranges=None, versions=None, **plan):
     """Write the results of an evaluation, and return its directory.
 
     Args:
@@ -77,7 +64,7 @@ def write_evaluation(
     return directory
 
 
-def _result(task: str, seed: int, number: int, total: float | None) -> EpisodeResult:
+def _result(task, seed, number, total):
     has_failed = total is None
     return EpisodeResult(
         task=task,

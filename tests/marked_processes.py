@@ -1,15 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Processes that a test has started, or that they have, found by a mark."""
 
-from __future__ import annotations
-
 import contextlib
 from pathlib import Path
 
 MARK = "MJREC_TEST_MARK"
 
 
-def marked(mark: str) -> list[str]:
+def marked(mark):
     """Return the commands of the processes in whose environment the mark stands."""
     wanted = f"{MARK}={mark}".encode()
     found = []

@@ -1,15 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Ray clusters of several nodes on this machine, for tests."""
 
-from __future__ import annotations
-
 import contextlib
 import logging
 import os
 import re
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
 import ray
@@ -22,7 +18,7 @@ SMALL_STORE = 80 << 20
 
 
 @contextlib.contextmanager
-def home_for_ray(home: Path) -> Iterator[None]:
+def home_for_ray(home):
     """Let Ray start from an empty home, and see that nothing of it is left."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("HOME", str(home))
@@ -41,7 +37,7 @@ def home_for_ray(home: Path) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def own_ray(*, cpus: int) -> Iterator[Any]:
+def own_ray(*, cpus):
     """Have a Ray that this process has started for itself."""
     ray.init(
         address="local",
@@ -57,7 +53,7 @@ def own_ray(*, cpus: int) -> Iterator[Any]:
 
 
 @contextlib.contextmanager
-def cluster_of(*nodes: dict[str, Any]) -> Iterator[Cluster]:
+def cluster_of(*nodes):
     """Have a cluster with a head on which nothing runs, and such nodes."""
     head = {
         "num_cpus": 0,
@@ -73,11 +69,11 @@ def cluster_of(*nodes: dict[str, Any]) -> Iterator[Cluster]:
         cluster.shutdown()
 
 
-def is_gone(pid: int) -> bool:
+def is_gone(pid):
     return not Path(f"/proc/{pid}").exists()
 
 
-def ray_processes(mark: str) -> list[str]:
+def ray_processes(mark):
     """Return the commands of processes in whose environment something stands.
 
     Without Ray's agents, which tell a cluster for a minute that it is gone.

@@ -1,13 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Handlers of jobs for workers that are spread over a cluster."""
 
-from __future__ import annotations
-
 import os
 import time
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 from odd_jobs import OddJobs
 
@@ -15,10 +11,10 @@ from odd_jobs import OddJobs
 class ClusterJobs(OddJobs):
     """Odd jobs, and such as ask where they are."""
 
-    def gpus(self, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
+    def gpus(self, arguments):
         return {"gpus": os.environ.get("CUDA_VISIBLE_DEVICES")}
 
-    def hold_till(self, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
+    def hold_till(self, arguments):
         """Go on until there is a file `go`; a line says each time that it begins."""
         begun = Path(arguments["begun"])
         with begun.open("a") as file:
@@ -28,5 +24,5 @@ class ClusterJobs(OddJobs):
         return {}
 
 
-def make(settings: Mapping[str, Any]) -> ClusterJobs:
+def make(settings):
     return ClusterJobs(settings)

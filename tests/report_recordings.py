@@ -1,11 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Small recordings that reports are made of."""
 
-from __future__ import annotations
-
-from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -23,8 +19,8 @@ from mjrec.json_text import dumps
 GYM = Path(__file__).parent / "data" / "gym"
 
 
-def entry(episode_id: int, **values: Any) -> JournalEntry:
-    known: dict[str, Any] = {
+def entry(episode_id, **values):
+    known = {
         "episode_id": episode_id,
         "length": 10,
         "reward": float(episode_id),
@@ -40,9 +36,7 @@ def entry(episode_id: int, **values: Any) -> JournalEntry:
     return JournalEntry(**{**known, **values})
 
 
-def write_journal(
-    directory: Path, infix: str, env_id: str, entries: Sequence[JournalEntry]
-) -> Path:
+def write_journal(directory, infix, env_id, entries):
     """Write what a monitor that was killed leaves."""
     directory.mkdir(parents=True, exist_ok=True)
     path = directory / f"openaigym.episodes.{infix}.jsonl"
@@ -54,7 +48,7 @@ def write_journal(
     return path
 
 
-def record(env: Any, directory: Path, episodes: int, **options: Any) -> None:
+def record(env, directory, episodes, **options):
     """Record episodes of a fixed action."""
     monitor = mjrec.Monitor(env, directory, **options)
     for seed in range(episodes):
@@ -68,14 +62,14 @@ def record(env: Any, directory: Path, episodes: int, **options: Any) -> None:
 
 
 def write_evaluation(
-    directory: Path,
-    tasks: Sequence[str],
+    directory,
+    tasks,
     *,
-    rewards: Sequence[float | None] = (3.0, 1.0, None, 2.0),
-    videos: dict[str, str] | None = None,
-    infix: str = "0.batch",
-    finished: bool = True,
-) -> None:
+    rewards=(3.0, 1.0, None, 2.0),
+    videos=None,
+    infix="0.batch",
+    finished=True,
+):
     """Write an evaluation of two seeds; each task's monitor has one journal.
 
     Args:
@@ -135,7 +129,7 @@ def write_evaluation(
         return
     shown = videos or {}
 
-    def files(result: EpisodeResult) -> EpisodeFiles:
+    def files(result):
         first = result.unit == units[0] and result.task in shown
         folder = result.task.replace("/", "-")
         return EpisodeFiles(folder, video=shown[result.task] if first else None)

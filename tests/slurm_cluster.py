@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A Slurm cluster of one machine, this one, for tests."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import secrets
@@ -10,8 +8,6 @@ import signal
 import socket
 import subprocess
 import time
-from collections.abc import Iterator
-from pathlib import Path
 
 # `low` gives way to `high`: SIGTERM, 20 seconds, SIGKILL.
 CONFIGURATION = """
@@ -45,7 +41,7 @@ PartitionName=high Nodes={host} PriorityTier=2 PreemptMode=OFF
 
 
 @contextlib.contextmanager
-def slurm_cluster(place: Path) -> Iterator[Path]:
+def slurm_cluster(place):
     """Yield the configuration file of a cluster that is up."""
     (place / "state").mkdir()
     (place / "spool").mkdir()
@@ -79,9 +75,7 @@ def slurm_cluster(place: Path) -> Iterator[Path]:
 
 
 @contextlib.contextmanager
-def _running(
-    command: list[str], environ: dict[str, str], place: Path
-) -> Iterator[None]:
+def _running(command, environ, place):
     with (
         (place / f"{command[0]}.out").open("wb") as said,
         subprocess.Popen(command, env=environ, stdout=said, stderr=said) as process,
@@ -96,7 +90,7 @@ def _running(
                 process.kill()
 
 
-def _wait_until_up(environ: dict[str, str]) -> None:
+def _wait_until_up(environ):
     deadline = time.monotonic() + 60
     while True:
         asked = subprocess.run(
@@ -112,7 +106,7 @@ def _wait_until_up(environ: dict[str, str]) -> None:
         time.sleep(0.1)
 
 
-def _free_ports(count: int) -> list[int]:
+def _free_ports(count):
     with contextlib.ExitStack() as stack:
         sockets = [stack.enter_context(socket.socket()) for _ in range(count)]
         for each in sockets:

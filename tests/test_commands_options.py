@@ -1,17 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the command line says of an engine."""
 
-from __future__ import annotations
-
-from typing import Any
-
 import pytest
 
 from mjrec import Error, LocalEngine
 from mjrec.commands.options import NO_ENGINE, EngineOptions
 
 
-def test_without_an_option_there_is_no_engine() -> None:
+def test_without_an_option_there_is_no_engine():
     """All is as it was before there were any."""
     assert NO_ENGINE.chosen(None) is None
     assert NO_ENGINE.chosen(3) is None
@@ -25,9 +21,7 @@ def test_without_an_option_there_is_no_engine() -> None:
         ({"engine": "local", "gpus": 2.0, "require_gpu": True}, 2.0, True),
     ],
 )
-def test_the_local_engine_may_be_meant(
-    options: dict[str, Any], gpus: float, required: bool
-) -> None:
+def test_the_local_engine_may_be_meant(options, gpus, required):
     """By its name, or by what each worker is to have of a GPU."""
     engine = EngineOptions(**options).chosen(3)
     assert isinstance(engine, LocalEngine)
@@ -35,7 +29,7 @@ def test_the_local_engine_may_be_meant(
     assert (engine.share.each, engine.share.required) == (gpus, required)
 
 
-WRONG: list[tuple[dict[str, Any], str]] = [
+WRONG = [
     ({"address": "auto"}, "--engine ray"),
     ({"address": "auto", "engine": "local"}, "Ray"),
     ({"address": "auto", "gpus": 0.5}, "--engine ray"),
@@ -51,9 +45,7 @@ WRONG: list[tuple[dict[str, Any], str]] = [
 
 
 @pytest.mark.parametrize(("options", "words"), WRONG)
-def test_what_contradicts_itself_is_one_clear_error(
-    options: dict[str, Any], words: str
-) -> None:
+def test_what_contradicts_itself_is_one_clear_error(options, words):
     """It says what there is, or how it is meant."""
     with pytest.raises(Error, match=words):
         EngineOptions(**options).chosen(None)

@@ -1,10 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """`mjrec report` writes a page and says where it is."""
 
-from __future__ import annotations
-
 import json
-from pathlib import Path
 
 import pytest
 
@@ -14,14 +11,12 @@ from report_recordings import GYM, entry, write_journal
 
 
 @pytest.fixture
-def recordings(tmp_path: Path) -> Path:
+def recordings(tmp_path):
     write_journal(tmp_path / "run", "0.a", "X-v0", [entry(i) for i in range(3)])
     return tmp_path / "run"
 
 
-def test_it_writes_a_folder_and_prints_its_page(
-    recordings: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_it_writes_a_folder_and_prints_its_page(recordings, tmp_path, capsys):
     """Of several directories."""
     page = tmp_path / "r" / "index.html"
     directories = (recordings, GYM / "0.7.4" / "plain")
@@ -33,12 +28,7 @@ def test_it_writes_a_folder_and_prints_its_page(
     assert "Tiny-v0" in text
 
 
-def test_json_names_the_page(
-    recordings: Path,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_json_names_the_page(recordings, tmp_path, capsys, monkeypatch):
     """With its whole path; in a folder called report, if none is given."""
     monkeypatch.chdir(tmp_path)
     assert report((recordings,), as_json=True) == 0
@@ -46,7 +36,7 @@ def test_json_names_the_page(
     assert said == {"page": str(tmp_path / "report" / "index.html")}
 
 
-def test_a_single_file_and_a_verdict(recordings: Path, tmp_path: Path) -> None:
+def test_a_single_file_and_a_verdict(recordings, tmp_path):
     """What the options say reaches the page."""
     said = {"path": "run", "level": "stats", "verdict": "FAIL", "findings": []}
     path = tmp_path / "said.json"

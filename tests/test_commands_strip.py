@@ -1,10 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """`mjrec strip` writes a film strip."""
 
-from __future__ import annotations
-
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,7 +13,7 @@ from mjrec.errors import InvalidArgument
 
 
 @pytest.fixture
-def video(tmp_path: Path) -> Path:
+def video(tmp_path):
     path = tmp_path / "video.mp4"
     with mjrec.VideoWriter(path, fps=10) as writer:
         for i in range(12):
@@ -24,9 +21,7 @@ def video(tmp_path: Path) -> Path:
     return path
 
 
-def test_it_writes_a_picture_and_says_its_size(
-    video: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_it_writes_a_picture_and_says_its_size(video, tmp_path, capsys):
     """In as many columns as asked for."""
     out = tmp_path / "strip.png"
     assert strip(video, frames=6, columns=2, out=out) == 0
@@ -35,7 +30,7 @@ def test_it_writes_a_picture_and_says_its_size(
         assert f"{image.width}x{image.height} pixels" in capsys.readouterr().out
 
 
-def test_json(video: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_json(video, tmp_path, capsys):
     """For scripts."""
     out = tmp_path / "strip.png"
     assert strip(video, frames=1, out=out, as_json=True) == 0
@@ -43,7 +38,7 @@ def test_json(video: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
     assert said == {"strip": str(out), "width": 52, "height": said["height"]}
 
 
-def test_what_a_video_cannot_show(video: Path, tmp_path: Path) -> None:
+def test_what_a_video_cannot_show(video, tmp_path):
     """Another size needs the trajectory; nothing is written."""
     with pytest.raises(InvalidArgument, match="trajectory"):
         strip(video, size="640x480", out=tmp_path / "strip.png")

@@ -1,12 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """From names to environments; Gymnasium's."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
-from pathlib import Path
-from typing import Any
 
 import gymnasium
 import numpy as np
@@ -14,7 +10,7 @@ import pytest
 
 import mjrec
 from mjrec.environments.episode_seeds import EpisodeSeeds, episode_seeds
-from mjrec.environments.from_name import NamedEnvironment, environment_from_name
+from mjrec.environments.from_name import environment_from_name
 from mjrec.environments.gymnasium_environments import make_gymnasium
 from mjrec.environments.named_environment import EnvironmentOptions
 from mjrec.environments.names import (
@@ -33,7 +29,7 @@ BALL = """
 
 
 @pytest.fixture(params=["HalfCheetah-v5", "dm_control/cheetah-run", "ball.xml"])
-def named(request: pytest.FixtureRequest, tmp_path: Path) -> NamedEnvironment:
+def named(request, tmp_path):
     """An environment of each kind."""
     name = request.param
     if name.endswith(".xml"):
@@ -45,9 +41,7 @@ def named(request: pytest.FixtureRequest, tmp_path: Path) -> NamedEnvironment:
     return environment_from_name(name, EnvironmentOptions(pictures=False))
 
 
-def trajectory(
-    named: NamedEnvironment, seeds: EpisodeSeeds, *, steps: int = 10
-) -> bytes:
+def trajectory(named, seeds, *, steps=10):
     """Return the observations of an episode's first steps under random actions."""
     policy = load_policy("random", named.environment)
     policy.reset(seeds)
@@ -59,7 +53,7 @@ def trajectory(
     return b"".join(np.asarray(part).tobytes() for row in parts for part in row)
 
 
-def test_an_episode_depends_on_its_seeds_alone(named: NamedEnvironment) -> None:
+def test_an_episode_depends_on_its_seeds_alone(named):
     """Neither on the episodes before it nor on how these ended."""
     first = trajectory(named, episode_seeds(5, 3))
     trajectory(named, episode_seeds(5, 4), steps=33)
@@ -69,7 +63,7 @@ def test_an_episode_depends_on_its_seeds_alone(named: NamedEnvironment) -> None:
     named.environment.close()
 
 
-def test_the_environments_seed_and_the_actions_seed_differ() -> None:
+def test_the_environments_seed_and_the_actions_seed_differ():
     """Each stream changes what it is for, and nothing else."""
     named = environment_from_name("HalfCheetah-v5", EnvironmentOptions(pictures=False))
     seeds = EpisodeSeeds(environment=1, actions=2, policy=3)
@@ -84,7 +78,7 @@ def test_the_environments_seed_and_the_actions_seed_differ() -> None:
     assert drawn[0] == drawn[1] != drawn[2]
 
 
-def test_importing_the_package_loads_no_framework() -> None:
+def test_importing_the_package_loads_no_framework():
     """Neither do names, seeds, options, and the way from a name."""
     code = (
         "import sys\n"
@@ -105,13 +99,13 @@ def test_importing_the_package_loads_no_framework() -> None:
         ("dm_control/humanoid_CMU-run", DmControlName("humanoid_CMU", "run")),
     ],
 )
-def test_names_mean_what_they_say(text: str, name: object) -> None:
+def test_names_mean_what_they_say(text, name):
     """And are written as they were read."""
     assert parse_environment_name(text) == name
     assert str(name) == text
 
 
-def test_a_file_is_named_by_its_path(tmp_path: Path) -> None:
+def test_a_file_is_named_by_its_path(tmp_path):
     """Its end says that it is an MJCF file; where there is none, those there are."""
     for file_name in ("a robot.mjcf", "ROBOT.XML", "robot.xml"):
         path = tmp_path / file_name
@@ -123,7 +117,7 @@ def test_a_file_is_named_by_its_path(tmp_path: Path) -> None:
         parse_environment_name(str(tmp_path / "nowhere" / "robot.xml"))
 
 
-def test_names_that_cannot_be_say_what_can(tmp_path: Path) -> None:
+def test_names_that_cannot_be_say_what_can(tmp_path):
     """Nothing, half a name, a file of another kind."""
     with pytest.raises(mjrec.InvalidArgument, match="needs a name"):
         parse_environment_name(" ")
@@ -138,13 +132,13 @@ def test_names_that_cannot_be_say_what_can(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["max_steps", "height", "width"])
 @pytest.mark.parametrize("bad", [0, 1.5, True])
-def test_options_are_checked_at_once(name: str, bad: Any) -> None:
+def test_options_are_checked_at_once(name, bad):
     """Before anything is made; also where only one side is given."""
     with pytest.raises(mjrec.InvalidArgument, match=name):
         EnvironmentOptions(**{name: bad})
 
 
-def steps_of(env: gymnasium.Env[Any, Any]) -> int:
+def steps_of(env):
     env.reset(seed=0)
     steps = 0
     while True:
@@ -156,11 +150,11 @@ def steps_of(env: gymnasium.Env[Any, Any]) -> int:
 
 
 @pytest.fixture
-def register() -> Any:
+def register():
     """Register environments for one test."""
     before = set(gymnasium.registry)
 
-    def register_environment(env_id: str, entry_point: Any, **kwargs: Any) -> None:
+    def register_environment(env_id, entry_point, **kwargs):
         gymnasium.register(env_id, entry_point, **kwargs)
 
     yield register_environment
@@ -171,9 +165,7 @@ def register() -> Any:
 @pytest.mark.parametrize(
     ("own", "asked", "expected"), [(None, None, 1000), (None, 3, 3), (4, 9, 4)]
 )
-def test_limits_of_other_environments(
-    register: Any, make_corridor: Any, own: Any, asked: Any, expected: int
-) -> None:
+def test_limits_of_other_environments(register, make_corridor, own, asked, expected):
     """1000 where an environment has none; its own where that is smaller."""
     register("Endless-v0", make_corridor, max_episode_steps=own)
     options = EnvironmentOptions(max_steps=asked, kwargs={"length": 10**6})
@@ -181,7 +173,7 @@ def test_limits_of_other_environments(
 
 
 @pytest.mark.parametrize(("own", "expected"), [(6, 6), (-1, 1000)])
-def test_gymnasiums_own_word_for_the_limit(own: int, expected: int) -> None:
+def test_gymnasiums_own_word_for_the_limit(own, expected):
     """`max_episode_steps` replaces the registered limit, and -1 is none."""
     options = EnvironmentOptions(pictures=False, kwargs={"max_episode_steps": own})
     env = make_gymnasium("HalfCheetah-v5", options)
@@ -193,18 +185,18 @@ def test_gymnasiums_own_word_for_the_limit(own: int, expected: int) -> None:
         )
 
 
-def camera_of(env: gymnasium.Env[Any, Any]) -> int:
-    return int(env.unwrapped.mujoco_renderer.camera_id)  # type: ignore[attr-defined]  # a MujocoEnv
+def camera_of(env):
+    return int(env.unwrapped.mujoco_renderer.camera_id)
 
 
-def robot_pixels(camera: int | None) -> int:
+def robot_pixels(camera):
     """Return how much of the robot is seen thirty metres from where it began."""
     options = EnvironmentOptions(camera=camera, height=48, width=64)
     env = make_gymnasium("HalfCheetah-v5", options)
     env.reset(seed=0)
     # Where Gymnasium's free camera looks is settled at the first picture.
     env.render()
-    simulated: Any = env.unwrapped
+    simulated = env.unwrapped
     simulated.data.qpos[0] = 30
     simulated.set_state(simulated.data.qpos, simulated.data.qvel)
     picture = np.asarray(env.render()).astype(int)
@@ -215,13 +207,13 @@ def robot_pixels(camera: int | None) -> int:
     return int(((red - blue > 60) & (red > green)).sum())
 
 
-def test_pictures_follow_the_robot_unless_asked_otherwise() -> None:
+def test_pictures_follow_the_robot_unless_asked_otherwise():
     """Gymnasium 1.4's default camera stays where it is; -1 asks for that one."""
     assert robot_pixels(None) > 15
     assert robot_pixels(-1) == 0
 
 
-def test_an_environments_own_camera_argument_stays() -> None:
+def test_an_environments_own_camera_argument_stays():
     """What --env-kwargs says about the view is what the person wants."""
     view = {"default_camera_config": {"distance": 9.0}}
     env = make_gymnasium("HalfCheetah-v5", EnvironmentOptions(kwargs=view))
@@ -234,7 +226,7 @@ def test_an_environments_own_camera_argument_stays() -> None:
         )
 
 
-def test_an_unknown_camera_names_those_there_are() -> None:
+def test_an_unknown_camera_names_those_there_are():
     """Before any episode begins."""
     with pytest.raises(mjrec.UnknownName, match=r"'nose'.*track"):
         make_gymnasium("HalfCheetah-v5", EnvironmentOptions(camera="nose"))
@@ -242,14 +234,12 @@ def test_an_unknown_camera_names_those_there_are() -> None:
         make_gymnasium("HalfCheetah-v5", EnvironmentOptions(camera=3))
 
 
-def test_a_mujoco_environment_that_takes_no_camera_is_given_one(register: Any) -> None:
+def test_a_mujoco_environment_that_takes_no_camera_is_given_one(register):
     """Gymnasium-Robotics' take none; their renderer has one all the same."""
     from gymnasium.envs.mujoco.half_cheetah_v5 import HalfCheetahEnv
 
     class NoCamera(HalfCheetahEnv):
-        def __init__(
-            self, render_mode: Any = None, width: int = 48, height: int = 48
-        ) -> None:
+        def __init__(self, render_mode=None, width=48, height=48):
             super().__init__(render_mode=render_mode, width=width, height=height)
 
     register("NoCamera-v0", NoCamera)
@@ -258,10 +248,10 @@ def test_a_mujoco_environment_that_takes_no_camera_is_given_one(register: Any) -
     env.close()
 
 
-def test_text_environments_give_text(register: Any, make_corridor: Any) -> None:
+def test_text_environments_give_text(register, make_corridor):
     """Where the environment has nothing else, or where text is asked for."""
 
-    class OnlyText(make_corridor):  # type: ignore[misc]  # a class from a fixture
+    class OnlyText(make_corridor):
         metadata = {"render_modes": ["human", "ansi"], "render_fps": 10}  # noqa: RUF012  Gymnasium's own way
 
     register("OnlyText-v0", OnlyText)
@@ -272,12 +262,10 @@ def test_text_environments_give_text(register: Any, make_corridor: Any) -> None:
     assert "FHFH" in str(env.render())
 
 
-def test_an_environment_without_pictures_says_what_it_has(
-    register: Any, make_corridor: Any
-) -> None:
+def test_an_environment_without_pictures_says_what_it_has(register, make_corridor):
     """The modes there are, the modes it takes, and the way out."""
 
-    class OnlyWindow(make_corridor):  # type: ignore[misc]  # a class from a fixture
+    class OnlyWindow(make_corridor):
         metadata = {"render_modes": ["human"], "render_fps": 10}  # noqa: RUF012  Gymnasium's own way
 
     register("OnlyWindow-v0", OnlyWindow)
@@ -294,7 +282,7 @@ def test_an_environment_without_pictures_says_what_it_has(
         )
 
 
-def test_a_function_may_make_the_environment(register: Any, make_corridor: Any) -> None:
+def test_a_function_may_make_the_environment(register, make_corridor):
     """Its render modes are known only when it has been called."""
     register("Made-v0", lambda render_mode=None: make_corridor(render_mode=render_mode))
     env = make_gymnasium("Made-v0", EnvironmentOptions())
@@ -304,7 +292,7 @@ def test_a_function_may_make_the_environment(register: Any, make_corridor: Any) 
         make_gymnasium("Blind-v0", EnvironmentOptions())
 
 
-def test_cameras_and_sizes_are_for_mujoco(register: Any, make_corridor: Any) -> None:
+def test_cameras_and_sizes_are_for_mujoco(register, make_corridor):
     """Another environment draws what it draws."""
     register("Corridor-v0", make_corridor)
     with pytest.raises(mjrec.InvalidArgument, match="Corridor-v0 has no cameras"):
@@ -313,7 +301,7 @@ def test_cameras_and_sizes_are_for_mujoco(register: Any, make_corridor: Any) -> 
         make_gymnasium("Corridor-v0", EnvironmentOptions(height=10, width=10))
 
 
-def test_an_unknown_environment_names_its_like() -> None:
+def test_an_unknown_environment_names_its_like():
     """Nobody remembers every version; unlike any, how names are made."""
     for env_id in ("HalfCheeta-v5", "HalfCheetah-v9", "halfcheetah"):
         with pytest.raises(mjrec.UnknownName, match="HalfCheetah-v5"):
@@ -323,17 +311,17 @@ def test_an_unknown_environment_names_its_like() -> None:
             make_gymnasium(env_id, EnvironmentOptions())
 
 
-def test_without_a_version_the_latest_is_meant() -> None:
+def test_without_a_version_the_latest_is_meant():
     """As for gymnasium.make, without its warning."""
     env = make_gymnasium("HalfCheetah", EnvironmentOptions(pictures=False))
     assert env.spec is not None
     assert env.spec.id == "HalfCheetah-v5"
 
 
-def test_what_a_constructor_raises_is_one_error_with_its_cause(register: Any) -> None:
+def test_what_a_constructor_raises_is_one_error_with_its_cause(register):
     """Whatever third-party code raises; of a bare assertion, where it stands."""
 
-    def asserting(**kwargs: Any) -> Any:
+    def asserting(**kwargs):
         raise AssertionError
 
     register("Asserting-v0", asserting)
@@ -347,10 +335,10 @@ def test_what_a_constructor_raises_is_one_error_with_its_cause(register: Any) ->
         make_gymnasium("Asserting-v0", EnvironmentOptions())
 
 
-def test_what_is_not_installed_is_named_with_its_command(register: Any) -> None:
+def test_what_is_not_installed_is_named_with_its_command(register):
     """Gymnasium's own message has the command between backticks."""
 
-    def missing(**kwargs: Any) -> Any:
+    def missing(**kwargs):
         try:
             import no_such_engine
         except ImportError as error:
@@ -372,8 +360,8 @@ def test_what_is_not_installed_is_named_with_its_command(register: Any) -> None:
     [("CartPole-v1", "classic-control"), ("FrozenLake-v1", "toy-text")],
 )
 def test_without_pygame_drawing_is_refused_before_the_first_episode(
-    env_id: str, extra: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    env_id, extra, monkeypatch
+):
     """The line to run; and text, where the environment has it."""
     monkeypatch.setitem(sys.modules, "pygame", None)
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
@@ -383,8 +371,8 @@ def test_without_pygame_drawing_is_refused_before_the_first_episode(
 
 
 def test_a_module_that_registers_lies_in_the_working_directory(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, register: Any
-) -> None:
+    tmp_path, monkeypatch, register
+):
     """`module:Id` imports it first; that it fails is one error."""
     (tmp_path / "mjrec_test_envs.py").write_text(
         "import gymnasium\n"
@@ -407,7 +395,7 @@ def test_a_module_that_registers_lies_in_the_working_directory(
     assert sys.path == path
 
 
-def test_a_stream_is_seeded_once() -> None:
+def test_a_stream_is_seeded_once():
     """As Gymnasium's users do: `reset(seed=...)`, then `reset()` and `reset()`."""
     options = EnvironmentOptions(pictures=False)
     named = environment_from_name("InvertedPendulum-v5", options)

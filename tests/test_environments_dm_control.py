@@ -1,13 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """dm_control's environments by their names."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -21,20 +17,15 @@ pytest.importorskip("dm_control")
 
 from dm_control import suite
 
-from mjrec.environments.dm_control_environments import (
-    make_dm_control,
-)
+from mjrec.environments.dm_control_environments import make_dm_control
 from mjrec.environments.dm_control_scenes import dm_control_scenes
-from mjrec.environments.named_environment import (
-    is_terminated,
-    is_truncated,
-)
+from mjrec.environments.named_environment import is_terminated, is_truncated
 
 
-def test_a_task_is_made_with_its_own_limit() -> None:
+def test_a_task_is_made_with_its_own_limit():
     """All but lqr have one; max_steps lowers it; lqr gets 1000."""
 
-    def limit(name: str, **options: Any) -> int:
+    def limit(name, **options):
         made = EnvironmentOptions(pictures=False, **options)
         return environment_from_name(f"dm_control/{name}", made).step_limit
 
@@ -52,10 +43,10 @@ def test_a_task_is_made_with_its_own_limit() -> None:
     assert limited.step(np.zeros(2)).first()
 
 
-def test_the_run_seeds_what_is_drawn_when_a_task_is_made() -> None:
+def test_the_run_seeds_what_is_drawn_when_a_task_is_made():
     """The springs of lqr are part of its model."""
 
-    def springs(seed: int, **kwargs: Any) -> list[float]:
+    def springs(seed, **kwargs):
         options = EnvironmentOptions(seed=seed, kwargs=kwargs)
         env = make_dm_control("lqr", "lqr_2_1", options)
         return list(env.physics.model.jnt_stiffness)
@@ -64,7 +55,7 @@ def test_the_run_seeds_what_is_drawn_when_a_task_is_made() -> None:
     assert springs(1, task_kwargs={"random": 2}) == springs(2)
 
 
-def test_a_monitor_is_told_the_seed(tmp_path: Path) -> None:
+def test_a_monitor_is_told_the_seed(tmp_path):
     """dm_env's reset takes none that it could see."""
     named = environment_from_name("dm_control/ball_in_cup-catch")
     env = named.environment
@@ -73,7 +64,7 @@ def test_a_monitor_is_told_the_seed(tmp_path: Path) -> None:
         assert monitor.seed == episode_seeds(0, 0).environment
 
 
-def test_arguments_reach_the_task_and_the_environment() -> None:
+def test_arguments_reach_the_task_and_the_environment():
     """In suite.load's own form; another is an error that shows it."""
     kwargs = {
         "task_kwargs": {"time_limit": 1},
@@ -92,7 +83,7 @@ def test_arguments_reach_the_task_and_the_environment() -> None:
     assert isinstance(e.value.__cause__, TypeError)
 
 
-def test_unknown_names_list_those_there_are() -> None:
+def test_unknown_names_list_those_there_are():
     """Domains first, then the domain's tasks."""
     with pytest.raises(mjrec.UnknownName, match=r"domain 'cheeta'.*cheetah.*walker"):
         environment_from_name("dm_control/cheeta-run")
@@ -108,14 +99,14 @@ def test_unknown_names_list_those_there_are() -> None:
         ("dm_control/swimmer-swimmer6", "tracking1"),
     ],
 )
-def test_the_view_follows_the_robot(name: str, camera: str) -> None:
+def test_the_view_follows_the_robot(name, camera):
     """Or is the model's first camera; the monitor is given it, and the size."""
     named = environment_from_name(name, EnvironmentOptions(height=48, width=64))
     assert named.env_id == name
     assert named.view == {"camera": camera, "height": 48, "width": 64}
 
 
-def test_a_camera_that_is_asked_for_is_checked() -> None:
+def test_a_camera_that_is_asked_for_is_checked():
     """Before any episode begins; without pictures there is no view."""
     named = environment_from_name(
         "dm_control/cheetah-run", EnvironmentOptions(camera="back")
@@ -131,7 +122,7 @@ def test_a_camera_that_is_asked_for_is_checked() -> None:
     assert named.view == {}
 
 
-def error_with_dm_control(package: Path, suite: str) -> str:
+def error_with_dm_control(package, suite):
     """Return what is said of a task where `dm_control.suite` is `suite`."""
     (package / "dm_control").mkdir(parents=True)
     (package / "dm_control" / "__init__.py").touch()
@@ -152,7 +143,7 @@ def error_with_dm_control(package: Path, suite: str) -> str:
     return run.stdout
 
 
-def test_without_dm_control_the_line_to_run_is_named(tmp_path: Path) -> None:
+def test_without_dm_control_the_line_to_run_is_named(tmp_path):
     """`mjrec[dm-control]`, which holds the right mujoco too."""
     suite = "raise ModuleNotFoundError('No module', name='dm_control')"
     said = error_with_dm_control(tmp_path, suite)
@@ -160,9 +151,7 @@ def test_without_dm_control_the_line_to_run_is_named(tmp_path: Path) -> None:
     assert 'pip install "mjrec[dm-control]"' in said
 
 
-def test_a_mujoco_that_dm_control_does_not_know_names_the_fix(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_mujoco_that_dm_control_does_not_know_names_the_fix(tmp_path, monkeypatch):
     """What dm_control 1.0.50 does with mujoco 4.0, imported or loading a task."""
     what = "'MjModel' object has no attribute 'flex_vertedge'"
     said = error_with_dm_control(tmp_path, f'raise AttributeError("{what}")')
@@ -170,7 +159,7 @@ def test_a_mujoco_that_dm_control_does_not_know_names_the_fix(
     assert 'pip install "mujoco<4"' in said
     assert "flex_vertedge" in said
 
-    def load(*_: Any, **__: Any) -> None:
+    def load(*_, **__):
         raise AttributeError(what)
 
     monkeypatch.setattr(suite, "load", load)
@@ -178,7 +167,7 @@ def test_a_mujoco_that_dm_control_does_not_know_names_the_fix(
         environment_from_name("dm_control/cheetah-run")
 
 
-def test_a_recording_says_with_what_its_task_was_made() -> None:
+def test_a_recording_says_with_what_its_task_was_made():
     """Also under the limit of ours; of somebody else's environment nobody knows."""
     options = EnvironmentOptions(
         seed=5, max_steps=3, kwargs={"task_kwargs": {"time_limit": 2}}
@@ -196,7 +185,7 @@ def test_a_recording_says_with_what_its_task_was_made() -> None:
 
 
 @pytest.mark.parametrize("task", ["lqr-lqr_2_1", "pendulum-swingup"])
-def test_a_stream_is_what_the_suites_users_have(task: str) -> None:
+def test_a_stream_is_what_the_suites_users_have(task):
     """Seeded once when it is loaded, then reset and reset, as `suite.load` is used."""
     domain, _, name = task.partition("-")
     theirs = suite.load(domain, name, task_kwargs={"random": 7})
@@ -212,7 +201,7 @@ def test_a_stream_is_what_the_suites_users_have(task: str) -> None:
         }
 
 
-def test_a_stream_of_another_seed_is_begun_anew() -> None:
+def test_a_stream_of_another_seed_is_begun_anew():
     """What the environment was made with does not matter then, nor what it drew."""
     options = EnvironmentOptions(seed=7, pictures=False)
     name = "dm_control/pendulum-swingup"

@@ -13,11 +13,9 @@ import random
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Mapping
 from concurrent.futures import Executor, Future
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -34,7 +32,6 @@ from mjrec import (
     UnknownName,
 )
 from mjrec.evaluation.evaluating import evaluate
-from mjrec.evaluation.evaluation import Evaluation, EvaluationProgress
 from mjrec.evaluation.plan import EvaluationPlan
 from mjrec.evaluation.planning import chunks_of
 from mjrec.evaluation.results_files import read_results
@@ -43,12 +40,12 @@ from mjrec.formats.video_metadata import metadata_path
 
 PENDULUM = "InvertedPendulum-v5"
 DOUBLE = "InvertedDoublePendulum-v5"
-SIXTEEN: dict[str, Any] = {"seeds": [5], "num_seeds": None, "episodes": 16}
+SIXTEEN = {"seeds": [5], "num_seeds": None, "episodes": 16}
 
 
-def run(directory: Path, **options: Any) -> Evaluation:
+def run(directory, **options):
     """Evaluate something small."""
-    small: dict[str, Any] = {
+    small = {
         "tasks": [PENDULUM],
         "policy": "random",
         "episodes": 2,
@@ -62,28 +59,28 @@ def run(directory: Path, **options: Any) -> Evaluation:
     return evaluate(**{**small, **options}, directory=directory)
 
 
-def contents(directory: Path) -> dict[str, bytes]:
+def contents(directory):
     return {
         name: (directory / name).read_bytes()
         for name in ("results.json", "results.csv")
     }
 
 
-def begun(directory: Path) -> int:
+def begun(directory):
     """Return how many episodes were begun in all, by the journals."""
     journals = directory.glob("*/*/openaigym.episodes.*.jsonl")
     return sum(path.read_text().count('{"begun"') for path in journals)
 
 
 @pytest.fixture(scope="module")
-def reference(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def reference(tmp_path_factory):
     """An evaluation by one worker, without videos."""
     directory = tmp_path_factory.mktemp("evaluations") / "reference"
     run(directory, tasks=[PENDULUM, DOUBLE], workers=1)
     return directory
 
 
-def test_every_episode_of_every_task_and_seed_is_there(reference: Path) -> None:
+def test_every_episode_of_every_task_and_seed_is_there(reference):
     """In the order of the plan, each with its trajectory, and all read back."""
     results = list(read_results(reference))
     assert [(each.task, *each.unit) for each in results] == [
@@ -97,17 +94,17 @@ def test_every_episode_of_every_task_and_seed_is_there(reference: Path) -> None:
     assert begun(reference) == 8
 
 
-def test_results_do_not_depend_on_the_workers(reference: Path, tmp_path: Path) -> None:
+def test_results_do_not_depend_on_the_workers(reference, tmp_path):
     """Byte for byte, and neither does the choice."""
     run(tmp_path / "two", tasks=[PENDULUM, DOUBLE], workers=2)
     assert contents(tmp_path / "two") == contents(reference)
 
 
 @pytest.mark.thorough
-def test_policies_that_draw_for_themselves_are_seeded(tmp_path: Path) -> None:
+def test_policies_that_draw_for_themselves_are_seeded(tmp_path):
     """Also from generators that nobody has given them, whatever ran before."""
 
-    def wander(_: Any) -> Any:
+    def wander(_):
         return np.random.uniform(-1, 1, 1) * random.random()
 
     for workers in (1, 2):
@@ -115,7 +112,7 @@ def test_policies_that_draw_for_themselves_are_seeded(tmp_path: Path) -> None:
     assert contents(tmp_path / "1") == contents(tmp_path / "2")
 
 
-def test_what_takes_long_begins_first(reference: Path) -> None:
+def test_what_takes_long_begins_first(reference):
     """Whatever the order of the plan, so that no worker ends long after the others."""
     with (reference / "timing.csv").open(newline="") as file:
         begun_at = {row["task"]: float(row["start"]) for row in csv.DictReader(file)}
@@ -123,7 +120,7 @@ def test_what_takes_long_begins_first(reference: Path) -> None:
     assert begun_at[DOUBLE] < begun_at[PENDULUM]
 
 
-def test_the_chosen_episodes_get_videos(tmp_path: Path) -> None:
+def test_the_chosen_episodes_get_videos(tmp_path):
     """By rule, for each task; table, metadata and report of it agree."""
     evaluation = run(tmp_path / "e", keep="best,worst")
     read = read_results(tmp_path / "e")
@@ -146,16 +143,16 @@ def test_the_chosen_episodes_get_videos(tmp_path: Path) -> None:
         )
 
 
-def names_in(directory: Path) -> set[str]:
+def names_in(directory):
     """Return the names of all files below a directory."""
     return {str(path.relative_to(directory)) for path in directory.rglob("*")}
 
 
 # Takes more than five seconds: two evaluations with videos.
 @parametrize("engine", ["local", mjrec.LocalEngine(5)])
-def test_workers_and_engines_change_nothing(tmp_path: Path, engine: Any) -> None:
+def test_workers_and_engines_change_nothing(tmp_path, engine):
     """Results, trajectories and videos are those of one worker."""
-    options: dict[str, Any] = {"tasks": [PENDULUM, DOUBLE], "keep": "best,worst"}
+    options = {"tasks": [PENDULUM, DOUBLE], "keep": "best,worst"}
     workers = 2 if engine == "local" else None
     there = run(tmp_path / "there", **options, engine=engine, workers=workers)
     here = run(tmp_path / "here", **options, workers=1)
@@ -168,11 +165,7 @@ def test_workers_and_engines_change_nothing(tmp_path: Path, engine: Any) -> None
     assert listed == {path.name for path in there.videos}
 
 
-def test_what_mujoco_warns_of_is_said_once(
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    caplog: pytest.LogCaptureFixture,
-) -> None:
+def test_what_mujoco_warns_of_is_said_once(tmp_path, monkeypatch, caplog):
     """In a run, whatever the number of workers; and no file of its own is left."""
     monkeypatch.chdir(tmp_path)
     evaluation = run(tmp_path / "e", env_kwargs={"reset_noise_scale": 1e12})
@@ -182,7 +175,7 @@ def test_what_mujoco_warns_of_is_said_once(
 
 
 @pytest.mark.thorough
-def test_a_dask_cluster_changes_nothing(tmp_path: Path) -> None:
+def test_a_dask_cluster_changes_nothing(tmp_path):
     """Results, trajectories and videos are those of one worker here."""
     import distributed
 
@@ -204,20 +197,18 @@ class Wandering(Executor):
         homes: where these are.
     """
 
-    def __init__(self, homes: Path) -> None:
+    def __init__(self, homes):
         self.homes = homes
-        self.workers: dict[str, Any] = {}
+        self.workers = {}
 
-    def submit(
-        self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any
-    ) -> Future[Any]:
+    def submit(self, fn, /, *args, **kwargs):
         place, job = json.loads(json.dumps(args))
         if place not in self.workers:
             work = json.loads(Path(place, "work.json").read_bytes())
             module, _, name = work["entry"].partition(":")
             make = getattr(importlib.import_module(module), name)
             self.workers[place] = make(work["settings"])
-        future: Future[Any] = Future()
+        future = Future()
         with pytest.MonkeyPatch.context() as patch:
             patch.setenv("XDG_STATE_HOME", str(self.homes / job["key"]))
             future.set_result({"value": self.workers[place](job["arguments"])})
@@ -225,7 +216,7 @@ class Wandering(Executor):
 
 
 @pytest.mark.dm_control
-def test_machines_with_other_homes_draw_what_others_recorded(tmp_path: Path) -> None:
+def test_machines_with_other_homes_draw_what_others_recorded(tmp_path):
     """Also where there is only a compiled model; and so does this machine."""
     pytest.importorskip("dm_control")
     evaluation = run(
@@ -241,19 +232,19 @@ def test_machines_with_other_homes_draw_what_others_recorded(tmp_path: Path) -> 
         assert mjrec.load_trajectory(path).model().nv == 8
 
 
-def folders_of(evaluation: Evaluation) -> list[Path]:
+def folders_of(evaluation):
     return [path for path in evaluation.directory.glob("*/*") if path.is_dir()]
 
 
-def listed_in(folder: Path) -> list[str]:
+def listed_in(folder):
     manifests = map(json.loads, map(Path.read_text, folder.glob("*.manifest.json")))
     return [video for manifest in manifests for video, _ in manifest["videos"]]
 
 
 @pytest.mark.thorough
-def test_videos_do_not_depend_on_what_was_run_before(tmp_path: Path) -> None:
+def test_videos_do_not_depend_on_what_was_run_before(tmp_path):
     """The camera is placed anew in each episode, not once for an environment."""
-    options: dict[str, Any] = {
+    options = {
         "tasks": ["Reacher-v5"],
         # By one worker in batches of two, by three in batches of one.
         "episodes": 8,
@@ -270,7 +261,7 @@ def test_videos_do_not_depend_on_what_was_run_before(tmp_path: Path) -> None:
     assert videos[0] == videos[1] == videos[2]
 
 
-def videos_in(evaluation: Evaluation) -> dict[str, bytes]:
+def videos_in(evaluation):
     """Return the videos by episode."""
     with (evaluation.directory / "timing.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
@@ -281,14 +272,14 @@ def videos_in(evaluation: Evaluation) -> dict[str, bytes]:
 
 
 @pytest.mark.thorough
-def test_results_are_there_before_an_engine_has_drawn(tmp_path: Path) -> None:
+def test_results_are_there_before_an_engine_has_drawn(tmp_path):
     """What is killed or cancelled then has only videos left."""
 
-    def interrupt(progress: EvaluationProgress) -> None:
+    def interrupt(progress):
         if progress.videos_done:
             raise KeyboardInterrupt
 
-    options: dict[str, Any] = {"keep": "all", "workers": None}
+    options = {"keep": "all", "workers": None}
     options["engine"] = mjrec.LocalEngine(1)
     with pytest.raises(KeyboardInterrupt):
         run(tmp_path / "e", **options, on_progress=interrupt)
@@ -305,9 +296,7 @@ def test_results_are_there_before_an_engine_has_drawn(tmp_path: Path) -> None:
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("name", [".mjrec.work", ".mjrec.evaluation.lock"])
-def test_what_an_engine_keeps_in_a_directory_is_nobodys(
-    tmp_path: Path, name: str
-) -> None:
+def test_what_an_engine_keeps_in_a_directory_is_nobodys(tmp_path, name):
     """It may be there before the evaluation is, and disturbs no reader."""
     place = tmp_path / "e" / name
     if name.endswith("lock"):
@@ -324,12 +313,7 @@ def test_what_an_engine_keeps_in_a_directory_is_nobodys(
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("engine", [None, "local"])
-def test_without_opengl_videos_stay_pending(
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    caplog: pytest.LogCaptureFixture,
-    engine: str | None,
-) -> None:
+def test_without_opengl_videos_stay_pending(tmp_path, monkeypatch, caplog, engine):
     """The results are there, and how to draw the videos elsewhere is told."""
     # It needs a display, and there is none.
     monkeypatch.setenv("MUJOCO_GL", "glfw")
@@ -350,9 +334,9 @@ def test_without_opengl_videos_stay_pending(
 
 
 @pytest.mark.thorough
-def test_progress_is_told(tmp_path: Path) -> None:
+def test_progress_is_told(tmp_path):
     """Up to the end, and never backwards."""
-    told: list[EvaluationProgress] = []
+    told = []
     run(tmp_path / "e", keep="best", on_progress=told.append)
     assert [each.done for each in told] == sorted(each.done for each in told)
     assert told[-1].done == told[-1].total == 4
@@ -360,28 +344,28 @@ def test_progress_is_told(tmp_path: Path) -> None:
     assert told[-1].failed == 0
 
 
-def raising(observation: Any) -> Any:
+def raising(observation):
     raise RuntimeError("out of ideas")
 
 
 class Faulty:
     """Fails in its own way in episodes that begin to the right."""
 
-    def __init__(self, env: Any) -> None:
+    def __init__(self, env):
         self.shape = env.action_space.shape
 
-    def __call__(self, observation: Any) -> Any:
+    def __call__(self, observation):
         if observation[0] > 0:
             return np.full(self.shape, np.nan)
         return np.zeros(self.shape)
 
 
 class Misshapen(Faulty):
-    def __call__(self, observation: Any) -> Any:
+    def __call__(self, observation):
         return np.zeros(self.shape if observation[0] > 0 else (7,))
 
 
-def local(kind: Any) -> Any:
+def local(kind):
     """Return a class or function that is not found by its name, but sent whole."""
     kind.__module__ = "__main__"
     return kind
@@ -391,9 +375,7 @@ def local(kind: Any) -> Any:
     ("policy", "reason"),
     [(Faulty, "nan"), (Misshapen, "must give an action of box(-3.0")],
 )
-def test_a_faulty_policy_fails_its_episodes_only(
-    tmp_path: Path, policy: Any, reason: str
-) -> None:
+def test_a_faulty_policy_fails_its_episodes_only(tmp_path, policy, reason):
     """The others go on, and both are in the table."""
     evaluation = run(tmp_path / "e", policy=local(policy), episodes=4)
     failed = evaluation.failed
@@ -411,10 +393,10 @@ def test_a_faulty_policy_fails_its_episodes_only(
 class DiesOnce:
     """Kills its worker, the first time that anybody builds it twice."""
 
-    def __init__(self, env: Any) -> None:
+    def __init__(self, env):
         self.shape = env.action_space.shape
 
-    def __call__(self, observation: Any) -> Any:
+    def __call__(self, observation):
         import os
         import pathlib
 
@@ -428,35 +410,33 @@ class DiesOnce:
 class DiesAlways:
     """Kills its worker in episode 3 of seed 5."""
 
-    def __init__(self, env: Any) -> None:
+    def __init__(self, env):
         self.shape = env.action_space.shape
         self.seed = 0
 
-    def reset(self, seed: int) -> None:
+    def reset(self, seed):
         self.seed = seed
 
-    def __call__(self, observation: Any) -> Any:
+    def __call__(self, observation):
         if self.seed == 580206707:
             self.end()
         return np.zeros(self.shape)
 
-    def end(self) -> None:
+    def end(self):
         import os
 
         os.kill(os.getpid(), 9)
 
 
 class Hangs(DiesAlways):
-    def end(self) -> None:
+    def end(self):
         import time
 
         time.sleep(1000)
 
 
 @pytest.mark.thorough
-def test_a_worker_that_dies_once_costs_nothing(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_worker_that_dies_once_costs_nothing(tmp_path, monkeypatch, caplog):
     """Its job is begun again, and the results are as if it had lived."""
     monkeypatch.setenv("MJREC_TEST_MARK", str(tmp_path / "mark"))
     died = run(tmp_path / "died", policy=local(DiesOnce), keep="best")
@@ -470,11 +450,9 @@ def test_a_worker_that_dies_once_costs_nothing(
 # Takes more than five seconds: three workers die, one after the other.
 @parametrize("workers", [1, 2])
 @pytest.mark.parametrize("protocol", ["seeded", "suite"])
-def test_an_episode_that_kills_its_workers_fails_alone(
-    tmp_path: Path, workers: int, protocol: str
-) -> None:
+def test_an_episode_that_kills_its_workers_fails_alone(tmp_path, workers, protocol):
     """With any number of workers; the others of its chunk are completed."""
-    options: dict[str, Any] = {"policy": local(DiesAlways), "protocol": protocol}
+    options = {"policy": local(DiesAlways), "protocol": protocol}
     evaluation = run(tmp_path / "e", **options, **SIXTEEN, workers=workers)
     assert [(each.unit, each.failure) for each in evaluation.failed] == [
         ((5, 3), "3 processes died in it")
@@ -482,7 +460,7 @@ def test_an_episode_that_kills_its_workers_fails_alone(
     assert {each.unit for each in evaluation.results} == {(5, n) for n in range(16)}
 
 
-def test_an_episode_that_hangs_fails_after_its_time(tmp_path: Path) -> None:
+def test_an_episode_that_hangs_fails_after_its_time(tmp_path):
     """The others are completed."""
     evaluation = run(tmp_path / "e", policy=local(Hangs), **SIXTEEN, episode_timeout=2)
     [failed] = evaluation.failed
@@ -512,7 +490,7 @@ class Slow:
 """
 
 
-def slow_run(place: Path, name: str, *arguments: str) -> subprocess.Popen[bytes]:
+def slow_run(place, name, *arguments):
     (place / "slow_policy.py").write_text(SLOW)
     return subprocess.Popen(
         [sys.executable, "-c", SCRIPT, str(place / name), *arguments],
@@ -522,20 +500,20 @@ def slow_run(place: Path, name: str, *arguments: str) -> subprocess.Popen[bytes]
     )
 
 
-def ended(directory: Path) -> int:
+def ended(directory):
     journals = directory.glob("*/*/openaigym.episodes.*.jsonl")
     return sum(path.read_bytes().count(b'"evaluation": {') for path in journals)
 
 
 @pytest.fixture(scope="module")
-def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def whole(tmp_path_factory):
     """What the script gives when nobody kills it."""
     place = tmp_path_factory.mktemp("whole")
     assert slow_run(place, "whole", "1").wait() == 0
     return place / "whole"
 
 
-def kill_with_workers(process: subprocess.Popen[bytes]) -> None:
+def kill_with_workers(process):
     tasks = Path(f"/proc/{process.pid}/task").glob("*/children")
     workers = [int(pid) for path in tasks for pid in path.read_text().split()]
     for pid in (process.pid, *workers):
@@ -554,9 +532,7 @@ def kill_with_workers(process: subprocess.Popen[bytes]) -> None:
         ("drawing", ("engine",)),
     ],
 )
-def test_a_killed_evaluation_goes_on_where_it_was(
-    whole: Path, tmp_path: Path, moment: str, engine: tuple[str, ...]
-) -> None:
+def test_a_killed_evaluation_goes_on_where_it_was(whole, tmp_path, moment, engine):
     """SIGKILL of all its processes: the same bytes, and nothing is repeated."""
     killed = tmp_path / "killed"
     process = slow_run(tmp_path, "killed", "2", *engine)
@@ -575,10 +551,10 @@ def test_a_killed_evaluation_goes_on_where_it_was(
 
 
 @pytest.mark.thorough
-def test_what_is_interrupted_stays_to_be_resumed(tmp_path: Path) -> None:
+def test_what_is_interrupted_stays_to_be_resumed(tmp_path):
     """Ctrl-C, or what else is raised, ends the workers and comes out."""
 
-    def interrupt(progress: EvaluationProgress) -> None:
+    def interrupt(progress):
         if progress.done >= 2:
             raise KeyboardInterrupt
 
@@ -591,7 +567,7 @@ def test_what_is_interrupted_stays_to_be_resumed(tmp_path: Path) -> None:
 
 
 @pytest.mark.thorough
-def test_more_may_be_asked_for(reference: Path, tmp_path: Path) -> None:
+def test_more_may_be_asked_for(reference, tmp_path):
     """More tasks, seeds and episodes; what was done is not done again."""
     run(tmp_path / "e", episodes=1)
     run(tmp_path / "e", tasks=[PENDULUM, DOUBLE], resume=True)
@@ -600,7 +576,7 @@ def test_more_may_be_asked_for(reference: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.thorough
-def test_nothing_is_run_when_all_is_done(reference: Path, tmp_path: Path) -> None:
+def test_nothing_is_run_when_all_is_done(reference, tmp_path):
     """The results are written again, the same."""
     run(tmp_path / "e", tasks=[PENDULUM, DOUBLE], resume=True)
     before = contents(tmp_path / "e")
@@ -625,9 +601,7 @@ def test_nothing_is_run_when_all_is_done(reference: Path, tmp_path: Path) -> Non
         ({"env_kwargs": {"reset_noise_scale": 0.1}}, "env_kwargs"),
     ],
 )
-def test_another_evaluation_is_not_gone_on_with(
-    reference: Path, options: Mapping[str, Any], what: str
-) -> None:
+def test_another_evaluation_is_not_gone_on_with(reference, options, what):
     """The differences are told, and nothing is changed."""
     before = contents(reference)
     with pytest.raises(DifferentEvaluation, match=what):
@@ -635,7 +609,7 @@ def test_another_evaluation_is_not_gone_on_with(
     assert contents(reference) == before
 
 
-def test_a_directory_belongs_to_one_evaluation(reference: Path, tmp_path: Path) -> None:
+def test_a_directory_belongs_to_one_evaluation(reference, tmp_path):
     """It is not begun over another, nor over anything else, nor while one is at it."""
     with pytest.raises(InvalidArgument, match="resume=True"):
         run(reference)
@@ -650,7 +624,7 @@ def test_a_directory_belongs_to_one_evaluation(reference: Path, tmp_path: Path) 
     lock.release()
 
 
-WRONG: list[tuple[dict[str, Any], type[Exception], str]] = [
+WRONG = [
     ({"tasks": ["HalfChetah-v5"]}, UnknownName, "HalfCheetah-v5"),
     ({"tasks": ["dm_control:bench"]}, UnknownName, "dm_control:benchmarking"),
     ({"tasks": []}, InvalidArgument, "needs a task"),
@@ -682,12 +656,8 @@ WRONG: list[tuple[dict[str, Any], type[Exception], str]] = [
 
 @pytest.mark.parametrize(("options", "kind", "words"), WRONG)
 def test_what_cannot_be_is_told_before_anything_is_written(
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    options: dict[str, Any],
-    kind: type[Exception],
-    words: str,
-) -> None:
+    tmp_path, monkeypatch, options, kind, words
+):
     """As the error that it is, with a way out."""
     (tmp_path / "broken_policy.py").write_text("undefined\n")
     monkeypatch.chdir(tmp_path)
@@ -724,12 +694,12 @@ gymnasium.register("FlatWorld-v0", FlatWorld)
 
 
 def test_of_what_is_drawn_live_all_is_recorded_and_the_losers_deleted(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    tmp_path, monkeypatch
+):
     """By the rule, as of what is drawn later; each in an environment of its own."""
     (tmp_path / "flat_world.py").write_text(FLAT_WORLD)
     monkeypatch.chdir(tmp_path)
-    live: dict[str, Any] = {
+    live = {
         "tasks": ["flat_world:FlatWorld-v0"],
         "height": None,
         "width": None,
@@ -748,9 +718,7 @@ def test_of_what_is_drawn_live_all_is_recorded_and_the_losers_deleted(
     assert one.plan.tasks[0].folder == "flat_world%3AFlatWorld-v0"
 
 
-def test_what_cannot_be_drawn_has_results_without_videos(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_what_cannot_be_drawn_has_results_without_videos(tmp_path, caplog):
     """And one line says why; nothing fails, and nothing stays pending."""
     is_drawn = importlib.util.find_spec("pygame") is not None
     evaluation = run(
@@ -766,9 +734,9 @@ def test_what_cannot_be_drawn_has_results_without_videos(
     assert len(said) == (not is_drawn)
 
 
-def test_newly_chosen_videos_are_drawn_from_their_trajectories(tmp_path: Path) -> None:
+def test_newly_chosen_videos_are_drawn_from_their_trajectories(tmp_path):
     """After more seeds were asked for; those of before stay."""
-    options: dict[str, Any] = {"keep": "median", "tasks": [DOUBLE], "episodes": 1}
+    options = {"keep": "median", "tasks": [DOUBLE], "episodes": 1}
     before = run(tmp_path / "e", **options, num_seeds=2)
     [first] = before.videos
     stamps = {path: path.stat().st_mtime_ns for path in before.directory.rglob("*.mp4")}
@@ -786,20 +754,18 @@ def test_newly_chosen_videos_are_drawn_from_their_trajectories(tmp_path: Path) -
 class Weighted:
     """A policy with a weight."""
 
-    def __init__(self, weight: float) -> None:
+    def __init__(self, weight):
         self.weight = weight
 
-    def __call__(self, observation: Any) -> Any:
+    def __call__(self, observation):
         return np.full(1, self.weight)
 
 
-def test_another_policy_is_not_gone_on_with(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_another_policy_is_not_gone_on_with(tmp_path, monkeypatch):
     """Other weights, other code of a module, another file that an argument names."""
     place = tmp_path / "e"
     run(place, policy=Weighted(0.0), seeds=[0], num_seeds=None)
-    options: dict[str, Any] = {"seeds": [0, 1], "num_seeds": None, "resume": True}
+    options = {"seeds": [0, 1], "num_seeds": None, "resume": True}
     with pytest.raises(DifferentEvaluation, match=r"policy \(its content\) was '\w+"):
         run(place, policy=Weighted(0.9), **options)
     assert len(run(place, policy=Weighted(0.0), **options).results) == 4
@@ -807,10 +773,7 @@ def test_another_policy_is_not_gone_on_with(
     module, weights = tmp_path / "own_policy.py", tmp_path / "weights.bin"
     module.write_text("def make(env, weights):\n    return lambda o: [0.0]\n")
     weights.write_bytes(b"1")
-    named: dict[str, Any] = {
-        "policy": "own_policy:make()",
-        "policy_kwargs": {"weights": str(weights)},
-    }
+    named = {"policy": "own_policy:make()", "policy_kwargs": {"weights": str(weights)}}
     run(tmp_path / "named", **named)
     module.write_text("def make(env, weights):\n    return lambda o: [1.0]\n")
     weights.write_bytes(b"2")
@@ -820,9 +783,7 @@ def test_another_policy_is_not_gone_on_with(
         run(tmp_path / "named", **named, resume=True)
 
 
-def test_going_on_needs_nothing_but_the_directory(
-    reference: Path, tmp_path: Path
-) -> None:
+def test_going_on_needs_nothing_but_the_directory(reference, tmp_path):
     """The plan says the rest; what is to be more is given."""
     run(tmp_path / "e", num_seeds=1)
     same = evaluate(directory=tmp_path / "e", resume=True, workers=1)
@@ -837,7 +798,7 @@ def test_going_on_needs_nothing_but_the_directory(
     assert contents(tmp_path / "e") == contents(reference)
 
 
-def test_force_deletes_the_evaluation_that_is_there(tmp_path: Path) -> None:
+def test_force_deletes_the_evaluation_that_is_there(tmp_path):
     """And nothing else."""
     run(tmp_path / "e", tasks=[PENDULUM, DOUBLE])
     (tmp_path / "e" / DOUBLE / "notes.txt").touch()
@@ -849,18 +810,18 @@ def test_force_deletes_the_evaluation_that_is_there(tmp_path: Path) -> None:
 class Counted:
     """Writes down each time that it is built."""
 
-    def __init__(self, env: Any, place: str) -> None:
+    def __init__(self, env, place):
         self.shape = env.action_space.shape
         (Path(place) / f"{os.getpid()}-{random.random()}").touch()
 
-    def __call__(self, observation: Any) -> Any:
+    def __call__(self, observation):
         return np.zeros(self.shape)
 
 
-def test_a_policy_is_built_once_for_each_worker_and_task(tmp_path: Path) -> None:
+def test_a_policy_is_built_once_for_each_worker_and_task(tmp_path):
     """Whatever the number of chunks."""
     (tmp_path / "built").mkdir()
-    counted: dict[str, Any] = {"policy": Counted, "num_seeds": 8}
+    counted = {"policy": Counted, "num_seeds": 8}
     run(
         tmp_path / "e",
         **counted,
@@ -871,11 +832,11 @@ def test_a_policy_is_built_once_for_each_worker_and_task(tmp_path: Path) -> None
 
 
 @pytest.mark.dm_control
-def test_a_time_limit_of_the_environment_is_part_of_its_scale(tmp_path: Path) -> None:
+def test_a_time_limit_of_the_environment_is_part_of_its_scale(tmp_path):
     """A task of 40 steps has returns from 0 to 40."""
     pytest.importorskip("dm_control")
     kwargs = {"task_kwargs": {"time_limit": 1}}
-    options: dict[str, Any] = {"num_seeds": 1, "env_kwargs": kwargs, "max_steps": None}
+    options = {"num_seeds": 1, "env_kwargs": kwargs, "max_steps": None}
     evaluation = run(tmp_path / "e", tasks=["dm_control/walker-walk"], **options)
     assert [each.score_range for each in evaluation.summaries] == [(0.0, 40.0)]
     assert {each.length for each in evaluation.results} == {40}
@@ -890,9 +851,7 @@ def test_a_time_limit_of_the_environment_is_part_of_its_scale(tmp_path: Path) ->
         ([1], 60, "suite", ["seed-001", "seed-001"]),
     ],
 )
-def test_chunks_follow_from_the_plan(
-    seeds: Any, episodes: int, protocol: Any, names: list[str]
-) -> None:
+def test_chunks_follow_from_the_plan(seeds, episodes, protocol, names):
     """Consecutive seeds, or a part of one, each episode once; they grow by new ones."""
     plan = EvaluationPlan(
         tasks=(), policy="x", seeds=tuple(seeds), episodes=episodes, protocol=protocol
@@ -910,9 +869,9 @@ def test_chunks_follow_from_the_plan(
 
 @pytest.mark.thorough
 @pytest.mark.dm_control
-def test_the_suite_has_a_scale_and_its_own_protocol(tmp_path: Path) -> None:
+def test_the_suite_has_a_scale_and_its_own_protocol(tmp_path):
     """One stream for each task and seed; returns over steps are scores."""
-    options: dict[str, Any] = {
+    options = {
         "tasks": ["dm_control/cartpole-swingup", "dm_control/pendulum-swingup"],
         "protocol": "suite",
         "keep": "median",
@@ -928,7 +887,7 @@ def test_the_suite_has_a_scale_and_its_own_protocol(tmp_path: Path) -> None:
 
 
 @pytest.mark.thorough
-def test_the_process_that_hands_out_loads_no_simulator(tmp_path: Path) -> None:
+def test_the_process_that_hands_out_loads_no_simulator(tmp_path):
     """It needs no OpenGL, and a policy's memory is the workers'."""
     code = (
         "import sys; from pathlib import Path; import test_evaluating\n"

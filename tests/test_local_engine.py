@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Of the local engine, what `test_engines` does not try on every one."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal
@@ -34,7 +32,7 @@ from mjrec.machine import usable_cpus
 pytestmark = pytest.mark.usefixtures("no_process_is_left")
 
 
-def test_a_thousand_small_jobs() -> None:
+def test_a_thousand_small_jobs():
     """Nothing is waited for but work."""
     keys = [str(number) for number in range(1000)]
     with Run(LocalEngine(2), odd_work()) as run:
@@ -44,16 +42,16 @@ def test_a_thousand_small_jobs() -> None:
     assert time.monotonic() - began < 10
 
 
-def test_workers_are_one_for_each_cpu() -> None:
+def test_workers_are_one_for_each_cpu():
     """Unless their number is given, which is refused before anything starts."""
     assert LocalEngine().workers == usable_cpus()
     assert repr(LocalEngine(3, gpus=0.5)) == "LocalEngine(workers=3, gpus=0.5)"
     for workers in (0, -1, 1.5, True, "2"):
         with pytest.raises(InvalidArgument, match="workers must be a whole number"):
-            LocalEngine(workers)  # type: ignore[arg-type]  # that is the test
+            LocalEngine(workers)
 
 
-def test_an_engine_that_was_shut_down_or_forgotten() -> None:
+def test_an_engine_that_was_shut_down_or_forgotten():
     """It takes no more jobs, and leaves no thread; those before are done."""
     engine = LocalEngine(2)
     calls = [engine.submit(len, "abc") for _ in range(5)]
@@ -65,7 +63,7 @@ def test_an_engine_that_was_shut_down_or_forgotten() -> None:
     wait_until(lambda: "mjrec-worker" not in str(threading.enumerate()))
 
 
-def test_children_have_more_environment() -> None:
+def test_children_have_more_environment():
     """And bytes that are the same for all, in a file."""
     environ = {"OMP_NUM_THREADS": "3"}
     work = Work(entry="odd_jobs:make", environ=environ, payload=b"weights")
@@ -76,9 +74,7 @@ def test_children_have_more_environment() -> None:
 
 
 @pytest.mark.thorough
-def test_children_share_the_gpus_that_there_are(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_children_share_the_gpus_that_there_are(tmp_path, monkeypatch, caplog):
     """Two share the first, and are told that they draw in software, or may not."""
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "3,5")
     os.mkfifo(tmp_path / "pipe")
@@ -95,7 +91,7 @@ def test_children_share_the_gpus_that_there_are(
             outcomes(run)
 
 
-def test_processes_that_a_child_leaves_are_not_waited_for(tmp_path: Path) -> None:
+def test_processes_that_a_child_leaves_are_not_waited_for(tmp_path):
     """Its end is its end, whatever holds copies of what it had open."""
     with Run(LocalEngine(1), odd_work()) as run:
         submit(run, "a", do="fork", children=str(tmp_path / "children"))
@@ -105,7 +101,7 @@ def test_processes_that_a_child_leaves_are_not_waited_for(tmp_path: Path) -> Non
         wait_for_end(int(line))
 
 
-def test_what_cannot_be_started(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_cannot_be_started(monkeypatch):
     """The error names it."""
     for entry in ("no_such_module:make", "odd_jobs:no_such_name"):
         with Run(LocalEngine(1), Work(entry=entry)) as run:
@@ -119,9 +115,7 @@ def test_what_cannot_be_started(monkeypatch: pytest.MonkeyPatch) -> None:
             outcomes(run)
 
 
-def test_what_jobs_print_is_passed_on(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_jobs_print_is_passed_on(capsys, monkeypatch):
     """Line by line, more than a pipe holds; where there is a standard error."""
     with Run(LocalEngine(2), odd_work()) as run:
         submit(run, "a", do="talk", more=1_000_000)
@@ -141,7 +135,7 @@ def test_what_jobs_print_is_passed_on(
         assert values(run) == [{"read": ""}]
 
 
-def test_ctrl_c_while_results_come(tmp_path: Path) -> None:
+def test_ctrl_c_while_results_come(tmp_path):
     """It is raised at once, and leaving `with` ends what the children are at."""
     run = Run(LocalEngine(1), odd_work())
     submit(run, "a", do="hold", begun=str(tmp_path / "begun"))
@@ -162,7 +156,7 @@ with Run(LocalEngine(2), Work(entry="odd_jobs:make")) as run:
 SAID = f"{[str(number) for number in range(9)]}\n"
 
 
-def test_from_wherever_the_caller_is(tmp_path: Path) -> None:
+def test_from_wherever_the_caller_is(tmp_path):
     """From standard input, from a script without a guard, in a daemonic process."""
     assert run_python("-", text=CALLER) == SAID
     (tmp_path / "script.py").write_text(CALLER)
@@ -199,7 +193,7 @@ if sys.argv[2] == "killed":
 
 
 @pytest.mark.parametrize("how", ["killed", "left"])
-def test_children_end_with_their_driver(tmp_path: Path, how: str) -> None:
+def test_children_end_with_their_driver(tmp_path, how):
     """In mid-job; at interpreter exit nothing waits for them."""
     subprocess.run(
         [sys.executable, "-c", LEAVING, str(tmp_path / "begun"), how],
@@ -210,7 +204,7 @@ def test_children_end_with_their_driver(tmp_path: Path, how: str) -> None:
     wait_for_end(int((tmp_path / "begun").read_text()))
 
 
-def test_import_is_inert() -> None:
+def test_import_is_inert():
     """Neither driver nor child loads a simulator, NumPy, or another engine."""
     heavy = ["mujoco", "numpy", "h5py", "ray", "submitit"]
     script = (

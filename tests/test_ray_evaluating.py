@@ -1,15 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Evaluations on Ray: the same files, whoever dies."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -19,7 +15,6 @@ from waiting import wait_until
 
 from mjrec.engines.ray import RayEngine
 from mjrec.evaluation.evaluating import evaluate
-from mjrec.evaluation.evaluation import Evaluation
 
 # Ray's own connections and pipes, of which it says so when they are collected.
 pytestmark = pytest.mark.filterwarnings("ignore::ResourceWarning")
@@ -30,15 +25,15 @@ BEGUN, ENDED = b'{"begun"', b'"evaluation": {'
 
 
 @pytest.fixture(scope="module", autouse=True)
-def home(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+def home(tmp_path_factory):
     """No process of Ray, and nothing in the home, is left by all tests of these."""
     with home_for_ray(tmp_path_factory.mktemp("home")):
         yield
 
 
-def run(directory: Path, **options: Any) -> Evaluation:
+def run(directory, **options):
     """Evaluate something small."""
-    small: dict[str, Any] = {
+    small = {
         "tasks": [PENDULUM],
         "policy": "random",
         "episodes": 3,
@@ -51,22 +46,22 @@ def run(directory: Path, **options: Any) -> Evaluation:
     return evaluate(**{**small, **options}, directory=directory)
 
 
-def results_in(directory: Path) -> list[bytes]:
+def results_in(directory):
     return [(directory / name).read_bytes() for name in ("results.csv", "results.json")]
 
 
 class Huge:
     """A policy whose weights are as large as those of a large network."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         self.weights = np.ones(MOST_BYTES, np.uint8)
 
-    def __call__(self, observation: Any) -> Any:
+    def __call__(self, observation):
         return np.sin(100 * observation[:1]) * self.weights[-1]
 
 
 # Takes more than five seconds: a real Ray, whose workers import MuJoCo.
-def test_the_files_are_those_of_this_machine(tmp_path: Path) -> None:
+def test_the_files_are_those_of_this_machine(tmp_path):
     """Results byte for byte, and all states and videos; with a policy of 200 MiB."""
     policy = Huge()
     here = run(tmp_path / "here", policy=policy, workers=2)
@@ -100,7 +95,7 @@ class Slow:
 """
 
 
-def slow_run(place: Path, *arguments: str) -> subprocess.Popen[bytes]:
+def slow_run(place, *arguments):
     (place / "slow_policy.py").write_text(SLOW)
     return subprocess.Popen(
         [sys.executable, "-c", SCRIPT, str(place / "e"), *arguments],
@@ -109,14 +104,14 @@ def slow_run(place: Path, *arguments: str) -> subprocess.Popen[bytes]:
     )
 
 
-def noted(directory: Path, what: bytes) -> int:
+def noted(directory, what):
     """Return how often journals say that an episode has begun, or ended."""
     journals = directory.glob("*/*/openaigym.episodes.*.jsonl")
     return sum(path.read_bytes().count(what) for path in journals)
 
 
 @pytest.mark.thorough
-def test_a_killed_driver_is_gone_on_with(tmp_path: Path) -> None:
+def test_a_killed_driver_is_gone_on_with(tmp_path):
     """With `resume`: what was finished is not repeated."""
     process = slow_run(tmp_path)
     wait_until(lambda: noted(tmp_path / "e", ENDED) >= 4)

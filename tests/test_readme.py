@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Every block of the README, and every example, runs."""
 
-from __future__ import annotations
-
 import os
 import re
 import shlex
@@ -21,18 +19,18 @@ BLOCKS = re.findall(r"```(\w+)\n(.*?)```", (ROOT / "README.md").read_text(), re.
 EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
 
 
-def blocks(language: str) -> list[str]:
+def blocks(language):
     return [text for kind, text in BLOCKS if kind == language]
 
 
-def shell_lines() -> list[str]:
+def shell_lines():
     lines = [
         line.partition("#")[0].strip() for b in blocks("sh") for line in b.split("\n")
     ]
     return sorted({line for line in lines if line})
 
 
-def run(*command: str, cwd: Path) -> str:
+def run(*command, cwd):
     """Run a command that finds `mjrec` where this Python has it."""
     path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
     done = subprocess.run(
@@ -47,13 +45,13 @@ def run(*command: str, cwd: Path) -> str:
     return done.stdout
 
 
-def needs_extras(text: str) -> None:
+def needs_extras(text):
     if "dm_control" in text:
         pytest.importorskip("dm_control", reason="dm_control is not installed here")
 
 
 @pytest.fixture
-def checkout(tmp_path: Path) -> Path:
+def checkout(tmp_path):
     """A directory in which the README's relative paths mean something."""
     (tmp_path / "assets").symlink_to(ROOT / "assets")
     return tmp_path
@@ -64,7 +62,7 @@ PYTHON = dict(zip(("gymnasium", "dm_control", "again"), blocks("python"), strict
 
 # Takes more than five seconds: the README's own size, 480x480, drawn in software.
 @parametrize("name", PYTHON)
-def test_python_block_runs(name: str, checkout: Path) -> None:
+def test_python_block_runs(name, checkout):
     """As it stands, after what it goes on from, and it leaves a video."""
     code = PYTHON[name]
     needs_extras(code)
@@ -75,7 +73,7 @@ def test_python_block_runs(name: str, checkout: Path) -> None:
     assert name != "again" or list(checkout.glob("recordings/again/*.mp4"))
 
 
-def needed_by(line: str) -> list[str]:
+def needed_by(line):
     """Return the lines that make what a line is about, in order."""
     command, subject = (*line.split(), "")[1:3]
     made_by = dict.fromkeys(("list", "render", "recover", "pack", "report"), "--out")
@@ -88,7 +86,7 @@ def needed_by(line: str) -> list[str]:
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("line", [x for x in shell_lines() if x.startswith("mjrec")])
-def test_command_runs(line: str, checkout: Path) -> None:
+def test_command_runs(line, checkout):
     """As it stands, with the recordings that the ones before it made."""
     needed = needed_by(line)
     for each in (*needed, line):
@@ -99,7 +97,7 @@ def test_command_runs(line: str, checkout: Path) -> None:
     assert out.strip()
 
 
-def test_system_packages_are_those_that_setup_installs() -> None:
+def test_system_packages_are_those_that_setup_installs():
     """The README's apt line names what scripts/setup looks for."""
     [line] = [x for x in shell_lines() if x.startswith("apt-get")]
     packages = [word for word in line.split() if word.startswith("lib")]
@@ -109,7 +107,7 @@ def test_system_packages_are_those_that_setup_installs() -> None:
         assert package in setup
 
 
-def test_tree_is_what_a_recording_leaves(checkout: Path) -> None:
+def test_tree_is_what_a_recording_leaves(checkout):
     """Name by name, but for the process id."""
     [tree] = blocks("text")
     run(
@@ -128,7 +126,7 @@ def test_tree_is_what_a_recording_leaves(checkout: Path) -> None:
     assert made == set(re.findall(r"openaigym\.\S+", tree))
 
 
-def test_links_lead_somewhere() -> None:
+def test_links_lead_somewhere():
     """Pictures and pages of the README are there."""
     targets = re.findall(r"\]\((?!https?:)([^)#]+)", (ROOT / "README.md").read_text())
     assert targets
@@ -138,7 +136,7 @@ def test_links_lead_somewhere() -> None:
 
 @pytest.mark.thorough
 @pytest.mark.dm_control
-def test_scripts_demo_runs(tmp_path: Path) -> None:
+def test_scripts_demo_runs(tmp_path):
     """The first command: twenty episodes, six videos, two tables."""
     assert "scripts/demo" in shell_lines()
     out = run(str(ROOT / "scripts" / "demo"), str(tmp_path / "demo"), cwd=ROOT)
@@ -159,7 +157,7 @@ def test_scripts_demo_runs(tmp_path: Path) -> None:
     ],
     ids=[path.stem for path in EXAMPLES],
 )
-def test_example_runs(example: Path, tmp_path: Path) -> None:
+def test_example_runs(example, tmp_path):
     """By itself, in an empty directory, and is listed on the examples' page."""
     needs_extras(example.read_text())
     copied = shutil.copy(example, tmp_path)
@@ -169,7 +167,7 @@ def test_example_runs(example: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.thorough
-def test_command_line_example_runs(tmp_path: Path) -> None:
+def test_command_line_example_runs(tmp_path):
     """It keeps as many videos as it says, and lists its episodes."""
     script = ROOT / "examples" / "command_line" / "evaluate.sh"
     out = run(str(script), str(tmp_path / "out"), cwd=tmp_path)
@@ -180,7 +178,7 @@ def test_command_line_example_runs(tmp_path: Path) -> None:
 
 @pytest.mark.thorough
 @pytest.mark.dm_control
-def test_workflow_records_and_uploads(tmp_path: Path) -> None:
+def test_workflow_records_and_uploads(tmp_path):
     """Its own commands leave what it uploads; the rest is what setup installs too."""
     workflow = yaml.safe_load((ROOT / "examples" / "ci" / "record.yml").read_text())
     [job] = workflow["jobs"].values()

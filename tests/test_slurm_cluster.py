@@ -1,15 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Of the Slurm engine, what only Slurm can show."""
 
-from __future__ import annotations
-
 import functools
 import os
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
 from slurm_cluster import slurm_cluster
@@ -28,30 +24,30 @@ pytestmark = pytest.mark.slurm
 
 
 @pytest.fixture(scope="module")
-def configuration(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+def configuration(tmp_path_factory):
     with slurm_cluster(tmp_path_factory.mktemp("slurm")) as path:
         yield path
 
 
 @pytest.fixture(autouse=True)
-def cluster(configuration: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+def cluster(configuration, monkeypatch):
     """Nothing is left in its queue by any test."""
     monkeypatch.setenv("SLURM_CONF", str(configuration))
     yield
     until(lambda: not asked("squeue", "--noheader"))
 
 
-def asked(*command: str) -> str:
+def asked(*command):
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert not done.returncode, (command, done.stderr)
     return done.stdout.strip()
 
 
-def engine(workers: int = 1, **options: Any) -> SlurmEngine:
+def engine(workers=1, **options):
     return SlurmEngine(workers, **options)
 
 
-def work(place: Path) -> Work:
+def work(place):
     return Work(
         entry="odd_jobs:make",
         settings={"left": str(place / "left")},
@@ -59,11 +55,11 @@ def work(place: Path) -> Work:
     )
 
 
-def hold(run: Run, place: Path) -> None:
+def hold(run, place):
     run.submit("held", do="hold", begun=str(place / "begun"))
 
 
-def wait_for(path: Path, run: Run) -> str:
+def wait_for(path, run):
     """Return the number of the process that has begun a job, which notes it there."""
     for _ in run.results(patience_s=0.02):
         if path.exists() and path.read_text():
@@ -71,16 +67,16 @@ def wait_for(path: Path, run: Run) -> str:
     return path.read_text()
 
 
-def lines(path: Path) -> list[str]:
+def lines(path):
     return path.read_text().splitlines() if path.exists() else []
 
 
-def slurm_job() -> str:
+def slurm_job():
     """Return the only one that runs."""
     return asked("squeue", "--noheader", "--array", "--states=running", "--format=%i")
 
 
-def test_jobs_are_done_in_slurm_jobs(tmp_path: Path) -> None:
+def test_jobs_are_done_in_slurm_jobs(tmp_path):
     """Which are submitted as one array, and have completed at the end."""
     with Run(engine(3), work(tmp_path)) as run:
         for number in range(50):
@@ -98,9 +94,7 @@ def test_jobs_are_done_in_slurm_jobs(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("how", ["preempted", "cancelled", "killed"])
-def test_a_slurm_job_that_is_ended(
-    tmp_path: Path, how: str, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_slurm_job_that_is_ended(tmp_path, how, caplog):
     """Files are closed where there is time; what it was at is done in another."""
     with Run(engine(partition="low"), work(tmp_path)) as run:
         hold(run, tmp_path)
@@ -120,9 +114,7 @@ def test_a_slurm_job_that_is_ended(
     assert lines(tmp_path / "left")
 
 
-def test_what_the_drivers_slurm_job_was_given_is_not_passed_on(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_the_drivers_slurm_job_was_given_is_not_passed_on(tmp_path, monkeypatch):
     """Where the cluster is is."""
     monkeypatch.setenv("SLURM_JOB_ID", "9999")
     monkeypatch.setenv("SLURM_MEM_PER_GPU", "1")
@@ -137,7 +129,7 @@ def test_what_the_drivers_slurm_job_was_given_is_not_passed_on(
     assert os.environ["SLURM_MEM_PER_GPU"] == "1"
 
 
-def test_what_slurm_refuses(tmp_path: Path) -> None:
+def test_what_slurm_refuses(tmp_path):
     """The error has its words."""
     with Run(engine(partition="none"), work(tmp_path)) as run:
         hold(run, tmp_path)
@@ -157,7 +149,7 @@ next(run.results())
 """
 
 
-def test_the_next_driver_ends_what_a_killed_one_has_left(tmp_path: Path) -> None:
+def test_the_next_driver_ends_what_a_killed_one_has_left(tmp_path):
     """Those that wait in the queue too."""
     driver = subprocess.Popen(
         [sys.executable, "-c", DRIVER, str(tmp_path)],
@@ -174,7 +166,7 @@ def test_the_next_driver_ends_what_a_killed_one_has_left(tmp_path: Path) -> None
     assert not (tmp_path / "shared" / WORK_FOLDER).exists()
 
 
-def test_an_evaluation_whose_driver_is_in_a_slurm_job(tmp_path: Path) -> None:
+def test_an_evaluation_whose_driver_is_in_a_slurm_job(tmp_path):
     """Byte for byte that of one process."""
     command = [
         *(sys.executable, "-m", "mjrec", "evaluate", "InvertedPendulum-v5"),
