@@ -18,7 +18,6 @@ from dm_control.suite.wrappers import pixels
 
 from mjrec.environments.dm_control_contexts import ContextsOnDemand
 from mjrec.environments.dm_control_scenes import dm_control_scenes
-from mjrec.errors import UnknownName
 
 pytestmark = pytest.mark.dm_control
 
@@ -62,12 +61,6 @@ def test_what_physics_cannot_draw_is_shown_as_it_is_live(tmp_path):
     for asked in ({"width": 4000}, {"camera": camera}):
         scene = begun(load(), tmp_path, **asked)
         assert (scene["fresh"], scene["max_geom"]) == (False, 10000)
-
-
-def test_camera_is_checked_at_once():
-    """Not at the first picture."""
-    with pytest.raises(UnknownName, match="side"):
-        dm_control_scenes(load(), camera="sideways")
 
 
 def test_a_physics_that_overrides_is_named():

@@ -245,37 +245,38 @@ def test_predict_is_understood(write):
     assert load("Short")(1) == [1, 0]
 
 
-def test_an_unknown_policy_says_what_there_is(write):
-    """Built-in names, modules nearby, names in the module, files nearby."""
-    write("import math\ndef act(observation): pass\nclass Other: pass\n_x = 1\n")
-    with pytest.raises(mjrec.UnknownName, match=r"'rnd'.*random, zero.*module:name"):
-        load_policy("rnd", BOX)
-    for half in (":act", "mjrec_test_policy:", "mjrec_test_policy:()"):
-        with pytest.raises(mjrec.UnknownName, match="module:name"):
-            load_policy(half, BOX)
-    with pytest.raises(mjrec.UnknownName, match=r"'mjrec_test_plicy'.*test_policy"):
-        load_policy("mjrec_test_plicy:act", BOX)
-    with pytest.raises(mjrec.UnknownName, match=r"'atc'.*There are: Other, act"):
-        load("atc")
+REFUSED = [
+    # Built-in names, modules nearby, names in the module, files nearby.
+    ("", "rnd", mjrec.UnknownName, "'rnd'.*random, zero.*module:name"),
+    ("", ":act", mjrec.UnknownName, "module:name"),
+    ("", "mjrec_test_policy:", mjrec.UnknownName, "module:name"),
+    ("", "mjrec_test_policy:()", mjrec.UnknownName, "module:name"),
+    ("", "mjrec_test_plicy:act", mjrec.UnknownName, "'mjrec_test_plicy'.*test_policy"),
+    ("", "bst.zip", mjrec.UnknownName, r"'bst.zip'.*best.zip"),
+    (
+        *("import math\ndef act(o): pass\nclass Other: pass\n_x = 1\n", "atc"),
+        *(mjrec.UnknownName, "'atc'.*There are: Other, act"),
+    ),
+    # Where it happened.
+    (
+        *("def f(o): pass\n1 / 0\n", "f", mjrec.PolicyError),
+        r"ZeroDivisionError.*mjrec_test_policy.py, line 2",
+    ),
+    ("import no_such_module\n", "f", mjrec.PolicyError, "no_such_module"),
+    ("def f(o:\n", "f", mjrec.PolicyError, r"SyntaxError.*line 1\)\.$"),
+    ("number = 3\n", "number", mjrec.PolicyError, "3, which neither"),
+    ("number = 3\n", "number()", mjrec.PolicyError, "Leave the parentheses away"),
+    ("def f(env): return 3\n", "f()", mjrec.PolicyError, "3, which neither"),
+]
+
+
+@pytest.mark.parametrize(("text", "name", "kind", "words"), REFUSED)
+def test_what_is_no_policy_says_what_there_is(write, text, name, kind, words):
+    """Or what is wrong with it."""
+    write(text)
     Path("best.zip").touch()
-    with pytest.raises(mjrec.UnknownName, match=r"'bst.zip'.*best.zip"):
-        load_policy("bst.zip", BOX)
-
-
-def test_a_module_that_cannot_be_imported_says_why(write):
-    """Where it happened, and the exception for those who look."""
-    write("def f(o): pass\n1 / 0\n")
-    with pytest.raises(
-        mjrec.PolicyError, match=r"ZeroDivisionError.*mjrec_test_policy.py, line 2"
-    ) as caught:
-        load("f")
-    assert isinstance(caught.value.__cause__, ZeroDivisionError)
-    write("import no_such_module_at_all\n")
-    with pytest.raises(mjrec.PolicyError, match="no_such_module_at_all"):
-        load("f")
-    write("def f(o:\n")
-    with pytest.raises(mjrec.PolicyError, match=r"SyntaxError.*line 1\)\.$"):
-        load("f")
+    with pytest.raises(kind, match=words):
+        load_policy(f"mjrec_test_policy:{name}" if text else name, BOX)
 
 
 def test_what_a_policy_raises_is_named(write):
@@ -296,16 +297,6 @@ def test_what_a_policy_raises_is_named(write):
         policy(None)
     with pytest.raises(mjrec.PolicyError, match=r"Building .*Early.*TypeError"):
         load("Early")
-
-
-def test_what_is_no_policy_is_refused(write):
-    """A number, and a call of what cannot be called."""
-    write("number = 3\ndef make(environment): return 3\n")
-    for name in ("number", "make()"):
-        with pytest.raises(mjrec.PolicyError, match="3, which neither"):
-            load(name)
-    with pytest.raises(mjrec.PolicyError, match="Leave the parentheses away"):
-        load("number()")
 
 
 def test_an_object_is_a_policy_as_what_a_name_names():

@@ -1,43 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """What is asked of an environment before its states are recorded, and what it costs."""
 
-import functools
-import weakref
-
 import gymnasium
 import numpy as np
 import pytest
 from gymnasium.wrappers import ClipAction, RecordEpisodeStatistics, TransformReward
 
 import mjrec
-from mjrec.environments.scenes import has_own_method
 from mjrec.environments.wrapping import around_dm_env, around_gymnasium
-
-
-class Shown:
-    """Has a method of each kind."""
-
-    def render(self):
-        return "shown"
-
-    @staticmethod
-    def size():
-        return 3
-
-
-@pytest.mark.parametrize(
-    "method",
-    [lambda: "other", functools.partial(str, "other"), None, str.upper],
-    ids=["function", "partial", "none", "builtin"],
-)
-@pytest.mark.parametrize("name", ["render", "size"])
-def test_methods_set_on_an_instance_are_its_own(method, name):
-    """Whatever they are; also where a proxy stands for the instance."""
-    instance = Shown()
-    setattr(instance, name, method)
-    assert has_own_method(instance, name)
-    assert has_own_method(weakref.proxy(instance), name)
-    assert not has_own_method(Shown(), name)
 
 
 @pytest.mark.parametrize("part", ["wrapper", "environment"])
