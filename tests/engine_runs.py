@@ -3,12 +3,16 @@
 
 import contextlib
 import os
+import re
 import select
 import subprocess
 import sys
 from pathlib import Path
 
 from mjrec.engines.jobs import Work
+
+# An environment variable, by which a test finds what it has started.
+MARK = "MJREC_TEST_MARK"
 
 
 def odd_work(make="make", *, shared=None, **settings):
@@ -39,7 +43,21 @@ def wait_for(path, run):
     for _ in run.results(patience_s=0.02):
         if path.exists() and path.read_text():
             break
-    return int(path.read_text())
+    return int(path.read_text().split()[-1])
+
+
+def marked(mark):
+    """Return the commands of other processes in whose environment the mark stands.
+
+    Without Ray's agents, which tell a cluster for a minute that it is gone, and
+    without Python's own.
+    """
+    wanted, found = f"{MARK}={mark}".encode(), []
+    for process in Path("/proc").glob("[0-9]*"):
+        with contextlib.suppress(OSError):
+            if wanted in (process / "environ").read_bytes().split(b"\0"):
+                found.append((process / "cmdline").read_text().replace("\0", " "))
+    return [c for c in found if not re.match(r"ray::\w+Agent|.*resource_tracker", c)]
 
 
 def wait_for_end(pid):

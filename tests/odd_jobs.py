@@ -38,6 +38,7 @@ class OddJobs:
             "directory": str(Path.cwd()),
             "session": os.getsid(0),
             "threads": os.environ.get("OMP_NUM_THREADS"),
+            "gpus": os.environ.get("CUDA_VISIBLE_DEVICES"),
             "payload": payload and Path(payload).read_text(),
         }
 
@@ -77,10 +78,9 @@ class OddJobs:
             return {"pid": os.getpid(), "gpus": gpus}
 
     def hold(self, arguments):
-        """Keep at it until a file is there; a file says when it has begun."""
-        # A new file, so that nothing is ever replaced.
-        with Path(arguments["begun"]).open("x") as file:
-            file.write(str(os.getpid()))
+        """Keep at it until a file is there; lines of another say who has begun."""
+        with Path(arguments["begun"]).open("a") as file:
+            file.write(f"{os.getpid()}\n")
         go = Path(arguments.get("go", "/no/such/file"))
         while not go.exists():
             with contextlib.suppress(SystemExit):

@@ -15,9 +15,10 @@ from parts import parametrize
 from recordings import frames_in, metadata_of, videos_in
 from trajectories_by_hand import write_log
 
+from evaluations import write_recorded
 from mjrec import Monitor, load_results
 from mjrec.commands import COMMANDS, main
-from report_recordings import entry, write_evaluation, write_journal
+from report_recordings import entry, write_journal
 
 PENDULUM = """
 <mujoco>
@@ -377,7 +378,7 @@ def test_list_shows_the_directories_in_one(mjrec, tmp_path):
 def test_list_shows_an_evaluation_as_one(mjrec, tmp_path):
     """Task, seed, return and video of each episode; what failed says so."""
     name = "openaigym.video.0.batch.video000000.mp4"
-    write_evaluation(tmp_path, ["a/x", "b/y"], videos={"a/x": name, "b/y": name})
+    write_recorded(tmp_path, ["a/x", "b/y"], videos={"a/x": name, "b/y": name})
     (tmp_path / "a-x" / name).touch()
     status, out, _ = mjrec("list", tmp_path)
     assert status == 0
@@ -396,7 +397,7 @@ def test_list_shows_an_evaluation_as_one(mjrec, tmp_path):
 
 def test_list_shows_what_is_over_of_an_evaluation_that_is_not(mjrec, tmp_path):
     """By task and seed, too; which get a video is not chosen yet."""
-    write_evaluation(tmp_path, ["a/x"], finished=False)
+    write_recorded(tmp_path, ["a/x"], finished=False)
     status, out, _ = mjrec("list", tmp_path)
     assert status == 0
     assert [line.split() for line in out.splitlines() if "/" in line] == [

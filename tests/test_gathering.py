@@ -16,6 +16,7 @@ import pytest
 from parts import parametrize
 
 import mjrec
+from evaluations import write_recorded
 from mjrec.commands import main
 from mjrec.errors import InvalidArgument, UnreadableFile
 from mjrec.evaluation.kept_episodes import keep_rule
@@ -24,7 +25,7 @@ from mjrec.formats.monitor_directory import infix_of
 from mjrec.reporting.contents import EPISODE
 from mjrec.reporting.episode_rows import episodes_with_roles
 from mjrec.reporting.gathering import gather
-from report_recordings import GYM, entry, record, write_evaluation, write_journal
+from report_recordings import GYM, entry, record, write_journal
 
 
 @pytest.fixture(scope="module")
@@ -192,7 +193,7 @@ def test_metadata_may_say_anything(corridor, tmp_path, metadata):
 
 def test_an_evaluation_has_its_results(tmp_path):
     """Its summaries are those of its file, its episodes in the plan's order."""
-    write_evaluation(tmp_path / "e", ["a/x", "b/y"])
+    write_recorded(tmp_path / "e", ["a/x", "b/y"])
     write_journal(tmp_path / "m", "0.a", "X-v0", [entry(i) for i in range(20)])
     contents = gather([tmp_path / "e", tmp_path / "m"])
     assert [task.name for task in contents.tasks] == ["a/x", "b/y", "X-v0"]
@@ -226,7 +227,7 @@ def test_videos_of_an_evaluation_know_their_episode(corridor, tmp_path):
     [path] = (tmp_path / "a-x").glob("*.mp4")
     infix = infix_of(path.name)
     assert infix is not None
-    write_evaluation(tmp_path, ["a/x"], videos={"a/x": path.name}, infix=infix)
+    write_recorded(tmp_path, ["a/x"], videos={"a/x": path.name}, monitor=infix)
     contents = gather(tmp_path)
     [video] = contents.videos
     assert (video.index, video.roles) == (0, ("best",))
@@ -236,7 +237,7 @@ def test_videos_of_an_evaluation_know_their_episode(corridor, tmp_path):
 def test_pending_videos_of_an_evaluation_are_told(tmp_path):
     """With the command that makes them."""
     name = "openaigym.video.0.batch.video000000.mp4"
-    write_evaluation(tmp_path, ["a/x"], videos={"a/x": name})
+    write_recorded(tmp_path, ["a/x"], videos={"a/x": name})
     [problem] = gather(tmp_path).problems
     assert "1 of 1 videos of a/x are not there" in problem
     assert f"mjrec render {tmp_path / 'a-x'}" in problem
@@ -254,7 +255,7 @@ def test_an_evaluation_without_results_is_shown_by_its_monitors(
     tmp_path, broken, content, told
 ):
     """Whether it is not finished or a file is damaged, which is said."""
-    write_evaluation(tmp_path, ["a/x", "b/y"], finished=broken is not None)
+    write_recorded(tmp_path, ["a/x", "b/y"], finished=broken is not None)
     if broken is not None and content is not None:
         (tmp_path / broken).write_text(content)
     contents = gather(tmp_path)
@@ -293,7 +294,7 @@ def test_roles(rewards, failed, roles):
 def test_roles_are_those_of_an_evaluation(tmp_path):
     """The rule that chose the videos and the page call the same episodes the best."""
     rewards = (2.0, 5.0, 5.0, 1.0, 1.0, 2.0)
-    write_evaluation(tmp_path, ["a/x"], rewards=rewards)
+    write_recorded(tmp_path, ["a/x"], rewards=rewards)
     results = list(read_results(tmp_path))
     expected = {}
     for result, role in keep_rule("best,median,worst").choose(results):

@@ -8,8 +8,17 @@ import sys
 from pathlib import Path
 
 import pytest
-from engine_runs import lines, odd_work, run_python, submit, values, wait_for
-from ray_clusters import MARK, home_for_ray, own_ray, ray_processes
+from engine_runs import (
+    MARK,
+    lines,
+    marked,
+    odd_work,
+    run_python,
+    submit,
+    values,
+    wait_for,
+)
+from ray_clusters import home_for_ray, own_ray
 from waiting import wait_until
 
 from mjrec.engines.jobs import Run
@@ -90,7 +99,7 @@ print(sorted(os.listdir(os.environ["HOME"])))
 """
     environ = {MARK: str(tmp_path), "HOME": str(tmp_path), "RAY_AUTH_TOKEN": ""}
     assert run_python("-c", script, str(tmp_path), **environ) == "[]\n"
-    wait_until(lambda: not ray_processes(f"{MARK}={tmp_path}"), seconds=10)
+    wait_until(lambda: not marked(tmp_path), seconds=10)
 
 
 @pytest.mark.thorough
@@ -113,7 +122,7 @@ except GLError as error:
     said = run_python("-c", script, str(tmp_path), **{MARK: str(tmp_path)})
     assert said.count("Ray finds none on this machine. They draw in software.") == 1
     assert "refused: Workers are to get GPUs" in said
-    wait_until(lambda: not ray_processes(f"{MARK}={tmp_path}"), seconds=10)
+    wait_until(lambda: not marked(tmp_path), seconds=10)
 
 
 HOLDING = f"""{BEGIN}
@@ -140,7 +149,7 @@ def test_a_driver_that_is_ended(tmp_path, signum, status):
         wait_until(lambda: lines(tmp_path / "begun"), seconds=60)
         driver.send_signal(signum)
     assert driver.returncode == status
-    wait_until(lambda: not ray_processes(f"{MARK}={tmp_path}"), seconds=30)
+    wait_until(lambda: not marked(tmp_path), seconds=30)
     assert lines(tmp_path / "left") == lines(tmp_path / "begun")
 
 

@@ -15,7 +15,9 @@ from pathlib import Path
 
 import pytest
 from engine_runs import (
+    MARK,
     lines,
+    marked,
     odd_work,
     outcomes,
     submit,
@@ -23,8 +25,6 @@ from engine_runs import (
     wait_for,
     wait_for_end,
 )
-from evaluated_files import recorded_in
-from marked_processes import MARK, marked
 from waiting import wait_until
 
 import mjrec
@@ -32,8 +32,6 @@ from mjrec.engines.jobs import WORK_FOLDER, Run
 from mjrec.engines.slurm import DEFAULT_WORKERS, SlurmEngine, slurm_options
 from mjrec.errors import Error, InvalidArgument, MissingDependency
 from mjrec.machine import usable_cpus
-from test_evaluating import contents
-from test_evaluating import run as run_small
 
 pytest.importorskip("submitit")
 
@@ -272,17 +270,6 @@ assert handler in [reference() for reference in logging._handlerList]
 assert "SUBMITIT_LOG_LEVEL" not in os.environ
 """
     subprocess.run([sys.executable, "-W", "error", "-c", script], check=True)
-
-
-# Takes more than five seconds: the same evaluation here and through submitit.
-def test_an_evaluation_in_slurm_jobs_is_that_of_this_machine(tmp_path):
-    """Results, trajectories and videos, however their jobs were handed out."""
-    there = run_small(tmp_path / "there", keep="best", engine=engine(2), workers=None)
-    here = run_small(tmp_path / "here", keep="best")
-    assert contents(there.directory) == contents(here.directory)
-    assert recorded_in(there) == recorded_in(here)
-    assert len(recorded_in(there)) == 4 + 1
-    assert not (tmp_path / "there" / WORK_FOLDER).exists()
 
 
 def test_it_does_jobs_only():
