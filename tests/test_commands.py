@@ -144,7 +144,10 @@ def test_keep_names_only_what_was_chosen(mjrec, tmp_path):
         number == worst for number in range(3)
     ]
     _, out, _ = mjrec(*run, "--out", tmp_path / "b", "--json")
-    pending = [episode["pending"] for episode in json.loads(out)["episodes"]]
+    said = json.loads(out)
+    assert (said["seed"], said["interrupted"]) == (0, False)
+    assert [episode["length"] for episode in said["episodes"]] == [3] * 3
+    pending = [episode["pending"] for episode in said["episodes"]]
     assert pending == [number == worst for number in range(3)]
 
 
@@ -162,18 +165,6 @@ def test_policies(mjrec, tmp_path, monkeypatch, policy):
     assert results_of(tmp_path / "out")["episode_rewards"] == [
         pytest.approx(0.0, abs=0.5)
     ]
-
-
-@pytest.mark.thorough
-def test_json_is_the_only_output(mjrec, tmp_path):
-    """One object with what a script wants to know."""
-    _, out, _ = mjrec(*CHEETAH, "--out", tmp_path, "--seed", 5, "--json")
-    summary = json.loads(out)
-    assert summary["seed"] == 5
-    assert summary["interrupted"] is False
-    [episode] = summary["episodes"]
-    assert episode["length"] == 3
-    assert (tmp_path / episode["video"]).exists()
 
 
 @pytest.mark.parametrize(
@@ -286,38 +277,25 @@ def test_wrong_usage_is_status_2(mjrec):
 
 
 @pytest.mark.thorough
-@pytest.mark.parametrize("env", ["HalfCheetah-v5", "model.xml"])
-def test_cameras_given_more_than_once_are_a_video_each(mjrec, tmp_path, env):
-    """All are listed, whether the environment or the monitor shows the first."""
+def test_cameras_are_a_video_each_or_one_side_by_side(mjrec, tmp_path):
+    """All are listed; captions and second names are asked for likewise."""
     (tmp_path / "model.xml").write_text(PENDULUM)
-    name = str(tmp_path / env) if env.endswith(".xml") else env
-    first = "front" if env.endswith(".xml") else "track"
-    status, out, _ = mjrec(
-        *("record", name, "--out", tmp_path / "out", "--max-steps", 2),
-        *("--size", "64x48", "--camera", first, "--camera", -1),
-    )
+    run = ("record", tmp_path / "model.xml", "--max-steps", 2, "--size", "64x48")
+    run = (*run, "--camera", "front", "--camera", -1)
+    status, out, _ = mjrec(*run, "--out", tmp_path / "a")
     assert status == 0
-    videos = sorted(path.name for path in (tmp_path / "out").glob("*.mp4"))
+    videos = sorted(path.name for path in (tmp_path / "a").glob("*.mp4"))
     assert len(videos) == 2
     assert "2 videos:" in out
     assert all(video in out for video in videos)
-    assert metadata_of(tmp_path / "out", 0)["camera"] == first
-
-
-@pytest.mark.thorough
-def test_cameras_side_by_side_with_captions_and_a_second_name(mjrec, tmp_path):
-    """One video, twice as wide, that says what it is."""
-    status, _, _ = mjrec(
-        *(*CHEETAH, "--out", tmp_path, "--camera", "track", "--camera", -1),
-        *("--tiled", "--annotate", "--name-prefix", "rl-video"),
-    )
-    assert status == 0
-    [frame, *_] = frames_in(tmp_path, 0)
+    assert metadata_of(tmp_path / "a", 0)["camera"] == "front"
+    more = ("--tiled", "--annotate", "--name-prefix", "rl-video")
+    assert mjrec(*run, "--out", tmp_path / "b", *more)[0] == 0
+    [frame, *_] = frames_in(tmp_path / "b", 0)
     assert frame.shape == (48, 128, 3)
-    about = metadata_of(tmp_path, 0)
-    assert about["tiled"]
-    assert about["annotated"]
-    assert (tmp_path / "rl-video-episode-0.mp4").exists()
+    about = metadata_of(tmp_path / "b", 0)
+    assert (about["tiled"], about["annotated"]) == (True, True)
+    assert (tmp_path / "b" / "rl-video-episode-0.mp4").exists()
 
 
 @pytest.mark.thorough
@@ -430,10 +408,6 @@ def test_list_says_that_there_is_nothing(mjrec, tmp_path):
     status, out, _ = mjrec("list", tmp_path)
     assert (status, out) == (0, f"No episode is recorded in {tmp_path}.\n")
     assert mjrec("list", tmp_path, "--json")[:2] == (0, "")
-
-
-def test_list_of_nothing_is_an_error(mjrec, tmp_path):
-    """The directory is named."""
     status, _, err = mjrec("list", tmp_path / "nothing")
     assert status == 1
     assert "nothing" in err

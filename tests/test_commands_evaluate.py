@@ -179,15 +179,3 @@ def test_ctrl_c_says_how_to_go_on(run, monkeypatch):
     status, _, err = run(TASK, "--policy", "zero")
     assert status == 130
     assert "mjrec evaluate --resume e goes on" in err
-
-
-def test_it_goes_on_with_resume(run, tmp_path):
-    """Without it the directory is refused."""
-    arguments = [TASK, "--policy", "zero", "--keep", "none"]
-    assert run(*arguments)[0] == 0
-    before = (tmp_path / "e" / "results.csv").read_bytes()
-    status, _, err = run(*arguments)
-    assert status == 1
-    assert "--resume" in err
-    assert run(*arguments, "--resume")[0] == 0
-    assert (tmp_path / "e" / "results.csv").read_bytes() == before

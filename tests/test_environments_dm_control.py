@@ -1,12 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """dm_control's environments by their names."""
 
-import os
-import subprocess
-import sys
-
 import numpy as np
 import pytest
+from engine_runs import run_python
 
 import mjrec
 from mjrec.environments.episode_seeds import episode_seeds
@@ -122,45 +119,44 @@ def test_a_camera_that_is_asked_for_is_checked():
     assert named.view == {}
 
 
-def error_with_dm_control(package, suite):
-    """Return what is said of a task where `dm_control.suite` is `suite`."""
-    (package / "dm_control").mkdir(parents=True)
-    (package / "dm_control" / "__init__.py").touch()
-    (package / "dm_control" / "suite.py").write_text(suite)
-    code = (
+FLEX = "'MjModel' object has no attribute 'flex_vertedge'"
+
+
+@pytest.mark.parametrize(
+    ("suite", "fix", "cause"),
+    [
+        (
+            "raise ModuleNotFoundError('No module', name='dm_control')",
+            *('pip install "mjrec[dm-control]"', "needs dm_control"),
+        ),
+        # What dm_control 1.0.50 does with mujoco 4.0.
+        (f'raise AttributeError("{FLEX}")', 'pip install "mujoco<4"', FLEX),
+    ],
+)
+def test_without_a_dm_control_that_works_the_line_to_run_is_named(
+    tmp_path, suite, fix, cause
+):
+    """Whether it is not there, or does not know this mujoco."""
+    (tmp_path / "dm_control").mkdir()
+    (tmp_path / "dm_control" / "__init__.py").touch()
+    (tmp_path / "dm_control" / "suite.py").write_text(suite)
+    said = run_python(
+        "-c",
         "import mjrec.environments.from_name as f\n"
         "try: f.environment_from_name('dm_control/cheetah-run')\n"
-        "except Exception as error: print(type(error).__name__, error)\n"
+        "except Exception as error: print(type(error).__name__, error)\n",
+        PYTHONPATH=str(tmp_path),
     )
-    env = {**os.environ, "PYTHONPATH": str(package)}
-    run = subprocess.run(
-        [sys.executable, "-c", code],
-        env=env,
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    return run.stdout
-
-
-def test_without_dm_control_the_line_to_run_is_named(tmp_path):
-    """`mjrec[dm-control]`, which holds the right mujoco too."""
-    suite = "raise ModuleNotFoundError('No module', name='dm_control')"
-    said = error_with_dm_control(tmp_path, suite)
-    assert said.startswith("MissingDependency dm_control/cheetah-run needs dm_control")
-    assert 'pip install "mjrec[dm-control]"' in said
-
-
-def test_a_mujoco_that_dm_control_does_not_know_names_the_fix(tmp_path, monkeypatch):
-    """What dm_control 1.0.50 does with mujoco 4.0, imported or loading a task."""
-    what = "'MjModel' object has no attribute 'flex_vertedge'"
-    said = error_with_dm_control(tmp_path, f'raise AttributeError("{what}")')
     assert said.startswith("MissingDependency dm_control/cheetah-run")
-    assert 'pip install "mujoco<4"' in said
-    assert "flex_vertedge" in said
+    assert fix in said
+    assert cause in said
+
+
+def test_a_mujoco_that_a_task_does_not_know_names_the_fix(monkeypatch):
+    """Though the package can be imported."""
 
     def load(*_, **__):
-        raise AttributeError(what)
+        raise AttributeError(FLEX)
 
     monkeypatch.setattr(suite, "load", load)
     with pytest.raises(mjrec.MissingDependency, match=r'pip install "mujoco<4"'):

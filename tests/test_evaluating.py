@@ -741,21 +741,3 @@ def test_chunks_follow_from_the_plan(seeds, episodes, protocol, names):
     assert grown[: len(chunks)] == chunks
     assert sorted(unit for chunk in grown for unit in chunk) == sorted(more)
     assert len({chunk.folder for chunk in grown}) == len(grown)
-
-
-@pytest.mark.thorough
-def test_the_process_that_hands_out_loads_no_simulator(tmp_path):
-    """It needs no OpenGL, and a policy's memory is the workers'."""
-    code = (
-        "import sys; from pathlib import Path; import test_evaluating\n"
-        "test_evaluating.run(Path(sys.argv[1]))\n"
-        "print([m for m in ('mujoco', 'OpenGL', 'dm_control') if m in sys.modules])"
-    )
-    said = subprocess.run(
-        [sys.executable, "-c", code, str(tmp_path / "e")],
-        env={**os.environ, "PYTHONPATH": str(Path(__file__).parent)},
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    assert said.stdout.strip() == "[]"

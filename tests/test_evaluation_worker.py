@@ -127,22 +127,6 @@ def test_what_is_done_is_not_repeated(tmp_path, names):
     assert names(folder) == before
 
 
-@pytest.mark.dm_control
-def test_by_the_suites_protocol_there_is_one_random_stream(tmp_path):
-    """A task of the suite, evaluated as its users do; seed after seed."""
-    pytest.importorskip("dm_control")
-    from dm_control import suite
-
-    plan = plan_of("dm_control/pendulum-swingup", seeds=(3, 4), protocol="suite")
-    results = run_chunk(tmp_path, plan)
-    for seed in plan.seeds:
-        theirs = suite.load("pendulum", "swingup", task_kwargs={"random": seed})
-        for episode in range(3):
-            theirs.reset()
-            state = states_of(tmp_path / "task" / "chunk", results[seed, episode])[0]
-            assert state[1] == theirs.physics.data.qpos[0]
-
-
 class Stumbling:
     """Pushes gently; does something else in the third step of some episodes."""
 
@@ -172,7 +156,6 @@ def leaving():
     raise SystemExit(3)
 
 
-@pytest.mark.parametrize("protocol", ["seeded", "suite"])
 @pytest.mark.parametrize(
     ("wrong", "failure"),
     [
@@ -182,9 +165,9 @@ def leaving():
         (lambda: np.zeros(7), "action of Box"),
     ],
 )
-def test_a_policy_that_fails_loses_its_episode_only(tmp_path, wrong, failure, protocol):
+def test_a_policy_that_fails_loses_its_episode_only(tmp_path, wrong, failure):
     """Its reason is one line; its trajectory says that it is not complete."""
-    plan = plan_of(protocol=protocol, keep="none")
+    plan = plan_of(keep="none")
     results = run_chunk(tmp_path, plan, policy=Stumbling({1: wrong}))
     failed = results[0, 1]
     assert failure.lower() in str(failed.failure).lower()

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Film strips show the right pictures with the right times."""
 
+import json
 import subprocess
 import sys
 
@@ -11,6 +12,7 @@ from PIL import Image
 from recordings import frames_of
 
 import mjrec
+from mjrec.commands.strip import strip
 from mjrec.errors import FileNotWritten, InvalidArgument, UnreadableFile
 from mjrec.reporting import film_strips as module
 from mjrec.reporting.film_strips import film_strip, write_film_strip
@@ -206,6 +208,23 @@ def test_a_strip_is_a_whole_png_for_print(video, tmp_path):
     with Image.open(tmp_path / "strip.png") as image:
         assert image.info["dpi"] == pytest.approx((300, 300), abs=0.1)
         np.testing.assert_array_equal(np.asarray(image), strip)
+
+
+def test_the_command_writes_a_picture_and_says_its_size(video, tmp_path, capsys):
+    """In as many columns as asked for; nothing where a video cannot show it."""
+    out = tmp_path / "strip.png"
+    with pytest.raises(InvalidArgument, match="trajectory"):
+        strip(video, size="640x480", out=out)
+    with pytest.raises(InvalidArgument, match="11 pictures"):
+        strip(video, frames=13, out=out)
+    assert not out.exists()
+    assert strip(video, frames=6, columns=2, out=out) == 0
+    with Image.open(out) as image:
+        assert image.width == 2 + 2 * (WIDTH + 2)
+        assert f"{image.width}x{image.height} pixels" in capsys.readouterr().out
+    assert strip(video, frames=1, out=out, as_json=True) == 0
+    said = json.loads(capsys.readouterr().out)
+    assert said == {"strip": str(out), "width": 4 + WIDTH, "height": said["height"]}
 
 
 def test_without_pillow(video):

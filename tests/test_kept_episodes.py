@@ -32,40 +32,38 @@ def chosen(keep, results):
     return [(each.episode, role) for each, role in keep_rule(keep).choose(results)]
 
 
-def test_best_median_and_worst_are_by_return():
-    """In the order of the rule, and within a part by rank."""
-    results = episodes(5, 1, 4, 2, 3)
-    assert chosen("best,median,worst", results) == [
-        *((0, "best"), (4, "median"), (1, "worst"))
-    ]
-    assert chosen("worst:2,best:3", results) == [
-        *((1, "worst"), (3, "worst"), (0, "best"), (2, "best"), (4, "best"))
-    ]
-
-
-def test_of_equal_returns_the_earlier_counts():
-    """Also for the median; one episode may be all three."""
-    assert chosen("best,median,worst", episodes(2, 2, 2)) == [
-        *((0, "best"), (0, "median"), (0, "worst"))
-    ]
-    assert chosen("median", episodes(9, 5, 0, 5, 5)) == [(1, "median")]
-
-
-def test_the_median_of_an_even_number_is_the_lower():
-    """An episode that was played, never a mean of two."""
-    assert chosen("median", episodes(1, 2, 3, 4)) == [(1, "median")]
-
-
-def test_what_is_no_number_is_the_worst():
-    """Below minus infinity."""
-    results = episodes(1, math.nan, -math.inf, math.inf)
-    assert chosen("worst:2,best", results) == [(1, "worst"), (2, "worst"), (3, "best")]
-
-
-def test_what_failed_has_no_return():
-    """It is neither best nor worst, and no episode is left over for the median."""
-    assert chosen("best:9,median,worst", episodes(None, None)) == []
-    assert chosen("worst", episodes(None, 3, 2)) == [(2, "worst")]
+@pytest.mark.parametrize(
+    ("returns", "keep", "expected"),
+    [
+        # In the order of the rule, and within a part by rank.
+        ([5, 1, 4, 2, 3], "best,median,worst", "0 best, 4 median, 1 worst"),
+        (
+            *([5, 1, 4, 2, 3], "worst:2,best:3"),
+            "1 worst, 3 worst, 0 best, 2 best, 4 best",
+        ),
+        # Of equal returns the earlier counts; one episode may be all three.
+        ([2, 2, 2], "best,median,worst", "0 best, 0 median, 0 worst"),
+        ([9, 5, 0, 5, 5], "median", "1 median"),
+        # An episode that was played, never a mean of two: the lower.
+        ([1, 2, 3, 4], "median", "1 median"),
+        # What is no number is below minus infinity.
+        (
+            *([1, math.nan, -math.inf, math.inf], "worst:2,best"),
+            "1 worst, 2 worst, 3 best",
+        ),
+        # What failed is neither best nor worst.
+        ([None, None], "best:9,median,worst", ""),
+        ([None, 3, 2], "worst", "2 worst"),
+        # Over all runs of a task; failed ones count, so that others keep numbers.
+        ([None] + [0.0] * 29, "cubic", "0 cubic, 1 cubic, 8 cubic, 27 cubic"),
+        ([1, 2, None], "all", "0 all, 1 all, 2 all"),
+        ([1, 2], "none", ""),
+    ],
+)
+def test_episodes_are_chosen_by_return(returns, keep, expected):
+    """By what each part of a rule says."""
+    found = chosen(keep, episodes(*returns))
+    assert ", ".join(f"{number} {role}" for number, role in found) == expected
 
 
 def test_failures_are_what_was_no_success():
@@ -86,19 +84,10 @@ def test_what_was_never_begun_cannot_be_shown(keep):
     assert chosen(keep, [result]) == []
 
 
-def test_cubic_counts_over_all_runs_of_a_task():
-    """Failed episodes count too, so that the others keep their numbers."""
-    assert [number for number, _ in chosen("cubic", episodes(*[0.0] * 30))] == [
-        *(0, 1, 8, 27)
-    ]
-
-
-def test_all_and_none_are_what_they_say():
-    """Each episode that has not failed, or none."""
-    assert len(chosen("all", episodes(1, 2, None))) == 3
-    assert chosen("none", episodes(1, 2)) == []
-    assert keep_rule("none").keeps_none
+def test_a_rule_has_a_name():
+    """Without what is only spelling."""
     assert keep_rule("best, worst").name == "best,worst"
+    assert keep_rule("none").keeps_none
 
 
 @pytest.mark.parametrize("keep", ["bset", "", "best:0", "best:x", "median:2", "best,"])

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Of the local engine, what `test_engines` does not try on every one."""
 
-import json
 import os
 import signal
 import subprocess
@@ -242,13 +241,3 @@ def test_children_end_with_their_driver(tmp_path, how):
         check=False,
     )
     wait_for_end(int((tmp_path / "begun").read_text()))
-
-
-def test_import_is_inert():
-    """Neither driver nor child loads a simulator, NumPy, or another engine."""
-    heavy = ["mujoco", "numpy", "h5py", "ray", "submitit"]
-    script = (
-        "import json, sys, mjrec.engines.jobs, mjrec.engines.child; "
-        f"print(json.dumps([m for m in {heavy} if m in sys.modules]))"
-    )
-    assert json.loads(run_python("-c", script)) == []

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The page of a report in a real browser: headless Chromium, driven by Playwright."""
 
+import contextlib
 import re
 import shutil
 from dataclasses import replace
@@ -42,8 +43,16 @@ def browser():
 
 @pytest.fixture
 def page(browser):
-    """Open a page that must neither complain nor ask for anything but files."""
-    with browser.new_context(viewport={"width": 1280, "height": 900}) as context:
+    """A page of a usual size."""
+    with page_of_width(browser, 1280) as page:
+        yield page
+
+
+@contextlib.contextmanager
+def page_of_width(browser, width, **options):
+    """Have a page that must neither complain nor ask for anything but files."""
+    size = {"width": width, "height": 900}
+    with browser.new_context(viewport=size, **options) as context:
         yield from watched(context.new_page())
 
 
@@ -263,21 +272,19 @@ def test_of_ten_thousand_episodes_a_hundred_are_laid_out(page, tmp_path):
 @pytest.mark.parametrize("report", [usual_report, hostile_report])
 def test_nothing_keeps_people_out(browser, videos, width, scheme, report):
     """axe-core finds nothing serious, and a phone scrolls in one direction only."""
-    size = {"width": width, "height": 800}
-    with browser.new_context(viewport=size, color_scheme=scheme) as context:
-        for page in watched(context.new_page()):
-            open_report(page, videos, report())
-            page.evaluate(
-                "document.querySelectorAll('details').forEach(d => d.open = true)"
-            )
-            assert page.evaluate("document.scrollingElement.scrollWidth") <= width
-            found = Axe().run(page).response["violations"]
-            bad = [
-                (v["id"], v["impact"], [node["html"][:200] for node in v["nodes"]][:3])
-                for v in found
-                if v["impact"] in ("serious", "critical")
-            ]
-            assert bad == []
+    with page_of_width(browser, width, color_scheme=scheme) as page:
+        open_report(page, videos, report())
+        page.evaluate(
+            "document.querySelectorAll('details').forEach(d => d.open = true)"
+        )
+        assert page.evaluate("document.scrollingElement.scrollWidth") <= width
+        found = Axe().run(page).response["violations"]
+        bad = [
+            (v["id"], v["impact"], [node["html"][:200] for node in v["nodes"]][:3])
+            for v in found
+            if v["impact"] in ("serious", "critical")
+        ]
+        assert bad == []
 
 
 @pytest.mark.thorough
@@ -285,15 +292,13 @@ def test_a_phone_shows_which_episodes_failed(browser, tmp_path):
     """And why, beside the task's name, without scrolling to the right."""
     reason = "PolicyError: " + "it gave an action of the wrong shape " * 4
     named = task("gymnasium/HalfCheetah-v5", [1.0] * 5, failures={0: reason})
-    size = {"width": 360, "height": 800}
-    with browser.new_context(viewport=size) as context:
-        for page in watched(context.new_page()):
-            open_report(page, tmp_path, contents(named))
-            outcome = page.locator("#episodes-table tbody tr").first.locator(".bad")
-            expect(outcome).to_have_text(f"failed: {reason.strip()}")
-            box = outcome.bounding_box()
-            assert box is not None
-            assert box["x"] + box["width"] <= 360
+    with page_of_width(browser, 360) as page:
+        open_report(page, tmp_path, contents(named))
+        outcome = page.locator("#episodes-table tbody tr").first.locator(".bad")
+        expect(outcome).to_have_text(f"failed: {reason.strip()}")
+        box = outcome.bounding_box()
+        assert box is not None
+        assert box["x"] + box["width"] <= 360
 
 
 @pytest.mark.thorough
@@ -303,17 +308,16 @@ def test_paper_has_the_whole_summary_pictures_and_no_buttons(browser, videos):
     made = usual_report()
     for each in made.tasks:
         each.summary = replace(each.summary, **known)
-    with browser.new_context(viewport={"width": 718, "height": 900}) as context:
-        for page in watched(context.new_page()):
-            page.emulate_media(media="print")
-            open_report(page, videos, made)
-            assert page.evaluate("document.scrollingElement.scrollWidth") <= 718
-            expect(page.locator("#gallery-filter")).to_be_hidden()
-            expect(page.locator("nav")).to_be_hidden()
-            picture = page.locator(".play").first
-            expect(picture).to_be_visible()
-            signs = "['::before', '::after'].map(p => getComputedStyle(e, p).display)"
-            assert picture.evaluate(f"e => {signs}") == ["none", "none"]
+    with page_of_width(browser, 718) as page:
+        page.emulate_media(media="print")
+        open_report(page, videos, made)
+        assert page.evaluate("document.scrollingElement.scrollWidth") <= 718
+        expect(page.locator("#gallery-filter")).to_be_hidden()
+        expect(page.locator("nav")).to_be_hidden()
+        picture = page.locator(".play").first
+        expect(picture).to_be_visible()
+        signs = "['::before', '::after'].map(p => getComputedStyle(e, p).display)"
+        assert picture.evaluate(f"e => {signs}") == ["none", "none"]
 
 
 def test_what_a_stranger_wrote_stays_text(page, videos):

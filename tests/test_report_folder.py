@@ -4,6 +4,7 @@
 import base64
 import hashlib
 import io
+import json
 import re
 import shutil
 
@@ -12,6 +13,7 @@ import pytest
 from PIL import Image
 
 import mjrec
+from mjrec.commands.report import report
 from mjrec.errors import DirectoryNotWritable, InvalidArgument
 from mjrec.reporting.gathering import gather
 from mjrec.reporting.media import ReportProgress, posters_of
@@ -64,6 +66,29 @@ def test_a_report_is_a_page_with_copies_beside_it(recordings, tmp_path):
     text = page.read_text()
     for words in (*names(page.parent)[1:], *hashes, "<title>Mine</title>"):
         assert words in text
+
+
+def test_the_command_writes_a_folder_and_prints_its_page(tmp_path, capsys, monkeypatch):
+    """Of several directories, with a verdict; with --json its whole path."""
+    monkeypatch.chdir(tmp_path)
+    run = write_journal(tmp_path / "run", "0.a", "X-v0", [entry(0)]).parent
+    said = {"path": "run", "level": "stats", "verdict": "FAIL", "findings": []}
+    (tmp_path / "said.json").write_text(json.dumps(said))
+    page = tmp_path / "r" / "index.html"
+    directories = (run, GYM / "0.7.4" / "plain")
+    options = {"title": "Both", "verification": (tmp_path / "said.json",)}
+    assert report(directories, out=page.parent, **options) == 0
+    assert capsys.readouterr().out == f"{page}\n"
+    text = page.read_text()
+    for words in ("<title>Both</title>", "X-v0", "Tiny-v0", "said.json"):
+        assert words in text
+    assert report((run,), as_json=True) == 0
+    said = json.loads(capsys.readouterr().out)
+    assert said == {"page": str(tmp_path / "report" / "index.html")}
+    one = {"out": tmp_path / "one.html", "single_file": True}
+    assert report((run,), **one) == 0
+    with pytest.raises(InvalidArgument, match="max_single_file_bytes"):
+        report((run,), **one, max_single_file_bytes=10)
 
 
 def test_posters_show_the_middle(recordings):

@@ -2,8 +2,6 @@
 
 import numpy as np
 import pytest
-from hypothesis import strategies as st
-from hypothesis.extra import numpy as npst
 
 from mjrec import InvalidArgument
 from mjrec.evaluation import statistics
@@ -42,9 +40,6 @@ Y = [
     np.array([0.5, 0.31, 0.46, 0.72, 0.51, 0.5, 0.21, 0.51, 0.31, 0.23]),
     np.array([0.74, 0.59, 0.47, 0.19, 0.72, 0.71, 0.14, 0.67, 0.66, 0.49]),
 ]
-
-# Few different ones, so that many are equal.
-SAMPLE = npst.arrays(np.float64, st.integers(1, 12), elements=st.integers(-4, 4))
 
 
 def array(*values):
@@ -113,13 +108,6 @@ def test_scores_at_a_threshold_and_above_one():
     profile = performance_profile([array(0.0, 0.5, 1.0, 1.0)], array(0, 0.5, 1))
     assert profile.values.tolist() == [0.75, 0.5, 0]
     assert optimality_gap([array(0, 1, 3)]).value == pytest.approx(1 / 3)
-
-
-def test_probability_of_improvement_by_hand():
-    """Ages of five men and four women with diabetes, of scipy's manual: U is 17."""
-    men, women = array(19, 22, 16, 29, 24), array(20, 11, 17, 12)
-    assert improvement(men, women).value == 17 / 20
-    assert improvement(men, men).value == 0.5
 
 
 @pytest.mark.parametrize(
