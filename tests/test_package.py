@@ -88,7 +88,7 @@ def test_wheel_alone_records_renders_evaluates_and_reports(tmp_path: Path) -> No
     run("-m", "mjrec", "record", "InvertedPendulum-v5", "--out", "a", *small)
     run("-m", "mjrec", "render", "a", "--episode", "0", "--size", "48x48")
     assert len(list((tmp_path / "a").glob("*.mp4"))) == 2
-    few = ("--episodes", "2", "--num-seeds", "1", "--workers", "1", *small)
+    few = ("--policy", "random", "--episodes", "2", "--num-seeds", "1", *small)
     run("-m", "mjrec", "evaluate", "InvertedPendulum-v5", "--out", "b", *few)
     run("-m", "mjrec", "report", "a", "b", "-o", "page")
     assert (tmp_path / "page" / "index.html").is_file()
