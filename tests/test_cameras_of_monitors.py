@@ -1,13 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Several cameras, captions and second names, through `mjrec.Monitor`."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys
-from pathlib import Path
-from typing import Any
 
 import gymnasium
 import numpy as np
@@ -23,11 +19,8 @@ WAYS = ["deferred", pytest.param("live", marks=pytest.mark.dm_control)]
 CAMERAS = {"deferred": ["track", -1], "live": ["side", "back"]}
 
 
-def record(
-    directory: Path, steps: int = 3, render: str = "deferred", **options: Any
-) -> dict[str, str]:
+def record(directory, steps=3, render="deferred", **options):
     """Record an episode; return the frame hashes of each video, by its name's end."""
-    made: Any
     if render == "live":
         from dm_control import suite
 
@@ -45,17 +38,17 @@ def record(
     }
 
 
-def _hashes(path: Path) -> str:
+def _hashes(path):
     lines = path.read_text().splitlines()
     return "\n".join(line for line in lines if not line.startswith("#"))
 
 
 # Takes more than five seconds: several monitors with workers of their own.
 @pytest.mark.parametrize("render", WAYS)
-def test_several_cameras(tmp_path: Path, render: str) -> None:
+def test_several_cameras(tmp_path, render):
     """Each has the video that it would have alone; side by side they are one."""
     first, second = CAMERAS[render]
-    several: dict[str, Any] = {"camera": [first, second], "render": render}
+    several = {"camera": [first, second], "render": render}
     both = record(tmp_path / "both", **several)
     assert both.keys() == {"", f".{second}"}
     assert both[""] != both[f".{second}"]
@@ -80,10 +73,10 @@ def test_several_cameras(tmp_path: Path, render: str) -> None:
 
 
 @pytest.mark.thorough
-def test_live_and_deferred_captions_are_the_same(tmp_path: Path) -> None:
+def test_live_and_deferred_captions_are_the_same(tmp_path):
     """They say the same of each frame, in the same letters."""
 
-    def hashes(name: str, **options: Any) -> str:
+    def hashes(name, **options):
         made = gymnasium.make(
             "HalfCheetah-v5", max_episode_steps=3, render_mode="rgb_array", **SIZE
         )
@@ -114,9 +107,7 @@ except mjrec.MissingDependency as error:
 """
 
 
-def test_captions_without_pillow_are_an_error_of_the_constructor(
-    tmp_path: Path,
-) -> None:
+def test_captions_without_pillow_are_an_error_of_the_constructor(tmp_path):
     """It says how to install it, and nothing is left."""
     done = subprocess.run(
         [sys.executable, "-c", WITHOUT_PILLOW, str(tmp_path / "run")],

@@ -1,13 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-from __future__ import annotations
-
 import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
 from gymnasium.vector import AsyncVectorEnv
@@ -46,10 +42,10 @@ _PROGRAM = """if True:
 """
 
 
-def monitored_hopper(directory: Path) -> Callable[[], Any]:
+def monitored_hopper(directory):
     """Return what makes a monitored environment, in whichever process."""
 
-    def make() -> Any:
+    def make():
         # In here, because a spawned process has imported nothing.
         import gymnasium
 
@@ -65,7 +61,7 @@ def monitored_hopper(directory: Path) -> Callable[[], Any]:
     ("context", "mode"),
     [("spawn", NEXT_STEP), ("forkserver", SAME_STEP), ("fork", DISABLED)],
 )
-def test_each_worker_records_its_own(tmp_path: Path, context: str, mode: Any) -> None:
+def test_each_worker_records_its_own(tmp_path, context, mode):
     """Videos are rendered from states, whole, also in daemonic processes."""
     make = monitored_hopper(tmp_path)
     env = AsyncVectorEnv([make, make], context=context, autoreset_mode=mode)
@@ -85,9 +81,7 @@ def test_each_worker_records_its_own(tmp_path: Path, context: str, mode: Any) ->
 @pytest.mark.parametrize(
     ("context", "ending"), [("fork", "kill"), ("spawn", "kill"), ("fork", "raise")]
 )
-def test_a_parent_that_is_gone_leaves_nothing_hanging(
-    tmp_path: Path, context: str, ending: str
-) -> None:
+def test_a_parent_that_is_gone_leaves_nothing_hanging(tmp_path, context, ending):
     """The workers end by themselves, and each video is there or pending."""
     target = tmp_path / "run"
     program = tmp_path / "train.py"
@@ -111,14 +105,14 @@ def test_a_parent_that_is_gone_leaves_nothing_hanging(
         assert f"{worker}.video000000.mp4" in content
 
 
-def _wait_for_end(pids: list[int]) -> None:
+def _wait_for_end(pids):
     deadline = time.monotonic() + _PATIENCE
     while left := [pid for pid in pids if _runs(pid)]:
         assert time.monotonic() < deadline, f"{left} go on"
         time.sleep(0.1)
 
 
-def _runs(pid: int) -> bool:
+def _runs(pid):
     try:
         # A zombie that nobody has collected is over too.
         return ") Z " not in Path(f"/proc/{pid}/stat").read_text()

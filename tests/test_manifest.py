@@ -1,11 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Manifest and statistics file are gym's, and safe to read from anybody."""
 
-from __future__ import annotations
-
 import json
 import math
-from pathlib import Path
 
 import pytest
 
@@ -40,11 +37,11 @@ STATS_TEXT = (
 
 
 @pytest.fixture
-def path(tmp_path: Path) -> Path:
+def path(tmp_path):
     return tmp_path / "openaigym.some.0.1.json"
 
 
-def test_keys_of_a_manifest_are_in_gyms_order_with_ours_last(path: Path) -> None:
+def test_keys_of_a_manifest_are_in_gyms_order_with_ours_last(path):
     """What is read is what was written; nothing stands for a missing key of ours."""
     write_manifest(path, MANIFEST)
     assert read_manifest(path) == MANIFEST
@@ -56,7 +53,7 @@ def test_keys_of_a_manifest_are_in_gyms_order_with_ours_last(path: Path) -> None
     assert read_manifest(path).mjrec is None
 
 
-def test_the_text_of_statistics_is_what_gym_wrote(path: Path) -> None:
+def test_the_text_of_statistics_is_what_gym_wrote(path):
     """Same keys, order and spacing; gyms before 0.4.7 wrote no types."""
     write_stats_file(path, STATS)
     assert path.read_text() == STATS_TEXT
@@ -71,7 +68,7 @@ def test_the_text_of_statistics_is_what_gym_wrote(path: Path) -> None:
     assert read_stats_file(path) == untyped
 
 
-def test_nan_and_infinity_come_back(path: Path) -> None:
+def test_nan_and_infinity_come_back(path):
     """From a file that is JSON, and from gym's own tokens."""
     rewards = (math.nan, math.inf, -math.inf)
     write_stats_file(path, StatsFile(None, (1.0, 2.0, 3.0), (1, 1, 1), rewards, None))
@@ -93,7 +90,7 @@ def test_nan_and_infinity_come_back(path: Path) -> None:
         ('{"stats": "s", "videos": [], "env_info": {}, "mjrec": 1}', "'mjrec'"),
     ],
 )
-def test_damage_of_a_manifest_is_named(path: Path, content: str, reason: str) -> None:
+def test_damage_of_a_manifest_is_named(path, content, reason):
     """Each kind is one clear error."""
     path.write_text(content)
     with pytest.raises(UnreadableFile, match=reason) as caught:
@@ -112,9 +109,7 @@ def test_damage_of_a_manifest_is_named(path: Path, content: str, reason: str) ->
         ("1.5", "9" * 400, "larger than a float"),
     ],
 )
-def test_damage_of_statistics_is_named(
-    path: Path, right: str, wrong: str, reason: str
-) -> None:
+def test_damage_of_statistics_is_named(path, right, wrong, reason):
     """Each kind is one clear error."""
     with pytest.raises(UnreadableFile, match=f"{path.name}: No such file"):
         read_stats_file(path)

@@ -1,12 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Statistics and manifest follow from the journal, whoever computes them."""
 
-from __future__ import annotations
-
 import json
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
 
 import gymnasium
 import pytest
@@ -16,7 +11,7 @@ import mjrec
 from mjrec.formats.monitor_directory import Infix
 from mjrec.results.manifest_writing import write_manifest_and_stats
 
-OPTIONS: dict[str, dict[str, Any]] = {
+OPTIONS = {
     "deferred": {"video_callable": lambda episode: episode % 2 == 0},
     "not waited for": {"video_callable": lambda episode: True, "workers": 0},
     "live": {"video_callable": lambda episode: episode < 2, "render": "live"},
@@ -26,7 +21,7 @@ OPTIONS: dict[str, dict[str, Any]] = {
 }
 
 
-def record(directory: Path, options: dict[str, Any]) -> None:
+def record(directory, options):
     """Record three episodes, of which the last is closed early."""
     env = gymnasium.make(
         "InvertedPendulum-v5", render_mode="rgb_array", width=32, height=32
@@ -44,9 +39,7 @@ def record(directory: Path, options: dict[str, Any]) -> None:
 
 
 @pytest.mark.parametrize("options", OPTIONS.values(), ids=OPTIONS)
-def test_another_process_computes_the_same(
-    options: dict[str, Any], tmp_path: Path
-) -> None:
+def test_another_process_computes_the_same(options, tmp_path):
     """Nothing is new for it; and made from nothing, both files are the same again."""
     record(tmp_path, options)
     manifest, stats = manifest_of(tmp_path), stats_of(tmp_path)
@@ -67,9 +60,7 @@ def test_another_process_computes_the_same(
     assert anew == stats
 
 
-def test_an_episode_that_was_cut_is_in_the_journal(
-    tmp_path: Path, make_corridor: Callable[..., Any]
-) -> None:
+def test_an_episode_that_was_cut_is_in_the_journal(tmp_path, make_corridor):
     """With its reason, and whether it was chosen; it is no part of the statistics."""
     env = mjrec.Monitor(make_corridor(), tmp_path, allow_early_reset=True)
     env.reset()
@@ -93,7 +84,7 @@ def test_an_episode_that_was_cut_is_in_the_journal(
     assert stats_of(tmp_path)["timestamps"] == []
 
 
-def test_a_reason_goes_with_the_video_that_comes(tmp_path: Path) -> None:
+def test_a_reason_goes_with_the_video_that_comes(tmp_path):
     """It stands in the manifest as long as the video is pending, and no longer."""
     record(tmp_path, OPTIONS["not waited for"])
     [video, *_] = [e["video"] for e in manifest_of(tmp_path)["mjrec"]["pending"]]

@@ -1,13 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """A file system that is full: what was recorded before and after is there."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys
-from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 from recordings import manifest_of, stats_of
@@ -18,7 +14,7 @@ STEPS = 8
 
 
 @pytest.fixture
-def disk(tmp_path: Path) -> Iterator[Path]:
+def disk(tmp_path):
     """A file system of two megabytes."""
     if os.geteuid() != 0:
         pytest.skip("mounting a small file system takes root")
@@ -60,9 +56,7 @@ monitor.close(wait=False)
 
 @pytest.mark.parametrize("ending", ["closed", "killed"])
 @pytest.mark.parametrize("room", [0, 4096, 65536])
-def test_episodes_of_a_full_disk_are_complete(
-    room: int, ending: str, disk: Path
-) -> None:
+def test_episodes_of_a_full_disk_are_complete(room, ending, disk):
     """Whether the monitor closes when there is room again, or never does.
 
     Rows tell what lines could not, and nothing claims what is not so.

@@ -1,21 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-from __future__ import annotations
-
 import gc
 import os
 import subprocess
 import sys
 import tempfile
 from fractions import Fraction
-from pathlib import Path
-from typing import Any
 
 import mujoco
 import mujoco.rollout
 import numpy as np
 import pytest
 from processes import children
-from rides import HEIGHT, WIDTH, Ride, move, record, start
+from rides import HEIGHT, WIDTH, move, record, start
 from trajectories_by_hand import write_log
 
 import mjrec
@@ -23,24 +19,22 @@ from mjrec.errors import InvalidArgument, NoPictures, UnknownName, UnreadableFil
 from mjrec.rendering.recorded_facts import chosen_frames
 
 SPEC = mujoco.mjtState.mjSTATE_FULLPHYSICS
-SIZE: dict[str, Any] = {"height": HEIGHT, "width": WIDTH}
+SIZE = {"height": HEIGHT, "width": WIDTH}
 
 
 @pytest.fixture(scope="module")
-def ride(tmp_path_factory: pytest.TempPathFactory) -> Ride:
+def ride(tmp_path_factory):
     return record(tmp_path_factory.mktemp("ride"))
 
 
 @pytest.fixture
-def temporary(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def temporary(tmp_path, monkeypatch):
     """Where temporary files go."""
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     return tmp_path
 
 
-def states_of(
-    model: mujoco.MjModel, data: mujoco.MjData, count: int
-) -> tuple[np.ndarray, list[np.ndarray]]:
+def states_of(model, data, count):
     """Return states, and what MuJoCo's own renderer shows of them."""
     states = np.empty((count, mujoco.mj_stateSize(model, int(SPEC))))
     shown = []
@@ -56,7 +50,7 @@ def states_of(
 # Recorded episodes
 
 
-def test_a_recording_is_drawn_again(ride: Ride) -> None:
+def test_a_recording_is_drawn_again(ride):
     """From its path or what was loaded of it, as it was seen."""
     before = children()
     assert np.array_equal(list(mjrec.render(str(ride.path))), ride.frames)
@@ -67,7 +61,7 @@ def test_a_recording_is_drawn_again(ride: Ride) -> None:
 
 
 @pytest.mark.thorough
-def test_a_recording_is_drawn_another_way(ride: Ride) -> None:
+def test_a_recording_is_drawn_another_way(ride):
     """Camera, size, quality and rate."""
     camera = mujoco.MjvCamera()
     camera.lookat[:], camera.distance = (1, 0, 0.5), 6
@@ -75,12 +69,7 @@ def test_a_recording_is_drawn_another_way(ride: Ride) -> None:
     pictures = {
         str(given): list(
             mjrec.render(
-                ride.path,
-                camera=given,
-                width=40,
-                height=30,
-                quality="draft",
-                max_fps=4,
+                ride.path, camera=given, width=40, height=30, quality="draft", max_fps=4
             )
         )
         for given in (camera, members, "side")
@@ -94,10 +83,10 @@ def test_a_recording_is_drawn_another_way(ride: Ride) -> None:
 
 
 @pytest.mark.thorough
-def test_a_recording_that_is_left_early(ride: Ride) -> None:
+def test_a_recording_that_is_left_early(ride):
     """Closing, or dropping what was returned, ends the workers."""
     before = children()
-    pictures: Any = mjrec.render(ride.path, workers=2)
+    pictures = mjrec.render(ride.path, workers=2)
     next(pictures)
     pictures.close()
     assert list(pictures) == []
@@ -127,13 +116,7 @@ WRONG = [
     ("arguments", "kind", "message"),
     [*WRONG, ({"max_fps": 0}, InvalidArgument, "positive")],
 )
-def test_arguments_are_checked_by_the_call(
-    ride: Ride,
-    temporary: Path,
-    arguments: dict[str, Any],
-    kind: type[Exception],
-    message: str,
-) -> None:
+def test_arguments_are_checked_by_the_call(ride, temporary, arguments, kind, message):
     """Not by the first frame; nothing is left running, and no file."""
     before = children()
     with pytest.raises(kind, match=message):
@@ -146,14 +129,14 @@ def test_arguments_are_checked_by_the_call(
     assert list(temporary.iterdir()) == []
 
 
-def test_what_is_no_recording(tmp_path: Path) -> None:
+def test_what_is_no_recording(tmp_path):
     """One error each."""
     with pytest.raises(UnreadableFile, match=r"lost\.h5"):
         mjrec.render(tmp_path / "lost.h5")
     with pytest.raises(NoPictures, match="no snapshots"):
         mjrec.render(write_log(tmp_path, frames=False, scene=None))
     with pytest.raises(InvalidArgument, match="trajectory is a path"):
-        mjrec.render(3)  # type: ignore[arg-type]  that is the test
+        mjrec.render(3)
 
 
 @pytest.mark.parametrize(
@@ -169,9 +152,7 @@ def test_what_is_no_recording(tmp_path: Path) -> None:
         (0, 1, []),
     ],
 )
-def test_pictures_are_chosen_by_rate(
-    count: int, max_fps: Any, chosen: list[int]
-) -> None:
+def test_pictures_are_chosen_by_rate(count, max_fps, chosen):
     """Every n-th of those that were recorded, and the last."""
     facts = {"rate": "20", "stride": 2}
     assert chosen_frames(count, facts, max_fps).indices == chosen
@@ -184,7 +165,7 @@ def test_pictures_are_chosen_by_rate(
 # Given states
 
 
-def test_states_are_drawn_as_mujoco_would(temporary: Path) -> None:
+def test_states_are_drawn_as_mujoco_would(temporary):
     """After `mj_forward`, over an infinite plane, by one worker and by three."""
     model, data = start()
     states, shown = states_of(model, data, 7)
@@ -200,7 +181,7 @@ def test_states_are_drawn_as_mujoco_would(temporary: Path) -> None:
 
 
 @pytest.mark.thorough
-def test_states_that_are_left_early_leave_no_files(temporary: Path) -> None:
+def test_states_that_are_left_early_leave_no_files(temporary):
     """Nor do they at interpreter exit."""
     model, _ = start()
     pictures = mjrec.render_states(model, np.zeros((50, 3)), SPEC, **SIZE)

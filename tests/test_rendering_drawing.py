@@ -1,35 +1,30 @@
 # SPDX-License-Identifier: Apache-2.0
-from __future__ import annotations
-
 import contextlib
 import random
-from collections.abc import Iterator, Sequence
-from pathlib import Path
-from typing import Any
 
 import mujoco
 import numpy as np
 import pytest
-from rides import FRAMES, HEIGHT, WIDTH, Ride, move, record, start
-from trajectories_by_hand import INFIX, add_row, new_logs, write_log
+from rides import FRAMES, HEIGHT, WIDTH, move, record, start
+from trajectories_by_hand import INFIX, add_row, new_logs
 
-from mjrec.errors import InvalidArgument, NoPictures, UnreadableFile
+from mjrec.errors import InvalidArgument, UnreadableFile
 from mjrec.formats.monitor_directory import trajectory_prefix
 from mjrec.formats.trajectory import packed, row_dtype
 from mjrec.formats.trajectory_file import finish_trajectory, open_trajectory
 from mjrec.rendering.pool import WorkerPool
 from mjrec.rendering.views import View
-from mjrec.rendering.worker import Drawing, trajectory_drawing
+from mjrec.rendering.worker import trajectory_drawing
 from mjrec.simulation.renderer import Canvas, SceneRenderer
 
 
 @pytest.fixture(scope="module")
-def ride(tmp_path_factory: pytest.TempPathFactory) -> Ride:
+def ride(tmp_path_factory):
     return record(tmp_path_factory.mktemp("ride"))
 
 
 @pytest.fixture
-def drawing(ride: Ride) -> Iterator[Drawing]:
+def drawing(ride):
     drawing = trajectory_drawing(ride.path, View())
     yield drawing
     drawing.close()
@@ -39,9 +34,7 @@ ORDER = [*range(FRAMES), *reversed(range(FRAMES)), 4, 4]
 
 
 @pytest.mark.parametrize("order", [range(FRAMES), ORDER, [0], [4], [FRAMES - 1]])
-def test_frames_are_those_that_were_seen(
-    ride: Ride, drawing: Drawing, order: Sequence[int]
-) -> None:
+def test_frames_are_those_that_were_seen(ride, drawing, order):
     """In any order, byte for byte, over an infinite plane; the model changes back."""
     if order is ORDER:
         random.Random(0).shuffle(ORDER)
@@ -54,7 +47,7 @@ def test_frames_are_those_that_were_seen(
             drawing.draw(number)
 
 
-def test_a_grid_is_what_each_camera_shows(ride: Ride, tmp_path: Path) -> None:
+def test_a_grid_is_what_each_camera_shows(ride, tmp_path):
     """Byte for byte, in any order; and so it is where the log has become HDF5."""
     side = record(tmp_path, camera="side")
     path = finish_trajectory(side.path)
@@ -71,7 +64,7 @@ def test_a_grid_is_what_each_camera_shows(ride: Ride, tmp_path: Path) -> None:
 
 
 @pytest.mark.thorough
-def test_a_camera_that_follows_does_not_depend_on_the_order(ride: Ride) -> None:
+def test_a_camera_that_follows_does_not_depend_on_the_order(ride):
     """Each frame moves it: those that another worker draws count too."""
     tracking = int(mujoco.mjtCamera.mjCAMERA_TRACKING)
     view = View(
@@ -87,7 +80,7 @@ def test_a_camera_that_follows_does_not_depend_on_the_order(ride: Ride) -> None:
     assert len({frame.tobytes() for frame in frames}) == FRAMES
 
 
-def test_the_plane_depends_on_the_picture_before(ride: Ride, tmp_path: Path) -> None:
+def test_the_plane_depends_on_the_picture_before(ride, tmp_path):
     """Or the tests above would show nothing of it; fresh scenes do not depend."""
     fresh = record(tmp_path, fresh=True)
     assert not np.array_equal(fresh.frames[4], ride.frames[4])
@@ -98,7 +91,7 @@ def test_the_plane_depends_on_the_picture_before(ride: Ride, tmp_path: Path) -> 
     drawing.close()
 
 
-def test_the_context_is_kept_from_drawing_to_drawing(ride: Ride) -> None:
+def test_the_context_is_kept_from_drawing_to_drawing(ride):
     """The first has changed its terrain, a texture and a plane; the next sees none."""
     other = View(height=30, quality="draft")
     with contextlib.closing(Canvas()) as canvas:
@@ -115,9 +108,7 @@ MEMBERS = {"lookat": [1, 0, 0.5], "distance": 3.0, "azimuth": 70, "elevation": -
 
 
 @pytest.mark.parametrize("camera", ["side", MEMBERS])
-def test_another_view_takes_the_place_of_the_recorded_one(
-    ride: Ride, camera: Any
-) -> None:
+def test_another_view_takes_the_place_of_the_recorded_one(ride, camera):
     """Camera, by its name or its members, size and quality; visual options stay."""
     view = View(camera=camera, height=30, width=50, quality="draft")
     with contextlib.closing(trajectory_drawing(ride.path, view)) as drawing:
@@ -143,30 +134,7 @@ def test_another_view_takes_the_place_of_the_recorded_one(
     assert np.array_equal(drawn, [expected[2], expected[0], expected[1]])
 
 
-@pytest.mark.parametrize(
-    ("camera", "message"),
-    [
-        ("sid", "no camera 'sid'"),
-        (2, "no camera number 2"),
-        ({"type": 2, "fixedcamid": 5}, "fixedcamid is 5"),
-        ({"type": 1}, "trackbodyid is -1"),
-        ({"type": 7}, "type is free"),
-    ],
-)
-def test_a_camera_that_the_model_lacks(ride: Ride, camera: Any, message: str) -> None:
-    """One error, and no crash of MuJoCo."""
-    with pytest.raises(InvalidArgument, match=message):
-        trajectory_drawing(ride.path, View(camera=camera))
-
-
-def test_a_trajectory_without_snapshots(tmp_path: Path) -> None:
-    """The reason of the recording is told, and another way."""
-    path = write_log(tmp_path, frames=False, scene=None, refusal="a plugin draws")
-    with pytest.raises(NoPictures, match=r"a plugin draws.*render_states"):
-        trajectory_drawing(path, View())
-
-
-def test_snapshots_of_another_model(ride: Ride, tmp_path: Path) -> None:
+def test_snapshots_of_another_model(ride, tmp_path):
     """The arrays do not fit."""
     dtype = row_dtype(snapshot=packed([("geom_xpos", ("<f8", (1, 3)))]))
     logs, name = new_logs(tmp_path), trajectory_prefix(INFIX, 0)
@@ -181,16 +149,12 @@ def test_snapshots_of_another_model(ride: Ride, tmp_path: Path) -> None:
         trajectory_drawing(path, View())
 
 
-def facts_of(ride: Ride) -> dict[str, Any]:
+def facts_of(ride):
     with open_trajectory(ride.path) as reader:
         return dict(reader.facts)
 
 
-def scene_of(ride: Ride) -> dict[str, Any]:
-    return dict(facts_of(ride)["scene"])
-
-
-def inertia_shown() -> mujoco.MjvOption:
+def inertia_shown():
     option = mujoco.MjvOption()
     option.flags[mujoco.mjtVisFlag.mjVIS_INERTIA] = True
     return option

@@ -1,6 +1,4 @@
 # SPDX-License-Identifier: Apache-2.0
-from __future__ import annotations
-
 import contextlib
 import gc
 import logging
@@ -12,26 +10,18 @@ import sys
 import textwrap
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from interruption import ctrl_c_soon
 from parts import parametrize
 from processes import children
-from rides import FRAMES, HEIGHT, WIDTH, Ride, record
+from rides import FRAMES, HEIGHT, WIDTH, record
 
 from mjrec import child_python
 from mjrec.child_python import Child
-from mjrec.errors import (
-    Error,
-    GLError,
-    InvalidArgument,
-    UnknownName,
-    UnreadableFile,
-)
+from mjrec.errors import Error, GLError, InvalidArgument, UnknownName, UnreadableFile
 from mjrec.gl import Probe, choice
 from mjrec.rendering import pool as pool_module
 from mjrec.rendering.pool import WorkerPool
@@ -39,37 +29,37 @@ from mjrec.rendering.views import View
 
 
 @pytest.fixture(scope="module")
-def ride(tmp_path_factory: pytest.TempPathFactory) -> Ride:
+def ride(tmp_path_factory):
     return record(tmp_path_factory.mktemp("ride"))
 
 
 @pytest.fixture(scope="module")
-def three() -> Iterator[WorkerPool]:
+def three():
     """Three workers, which stay from test to test."""
     with WorkerPool(3) as three:
         yield three
 
 
 @pytest.fixture
-def one() -> Iterator[WorkerPool]:
+def one():
     with WorkerPool(1) as one:
         yield one
 
 
 @contextlib.contextmanager
-def new_children() -> Iterator[list[int]]:
+def new_children():
     """Fill the list with the processes that the block has started and not ended."""
     before = children()
-    new: list[int] = []
+    new = []
     yield new
     new += children() - before
 
 
-def pids(pool: WorkerPool) -> list[int]:
+def pids(pool):
     return [worker.child.pid for worker in pool._workers if worker.child is not None]
 
 
-def wait_for_end(pid: int) -> None:
+def wait_for_end(pid):
     """Wait until a process that need not be a child is gone."""
     with contextlib.suppress(ProcessLookupError):
         descriptor = os.pidfd_open(pid)
@@ -78,13 +68,13 @@ def wait_for_end(pid: int) -> None:
         assert ready, f"process {pid} goes on"
 
 
-def use_process(monkeypatch: pytest.MonkeyPatch, script: str) -> None:
+def use_process(monkeypatch, script):
     """Let another program be the worker."""
     command = [sys.executable, "-c", textwrap.dedent(script)]
     monkeypatch.setattr(child_python, "python_command", lambda _: command)
 
 
-def draw_otherwise(monkeypatch: pytest.MonkeyPatch, body: str) -> None:
+def draw_otherwise(monkeypatch, body):
     """Let workers draw with other code, which may call `draw(self, index, **rest)`."""
     code = f"""
 import logging, os, pathlib, signal, sys, threading, time
@@ -102,9 +92,7 @@ worker.main()
 
 
 @pytest.mark.parametrize("indices", [range(FRAMES), [8, 0, 0, 3, 7, 2, 2, 8]])
-def test_any_workers_give_what_was_seen(
-    ride: Ride, one: WorkerPool, three: WorkerPool, indices: Sequence[int]
-) -> None:
+def test_any_workers_give_what_was_seen(ride, one, three, indices):
     """Byte for byte, over an infinite plane, whose place depends on the frame before.
 
     In any order, also repeated; and who draws is known from the first frame on.
@@ -118,7 +106,7 @@ def test_any_workers_give_what_was_seen(
     assert os.getpriority(os.PRIO_PROCESS, pids(one)[0]) == 10
 
 
-def test_few_frames_are_kept_here(ride: Ride, three: WorkerPool) -> None:
+def test_few_frames_are_kept_here(ride, three):
     """However slow the caller is: two of each worker, besides what its pipe holds."""
     indices = [number % FRAMES for number in range(60)]
     kept = []
@@ -131,7 +119,7 @@ def test_few_frames_are_kept_here(ride: Ride, three: WorkerPool) -> None:
     assert all((frame == 1).all() for frame in kept)
 
 
-def test_workers_stay_and_go_over_to_other_views(ride: Ride, three: WorkerPool) -> None:
+def test_workers_stay_and_go_over_to_other_views(ride, three):
     """Larger and smaller frames through the same pipes; also if some are dropped."""
     list(three.frames(ride.path, range(5)))
     before = pids(three)
@@ -146,7 +134,7 @@ def test_workers_stay_and_go_over_to_other_views(ride: Ride, three: WorkerPool) 
 # What goes wrong
 
 
-def test_errors_come_at_their_place(ride: Ride, three: WorkerPool) -> None:
+def test_errors_come_at_their_place(ride, three):
     """The same class and facts as in the worker; the workers go on."""
     with pytest.raises(UnknownName, match="no camera 'sid'") as caught:
         three.frames(ride.path, range(FRAMES), View(camera="sid"))
@@ -161,9 +149,7 @@ def test_errors_come_at_their_place(ride: Ride, three: WorkerPool) -> None:
     assert np.array_equal(list(three.frames(ride.path, [3])), [ride.frames[3]])
 
 
-def test_a_killed_worker_is_replaced(
-    ride: Ride, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_killed_worker_is_replaced(ride, caplog):
     """What it was drawing is drawn again, and the log says so."""
     indices = [number % FRAMES for number in range(40)]
     with WorkerPool(2) as pool:
@@ -178,13 +164,13 @@ def test_a_killed_worker_is_replaced(
 
 
 @pytest.fixture
-def be_impatient(monkeypatch: pytest.MonkeyPatch) -> Callable[[WorkerPool], None]:
+def be_impatient(monkeypatch):
     """Let a worker hang after a moment; the next one gets its time."""
 
-    def shorten(pool: WorkerPool) -> None:
+    def shorten(pool):
         stacks = Child.stacks
 
-        def prolong_and_ask(child: Child) -> str:
+        def prolong_and_ask(child):
             pool._patience.seconds = 120
             return stacks(child)
 
@@ -195,12 +181,8 @@ def be_impatient(monkeypatch: pytest.MonkeyPatch) -> Callable[[WorkerPool], None
 
 
 def test_a_worker_that_hangs_is_replaced_and_the_log_says_where(
-    ride: Ride,
-    tmp_path: Path,
-    be_impatient: Callable[[WorkerPool], None],
-    monkeypatch: pytest.MonkeyPatch,
-    caplog: pytest.LogCaptureFixture,
-) -> None:
+    ride, tmp_path, be_impatient, monkeypatch, caplog
+):
     """Nothing of it is missing or comes twice."""
     hung = tmp_path / "hung"
     draw_otherwise(
@@ -221,9 +203,7 @@ def test_a_worker_that_hangs_is_replaced_and_the_log_says_where(
     assert "in draw_otherwise" in caplog.text
 
 
-def test_a_worker_that_dies_twice_is_an_error(
-    ride: Ride, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_worker_that_dies_twice_is_an_error(ride, monkeypatch):
     """It names the signal, the file, and what the worker said, with Python's stack."""
     draw_otherwise(
         monkeypatch,
@@ -238,9 +218,7 @@ def test_a_worker_that_dies_twice_is_an_error(
     assert str(ride.path) in str(caught.value)
 
 
-def test_what_a_worker_says_is_heard(
-    ride: Ride, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_what_a_worker_says_is_heard(ride, monkeypatch, caplog):
     """Warnings are logged here; what a driver prints is not, however much."""
     draw_otherwise(
         monkeypatch,
@@ -257,17 +235,10 @@ def test_what_a_worker_says_is_heard(
     assert levels == {"no GPU": logging.ERROR}
 
 
-@pytest.mark.parametrize("count", [0, -1, 1.5, True, "2"])
-def test_a_number_of_workers_that_cannot_be(count: Any) -> None:
-    """One error before anything is started."""
-    with pytest.raises(InvalidArgument, match="workers must be"):
-        WorkerPool(count)
-
-
 # Their life
 
 
-def test_forgotten_workers_end(ride: Ride) -> None:
+def test_forgotten_workers_end(ride):
     """Garbage collection is enough."""
     with new_children() as new:
         pool = WorkerPool(1)
@@ -278,7 +249,7 @@ def test_forgotten_workers_end(ride: Ride) -> None:
     assert new == []
 
 
-def test_ctrl_c_while_a_picture_is_drawn(ride: Ride, one: WorkerPool) -> None:
+def test_ctrl_c_while_a_picture_is_drawn(ride, one):
     """It reaches only the parent; another worker draws for the next call."""
     list(one.frames(ride.path, [0]))
     [pid] = pids(one)
@@ -305,9 +276,7 @@ print(len(frames), sum(int(frame.sum()) for frame in frames))
 """
 
 
-def run(
-    arguments: list[str], ride: Ride, *, text: str | None = None, **environment: str
-) -> subprocess.CompletedProcess[str]:
+def run(arguments, ride, *, text=None, **environment):
     inherited = {k: v for k, v in os.environ.items() if k != "PYOPENGL_PLATFORM"}
     return subprocess.run(
         [sys.executable, *arguments],
@@ -320,7 +289,7 @@ def run(
     )
 
 
-def said(ride: Ride) -> str:
+def said(ride):
     return f"{FRAMES} {sum(int(frame.sum()) for frame in ride.frames)}\n"
 
 
@@ -349,9 +318,7 @@ thread.join()
         ("command", THREAD),
     ],
 )
-def test_any_program_can_have_workers(
-    way: str, code: str, ride: Ride, tmp_path: Path
-) -> None:
+def test_any_program_can_have_workers(way, code, ride, tmp_path):
     """A script without a guard runs once, and what lies beside it is not Python's."""
     (tmp_path / "script.py").write_text(code)
     (tmp_path / "mujoco.py").write_text("raise RuntimeError('not this one')")
@@ -362,7 +329,7 @@ def test_any_program_can_have_workers(
     assert (done.returncode, done.stdout, done.stderr) == (0, said(ride), "")
 
 
-def test_a_killed_parent_leaves_no_workers(ride: Ride) -> None:
+def test_a_killed_parent_leaves_no_workers(ride):
     """Their input ends with it, whatever else it has started."""
     script = """
 import os, signal, sys, time
@@ -409,9 +376,7 @@ os.kill(os.getpid(), signal.SIGKILL)
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("setting", ["disable", None])
-def test_a_backend_is_chosen_where_none_is_named(
-    ride: Ride, setting: str | None, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_backend_is_chosen_where_none_is_named(ride, setting, monkeypatch):
     """Also where rendering is turned off, which is for the simulation."""
     monkeypatch.delenv("PYOPENGL_PLATFORM", raising=False)
     if setting is None:
@@ -425,23 +390,8 @@ def test_a_backend_is_chosen_where_none_is_named(
     assert os.environ.get("MUJOCO_GL") == setting
 
 
-def test_a_backend_that_is_named_is_used(
-    ride: Ride, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """In mjrec's spelling or another."""
-    monkeypatch.setenv("MUJOCO_GL", "OSMesa")
-    with WorkerPool(1) as pool:
-        list(pool.frames(ride.path, [0]))
-        [pid] = pids(pool)
-        environment = Path(f"/proc/{pid}/environ").read_bytes().split(b"\0")
-    assert b"MUJOCO_GL=osmesa" in environment
-    assert b"PYOPENGL_PLATFORM=osmesa" in environment
-
-
 # Takes more than five seconds: both backends are tried by processes of their own.
-def test_where_egl_does_not_work_another_backend_draws(
-    ride: Ride, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_where_egl_does_not_work_another_backend_draws(ride, monkeypatch):
     """No frame is lost or drawn by EGL, and nothing is tried twice."""
     monkeypatch.delenv("MUJOCO_GL")
     monkeypatch.delenv("PYOPENGL_PLATFORM", raising=False)
@@ -455,7 +405,7 @@ def test_where_egl_does_not_work_another_backend_draws(
     assert b"MUJOCO_GL=osmesa" in environment
 
 
-def test_no_backend_works(ride: Ride, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_backend_works(ride, monkeypatch):
     """One error with the reasons of all; the workers may be asked again."""
     broken = Probe("", False, cause="it is broken")
     monkeypatch.setattr(choice, "probe", lambda name: broken)
@@ -481,13 +431,13 @@ sys.stdin.read()
 
 
 @pytest.fixture
-def two_cpus(monkeypatch: pytest.MonkeyPatch) -> None:
+def two_cpus(monkeypatch):
     """Let the machine have two CPUs."""
     monkeypatch.setattr(pool_module, "usable_cpus", lambda: 2)
 
 
 @pytest.mark.usefixtures("two_cpus")
-def test_the_cpus_of_another_process_are_waited_for(tmp_path: Path) -> None:
+def test_the_cpus_of_another_process_are_waited_for(tmp_path):
     """Until it rests or dies; the files of a dead one do not count."""
     with subprocess.Popen(
         [sys.executable, "-c", HOLDER, str(tmp_path)],

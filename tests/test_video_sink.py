@@ -1,11 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The sink: frames in, one finished video with its metadata out."""
 
-from __future__ import annotations
-
 import json
 from fractions import Fraction
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,20 +14,19 @@ from mjrec.annotation import Caption
 from mjrec.formats.unfinished_video import read_note
 from mjrec.formats.video_metadata import StepRuns, timing_facts
 from mjrec.formats.video_sink import VideoSink
-from mjrec.frames import Frame
 
 
-def moving(number: int) -> Frame:
+def moving(number):
     frame = np.full((48, 96, 3), 90, np.uint8)
     frame[:, 5 * number : 5 * number + 20] = (200, 40, 10)
     return frame
 
 
-def names(directory: Path) -> list[str]:
+def names(directory):
     return sorted(path.name for path in directory.iterdir())
 
 
-def film(path: Path, count: int = 4) -> VideoSink:
+def film(path, count=4):
     """Return a sink that has been given some frames."""
     sink = VideoSink(path, fps=Fraction(20))
     for number in range(count):
@@ -38,7 +34,7 @@ def film(path: Path, count: int = 4) -> VideoSink:
     return sink
 
 
-def test_the_metadata_comes_last_and_tells_of_the_file(tmp_path: Path) -> None:
+def test_the_metadata_comes_last_and_tells_of_the_file(tmp_path):
     """Until then, no final name says that there is a video; it can be told later."""
     sink = film(tmp_path / "v.mp4")
     assert all(name.startswith(".") for name in names(tmp_path))
@@ -55,7 +51,7 @@ def test_the_metadata_comes_last_and_tells_of_the_file(tmp_path: Path) -> None:
     assert len(frames_of(tmp_path / "v.mp4")) == 4
 
 
-def test_discarded_it_leaves_an_older_video(tmp_path: Path) -> None:
+def test_discarded_it_leaves_an_older_video(tmp_path):
     """But for one that it has replaced."""
     older = film(tmp_path / "v.mp4", 2)
     older.finish()
@@ -72,7 +68,7 @@ def test_discarded_it_leaves_an_older_video(tmp_path: Path) -> None:
     assert names(tmp_path) == []
 
 
-def test_a_note_says_what_an_unfinished_video_is(tmp_path: Path) -> None:
+def test_a_note_says_what_an_unfinished_video_is(tmp_path):
     """It is there before the video is, and goes when the metadata is there."""
     timing = {"fps": "20", "timestep": "1/20", "stride": 1, "frames_per_step": 1}
     path = tmp_path / "v.mp4"
@@ -89,7 +85,7 @@ def test_a_note_says_what_an_unfinished_video_is(tmp_path: Path) -> None:
     assert names(tmp_path) == ["v.framehash", "v.meta.json", "v.mp4"]
 
 
-def test_a_caption_is_on_the_frame_and_hides_no_blank_one(tmp_path: Path) -> None:
+def test_a_caption_is_on_the_frame_and_hides_no_blank_one(tmp_path):
     """What shows nothing shows nothing, whatever is written on it."""
     sink = VideoSink(tmp_path / "v.mp4", fps=Fraction(20))
     for step in range(3):
@@ -102,7 +98,7 @@ def test_a_caption_is_on_the_frame_and_hides_no_blank_one(tmp_path: Path) -> Non
     assert max(frame.max() for frame in frames_of(tmp_path / "v.mp4")) > 100
 
 
-def test_steps_are_runs_and_timing_is_in_exact_fractions() -> None:
+def test_steps_are_runs_and_timing_is_in_exact_fractions():
     """The last frame is always taken; a step may have several; thirds stay thirds."""
     assert StepRuns([0, 4, 8, 10], stride=4).ranges == [[0, 8], [10, 10]]
     assert StepRuns([0, 1, 1, 2]).ranges == [[0, 1], [1, 2]]
