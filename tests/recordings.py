@@ -1,69 +1,84 @@
 # SPDX-License-Identifier: Apache-2.0
 """Reads what a monitor wrote, with nothing of mjrec."""
 
+from __future__ import annotations
+
 import json
 import re
+from pathlib import Path
+from typing import Any
 
 import av
 
 from mjrec.formats.spans import append_line, get_recording, recordings_in_flight
 
 
-def in_flight(directory):
+def in_flight(directory: Path) -> list[Path]:
     """Return what recordings that only logs have are called, sorted by name."""
     return sorted(each.path for each in recordings_in_flight(directory))
 
 
-def manifest_of(directory):
+def manifest_of(directory: Path) -> dict[str, Any]:
     return _json("openaigym.manifest.*", directory)
 
 
-def stats_of(directory):
+def stats_of(directory: Path) -> dict[str, Any]:
     return _json("openaigym.episode_batch.*", directory)
 
 
-def journal_of(directory):
+def journal_of(directory: Path) -> list[dict[str, Any]]:
     """Return the complete episodes that the journal has."""
     return [line for line in _lines(directory) if "episode_id" in line]
 
 
-def events_of(directory, kind):
+def events_of(directory: Path, kind: str) -> list[Any]:
     """Return the facts of the journal's other events of a kind."""
     return [line[kind] for line in _lines(directory) if kind in line]
 
 
-def _lines(directory):
+def edit_journal(directory: Path, index: int, **values: Any) -> None:
+    """Change what the journal says of a complete episode."""
+    [path] = directory.glob("openaigym.episodes.*")
+    lines = path.read_text().splitlines()
+    of_episodes = [n for n, line in enumerate(lines) if '"episode_id"' in line[:14]]
+    number = of_episodes[index]
+    lines[number] = json.dumps({**json.loads(lines[number]), **values})
+    path.write_text("".join(f"{line}\n" for line in lines))
+
+
+def _lines(directory: Path) -> list[dict[str, Any]]:
     [path] = directory.glob("openaigym.episodes.*")
     return [json.loads(line) for line in path.read_text().splitlines()]
 
 
-def metadata_of(directory, episode):
+def metadata_of(directory: Path, episode: int) -> dict[str, Any]:
     return _json(f"*.video{episode:06d}.meta.json", directory)
 
 
-def frames_in(directory, episode):
+def frames_in(directory: Path, episode: int) -> list[Any]:
     [path] = directory.glob(f"*.video{episode:06d}.mp4")
     return frames_of(path)
 
 
-def frames_of(path):
+def frames_of(path: str | Path | None) -> list[Any]:
     """Decode a video, with another decoder than the one that wrote it."""
     with av.open(str(path)) as container:
         return [f.to_ndarray(format="rgb24") for f in container.decode(video=0)]
 
 
-def videos_in(directory):
+def videos_in(directory: Path) -> list[int]:
     """Return the numbers of the episodes that have a video."""
     names = (path.name for path in directory.glob("openaigym.*.mp4"))
     return sorted(int(re.findall(r"video(\d{6})\.mp4", name)[0]) for name in names)
 
 
-def _json(pattern, directory):
+def _json(pattern: str, directory: Path) -> dict[str, Any]:
     [path] = directory.glob(pattern)
-    return json.loads(path.read_text())
+    content: dict[str, Any] = json.loads(path.read_text())
+    return content
 
 
-def add_facts(path, facts):
+def add_facts(path: Path, facts: dict[str, Any]) -> None:
     """Add to the facts of a recording in flight, as its monitor does."""
     recording = get_recording(path)
     append_line(recording.spans.path, {"note": recording.name, "facts": facts})

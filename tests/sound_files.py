@@ -1,8 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """One sound file of every kind that is read back, to be spoilt."""
 
+from __future__ import annotations
+
 import itertools
 import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -21,30 +26,30 @@ PARTS = (".spans", ".log", ".tail", ".looks")
 SPHERE = '<mujoco><worldbody><geom size=".1"/></worldbody></mujoco>'
 
 
-def manifest(directory):
+def manifest(directory: Path) -> Path:
     return write_saved(directory, "0.7", 3)
 
 
-def stats(directory):
+def stats(directory: Path) -> Path:
     write_saved(directory, "0.7", 3)
     return directory / "openaigym.episode_batch.0.7.stats.json"
 
 
-def journal(directory):
+def journal(directory: Path) -> Path:
     return write_journal(directory, "0.7", 3)
 
 
-def metadata(directory):
+def metadata(directory: Path) -> Path:
     path = directory / "openaigym.video.0.7.video000000.meta.json"
     path.write_text('{"broken": false}')
     return path
 
 
-def finished(directory):
+def finished(directory: Path) -> Path:
     return finish_trajectory(write_log(directory))
 
 
-def stored(directory, xml=SPHERE):
+def stored(directory: Path, xml: str = SPHERE) -> dict[str, Any]:
     source = directory.parent / "main.xml"
     source.write_text(xml)
     store = ModelStore(directory)
@@ -55,32 +60,32 @@ def stored(directory, xml=SPHERE):
     return facts
 
 
-def compiled(directory):
+def compiled(directory: Path) -> Path:
     facts = {**stored(directory), "xml": None}
     (directory / "facts.json").write_text(json.dumps(facts))
     return directory / facts["mjb"]
 
 
-def source(directory):
+def source(directory: Path) -> Path:
     facts = {**stored(directory), "mujoco": "3.1.4", "mjb": None}
     (directory / "facts.json").write_text(json.dumps(facts))
     return directory / facts["xml"]
 
 
-def mjcf(directory):
+def mjcf(directory: Path) -> Path:
     path = directory / "sphere.xml"
     path.write_text(SPHERE)
     return path
 
 
-def video(directory):
+def video(directory: Path) -> Path:
     path = directory / "openaigym.video.0.7.video000000.mp4"
     path.write_bytes(b"frames")
     metadata(directory)
     return path
 
 
-def killed(directory):
+def killed(directory: Path) -> Path:
     """Record an episode and be killed; return its list."""
     dtype = row_dtype(observation=np.dtype(("<f8", (9,))))
     logs = SpanLogs(directory, INFIX, numbers=itertools.count(), tail_bytes=1)
@@ -95,12 +100,12 @@ def killed(directory):
     return spans
 
 
-def killed_with(part):
+def killed_with(part: str) -> Callable[[Path], Path]:
     return lambda directory: killed(directory).with_suffix(part)
 
 
 # Each with the reader of `hostile_reading` that it is for.
-FILES = {
+FILES: dict[str, tuple[str, Callable[[Path], Path]]] = {
     "manifest": ("manifest", manifest),
     "stats": ("stats", stats),
     "journal": ("journal", journal),

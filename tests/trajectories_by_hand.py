@@ -5,7 +5,12 @@ Frame k of one is a grey picture of brightness `grey(k)`, which `Painter` draws 
 its snapshots, with a white pixel in a corner.
 """
 
+from __future__ import annotations
+
 import itertools
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -16,7 +21,7 @@ from mjrec.formats.monitor_directory import (
     trajectory_prefix,
     video_prefix,
 )
-from mjrec.formats.span_writer import SpanLogs
+from mjrec.formats.span_writer import SpanLogs, SpanWriter
 from mjrec.formats.spans import list_paths
 from mjrec.formats.trajectory import packed, row_dtype
 from mjrec.formats.trajectory_file import finish_trajectory, open_trajectory
@@ -30,7 +35,7 @@ GREY_ROWS = row_dtype(
 )
 
 
-def grey(frame):
+def grey(frame: int) -> int:
     """Return the brightness of a frame."""
     return 10 + 20 * frame
 
@@ -52,14 +57,23 @@ class Painter:
 
     gl_facts = {"gl_renderer": "a painter"}  # noqa: RUF012  as it is asked for
 
-    def __init__(self, size=(16, 24), *, plain=False):
+    def __init__(
+        self, size: tuple[int, int] = (16, 24), *, plain: bool = False
+    ) -> None:
         self.size = size
         self.plain = plain
-        self.asked = []
-        self.tiles = []
-        self.breaks_at = lambda *_: None
+        self.asked: list[tuple[Path, list[int], View]] = []
+        self.tiles: list[Any] = []
+        self.breaks_at: Callable[[Path, View, int], object] = lambda *_: None
 
-    def frames(self, trajectory, indices, view=None, *, cameras=None):
+    def frames(
+        self,
+        trajectory: Path,
+        indices: Sequence[int],
+        view: View | None = None,
+        *,
+        cameras: Any = None,
+    ) -> Iterator[Any]:
         view = view or View()
         self.asked.append((trajectory, list(indices), view))
         self.tiles.append(cameras)
@@ -75,21 +89,21 @@ class Painter:
                 picture[-1, -1] = 255
             yield picture
 
-    def start(self): ...
+    def start(self) -> None: ...
 
-    def rest(self): ...
+    def rest(self) -> None: ...
 
-    def close(self): ...
+    def close(self) -> None: ...
 
 
-def new_logs(directory, infix=INFIX):
+def new_logs(directory: Path, infix: Infix = INFIX) -> SpanLogs:
     """Return what writes recordings beside those that others have written."""
     used = [int(path.suffixes[-2][1:]) for path in list_paths(directory, infix)]
     first = max(used, default=-1) + 1
     return SpanLogs(directory, infix, numbers=itertools.count(first))
 
 
-def add_row(span, step, **values):
+def add_row(span: SpanWriter, step: int, **values: Any) -> None:
     """Add a row whose columns are `values`; with a snapshot it is a frame's, too."""
     slot = span.make_room()
     commit = {
@@ -104,19 +118,19 @@ def add_row(span, step, **values):
 
 
 def write_log(
-    directory,
-    episode_id=0,
+    directory: Path,
+    episode_id: int = 0,
     *,
-    infix=INFIX,
-    steps=4,
-    stride=1,
-    frames=True,
-    video="deferred",
-    ended=True,
-    over=None,
-    fps=None,
-    **facts,
-):
+    infix: Infix = INFIX,
+    steps: int = 4,
+    stride: int = 1,
+    frames: bool = True,
+    video: str | None = "deferred",
+    ended: bool = True,
+    over: bool | None = None,
+    fps: str | None = None,
+    **facts: Any,
+) -> Path:
     """Record an episode at 20 steps a second; return the file that it would become.
 
     Where it has `ended`, its last words are there; where it is `over`, its last row
@@ -152,7 +166,7 @@ def write_log(
     )
     taken = 0
     for step in range(steps + 1):
-        values = {}
+        values: dict[str, Any] = {}
         if frames and (step % stride == 0 or step == steps):
             values["snapshot"] = grey(taken)
             taken += 1
@@ -165,13 +179,15 @@ def write_log(
     return logs.path_of(name)
 
 
-def write_finished(directory, episode_id=0, **rest):
+def write_finished(directory: Path, episode_id: int = 0, **rest: Any) -> Path:
     """Write the finished trajectory of an episode, as this user's own."""
     note_models([directory_digest(directory)])
     return finish_trajectory(write_log(directory, episode_id, **rest))
 
 
-def write_pending_manifest(directory, *episode_ids, infix=INFIX, **rest):
+def write_pending_manifest(
+    directory: Path, *episode_ids: int, infix: Infix = INFIX, **rest: Any
+) -> Path:
     """Write the manifest of a closed monitor whose videos are all pending."""
     path = directory / manifest_name(infix)
     pending = [
