@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Sessions whose pictures are drawn later, by others, or not at all."""
 
+from __future__ import annotations
+
 import contextlib
 import importlib.util
 import json
@@ -8,6 +10,8 @@ import os
 import subprocess
 import sys
 from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 import pytest
 from recordings import manifest_of, videos_in
@@ -21,7 +25,9 @@ from mjrec.recorder.options import RecorderOptions
 from mjrec.sessions import Session, record_session
 
 
-def session(directory, *, name="InvertedPendulum-v5", **options):
+def session(
+    directory: Path, *, name: str = "InvertedPendulum-v5", **options: Any
+) -> Any:
     """Return a session of two steps an episode; options of the session or monitor."""
     own = {k: options.pop(k) for k in ("episodes", "schedule") if k in options}
     return Session(
@@ -35,28 +41,33 @@ def session(directory, *, name="InvertedPendulum-v5", **options):
 
 
 @pytest.fixture
-def no_probing(monkeypatch):
+def no_probing(monkeypatch: pytest.MonkeyPatch) -> None:
     """Fail where an OpenGL backend is looked for."""
 
-    def fail():
+    def fail() -> None:
         raise AssertionError("looked for OpenGL")
 
     monkeypatch.setattr(sessions, "use_gl", fail)
 
 
 @pytest.fixture
-def no_gl(monkeypatch):
+def no_gl(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let no OpenGL backend be found."""
 
-    def fail():
+    def fail() -> None:
         raise GLError("Nothing renders here.")
 
     monkeypatch.setattr(sessions, "use_gl", fail)
 
 
 @pytest.mark.usefixtures("no_probing")
-@pytest.mark.parametrize("options", [{"workers": 0}, {"render": "off"}])
-def test_what_is_not_drawn_here_looks_for_no_gl(options, tmp_path):
+@pytest.mark.parametrize(
+    "options",
+    [{"workers": 0}, {"render": "off"}],
+)
+def test_what_is_not_drawn_here_looks_for_no_gl(
+    options: dict[str, Any], tmp_path: Path
+) -> None:
     """The states are recorded, and the videos are promised, or not wanted."""
     [episode] = record_session(session(tmp_path, **options))
     pending = manifest_of(tmp_path)["mjrec"]["pending"]
@@ -71,7 +82,7 @@ def test_what_is_not_drawn_here_looks_for_no_gl(options, tmp_path):
 
 @pytest.mark.parametrize("render", [None, "live"])
 @pytest.mark.usefixtures("no_gl")
-def test_without_gl_the_way_out_is_named(tmp_path, render):
+def test_without_gl_the_way_out_is_named(tmp_path: Path, render: str | None) -> None:
     """Where the pictures could be drawn elsewhere; nothing is written."""
     options = {"render": render} if render else {}
     with pytest.raises(GLError, match="Nothing renders here") as raised:
@@ -81,7 +92,7 @@ def test_without_gl_the_way_out_is_named(tmp_path, render):
     assert not (tmp_path / "out").exists()
 
 
-def test_an_iterator_that_is_left_waits_for_nothing(tmp_path):
+def test_an_iterator_that_is_left_waits_for_nothing(tmp_path: Path) -> None:
     """What is not rendered by then stays pending."""
     with contextlib.closing(
         record_session(session(tmp_path, episodes=3, schedule="all", workers=1))
@@ -94,7 +105,9 @@ def test_an_iterator_that_is_left_waits_for_nothing(tmp_path):
 RECORD = ("record", "InvertedPendulum-v5", "--size", "32x32", "--max-steps", "9")
 
 
-def test_record_says_which_videos_are_pending(tmp_path, capsys):
+def test_record_says_which_videos_are_pending(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     """And what makes them; also for programs."""
     command = [*RECORD, "--seed", "0", "--workers", "0", "--out"]
     assert main([*command, str(tmp_path / "a")]) == 0
@@ -110,7 +123,9 @@ def test_record_says_which_videos_are_pending(tmp_path, capsys):
     importlib.util.find_spec("pygame") is not None, reason="pygame is installed"
 )
 @pytest.mark.parametrize("options", [{}, {"keep": "best:1"}])
-def test_what_cannot_be_drawn_is_recorded_without_videos(options, tmp_path, caplog):
+def test_what_cannot_be_drawn_is_recorded_without_videos(
+    options: dict[str, Any], tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     """CartPole needs pygame: one line says so, unless pictures were asked for."""
     asked = replace(
         session(tmp_path, name="CartPole", episodes=2, **options),
@@ -126,7 +141,7 @@ def test_what_cannot_be_drawn_is_recorded_without_videos(options, tmp_path, capl
 
 
 @pytest.mark.thorough
-def test_record_without_any_gl(tmp_path):
+def test_record_without_any_gl(tmp_path: Path) -> None:
     """On a machine, or in a process, that has none."""
     command = [*RECORD, "--seed", "0", "--workers", "0"]
     run = subprocess.run(
