@@ -23,7 +23,6 @@ from mjrec.formats.monitor_directory import Infix
 from mjrec.formats.spans import find_recording, is_in_flight
 from mjrec.formats.trajectory_file import open_trajectory
 from mjrec.rendering.background import Background
-from mjrec.rendering.jobs import Progress
 
 # A program around it, with the directory at argv[1].
 PROGRAM = """
@@ -123,21 +122,6 @@ def test_one_process_does_all(tmp_path, others, start, monkeypatch):
         assert os.getpriority(os.PRIO_PROCESS, process) == 10
     background.stop()
     assert children() == others
-
-
-def test_videos_are_rendered(recorded, start):
-    """By workers of their own, and every frame is shown to be drawn."""
-    logs = in_flight(recorded)
-    background = start(recorded, *logs, workers=None)
-    seen = []
-    background.wait(seen.append)
-    assert background.failures == {}
-    videos = sorted(recorded.glob("*.mp4"))
-    assert [len(frames_of(video)) for video in videos] == [4, 4]
-    assert all(map(is_finished, logs))
-    assert seen[-1] == Progress(videos_done=2, videos=2, frames_done=8, frames=8)
-    background.stop()
-    assert not list(recorded.glob(".*"))
 
 
 def test_submitting_never_waits(others, tmp_path, start):

@@ -8,7 +8,7 @@ import sys
 import gymnasium
 import numpy as np
 import pytest
-from recordings import frames_of, manifest_of
+from recordings import frames_of, hashes_at, manifest_of
 
 import mjrec
 
@@ -33,14 +33,9 @@ def record(directory, steps=3, render="deferred", **options):
         for _ in range(steps):
             env.step(np.full(6, 0.5, np.float32))
     return {
-        path.name.split(".video000000")[-1].removesuffix(".framehash"): _hashes(path)
+        path.name.split(".video000000")[-1].removesuffix(".framehash"): hashes_at(path)
         for path in directory.glob("*.framehash")
     }
-
-
-def _hashes(path):
-    lines = path.read_text().splitlines()
-    return "\n".join(line for line in lines if not line.startswith("#"))
 
 
 # Takes more than five seconds: several monitors with workers of their own.
@@ -85,7 +80,7 @@ def test_live_and_deferred_captions_are_the_same(tmp_path):
             for _ in range(3):
                 env.step(np.full(6, 0.5, np.float32))
         [path] = (tmp_path / name).glob("*.framehash")
-        return _hashes(path)
+        return hashes_at(path)
 
     live = hashes("live", annotate=True, render="live")
     later = hashes("later", annotate=True, render="deferred")

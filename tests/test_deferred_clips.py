@@ -15,7 +15,7 @@ from compiled_tasks import growing
 from full_disk import file_size_limit
 from parts import parametrize
 from recorded_states import assert_same, trajectories
-from recordings import add_facts, in_flight, manifest_of
+from recordings import add_facts, hashes_at, in_flight, manifest_of
 
 import mjrec
 from mjrec.commands import main
@@ -95,11 +95,7 @@ def parts(directory):
 def hashes(directory):
     """Return the hashes of the pictures of each video, by the end of its name."""
     return {
-        path.name.partition(".video")[2].split(".video")[-1]: [
-            line.split(",")[-1].strip()
-            for line in path.read_text().splitlines()
-            if not line.startswith("#")
-        ]
+        path.name.partition(".video")[2].split(".video")[-1]: hashes_at(path)
         for path in sorted(directory.glob("*.framehash"))
     }
 

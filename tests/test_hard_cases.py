@@ -17,6 +17,7 @@ import gymnasium
 import numpy as np
 import pytest
 from compiled_tasks import growing
+from recordings import hashes_at
 from robots import robots_that_reset
 
 import mjrec
@@ -74,10 +75,7 @@ def play_task(env, episodes):
 def hashes(directory):
     """Return the hashes of all frames of all videos, in the order of their names."""
     return [
-        line.split(",")[-1].strip()
-        for path in sorted(directory.glob("*.framehash"))
-        for line in path.read_text().splitlines()
-        if not line.startswith("#")
+        h for path in sorted(directory.glob("*.framehash")) for h in hashes_at(path)
     ]
 
 

@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 from gymnasium.vector import AsyncVectorEnv
 from parts import parametrize
-from vector_environments import DISABLED, NEXT_STEP, SAME_STEP, hashes_at, play
+from recordings import hashes_at
+from vector_environments import DISABLED, NEXT_STEP, SAME_STEP, play
 from waiting import wait_until
 
 import mjrec

@@ -6,12 +6,9 @@ import mujoco
 import numpy as np
 import pytest
 from rides import FRAMES, HEIGHT, WIDTH, move, record, start
-from trajectories_by_hand import INFIX, add_row, new_logs
 
-from mjrec.errors import InvalidArgument, UnreadableFile
-from mjrec.formats.monitor_directory import trajectory_prefix
-from mjrec.formats.trajectory import packed, row_dtype
-from mjrec.formats.trajectory_file import finish_trajectory, open_trajectory
+from mjrec.errors import InvalidArgument
+from mjrec.formats.trajectory_file import finish_trajectory
 from mjrec.rendering.pool import WorkerPool
 from mjrec.rendering.views import View
 from mjrec.rendering.worker import trajectory_drawing
@@ -132,26 +129,6 @@ def test_another_view_takes_the_place_of_the_recorded_one(ride, camera):
             move(model, data, number)
             expected.append(renderer.render(data))
     assert np.array_equal(drawn, [expected[2], expected[0], expected[1]])
-
-
-def test_snapshots_of_another_model(ride, tmp_path):
-    """The arrays do not fit."""
-    dtype = row_dtype(snapshot=packed([("geom_xpos", ("<f8", (1, 3)))]))
-    logs, name = new_logs(tmp_path), trajectory_prefix(INFIX, 0)
-    path = logs.path_of(name)
-    span = logs.begin(name, facts_of(ride), dtype)
-    add_row(span, 0, snapshot=0)
-    logs.close()
-    [model] = ride.path.parent.glob("openaigym.model.*")
-    (tmp_path / model.name).write_bytes(model.read_bytes())
-
-    with pytest.raises(UnreadableFile, match="geom_xpos"):
-        trajectory_drawing(path, View())
-
-
-def facts_of(ride):
-    with open_trajectory(ride.path) as reader:
-        return dict(reader.facts)
 
 
 def inertia_shown():

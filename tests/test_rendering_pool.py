@@ -3,7 +3,6 @@ import contextlib
 import gc
 import logging
 import os
-import select
 import signal
 import subprocess
 import sys
@@ -15,14 +14,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from interruption import ctrl_c_soon
-from parts import parametrize
 from processes import children
-from rides import FRAMES, HEIGHT, WIDTH, record
+from rides import FRAMES, WIDTH, record
 
 from mjrec import child_python
 from mjrec.child_python import Child
-from mjrec.errors import Error, GLError, InvalidArgument, UnknownName, UnreadableFile
-from mjrec.gl import Probe, choice
+from mjrec.errors import Error, InvalidArgument, UnknownName, UnreadableFile
 from mjrec.rendering import pool as pool_module
 from mjrec.rendering.pool import WorkerPool
 from mjrec.rendering.views import View
@@ -57,15 +54,6 @@ def new_children():
 
 def pids(pool):
     return [worker.child.pid for worker in pool._workers if worker.child is not None]
-
-
-def wait_for_end(pid):
-    """Wait until a process that need not be a child is gone."""
-    with contextlib.suppress(ProcessLookupError):
-        descriptor = os.pidfd_open(pid)
-        ready, _, _ = select.select([descriptor], [], [], 30)
-        os.close(descriptor)
-        assert ready, f"process {pid} goes on"
 
 
 def use_process(monkeypatch, script):
@@ -267,7 +255,6 @@ def test_ctrl_c_while_a_picture_is_drawn(ride, one):
 
 CALLER = """
 import os, sys
-import numpy as np
 from pathlib import Path
 from mjrec.rendering.pool import WorkerPool
 with WorkerPool(2) as pool:
@@ -276,118 +263,23 @@ print(len(frames), sum(int(frame.sum()) for frame in frames))
 """
 
 
-def run(arguments, ride, *, text=None, **environment):
+def test_a_script_can_have_workers(ride, tmp_path):
+    """Without a guard it runs once, and what lies beside it is not Python's."""
+    script = tmp_path / "script.py"
+    script.write_text(CALLER)
+    (tmp_path / "mujoco.py").write_text("raise RuntimeError('not this one')")
     inherited = {k: v for k, v in os.environ.items() if k != "PYOPENGL_PLATFORM"}
-    return subprocess.run(
-        [sys.executable, *arguments],
-        env={**inherited, "RIDE": str(ride.path), **environment},
-        input=text,
+    done = subprocess.run(
+        [sys.executable, script],
+        env={**inherited, "RIDE": str(ride.path)},
         capture_output=True,
         text=True,
-        timeout=120,
-        check=False,
     )
-
-
-def said(ride):
-    return f"{FRAMES} {sum(int(frame.sum()) for frame in ride.frames)}\n"
-
-
-DAEMONIC = f"""
-import multiprocessing
-def work():
-    exec({CALLER!r})
-if __name__ == "__main__":
-    process = multiprocessing.get_context("fork").Process(target=work, daemon=True)
-    process.start()
-    process.join()
-    raise SystemExit(process.exitcode)
-"""
-THREAD = f"""
-import threading
-thread = threading.Thread(target=exec, args=[{CALLER!r}, {{}}])
-thread.start()
-thread.join()
-"""
-
-
-@parametrize(
-    ("way", "code"),
-    [
-        *(("script", CALLER), ("stdin", CALLER), ("command", DAEMONIC)),
-        ("command", THREAD),
-    ],
-)
-def test_any_program_can_have_workers(way, code, ride, tmp_path):
-    """A script without a guard runs once, and what lies beside it is not Python's."""
-    (tmp_path / "script.py").write_text(code)
-    (tmp_path / "mujoco.py").write_text("raise RuntimeError('not this one')")
-    argument = {"script": [str(tmp_path / "script.py")], "stdin": ["-"]}
-    done = run(
-        argument.get(way, ["-c", code]), ride, text=code if way == "stdin" else None
-    )
-    assert (done.returncode, done.stdout, done.stderr) == (0, said(ride), "")
-
-
-def test_a_killed_parent_leaves_no_workers(ride):
-    """Their input ends with it, whatever else it has started."""
-    script = """
-import os, signal, sys, time
-from pathlib import Path
-from mjrec.rendering.pool import WorkerPool
-pool = WorkerPool(2)
-frames = pool.frames(Path(os.environ["RIDE"]), range(9))
-if not os.fork():
-    # A forked child has copies of the pipes, and may not use them.
-    try:
-        pool.frames(Path(os.environ["RIDE"]), range(9))
-    except Exception as error:
-        os.write(1, f"{type(error).__name__}\\n".encode())
-    sys.stdin.read()
-    os._exit(0)
-os.write(1, " ".join(str(w.child.pid) for w in pool._workers).encode() + b"\\n")
-os.kill(os.getpid(), signal.SIGKILL)
-"""
-    # The child reads this end until the test is over.
-    reading, writing = os.pipe()
-    process = subprocess.Popen(
-        [sys.executable, "-W", "ignore", "-c", script],
-        env={**os.environ, "RIDE": str(ride.path)},
-        stdin=reading,
-        stdout=subprocess.PIPE,
-        text=True,
-    )
-    assert process.stdout is not None
-    lines = [process.stdout.readline(), process.stdout.readline()]
-    process.wait()
-    # Two processes say a line each, in any order.
-    told, numbers = sorted(lines, reverse=True)
-    assert told == "ClosedError\n"
-
-    for pid in numbers.split():
-        wait_for_end(int(pid))
-    os.close(writing)
-    os.close(reading)
-    process.stdout.close()
+    said = f"{FRAMES} {sum(int(frame.sum()) for frame in ride.frames)}\n"
+    assert (done.returncode, done.stdout, done.stderr) == (0, said, "")
 
 
 # What draws
-
-
-@pytest.mark.thorough
-@pytest.mark.parametrize("setting", ["disable", None])
-def test_a_backend_is_chosen_where_none_is_named(ride, setting, monkeypatch):
-    """Also where rendering is turned off, which is for the simulation."""
-    monkeypatch.delenv("PYOPENGL_PLATFORM", raising=False)
-    if setting is None:
-        monkeypatch.delenv("MUJOCO_GL")
-    else:
-        monkeypatch.setenv("MUJOCO_GL", setting)
-    with WorkerPool(3) as pool:
-        drawn = list(pool.frames(ride.path, range(FRAMES)))
-        assert len(pids(pool)) == 3
-    assert [frame.shape for frame in drawn] == [(HEIGHT, WIDTH, 3)] * FRAMES
-    assert os.environ.get("MUJOCO_GL") == setting
 
 
 # Takes more than five seconds: both backends are tried by processes of their own.
@@ -403,18 +295,6 @@ def test_where_egl_does_not_work_another_backend_draws(ride, monkeypatch):
         assert pids(pool) == before
         environment = Path(f"/proc/{before[0]}/environ").read_bytes().split(b"\0")
     assert b"MUJOCO_GL=osmesa" in environment
-
-
-def test_no_backend_works(ride, monkeypatch):
-    """One error with the reasons of all; the workers may be asked again."""
-    broken = Probe("", False, cause="it is broken")
-    monkeypatch.setattr(choice, "probe", lambda name: broken)
-    monkeypatch.setenv("MUJOCO_GL", "off")
-    monkeypatch.setenv("__EGL_VENDOR_LIBRARY_FILENAMES", "/nonexistent")
-    with WorkerPool(2) as pool:
-        for _ in range(2):
-            with pytest.raises(GLError, match=r"(?s)egl.*broken.*osmesa.*broken"):
-                pool.frames(ride.path, range(FRAMES))
 
 
 # CPUs, shared by all that render into a directory

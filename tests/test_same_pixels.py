@@ -285,15 +285,6 @@ def test_own_model_over_an_infinite_plane(workers, tmp_path):
     check_frames(tmp_path / "out", record(env, tmp_path / "out"), workers)
 
 
-class Overlay(gymnasium.Wrapper):
-    """Draws something on top."""
-
-    def render(self):
-        frame = super().render().copy()
-        frame[:4] = 255
-        return frame
-
-
 class Negative(InvertedPendulumEnv):
     """Shows itself in other colours."""
 
@@ -304,7 +295,6 @@ class Negative(InvertedPendulumEnv):
 @pytest.mark.parametrize(
     ("make_env", "named"),
     [
-        (lambda: Overlay(make("InvertedPendulum-v5")), "Overlay overrides render()"),
         (
             lambda: Negative(render_mode="rgb_array", **SIZE),
             "Negative overrides render()",
@@ -328,7 +318,6 @@ def test_deferred_where_it_would_lie_is_an_error_and_never_chosen(
         shown = monitor.render()
     assert named in json.dumps(metadata_of(tmp_path, 0))
     [frame] = frames_in(tmp_path, 0)
-    # Encoded, but bright where the overlay is, or everywhere.
     assert np.abs(frame.astype(int) - shown).mean() < 12
 
 

@@ -8,13 +8,12 @@ import gymnasium
 import numpy as np
 import pytest
 from gymnasium.vector import SyncVectorEnv
-from recordings import frames_of
+from recordings import frames_of, hashes_at
 from vector_environments import (
     DISABLED,
     NEXT_STEP,
     SAME_STEP,
     VectorCorridor,
-    hashes_at,
     metadata_at,
     path_of,
     play,

@@ -127,9 +127,3 @@ def metadata_at(path: Path) -> dict[str, Any]:
     """Return what a JSON file holds."""
     content: dict[str, Any] = json.loads(path.read_text())
     return content
-
-
-def hashes_at(path: Path) -> list[str]:
-    """Return the sha256 of each frame, as a framehash file says them."""
-    lines = [line for line in path.read_text().splitlines() if line[:1] != "#"]
-    return [line.rpartition(",")[2].strip() for line in lines]
