@@ -6,16 +6,21 @@ checksums that are right again. It always makes the same ones. What could take t
 process with it is read in forks.
 """
 
+from __future__ import annotations
+
 import contextlib
 import copy
 import itertools
 import json
 import os
 import struct
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
-from hostile_reading import Inspector
+from hostile_reading import Inspector, Outcome
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from sound_files import compiled, finished, source
@@ -53,17 +58,17 @@ FEWER = settings(FEW, max_examples=20)
 # --- JSON ----------------------------------------------------------------------------
 
 # What has broken readers: each is tried in every place.
-NASTY = [
+NASTY: list[Any] = [
     *(None, True, 0, 5, -1, 0.5, 10**400, 2**64, -(2**63), 1e308, float("inf")),
     *("", "5", "..", "../x", "a/b", "\ud800", "a" * 300, "1e999999999"),
     *([], {}, [5], [None], ["../x"], [[]], {"a": 1}, [{}], [{"video": 5}]),
 ]
 
 
-def spoilt(sound):
+def spoilt(sound: Any) -> Iterator[Any]:
     """Yield `sound` with each thing in it replaced by each nasty one, and left out."""
     if isinstance(sound, dict | list):
-        keys = [*sound] if isinstance(sound, dict) else [*range(len(sound))]
+        keys: list[Any] = [*sound] if isinstance(sound, dict) else [*range(len(sound))]
         for key in keys:
             for inner in spoilt(sound[key]):
                 changed = copy.copy(sound)
@@ -87,7 +92,7 @@ DAMAGE = st.lists(
 )
 
 
-def damaged(data, damage):
+def damaged(data: bytes, damage: list[tuple[float, str, int, int]]) -> bytes:
     """Return `data` with bytes flipped, set, overwritten, cut off or put in."""
     result = bytearray(data)
     for place, what, byte, number in damage:
@@ -143,7 +148,7 @@ ENTRY = {
 METADATA = {"broken": True, "frame_steps": [[0, 3]], "episode_id": 2}
 
 
-def manifest(path):
+def manifest(path: Path) -> None:
     """What is read can be written again, and names files of the directory only."""
     found = read_manifest(path)
     names = [found.stats, *(name for pair in found.videos for name in pair)]
@@ -154,25 +159,25 @@ def manifest(path):
     update_manifests(path.parent)
 
 
-def statistics(path):
+def statistics(path: Path) -> None:
     found = read_stats_file(path)
     write_stats_file(path, found)
     assert read_stats_file(path).episode_lengths == found.episode_lengths
 
 
-def journal(path):
+def journal(path: Path) -> None:
     """The lines that cannot be written again are left out."""
     with contextlib.closing(JournalWriter(path.with_name("again"))) as writer:
         for entry in read_journal(path):
             writer.append(entry)
 
 
-def metadata(path):
+def metadata(path: Path) -> None:
     """What cannot be read calls no video broken."""
     assert is_broken(path) in (True, False)
 
 
-KINDS = {
+KINDS: dict[str, tuple[str, Any, Callable[[Path], None]]] = {
     "manifest": ("manifest.0.7.manifest.json", MANIFEST, manifest),
     "statistics": ("episode_batch.0.7.stats.json", STATS, statistics),
     "journal": ("episodes.0.7.jsonl", ENTRY, journal),
@@ -180,12 +185,12 @@ KINDS = {
 }
 
 
-def read_or_refuse(directory, kind, data):
+def read_or_refuse(directory: Path, kind: str, data: bytes) -> None:
     """Read a file; the only error is one that names it."""
     name, _, read = KINDS[kind]
     path = directory / f"openaigym.{name}"
     path.write_bytes(data)
-    refusal = None
+    refusal: UnreadableFile | None = None
     try:
         read(path)
     except UnreadableFile as error:
@@ -195,7 +200,7 @@ def read_or_refuse(directory, kind, data):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_every_file_with_one_thing_wrong(tmp_path, kind):
+def test_every_file_with_one_thing_wrong(tmp_path: Path, kind: str) -> None:
     """Each thing in it replaced by each nasty one, and left out."""
     for value in spoilt(KINDS[kind][1]):
         read_or_refuse(tmp_path, kind, json.dumps(value).encode())
@@ -212,7 +217,7 @@ VALUES = st.recursive(
 
 @FEW
 @given(value=VALUES)
-def test_any_value_can_be_written_and_read(value):
+def test_any_value_can_be_written_and_read(value: Any) -> None:
     """And gives the same text again."""
     assert dumps(loads(dumps(value))) == dumps(value)
 
@@ -221,7 +226,7 @@ def test_any_value_can_be_written_and_read(value):
     "value",
     [{1: "a", "1": "b"}, {"a": [{None: 1, "null": 2}]}, {np.int64(3): 1, "3": 4}],
 )
-def test_keys_that_would_be_written_as_the_same_come_back(value):
+def test_keys_that_would_be_written_as_the_same_come_back(value: Any) -> None:
     """Shown as Python shows them: a text with a key twice would be refused."""
     assert "repr" in dumps(value)
     assert dumps(loads(dumps(value))) == dumps(value)
@@ -233,9 +238,11 @@ NAME = trajectory_prefix(INFIX, 0)
 SPANS = states_name(INFIX, 0)
 PARTS = (".spans", ".log", ".looks")
 
+Files = dict[str, bytes]
+
 
 @pytest.fixture(scope="module")
-def sound_log(tmp_path_factory):
+def sound_log(tmp_path_factory: pytest.TempPathFactory) -> Files:
     """The files of a recording, by their suffixes."""
     directory = tmp_path_factory.mktemp("log")
     write_log(directory)
@@ -248,7 +255,7 @@ def sound_log(tmp_path_factory):
 _numbers = itertools.count()
 
 
-def put_log(tmp_path, files):
+def put_log(tmp_path: Path, files: Files) -> Path:
     """Write files into a directory of their own; return the recording's path."""
     directory = tmp_path / str(next(_numbers))
     directory.mkdir()
@@ -257,9 +264,9 @@ def put_log(tmp_path, files):
     return directory / f"{NAME}.h5"
 
 
-def read_log(path):
+def read_log(path: Path) -> Any:
     """Return what is read, None where there is one error that names a file of it."""
-    refusal = None
+    refusal: UnreadableFile | None = None
     try:
         with open_trajectory(path) as reader:
             content = content_of(reader)
@@ -274,7 +281,9 @@ def read_log(path):
 
 
 @pytest.mark.parametrize("number", range(4))
-def test_every_line_with_one_thing_wrong(tmp_path, sound_log, number):
+def test_every_line_with_one_thing_wrong(
+    tmp_path: Path, sound_log: Files, number: int
+) -> None:
     """Of a list; what is relied on in rendering is looked at there."""
     lines = sound_log[".spans"].splitlines()
     assert len(lines) == 4
@@ -286,7 +295,9 @@ def test_every_line_with_one_thing_wrong(tmp_path, sound_log, number):
 
 @FEW
 @given(part=st.sampled_from(PARTS), damage=DAMAGE)
-def test_any_damaged_log(tmp_path, sound_log, part, damage):
+def test_any_damaged_log(
+    tmp_path: Path, sound_log: Files, part: str, damage: Any
+) -> None:
     """Bytes changed anywhere in one of its files."""
     content = damaged(sound_log[part], damage)
     found = read_log(put_log(tmp_path, {**sound_log, part: content}))
@@ -301,14 +312,16 @@ def test_any_damaged_log(tmp_path, sound_log, part, damage):
 
 @FEW
 @given(damage=DAMAGE, written=st.integers(0, 4))
-def test_any_damaged_tail(tmp_path, sound_log, damage, written):
+def test_any_damaged_tail(
+    tmp_path: Path, sound_log: Files, damage: Any, written: int
+) -> None:
     """Rows are taken from it as far as they say that they are the next ones."""
     rows = sound_log[".log"]
     size = len(rows) // 5
     head = struct.pack("=QQQ", 5, size // 8, 5).ljust(TAIL_HEAD, b"\0")
     # Where it counts: most of a head is nothing.
     place = [(p / 20 if p < 0.5 else p, *rest) for p, *rest in damage]
-    tail = damaged(head[:24] + rows, place)
+    tail = damaged(head[:24] + rows, place)  # type: ignore[arg-type]
     tail = tail[:24].ljust(TAIL_HEAD, b"\0") + tail[24:]
     files = {**sound_log, ".log": rows[: written * size], ".tail": tail}
     found = read_log(put_log(tmp_path, files))
@@ -319,15 +332,15 @@ def test_any_damaged_tail(tmp_path, sound_log, damage, written):
 
 
 @pytest.fixture(scope="module")
-def inspector():
+def inspector() -> Iterator[Inspector]:
     with Inspector() as one:
         yield one
 
 
 @pytest.fixture(scope="module")
-def sound(tmp_path_factory):
+def sound(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     """A sound file of each kind, in a directory of its own."""
-    found = {}
+    found: dict[str, Path] = {}
     for name, write in {"h5": finished, "zip": source, "mjb": compiled}.items():
         directory = tmp_path_factory.mktemp(name) / "recordings"
         directory.mkdir()
@@ -335,7 +348,7 @@ def sound(tmp_path_factory):
     return found
 
 
-def check(outcome, path):
+def check(outcome: Outcome, path: Path) -> None:
     assert outcome.kind in ("value", "refused"), outcome
     assert outcome.kind == "value" or outcome.names == str(path), outcome
 
@@ -345,7 +358,9 @@ def check(outcome, path):
 )
 @FEWER
 @given(damage=DAMAGE)
-def test_any_damaged_file(inspector, sound, kind, reader, damage):
+def test_any_damaged_file(
+    inspector: Inspector, sound: dict[str, Path], kind: str, reader: str, damage: Any
+) -> None:
     """Of HDF5, of a model's sources, of a compiled model: no crash, no hang."""
     path = sound[kind]
     data = path.read_bytes()

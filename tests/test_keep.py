@@ -1,12 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """Monitors that decide after the episodes which of them get a video."""
 
+from __future__ import annotations
+
 import contextlib
 import logging
 import signal
 import subprocess
 import sys
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import gymnasium
 import pytest
@@ -23,26 +27,28 @@ from waiting import wait_until
 
 import mjrec
 from mjrec.formats.trajectory_file import open_trajectory
-from mjrec.recorder.tracking import Tracker
+from mjrec.recorder.tracking import FinishedVideo, Tracker
 from mjrec.rendering.finish import finish
 
 # Of the episodes of `pendulum`, in their order.
 RETURNS = [5.0, 2.0, 4.0, 1.0, 4.0, 2.0, 3.0, 6.0]
 
 
-class Limited(gymnasium.Wrapper):
+class Limited(gymnasium.Wrapper[Any, Any, Any, Any]):
     """Ends an episode after as many steps as its return is to be."""
 
-    def __init__(self, env, returns, success=()):
+    def __init__(
+        self, env: Any, returns: Sequence[float], success: Sequence[bool] = ()
+    ) -> None:
         super().__init__(env)
         self.lengths = [int(number) for number in returns]
         self.success = list(success)
 
-    def reset(self, **options):
+    def reset(self, **options: Any) -> Any:
         self.left = self.lengths.pop(0)
         return self.env.reset(**options)
 
-    def step(self, action):
+    def step(self, action: Any) -> Any:
         observation, _, _, _, info = self.env.step(action)
         self.left -= 1
         if not self.left and self.success:
@@ -53,18 +59,20 @@ class Limited(gymnasium.Wrapper):
 class OneStep(Limited):
     """Ends an episode after a step, with its return as the reward."""
 
-    def step(self, action):
+    def step(self, action: Any) -> Any:
         observation, *_, info = self.env.step(action)
         return observation, float(self.left), False, True, info
 
 
-def pendulum(returns=RETURNS, *, kind=Limited, **arguments):
+def pendulum(
+    returns: Sequence[float] = RETURNS, *, kind: type = Limited, **arguments: Any
+) -> Any:
     """Return a small environment."""
     size = {"width": 64, "height": 64, "render_mode": "rgb_array"}
     return kind(gymnasium.make("InvertedPendulum-v5", **size), returns, **arguments)
 
 
-def run(env, episodes):
+def run(env: Any, episodes: int) -> None:
     """Run whole episodes."""
     for _ in range(episodes):
         env.reset(seed=0)
@@ -72,23 +80,23 @@ def run(env, episodes):
             pass
 
 
-def h5_of(directory):
+def h5_of(directory: Path) -> list[int]:
     """Return the numbers of the episodes with a finished trajectory."""
     return sorted(int(path.stem[-6:]) for path in directory.glob("*.h5"))
 
 
-def logs_of(directory):
+def logs_of(directory: Path) -> list[int]:
     """Return the numbers of the episodes in flight."""
     return [int(path.stem[-6:]) for path in in_flight(directory)]
 
 
-def pending_in(directory):
+def pending_in(directory: Path) -> list[int]:
     """Return the numbers of the episodes whose videos the manifest calls pending."""
     entries = manifest_of(directory)["mjrec"]["pending"]
     return [entry["episode_id"] for entry in entries]
 
 
-def facts_of(directory, episode):
+def facts_of(directory: Path, episode: int) -> dict[str, Any]:
     """Return the facts of a trajectory."""
     found = {*directory.glob("*.h5"), *in_flight(directory)}
     [path] = [p for p in found if p.name.endswith(f".episode{episode:06d}.h5")]
@@ -96,7 +104,7 @@ def facts_of(directory, episode):
         return dict(reader.facts)
 
 
-def render(directory):
+def render(directory: Path) -> None:
     """Render what is pending."""
     outcomes = finish(directory, workers=1)
     assert not any(each.failures for each in outcomes)
@@ -105,10 +113,10 @@ def render(directory):
 class Listener(Tracker):
     """Notes of which videos it is notified, and how long their episodes were."""
 
-    def __init__(self):
-        self.videos = {}
+    def __init__(self) -> None:
+        self.videos: dict[int, int] = {}
 
-    def video(self, run, video):
+    def video(self, run: Any, video: FinishedVideo) -> None:
         assert video.path.exists()
         assert video.episode is not None
         self.videos[video.episode_id] = video.episode.length
@@ -121,10 +129,10 @@ both_ways = pytest.mark.parametrize("way", ["live", "deferred"])
 
 
 @both_ways
-def test_the_worst_n_are_kept(tmp_path, way):
+def test_the_worst_n_are_kept(tmp_path: Path, way: Any) -> None:
     """Never more candidates than N; only the chosen are drawn, named, notified."""
     listener = Listener()
-    options = {"workers": 1, "trackers": listener, "name_prefix": "w"}
+    options: dict[str, Any] = {"workers": 1, "trackers": listener, "name_prefix": "w"}
     with mjrec.Monitor(
         pendulum(), tmp_path, keep="worst:2", render=way, **options
     ) as monitor:
@@ -156,7 +164,9 @@ def test_the_worst_n_are_kept(tmp_path, way):
 
 
 @parametrize("episodes", [100, 1000])
-def test_the_disk_holds_n_candidates_and_the_running_episode(tmp_path, episodes):
+def test_the_disk_holds_n_candidates_and_the_running_episode(
+    tmp_path: Path, episodes: int
+) -> None:
     """However long the run is; each goes when it is out."""
     # Most are worse than those before.
     returns = [episodes - number + 7 * number % 5 for number in range(episodes)]
@@ -172,7 +182,7 @@ def test_the_disk_holds_n_candidates_and_the_running_episode(tmp_path, episodes)
 
 
 @both_ways
-def test_failures_are_what_the_environment_calls_so(tmp_path, way):
+def test_failures_are_what_the_environment_calls_so(tmp_path: Path, way: Any) -> None:
     """Drawn at the end of each; after N no frame is recorded any more."""
     made = pendulum(success=[True, False, True, False, False, True, False, False])
     with mjrec.Monitor(
@@ -188,7 +198,7 @@ def test_failures_are_what_the_environment_calls_so(tmp_path, way):
     assert manifest_of(tmp_path)["mjrec"]["keep"]["chosen"] == [1, 3]
 
 
-def longest_two(episodes):
+def longest_two(episodes: Sequence[Any]) -> list[int]:
     """Choose by length."""
     return [e.episode_id for e in sorted(episodes, key=lambda e: -e.length)[:2]]
 
@@ -198,7 +208,9 @@ def longest_two(episodes):
     ("keep", "way", "kept"),
     [("median", "deferred", [6]), (longest_two, "live", [0, 7])],
 )
-def test_what_is_decided_at_the_end_holds_all(keep, way, kept, tmp_path, caplog):
+def test_what_is_decided_at_the_end_holds_all(
+    keep: Any, way: str, kept: list[int], tmp_path: Path, caplog: Any
+) -> None:
     """It says so once; the rule or the function's name stands in the manifest."""
     caplog.set_level(logging.INFO, "mjrec")
     with mjrec.Monitor(pendulum(), tmp_path, keep=keep, render=way, workers=1) as env:
@@ -218,7 +230,9 @@ def test_what_is_decided_at_the_end_holds_all(keep, way, kept, tmp_path, caplog)
         ({"trajectory_callable": lambda episode: episode == 1, "workers": 1}, [1]),
     ],
 )
-def test_trajectories_are_kept_as_asked(tmp_path, options, kept):
+def test_trajectories_are_kept_as_asked(
+    tmp_path: Path, options: dict[str, Any], kept: list[int]
+) -> None:
     """Whatever becomes of the videos; those that fell out promise none."""
     with mjrec.Monitor(pendulum([3, 2, 4, 1]), tmp_path, keep="best:1", **options) as e:
         run(e, 4)
@@ -233,9 +247,9 @@ def test_trajectories_are_kept_as_asked(tmp_path, options, kept):
 
 
 @both_ways
-def test_incomplete_episodes_are_never_chosen(tmp_path, way):
+def test_incomplete_episodes_are_never_chosen(tmp_path: Path, way: Any) -> None:
     """Neither one that was reset nor the one that was closed; nothing of them stays."""
-    options = {"render": way, "allow_early_reset": True}
+    options: dict[str, Any] = {"render": way, "allow_early_reset": True}
     with mjrec.Monitor(
         pendulum([3, 5, 4]), tmp_path, keep="worst:3", workers=1, **options
     ) as monitor:
@@ -253,7 +267,7 @@ def test_incomplete_episodes_are_never_chosen(tmp_path, way):
 
 
 @parametrize("way", ["close", "exception"])
-def test_leaving_early_leaves_the_chosen_pending(tmp_path, way):
+def test_leaving_early_leaves_the_chosen_pending(tmp_path: Path, way: str) -> None:
     """What fell out is gone then too, and so is a running episode."""
     env = mjrec.Monitor(pendulum(), tmp_path, keep="worst:2", workers=1)
     run(env, 7)
@@ -271,7 +285,7 @@ def test_leaving_early_leaves_the_chosen_pending(tmp_path, way):
     assert pending_in(tmp_path) == []
 
 
-def confused(episodes):
+def confused(episodes: Sequence[Any]) -> list[int]:
     """Return a number that is none of an episode."""
     return [len(episodes)]
 
@@ -281,7 +295,9 @@ def confused(episodes):
     [("live", {}), ("deferred", {"wait": True}), ("deferred", {"wait": False})],
     default=2,
 )
-def test_a_function_that_cannot_choose_loses_nothing(tmp_path, way, options):
+def test_a_function_that_cannot_choose_loses_nothing(
+    tmp_path: Path, way: Any, options: dict[str, bool]
+) -> None:
     """One error names it; all is closed, and all videos are there or pending."""
     env = mjrec.Monitor(pendulum(), tmp_path, keep=confused, workers=1, render=way)
     run(env, 3)
@@ -322,7 +338,9 @@ os.kill(os.getpid(), 9)
     [("deferred", True), ("live", True), ("deferred", False)],
     default=2,
 )
-def test_a_killed_run_leaves_its_candidates(tmp_path, kind, recovers):
+def test_a_killed_run_leaves_its_candidates(
+    tmp_path: Path, kind: str, recovers: bool
+) -> None:
     """And the running episode, and nothing of what had fallen out; undecided."""
     here = str(Path(__file__).parent)
     command = [sys.executable, "-c", PROGRAM, str(tmp_path), kind, here]

@@ -5,18 +5,27 @@ One clear error; the video stays pending, and the manifest says why; nothing is 
 half-written; all other episodes are rendered, and a later try finds all it needs.
 """
 
+from __future__ import annotations
+
 import contextlib
 import json
 import time
+from pathlib import Path
+from typing import Any
 
 import gymnasium
 import pytest
 from full_disk import file_size_limit
 from parts import parametrize
 from recordings import frames_in, frames_of, manifest_of, metadata_of
-from trajectories_by_hand import write_log, write_pending_manifest
+from trajectories_by_hand import Painter, write_log, write_pending_manifest
 
-from mjrec import BlankVideo, Monitor, RenderError, render_videos
+from mjrec import (
+    BlankVideo,
+    Monitor,
+    RenderError,
+    render_videos,
+)
 from mjrec.formats.ffmpeg import ffmpeg_executable
 from mjrec.formats.spans import recordings_in_flight
 from mjrec.formats.trajectory_file import (
@@ -26,6 +35,7 @@ from mjrec.formats.trajectory_file import (
 )
 from mjrec.formats.video_metadata import metadata_path
 from mjrec.rendering import finish as module
+from mjrec.rendering.jobs import Progress, RenderedVideos
 from mjrec.rendering.recordings import recordings
 
 VIDEO = "openaigym.video.0.7.video00000{}.mp4"
@@ -33,7 +43,7 @@ FRAMES = 5
 
 
 @pytest.fixture
-def two(tmp_path, painter):
+def two(tmp_path: Path, painter: Painter) -> Path:
     """A directory with two pending videos and a manifest that says so."""
     directory = tmp_path / "two"
     directory.mkdir()
@@ -44,18 +54,18 @@ def two(tmp_path, painter):
     return directory
 
 
-def finish(directory, **options):
+def finish(directory: Path, **options: Any) -> list[RenderedVideos]:
     return list(module.finish(directory, workers=1, **options))
 
 
-def reasons_in(directory):
+def reasons_in(directory: Path) -> dict[str, str | None]:
     """Return why the videos are pending, by their names."""
     [path] = directory.glob("*.manifest.json")
     pending = json.loads(path.read_text())["mjrec"]["pending"]
     return {entry["video"]: entry.get("reason") for entry in pending}
 
 
-def check_nothing_is_half(directory):
+def check_nothing_is_half(directory: Path) -> None:
     """Whatever has a final name is whole, and nothing else is there."""
     assert not list(directory.glob(".*"))
     for video in directory.glob("*.mp4"):
@@ -72,7 +82,7 @@ def check_nothing_is_half(directory):
             assert reader.frame_count == FRAMES
 
 
-def check_all_is_there_after_another_try(directory):
+def check_all_is_there_after_another_try(directory: Path) -> None:
     assert not [each for each in finish(directory) if each.failures]
     check_nothing_is_half(directory)
     assert len(list(directory.glob("*.mp4"))) == 2
@@ -82,7 +92,9 @@ def check_all_is_there_after_another_try(directory):
 # Encoders that are killed or hang
 
 
-def use_encoder(folder, monkeypatch, *, of, instead):
+def use_encoder(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, *, of: str, instead: str
+) -> None:
     """Let one video's encoder do something else, in the shell; all others encode."""
     program = folder / "ffmpeg"
     program.write_text(
@@ -97,12 +109,17 @@ def use_encoder(folder, monkeypatch, *, of, instead):
 KILLED = "head -c 3000 >/dev/null; echo no memory >&2; kill -9 $$"
 
 
-def test_a_killed_encoder_gets_a_second_try(two, tmp_path, monkeypatch, caplog):
+def test_a_killed_encoder_gets_a_second_try(
+    two: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
     """In mid-video; every frame is in the file once, and each is told once."""
     flag = tmp_path / "killed"
     once = f"if mkdir {flag} 2>/dev/null; then {KILLED}; fi"
     use_encoder(tmp_path, monkeypatch, of="video000000", instead=once)
-    told = []
+    told: list[Progress] = []
     results = finish(two, on_progress=told.append)
     assert flag.exists()
     assert not [each for each in results if each.failures]
@@ -115,8 +132,8 @@ def test_a_killed_encoder_gets_a_second_try(two, tmp_path, monkeypatch, caplog):
 # Takes more than five seconds: the encoder's timeout, twice.
 @parametrize("instead", ["exec sleep 60", "cat >/dev/null; sleep 60"])
 def test_an_encoder_that_hangs_leaves_the_video_pending(
-    instead, two, tmp_path, monkeypatch
-):
+    instead: str, two: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Whether it takes nothing or does not end; the other video is rendered."""
     monkeypatch.setenv("MJREC_PATIENCE", "2")
     use_encoder(tmp_path, monkeypatch, of="video000000", instead=instead)
@@ -141,7 +158,9 @@ ROOM = [30, 800, 1600, 2500, 3000]
     ("finished", "room"),
     [(False, 100), (False, 4000), *((True, room) for room in ROOM)],
 )
-def test_a_full_disk_is_one_clear_error_wherever_it_comes(finished, room, two):
+def test_a_full_disk_is_one_clear_error_wherever_it_comes(
+    finished: bool, room: int, two: Path
+) -> None:
     """Be it at the trajectory, the hashes, the video, its metadata or the manifest."""
     if finished:
         for recording in recordings_in_flight(two):
@@ -164,7 +183,9 @@ def test_a_full_disk_is_one_clear_error_wherever_it_comes(finished, room, two):
 @pytest.mark.parametrize(
     "damage", [b"?\n", b'{"format": "mjrec spans", "version": 99}\n']
 )
-def test_a_list_that_cannot_be_read_is_told_and_costs_no_other(damage, two):
+def test_a_list_that_cannot_be_read_is_told_and_costs_no_other(
+    damage: bytes, two: Path
+) -> None:
     """It stays; what it was of is not known."""
     damaged = min(two.glob("*.spans"))
     damaged.write_bytes(damage)
@@ -198,7 +219,7 @@ DARK = """
 """
 
 
-def pendulum(folder=None, **arguments):
+def pendulum(folder: Path | None = None, **arguments: Any) -> Any:
     """Return a small environment; one without any light, if there is a folder."""
     if folder is not None:
         model = folder / "dark.xml"
@@ -209,7 +230,7 @@ def pendulum(folder=None, **arguments):
     )
 
 
-def run(monitor, *, episodes):
+def run(monitor: Any, *, episodes: int) -> None:
     for episode in range(episodes):
         monitor.reset(seed=episode)
         done = False
@@ -218,7 +239,9 @@ def run(monitor, *, episodes):
             done = terminated or truncated
 
 
-def test_a_killed_encoder_beside_a_simulation(tmp_path, monkeypatch):
+def test_a_killed_encoder_beside_a_simulation(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """`close` tells of it, all else is there, and `mjrec render` makes what lacks."""
     use_encoder(tmp_path, monkeypatch, of="video000001", instead=KILLED)
     directory = tmp_path / "run"
@@ -240,7 +263,9 @@ def test_a_killed_encoder_beside_a_simulation(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("render", ["deferred", "live"])
-def test_a_dark_scene_is_suspect_whichever_way_it_is_drawn(render, tmp_path, caplog):
+def test_a_dark_scene_is_suspect_whichever_way_it_is_drawn(
+    render: Any, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     """The metadata says so, and the log warns; with `strict` it is an error.
 
     Drawn live as its episode ends, else as the monitor closes. The video is there.
