@@ -14,6 +14,7 @@ from typing import Any
 
 import gymnasium
 import pytest
+from full_disk import file_size_limit
 from parts import parametrize
 from recordings import (
     frames_in,
@@ -317,6 +318,31 @@ def test_a_function_that_cannot_choose_loses_nothing(
     assert len(manifest_of(tmp_path)["videos"]) == 3
     selection = {"rule": "confused", "decided": False}
     assert metadata_of(tmp_path, 0)["selection"] == selection
+
+
+@parametrize("on_error", ["warn", "raise"])
+def test_a_full_disk_at_the_end_loses_no_chosen_video(
+    tmp_path: Path, on_error: str
+) -> None:
+    """Facts that its log has no room for are lost; it is pending all the same."""
+    env = mjrec.Monitor(
+        pendulum(), tmp_path, keep="worst:2", workers=0, on_error=on_error
+    )
+    run(env, 8)
+    size = max(path.stat().st_size for path in tmp_path.glob("*.spans"))
+    # Enough for all but what is added to the longer list.
+    with file_size_limit(size + 20):
+        if on_error == "raise":
+            with pytest.raises(mjrec.FileNotWritten):
+                env._recorder.finish()
+        else:
+            env._recorder.finish()
+    env.close()
+    assert pending_in(tmp_path) == [1, 3]
+    assert manifest_of(tmp_path)["mjrec"]["schedule"]["recorded"] == [1, 3]
+    assert not list(tmp_path.glob("*episode00000[024567]*"))
+    render(tmp_path)
+    assert videos_in(tmp_path) == [1, 3]
 
 
 PROGRAM = """
