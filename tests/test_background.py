@@ -138,19 +138,6 @@ def test_submitting_never_waits(others, tmp_path, start):
     assert is_finished(log)
 
 
-def test_what_fails_is_told_and_stops_nothing_else(tmp_path, start):
-    """By the name of the video, also where nobody waits; the trajectory stays."""
-    bad, good = write_log(tmp_path, 0), write_log(tmp_path, 1, video=None)
-    min(tmp_path.glob("*.log")).unlink()
-    background = start(tmp_path, bad, good)
-    wait_until(lambda: is_finished(good))
-    background.stop()
-    [(name, reason)] = background.failures.items()
-    assert name == "openaigym.video.0.7.video000000.mp4"
-    assert "Cannot read" in reason
-    assert in_flight(tmp_path) == [bad]
-
-
 def test_a_model_that_is_still_being_written_is_waited_for(recorded, start):
     """It is compressed beside the simulation; once nobody writes, it is an error."""
     [model] = recorded.glob("*.mjb.gz")

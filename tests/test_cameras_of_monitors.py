@@ -67,28 +67,6 @@ def test_several_cameras(tmp_path, render):
         assert difference.mean() < 4
 
 
-@pytest.mark.thorough
-def test_live_and_deferred_captions_are_the_same(tmp_path):
-    """They say the same of each frame, in the same letters."""
-
-    def hashes(name, **options):
-        made = gymnasium.make(
-            "HalfCheetah-v5", max_episode_steps=3, render_mode="rgb_array", **SIZE
-        )
-        with mjrec.Monitor(made, tmp_path / name, **options) as env:
-            env.reset(seed=0)
-            for _ in range(3):
-                env.step(np.full(6, 0.5, np.float32))
-        [path] = (tmp_path / name).glob("*.framehash")
-        return hashes_at(path)
-
-    live = hashes("live", annotate=True, render="live")
-    later = hashes("later", annotate=True, render="deferred")
-    plain = hashes("plain", render="deferred")
-    assert live == later
-    assert live != plain
-
-
 WITHOUT_PILLOW = """
 import sys
 

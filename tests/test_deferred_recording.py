@@ -422,8 +422,9 @@ def test_the_global_random_state_is_left_alone(tmp_path):
 
 
 def test_works_in_a_script_without_a_main_guard(tmp_path):
-    """Workers never import the user's main module."""
+    """Workers never import the user's main module, nor what lies beside it."""
     script = tmp_path / "script.py"
+    (tmp_path / "h5py.py").write_text("raise RuntimeError('not this one')")
     script.write_text(SCRIPT + "print('once')\nenv.close()\n")
     command = [sys.executable, str(script), str(tmp_path / "out")]
     assert subprocess.check_output(command, text=True) == "once\n"

@@ -130,21 +130,6 @@ def test_an_exception_that_has_no_text_or_much():
     }
 
 
-def test_leaving_with_by_an_exception(monitored, tmp_path):
-    """Of the user's own code: the episode is marked, and nothing is waited for."""
-    _, monitor = monitored
-    with pytest.raises(ZeroDivisionError), monitor:  # noqa: PT012  a user's program
-        monitor.reset(seed=0)
-        steps(monitor, 1)
-        raise ZeroDivisionError
-    subprocess.run(
-        [sys.executable, "-m", "mjrec", "render", str(tmp_path)],
-        check=False,
-        capture_output=True,
-    )
-    assert metadata_of(tmp_path, 0)["exception"]["type"] == "ZeroDivisionError"
-
-
 PROGRAM = """
 import os, signal, sys, gymnasium, mjrec
 mjrec.exit_on_signals()

@@ -1,10 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What users see, in the words of mujoco 3.3, 3.17 and 4.0, is explained."""
 
-import os
-import subprocess
-import sys
-
 import pytest
 
 from mjrec.gl import diagnose
@@ -77,15 +73,3 @@ def test_other_failures():
         found = diagnose(_CONTEXT, backend=backend, environ={})
         assert found is not None
         assert said in found.cause
-
-
-def test_what_a_user_of_mujoco_sees():
-    """A user's own program, with contradicting variables, in today's words."""
-    environ = {**os.environ, "MUJOCO_GL": "egl", "PYOPENGL_PLATFORM": "osmesa"}
-    code = "import mujoco\nmujoco.Renderer(mujoco.MjModel.from_xml_string('<mujoco/>'))"
-    done = subprocess.run(
-        [sys.executable, "-P", "-c", code], env=environ, capture_output=True, text=True
-    )
-    found = diagnose(done.stderr, environ=environ)
-    assert found is not None, done.stderr
-    assert "PYOPENGL_PLATFORM (osmesa) contradicts MUJOCO_GL (egl)" in found.cause

@@ -116,20 +116,6 @@ def test_a_model_whose_colours_change_at_every_step(tmp_path):
 
 
 @pytest.mark.dm_control
-def test_a_task_that_shows_its_reward(tmp_path):
-    """`visualize_reward` paints the robot anew at every step."""
-    from dm_control import suite
-
-    def make():
-        task = {"random": 0, "time_limit": 0.05}
-        return suite.load("cartpole", "balance", task, visualize_reward=True)
-
-    live_and_later(
-        make, lambda env: play_task(env, 1), tmp_path, env_id="dm_control/x", **SIZE
-    )
-
-
-@pytest.mark.dm_control
 @pytest.mark.parametrize(
     "options", [{}, {"step_trigger": lambda step: step == 2, "video_length": 9}]
 )

@@ -108,17 +108,3 @@ def test_every_member_of_a_view_is_watched(model, which):
         assert list(changed) == [f"{which}.{name}"]
         assert np.array_equal(*changed.values(), read_member(struct, name))
         assert looks.changed() is None
-
-
-def test_a_change_is_told_once_and_going_back_is_one(model, looks):
-    """At captures the last look counts, at resets what is stored."""
-    model.geom_rgba[1] = 0.25
-    changed = looks.changed() or {}
-    changed["geom_rgba"][:] = 9
-    assert looks.changed() is None, "a copy was given away"
-    model.geom_rgba[1] = (0.5, 0.5, 0.5, 1)
-    assert (looks.changed() or {}).keys() == {"geom_rgba"}
-    assert looks.since_stored() == {}
-    model.geom_rgba[1] = 0.75
-    assert looks.since_stored().keys() == {"geom_rgba"}
-    assert looks.changed() is None, "what a reset has told is no news"

@@ -60,46 +60,6 @@ def test_a_recording_is_drawn_again(ride):
     assert children() == before
 
 
-@pytest.mark.thorough
-def test_a_recording_is_drawn_another_way(ride):
-    """Camera, size, quality and rate."""
-    camera = mujoco.MjvCamera()
-    camera.lookat[:], camera.distance = (1, 0, 0.5), 6
-    members = {"lookat": [1, 0, 0.5], "distance": 6}
-    pictures = {
-        str(given): list(
-            mjrec.render(
-                ride.path, camera=given, width=40, height=30, quality="draft", max_fps=4
-            )
-        )
-        for given in (camera, members, "side")
-    }
-
-    first, second, side = pictures.values()
-    # Ten a second are recorded: 0, 3, 6, and the last.
-    assert [frame.shape for frame in first] == [(30, 40, 3)] * 4
-    assert np.array_equal(first, second)
-    assert not np.array_equal(first, side)
-
-
-@pytest.mark.thorough
-def test_a_recording_that_is_left_early(ride):
-    """Closing, or dropping what was returned, ends the workers."""
-    before = children()
-    pictures = mjrec.render(ride.path, workers=2)
-    next(pictures)
-    pictures.close()
-    assert list(pictures) == []
-    assert children() == before
-
-    pictures = mjrec.render(ride.path, workers=2)
-    next(pictures)
-    assert len(children() - before) == 2
-    del pictures
-    gc.collect()
-    assert children() == before
-
-
 WRONG = [
     ({"camera": "top"}, UnknownName, r"no camera 'top'.*side, rider"),
     ({"camera": 1.5}, InvalidArgument, "camera is a name"),

@@ -253,32 +253,6 @@ def test_ctrl_c_while_a_picture_is_drawn(ride, one):
 
 # Wherever the caller is
 
-CALLER = """
-import os, sys
-from pathlib import Path
-from mjrec.rendering.pool import WorkerPool
-with WorkerPool(2) as pool:
-    frames = list(pool.frames(Path(os.environ["RIDE"]), range(9)))
-print(len(frames), sum(int(frame.sum()) for frame in frames))
-"""
-
-
-def test_a_script_can_have_workers(ride, tmp_path):
-    """Without a guard it runs once, and what lies beside it is not Python's."""
-    script = tmp_path / "script.py"
-    script.write_text(CALLER)
-    (tmp_path / "mujoco.py").write_text("raise RuntimeError('not this one')")
-    inherited = {k: v for k, v in os.environ.items() if k != "PYOPENGL_PLATFORM"}
-    done = subprocess.run(
-        [sys.executable, script],
-        env={**inherited, "RIDE": str(ride.path)},
-        capture_output=True,
-        text=True,
-    )
-    said = f"{FRAMES} {sum(int(frame.sum()) for frame in ride.frames)}\n"
-    assert (done.returncode, done.stdout, done.stderr) == (0, said, "")
-
-
 # What draws
 
 

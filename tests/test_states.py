@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a row holds of a simulation, and the memory that it is gathered from."""
 
-import gymnasium
 import mujoco
 import numpy as np
 import pytest
@@ -52,13 +51,6 @@ def test_the_words_of_a_state_are_what_mujoco_gives(xml):
     data.mocap_pos[:] = 7
     data.userdata[:] = np.arange(len(data.userdata))
     check_memory(model, data)
-
-
-@pytest.mark.parametrize("env_id", ["HalfCheetah-v5", "Humanoid-v5"])
-def test_the_states_of_environments_can_be_gathered(env_id):
-    """As Gymnasium makes them."""
-    env = gymnasium.make(env_id).unwrapped
-    check_memory(env.model, env.data)
 
 
 def test_a_component_of_another_type_has_to_be_asked_for():

@@ -10,7 +10,6 @@ from full_disk import file_size_limit
 from recordings import frames_of
 
 from mjrec import FileNotWritten
-from mjrec.annotation import Caption
 from mjrec.formats.unfinished_video import read_note
 from mjrec.formats.video_metadata import StepRuns, timing_facts
 from mjrec.formats.video_sink import VideoSink
@@ -83,19 +82,6 @@ def test_a_note_says_what_an_unfinished_video_is(tmp_path):
     sink.finish()
     sink.describe({})
     assert names(tmp_path) == ["v.framehash", "v.meta.json", "v.mp4"]
-
-
-def test_a_caption_is_on_the_frame_and_hides_no_blank_one(tmp_path):
-    """What shows nothing shows nothing, whatever is written on it."""
-    sink = VideoSink(tmp_path / "v.mp4", fps=Fraction(20))
-    for step in range(3):
-        caption = Caption(episode_id=0, step=step, time=None, reward=0.0)
-        sink.write(np.zeros((48, 96, 3), np.uint8), caption)
-    sink.finish()
-    written = sink.describe({})
-    assert written["suspect_black"]
-    assert written["annotated"]["pillow"]
-    assert max(frame.max() for frame in frames_of(tmp_path / "v.mp4")) > 100
 
 
 def test_steps_are_runs_and_timing_is_in_exact_fractions():
