@@ -17,6 +17,7 @@ from trajectories_by_hand import write_log
 import mjrec
 from mjrec.errors import InvalidArgument, NoPictures, UnknownName, UnreadableFile
 from mjrec.rendering.recorded_facts import chosen_frames
+from mjrec.simulation.renderer import SceneRenderer
 
 SPEC = mujoco.mjtState.mjSTATE_FULLPHYSICS
 SIZE = {"height": HEIGHT, "width": WIDTH}
@@ -58,6 +59,28 @@ def test_a_recording_is_drawn_again(ride):
     again = list(mjrec.render(loaded, workers=2))
     assert np.array_equal(again, ride.frames)
     assert children() == before
+
+
+MEMBERS = {"lookat": [1, 0, 0.5], "distance": 3.0, "azimuth": 70, "elevation": -20}
+
+
+@pytest.mark.parametrize("kind", ["name", "members", "own"])
+def test_another_view_takes_the_place_of_the_recorded_one(ride, kind):
+    """Camera, size, quality and rate; visual options stay."""
+    shown, option = mujoco.MjvCamera(), mujoco.MjvOption()
+    for name, value in MEMBERS.items():
+        setattr(shown, name, value)
+    option.flags[mujoco.mjtVisFlag.mjVIS_INERTIA] = True
+    camera = {"name": "side", "members": MEMBERS, "own": shown}[kind]
+    view = {"height": 30, "width": 50, "quality": "draft"}
+    # Ten a second are recorded: 0, 3, 6, and the last.
+    drawn = list(mjrec.render(ride.path, camera=camera, max_fps=4, **view))
+    assert [frame.shape for frame in drawn] == [(30, 50, 3)] * 4
+    model, data = start()
+    shown = "side" if kind == "name" else shown
+    with SceneRenderer(model, camera=shown, scene_option=option, **view) as renderer:
+        move(model, data, 0)
+        assert np.array_equal(drawn[0], renderer.render(data))
 
 
 WRONG = [

@@ -15,11 +15,12 @@ import numpy as np
 import pytest
 from interruption import ctrl_c_soon
 from processes import children
-from rides import FRAMES, WIDTH, record
+from rides import FRAMES, HEIGHT, WIDTH, record
 
 from mjrec import child_python
 from mjrec.child_python import Child
 from mjrec.errors import Error, InvalidArgument, UnknownName, UnreadableFile
+from mjrec.formats.trajectory_file import finish_trajectory
 from mjrec.rendering import pool as pool_module
 from mjrec.rendering.pool import WorkerPool
 from mjrec.rendering.views import View
@@ -108,15 +109,48 @@ def test_few_frames_are_kept_here(ride, three):
 
 
 def test_workers_stay_and_go_over_to_other_views(ride, three):
-    """Larger and smaller frames through the same pipes; also if some are dropped."""
+    """Larger and smaller frames, and none that shows what the last have changed."""
     list(three.frames(ride.path, range(5)))
     before = pids(three)
     for height in (20, 90):
         for frame in three.frames(ride.path, range(5), View(height=height)):
             assert frame.shape == (height, WIDTH, 3)
     assert pids(three) == before
+    # Some are dropped.
     next(three.frames(ride.path, range(FRAMES)))
-    assert np.array_equal(list(three.frames(ride.path, [5])), [ride.frames[5]])
+    assert np.array_equal(list(three.frames(ride.path, range(FRAMES))), ride.frames)
+
+
+def test_a_grid_is_what_each_camera_shows(ride, three, tmp_path):
+    """Byte for byte, in any order; and so it is where the log has become HDF5."""
+    side = record(tmp_path, camera="side")
+    path, numbers = finish_trajectory(side.path), [*range(FRAMES), 3, 7, 0]
+    frames = three.frames(path, numbers, cameras=[None, "rider", "side"])
+    for number, frame in zip(numbers, frames, strict=True):
+        upper, lower = frame[:HEIGHT], frame[HEIGHT:]
+        np.testing.assert_array_equal(upper[:, :WIDTH], side.frames[number])
+        np.testing.assert_array_equal(upper[:, WIDTH:], ride.frames[number])
+        np.testing.assert_array_equal(lower[:, :WIDTH], side.frames[number])
+        assert not lower[:, WIDTH:].any()
+
+
+@pytest.mark.thorough
+def test_a_camera_that_follows_does_not_depend_on_the_order(ride, one, three):
+    """Each frame moves it: those that another worker draws count too."""
+    camera = {"type": 1, "trackbodyid": 1, "distance": 4, "elevation": -30}
+    frames = list(one.frames(ride.path, range(FRAMES), View(camera=camera)))
+    assert len({frame.tobytes() for frame in frames}) == FRAMES
+    order = [4, 2, 8, 0, 0, 5, 7]
+    drawn = list(three.frames(ride.path, order, View(camera=camera)))
+    np.testing.assert_array_equal(drawn, [frames[number] for number in order])
+
+
+def test_the_plane_depends_on_the_picture_before(ride, one, tmp_path):
+    """Or the tests above would show nothing of it; fresh scenes do not depend."""
+    fresh = record(tmp_path, fresh=True)
+    assert not np.array_equal(fresh.frames[4], ride.frames[4])
+    drawn = list(one.frames(fresh.path, [*range(FRAMES), 4, 2]))
+    assert np.array_equal(drawn, [*fresh.frames, fresh.frames[4], fresh.frames[2]])
 
 
 # What goes wrong
