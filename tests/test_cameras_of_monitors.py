@@ -2,12 +2,11 @@
 """Several cameras, captions and second names, through `mjrec.Monitor`."""
 
 import json
-import subprocess
-import sys
 
 import gymnasium
 import numpy as np
 import pytest
+from other_python import run_python
 from recordings import frames_of, hashes_at, manifest_of
 
 import mjrec
@@ -82,11 +81,6 @@ except mjrec.MissingDependency as error:
 
 def test_captions_without_pillow_are_an_error_of_the_constructor(tmp_path):
     """It says how to install it, and nothing is left."""
-    done = subprocess.run(
-        [sys.executable, "-c", WITHOUT_PILLOW, str(tmp_path / "run")],
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    assert "pip install 'mjrec[annotate]'" in done.stdout
+    said = run_python(WITHOUT_PILLOW, tmp_path / "run").stdout
+    assert "pip install 'mjrec[annotate]'" in said
     assert not (tmp_path / "run").exists()

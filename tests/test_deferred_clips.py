@@ -4,8 +4,6 @@
 import copy
 import json
 import signal
-import subprocess
-import sys
 from pathlib import Path
 
 import gymnasium
@@ -13,6 +11,7 @@ import numpy as np
 import pytest
 from compiled_tasks import growing
 from full_disk import file_size_limit
+from other_python import run_python
 from parts import parametrize
 from recorded_states import assert_same, trajectories
 from recordings import add_facts, hashes_at, in_flight, manifest_of
@@ -224,10 +223,7 @@ def test_a_killed_process_leaves_a_clip_that_can_be_rendered(tmp_path):
         "hop(env, 13)\n"
         "os.kill(os.getpid(), 9)\n"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", script], check=False, capture_output=True, text=True
-    )
-    assert done.returncode == -signal.SIGKILL, done.stderr
+    run_python(script, status=-signal.SIGKILL)
     assert mjrec.recover(tmp_path)
     details = manifest_of(tmp_path)["mjrec"]
     [entry] = details["pending"]

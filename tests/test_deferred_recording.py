@@ -19,6 +19,7 @@ from typing import Any, ClassVar
 import gymnasium
 import numpy as np
 import pytest
+from other_python import run_python
 from parts import parametrize
 from processes import children
 from recordings import frames_in, in_flight, manifest_of, metadata_of, videos_in
@@ -229,19 +230,6 @@ env.step(env.action_space.sample())
 """
 
 
-def run_script(code, *arguments, **environment):
-    """Run code as `python -`, which has no file to come from."""
-    return subprocess.run(
-        [sys.executable, "-", *map(str, arguments)],
-        input=code,
-        capture_output=True,
-        text=True,
-        env={**os.environ, **environment},
-        timeout=120,
-        check=False,
-    )
-
-
 @pytest.mark.usefixtures("default_signals")
 def test_ctrl_c_while_waiting_leaves_the_rest_pending(tmp_path, stuck_encoder):
     """The manifest is written, the line is said, and the process ends at once."""
@@ -253,8 +241,7 @@ def test_ctrl_c_while_waiting_leaves_the_rest_pending(tmp_path, stuck_encoder):
         "threading.Thread(target=interrupt).start()\n"
         "env.close()\n"
     )
-    done = run_script(code, tmp_path, stuck_encoder)
-    assert done.returncode == -signal.SIGINT, done.stderr
+    done = run_python(code, tmp_path, stuck_encoder, status=-signal.SIGINT)
     assert "1 video pending: mjrec render" in done.stderr
     assert pending_in(tmp_path) == [0]
 
@@ -377,8 +364,7 @@ def test_no_opengl_in_the_simulation(tmp_path):
         f"{bare}{OPENGL}before = opengl()\nenv = mjrec{recorded}env.close()\n"
         "print(sorted(opengl() - before))"
     )
-    done = run_script(code, tmp_path, MUJOCO_GL="disable")
-    assert done.returncode == 0, done.stderr
+    done = run_python(code, tmp_path, env={**os.environ, "MUJOCO_GL": "disable"})
     assert done.stdout == "[]\n"
     assert len(frames_in(tmp_path, 0)) == 2
 
@@ -414,8 +400,7 @@ def test_the_global_random_state_is_left_alone(tmp_path):
         f"before = state()\nenv = mjrec{recorded}env.close()\n"
         "assert state() == before\n"
     )
-    done = run_script(code.replace("env.action_space.sample()", "[0.0]"), tmp_path)
-    assert done.returncode == 0, done.stderr
+    run_python(code.replace("env.action_space.sample()", "[0.0]"), tmp_path)
 
 
 # --- where monitors live -------------------------------------------------------------

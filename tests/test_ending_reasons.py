@@ -2,11 +2,10 @@
 """What an environment raises goes on unchanged, and the recording says it."""
 
 import signal
-import subprocess
-import sys
 
 import gymnasium
 import pytest
+from other_python import run_python
 from recordings import frames_in, in_flight, manifest_of, metadata_of, stats_of
 
 import mjrec
@@ -143,13 +142,8 @@ for seed in range(2):
 """
 
 
-def run(code, directory, *, under=()):
-    return subprocess.run(
-        [*under, sys.executable, "-c", PROGRAM + code, str(directory)],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+def run(code, directory, status, *, under=()):
+    return run_python(PROGRAM + code, directory, under=under, status=status)
 
 
 @pytest.mark.usefixtures("default_signals")
@@ -166,8 +160,7 @@ def run(code, directory, *, under=()):
 )
 def test_ways_of_ending_a_program(code, status, reason, tmp_path):
     """Without `with`, every file is closed and named, nothing is rendered, and said."""
-    done = run(code, tmp_path)
-    assert done.returncode == status, done.stderr
+    done = run(code, tmp_path, status)
     assert done.stderr.count("2 videos pending: mjrec render") == 1
     assert len(stats_of(tmp_path)["episode_lengths"]) == 1
     assert len(manifest_of(tmp_path)["mjrec"]["pending"]) == 2
@@ -190,10 +183,10 @@ def test_a_hangup_that_is_ignored_stays_ignored(tmp_path):
         "print('still here', flush=True)\n"
         "os.kill(os.getpid(), signal.SIGTERM)\n",
         tmp_path,
+        143,
         under=("env", "--ignore-signal=HUP"),
     )
     assert done.stdout == "still here\n"
-    assert done.returncode == 143, done.stderr
     assert done.stderr.count("2 videos pending: mjrec render") == 1
 
 
@@ -206,6 +199,6 @@ def test_a_signal_whose_exception_is_lost_comes_again(tmp_path):
         "import time\n"
         "time.sleep(30)\n",
         tmp_path,
+        143,
     )
-    assert done.returncode == 143, done.stderr
     assert "2 videos pending" in done.stderr

@@ -3,13 +3,13 @@
 
 import itertools
 import signal
-import subprocess
 import sys
 
 import gymnasium
 import mujoco
 import numpy as np
 import pytest
+from other_python import run_python
 from recorded_states import assert_same, is_fast, trajectories
 from recordings import stats_of
 
@@ -400,8 +400,7 @@ while True:
 @pytest.mark.parametrize("moment", ["being filled", "filled"])
 def test_a_kill_at_a_row_loses_that_row(moment, tmp_path):
     """Between filling it and counting it, too: all rows before it are there."""
-    done = subprocess.run([sys.executable, "-c", KILLED, str(tmp_path), moment])
-    assert done.returncode == -signal.SIGKILL
+    run_python(KILLED, tmp_path, moment, status=-signal.SIGKILL)
     mjrec.recover(tmp_path)
     # The first step of all did not go the fast way.
     assert [len(each) for each in trajectories(tmp_path)] == [3, 3, 1]

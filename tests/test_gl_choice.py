@@ -1,17 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """`use_gl`, in processes of their own: it is about what a process has done so far."""
 
-import os
-import subprocess
-import sys
-
 import pytest
+from other_python import run_python, without_gl
 from parts import parametrize
 
 from mjrec.gl import probe
 
-_CHOOSING = ("MUJOCO_GL", "PYOPENGL_PLATFORM", "MUJOCO_EGL_DEVICE_ID")
-_SCREEN = ("DISPLAY", "WAYLAND_DISPLAY", "XDG_SESSION_TYPE")
 _SHOW = (
     "\nprint(answer, os.environ.get('MUJOCO_GL'), os.environ.get('PYOPENGL_PLATFORM'))"
 )
@@ -20,21 +15,12 @@ _HEAD = "import logging, os, sys; import mjrec; logging.basicConfig(level='INFO'
 
 def run(code, **variables):
     """Run `code` in a Python whose environment chooses no OpenGL but these."""
-    environ = {k: v for k, v in os.environ.items() if k not in _CHOOSING + _SCREEN}
-    return subprocess.run(
-        [sys.executable, "-P", "-c", _HEAD + code],
-        env={**environ, **variables},
-        capture_output=True,
-        check=False,
-        text=True,
-    )
+    return run_python(_HEAD + code, env=without_gl(**variables))
 
 
 def answer_of(code, **variables):
     """Return what `code`, which sets `answer`, and the variables afterwards say."""
-    done = run(code + _SHOW, **variables)
-    assert done.returncode == 0, done.stderr
-    return done.stdout.strip()
+    return run(code + _SHOW, **variables).stdout.strip()
 
 
 def error_of(code, **variables):
@@ -47,9 +33,7 @@ def error_of(code, **variables):
         "  assert dict(os.environ) == before\n"
         "else:\n  sys.exit('no error')"
     )
-    done = run(wrapped, **variables)
-    assert done.returncode == 0, done.stderr
-    return done.stdout
+    return run(wrapped, **variables).stdout
 
 
 @parametrize(

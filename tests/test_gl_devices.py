@@ -1,12 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Rendering on a given GPU: found among EGL's devices, and said where there is none."""
 
-import os
-import subprocess
-import sys
 from dataclasses import replace
 
 import pytest
+from other_python import run_python, without_gl
 
 from mjrec.errors import InvalidArgument
 from mjrec.gl import EglDevice, probe, render_on_given_gpu, visible_gpus
@@ -29,7 +27,6 @@ LLVMPIPE = EglDevice(index=0, device_file="", cuda_id=None, software=True, in_us
 OTHER = replace(
     HIDDEN, index=1, in_use=False, uuid="GPU-0f3e5d1c-2b4a-4968-8877-665544332211"
 )
-CHOOSING = ("MUJOCO_GL", "PYOPENGL_PLATFORM", "MUJOCO_EGL_DEVICE_ID")
 
 
 @pytest.fixture(autouse=True)
@@ -44,14 +41,7 @@ def run(code, **variables):
         "import logging, os, sys; logging.basicConfig(level='INFO')\n"
         "from mjrec.gl import render_on_given_gpu\n"
     )
-    environ = {k: v for k, v in os.environ.items() if k not in CHOOSING}
-    return subprocess.run(
-        [sys.executable, "-P", "-c", head + code],
-        env={**environ, **variables},
-        capture_output=True,
-        check=False,
-        text=True,
-    )
+    return run_python(head + code, env=without_gl(**variables), status=None)
 
 
 def has_gpu():

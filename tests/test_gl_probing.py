@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from other_python import without_gl
 
 from mjrec.gl import Probe, probe, probing
 from mjrec.gl.probing import probe_environment
@@ -22,10 +23,7 @@ _EGL_PACKAGES = "libegl1 libegl-mesa0 libgl1-mesa-dri libopengl0"
 
 def probe_with(backend, **variables):
     """Probe with the test's environment, free of what chooses OpenGL, and these."""
-    chosen = ("MUJOCO_GL", "PYOPENGL_PLATFORM", "MUJOCO_EGL_DEVICE_ID")
-    screen = ("DISPLAY", "WAYLAND_DISPLAY", "XDG_SESSION_TYPE")
-    environ = {k: v for k, v in os.environ.items() if k not in chosen + screen}
-    return probe_environment({**environ, "MUJOCO_GL": backend, **variables})
+    return probe_environment(without_gl(MUJOCO_GL=backend, **variables))
 
 
 def let_python_start_with(code, folder, monkeypatch):

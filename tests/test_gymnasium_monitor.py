@@ -1,13 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-import subprocess
-import sys
 import threading
 import warnings
-from pathlib import Path
 
 import gymnasium
 import pytest
 from gymnasium.utils.env_checker import check_env
+from other_python import run_python
 from parts import parametrize
 from recordings import (
     frames_in,
@@ -237,14 +235,12 @@ def test_garbage_collection_closes(corridor, tmp_path, play, thread):
 
 LEAVING = """
 import sys
-sys.path.insert(0, {tests!r})
-import conftest, gymnasium, mjrec
+import gymnasium, mjrec
 env = gymnasium.make("HalfCheetah-v5", render_mode="rgb_array", width=32, height=32)
-env = mjrec.Monitor(env, {directory!r}, render="live")
+env = mjrec.Monitor(env, sys.argv[1], render="live")
 env.reset(seed=0)
 for _ in range(3):
     env.step(env.action_space.sample())
-{how}
 """
 
 
@@ -255,13 +251,7 @@ for _ in range(3):
 )
 def test_leaving_the_interpreter_closes(tmp_path, how, status):
     """Without close(): a live video, statistics and manifest, without noise."""
-    script = LEAVING.format(
-        tests=str(Path(__file__).parent), directory=str(tmp_path), how=how
-    )
-    done = subprocess.run(
-        [sys.executable, "-c", script], capture_output=True, text=True, check=False
-    )
-    assert done.returncode == status
+    done = run_python(LEAVING + how, tmp_path, status=status)
     assert len(frames_in(tmp_path, 0)) == 4
     assert manifest_of(tmp_path)["videos"]
     assert "Exception ignored" not in done.stderr

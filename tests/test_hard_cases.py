@@ -17,6 +17,7 @@ import gymnasium
 import numpy as np
 import pytest
 from compiled_tasks import growing
+from other_python import run_python
 from recordings import hashes_at
 from robots import robots_that_reset
 
@@ -283,10 +284,6 @@ def test_an_episode_of_a_million_steps_needs_no_more_memory(tmp_path):
     )
     used = {}
     for steps in (10_000, 1_000_000):
-        done = subprocess.run(
-            [sys.executable, "-c", program, str(tmp_path / str(steps)), str(steps)],
-            check=True,
-            stdout=subprocess.PIPE,
-        )
+        done = run_python(program, tmp_path / str(steps), steps)
         used[steps] = int(done.stdout) << 10
     assert used[1_000_000] - used[10_000] < 32 << 20, used

@@ -3,11 +3,10 @@
 
 import json
 import signal
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
+from other_python import run_python
 from parts import parametrize
 from recordings import frames_in, manifest_of, metadata_of, stats_of
 from result_files import entry, write_journal
@@ -32,12 +31,7 @@ def die(*_, **__):
 
 def run(program, directory, place):
     """Run a program; tell whether it was killed, and not over before that."""
-    done = subprocess.run(
-        [sys.executable, "-c", START + program, directory, str(place)],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    done = run_python(START + program, directory, place, status=None)
     assert done.returncode in (0, -signal.SIGKILL), done.stderr
     # An encoder outlives it for a moment.
     wait_until(lambda: not any(map(is_locked, directory.glob(".*.part"))))

@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 import ast
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
+from other_python import run_python
 
 import mjrec
 from mjrec import errors
@@ -168,9 +167,7 @@ def test_every_error_is_public_and_an_error():
 
 
 def _run(code):
-    return subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=True
-    ).stdout
+    return run_python(code).stdout
 
 
 def test_import_is_inert():

@@ -3,9 +3,9 @@
 
 import os
 import subprocess
-import sys
 
 import pytest
+from other_python import run_python
 from recordings import manifest_of, stats_of
 
 import mjrec
@@ -61,13 +61,7 @@ def test_episodes_of_a_full_disk_are_complete(room, ending, disk):
 
     Rows tell what lines could not, and nothing claims what is not so.
     """
-    done = subprocess.run(
-        [sys.executable, "-c", PROGRAM, str(disk), str(room), ending],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == (0 if ending == "closed" else -9), done.stderr
+    run_python(PROGRAM, disk, room, ending, status=0 if ending == "closed" else -9)
     (disk / "filler").unlink(missing_ok=True)
     run = disk / "run"
     assert not mjrec.recover(run).failures

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 import gc
 import os
-import subprocess
-import sys
 import tempfile
 from fractions import Fraction
 
@@ -10,6 +8,7 @@ import mujoco
 import mujoco.rollout
 import numpy as np
 import pytest
+from other_python import run_python
 from processes import children
 from rides import HEIGHT, WIDTH, move, record, start
 from trajectories_by_hand import write_log
@@ -181,9 +180,6 @@ def test_states_that_are_left_early_leave_no_files(temporary):
         "kept = mjrec.render_states(model, states, 1, height=8, width=8)\n"
         "next(kept)\n"
     )
-    subprocess.run(
-        [sys.executable, "-W", "error", "-c", script],
-        env={**os.environ, "TMPDIR": str(temporary)},
-        check=True,
-    )
+    variables = {"TMPDIR": str(temporary), "PYTHONWARNINGS": "error"}
+    run_python(script, env={**os.environ, **variables})
     assert list(temporary.iterdir()) == []

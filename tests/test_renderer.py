@@ -3,8 +3,6 @@
 
 import gc
 import os
-import subprocess
-import sys
 import textwrap
 from pathlib import Path
 
@@ -12,6 +10,7 @@ import gymnasium
 import mujoco
 import numpy as np
 import pytest
+from other_python import run_python
 
 from mjrec.errors import InvalidArgument
 from mjrec.simulation import gl_context
@@ -93,14 +92,8 @@ def load(name):
     mujoco.mj_forward(model, data)
     return model, data
 """
-    done = subprocess.run(
-        [sys.executable, "-c", head + textwrap.dedent(script)],
-        env={**inherited, **environment},
-        capture_output=True,
-        text=True,
-        timeout=120,
-        check=False,
-    )
+    env = {**inherited, **environment}
+    done = run_python(head + textwrap.dedent(script), env=env, status=None)
     # Other packages' deprecations are theirs to mend.
     for trouble in ("Exception ignored", "Error", "mjrec"):
         assert trouble not in done.stderr, done.stderr

@@ -1,10 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the trackers have in common."""
 
-import subprocess
-import sys
-
 import pytest
+from other_python import run_python
 
 import mjrec.trackers
 from mjrec.errors import InvalidArgument
@@ -23,9 +21,7 @@ sys.meta_path.insert(0, Lack())
 
 
 def run(code, cwd):
-    return subprocess.run(
-        [sys.executable, "-c", code], cwd=cwd, capture_output=True, text=True
-    )
+    return run_python(code, cwd=cwd, status=None)
 
 
 def test_import_loads_no_service(tmp_path):

@@ -1,14 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Recorded episodes are read back as arrays, and replayed bit for bit."""
 
-import subprocess
-import sys
 from pathlib import Path
 
 import gymnasium
 import mujoco
 import numpy as np
 import pytest
+from other_python import run_python
 from trajectories_by_hand import INFIX, add_row, new_logs
 
 import mjrec
@@ -221,7 +220,4 @@ def test_reading_needs_no_simulator(tmp_path):
         "try: t.model()\n"
         "except ModuleNotFoundError as error: print(error.name)\n"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=True
-    )
-    assert done.stdout == "12 (13, 15) 7\nmujoco\n"
+    assert run_python(code).stdout == "12 (13, 15) 7\nmujoco\n"

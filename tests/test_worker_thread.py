@@ -1,10 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The bounded worker thread; what else it promises is seen in `test_video_writer`."""
 
-import subprocess
-import sys
-
 import pytest
+from other_python import run_python
 
 from mjrec.worker_thread import WorkerThread
 
@@ -42,4 +40,4 @@ def test_neither_forks_nor_the_interpreter_wait_for_the_thread():
         "        os._exit(7)\n"
         "assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 7\n"
     )
-    subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
+    run_python(code, timeout=60)
