@@ -153,13 +153,18 @@ def test_plain_h5py_finds_every_array_by_its_name(path: Path) -> None:
 def test_the_example_of_the_specification_runs(
     path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """What docs/format.md shows a stranger works on a real file."""
+    """What docs/reference/trajectories.md shows a stranger works on a real file."""
     record(path)
     finish_trajectory(path).rename(path.with_name("episode.h5"))
-    text = Path(__file__).parents[1].joinpath("docs", "format.md").read_text()
+    text = (
+        Path(__file__)
+        .parents[1]
+        .joinpath("docs", "reference", "trajectories.md")
+        .read_text()
+    )
     (code,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
     monkeypatch.chdir(path.parent)
-    exec(compile(code, "docs/format.md", "exec"), {})
+    exec(compile(code, "docs/reference/trajectories.md", "exec"), {})
     assert "E-v0" in capsys.readouterr().out
 
 

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """The HDF5 file of a recorded episode: as strangers read it, with plain h5py.
 
-`docs/format.md` has every dataset. States and snapshots are rows of a compound type,
-whose members bear MuJoCo's names: `file["states"]["qpos"]` is an array. The shuffle
-filter, which goes by whole rows there, puts the same byte of one row after the other
-side by side, so that what does not change costs nothing.
+`docs/reference/trajectories.md` has every dataset. States and snapshots are rows of a
+compound type, whose members bear MuJoCo's names: `file["states"]["qpos"]` is an array.
+The shuffle filter, which goes by whole rows there, puts the same byte of one row after
+the other side by side, so that what does not change costs nothing.
 
 Nothing here bounds the memory or time that a file asks for: `foreign_files`
 does.
