@@ -9,10 +9,8 @@ from mjrec.errors import PicturesDiffer
 from mjrec.simulation.capture import Capture
 from mjrec.simulation.fields import apply_fields
 from mjrec.simulation.model_store import load_model
-from mjrec.simulation.raw_memory import WORDS
 from mjrec.simulation.self_check import differences
 from mjrec.simulation.snapshot import restore_snapshot
-from mjrec.simulation.states import read_state
 from mjrec.simulation.view import SceneView, view_from_facts
 
 BALL = """
@@ -111,29 +109,6 @@ def simulation(new):
     return new()
 
 
-def test_rows_can_be_gathered_while_only_the_state_changes(new):
-    """State and snapshot; not once model, view or what `model_changed` says moved."""
-    still = new(is_unmoved=lambda: still.is_unmoved)
-    start = still.begin()
-    assert start.words is not None
-    for _ in range(3):
-        still.step()
-        assert start.is_current()
-        assert still.capture() is None
-        state = read_state(still.model, still.data).tobytes()
-        assert WORDS.take(start.words).tobytes() == state + still.words.tobytes()
-    still.model.geom_rgba[0] = (1, 0, 0, 1)
-    assert not start.is_current()
-    assert list(still.capture()) == ["geom_rgba"]
-    assert start.is_current()
-    still.is_unmoved = False
-    assert not start.is_current()
-    still.is_unmoved = True
-    still.states.model_changed()
-    assert not start.is_current()
-    assert still.begin().words is not None
-
-
 def test_changes_of_model_and_view_are_told_once(simulation):
     """And the stored model, facts, a row and these changes give the scene."""
     simulation.shown("INERTIA")
@@ -170,33 +145,6 @@ def test_changes_of_model_and_view_are_told_once(simulation):
 
 def update(scene, model, data, view):
     mujoco.mjv_updateScene(model, data, view.option, None, view.camera, 7, scene)
-
-
-def test_long_arrays_are_looked_at_when_somebody_says_so(simulation):
-    """Textures, for example; and at the next reset, without a word."""
-    simulation.begin()
-    simulation.model.tex_data[5] ^= 1
-    assert simulation.capture() is None
-    simulation.states.model_changed()
-    assert simulation.capture().keys() == {"tex_data"}
-    assert simulation.capture() is None
-    assert simulation.begin().model_fields.keys() == {"tex_data"}
-    assert simulation.capture() is None
-    simulation.model.tex_data[5] ^= 1
-    assert simulation.begin().model_fields == {}
-
-
-def test_the_model_is_stored_once_and_differences_are_told(simulation):
-    """Every episode says in what its model is other than the stored one."""
-    first = simulation.begin()
-    assert first.model_fields == {}
-    simulation.model.body_pos[1] = (1, 2, 3)
-    second = simulation.begin()
-    assert second.model == first.model
-    assert second.model_fields["body_pos"][1].tolist() == [1, 2, 3]
-    assert simulation.capture() is None
-    simulation.states.finish()
-    assert len(list(simulation.directory.iterdir())) == 1
 
 
 def test_a_model_that_consists_of_other_things_is_stored_anew(simulation):

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Videos counted in steps: `step_trigger` and `video_length`."""
 
-import json
 from pathlib import Path
 
 import numpy as np
@@ -99,19 +98,3 @@ def test_a_clip_is_its_first_frame_and_n_steps(length, steps, options, shown, tm
     results = mjrec.load_results(tmp_path)
     listed = [Path(video).name for video, _ in results["videos"]]
     assert listed == [path.name for path in sorted(tmp_path.glob("*.mp4"))]
-
-
-@pytest.mark.parametrize(
-    ("length", "expected"),
-    [
-        (5, {"length": 5, "complete": True, "last_episode_id": 2}),
-        (50, {"length": 10, "complete": False, "reason": "close"}),
-    ],
-)
-def test_what_the_metadata_of_a_clip_says(length, expected, tmp_path):
-    """How long it is, which episodes it is of, and whether it was cut off."""
-    options = {**begins((2,)), "video_length": length}
-    with mjrec.Monitor(Counting(3), tmp_path, **options) as env:
-        ride(env, 12)
-    [path] = tmp_path.glob("*.meta.json")
-    assert json.loads(path.read_text()).items() >= {"episode_id": 0, **expected}.items()

@@ -13,7 +13,6 @@ from compiled_tasks import growing
 from full_disk import file_size_limit
 from other_python import run_python
 from parts import parametrize
-from recorded_states import assert_same, trajectories
 from recordings import add_facts, hashes_at, in_flight, manifest_of
 
 import mjrec
@@ -162,22 +161,6 @@ def test_resets_that_change_or_compile_the_model_are_seen(make, annotate, tmp_pa
     for render in ("live", "deferred"):
         record(tmp_path / render, make(), 14, render=render, **options)
     check_same(tmp_path / "live", tmp_path / "deferred")
-
-
-@pytest.mark.thorough
-def test_trajectories_and_clips_run_beside_each_other(tmp_path):
-    """Each sees all that changes in the model, whoever looks first."""
-    clips = {"step_trigger": lambda step: step in (2, 9), "video_length": 6}
-    live = hopper(render_mode="rgb_array")
-    evaluation = {"mode": "evaluation"}
-    record(tmp_path / "live", live, 14, render="live", **clips, **evaluation)
-    record(tmp_path / "both", hopper(), 14, **clips, **evaluation)
-    record(tmp_path / "plain", hopper(), 14, video_callable=False, **evaluation)
-    check_same(tmp_path / "live", tmp_path / "both")
-    recorded, plain = trajectories(tmp_path / "both"), trajectories(tmp_path / "plain")
-    assert len(recorded) == 3
-    for one, other in zip(recorded, plain, strict=True):
-        assert_same(one, other)
 
 
 @parametrize(

@@ -227,23 +227,6 @@ def test_rewards_of_any_type_are_numbers(kind, tmp_path):
     assert stats_of(tmp_path)["episode_rewards"] == [total]
 
 
-def test_episodes_that_are_only_counted(tmp_path):
-    """Lengths, sums and ends are those of episodes whose states are recorded."""
-    found = []
-    for name, schedule in (("counted", False), ("recorded", None)):
-        with monitored(make(HOPPER, 30), tmp_path / name, schedule) as monitor:
-            begin(monitor)
-            for steps in range(1, 101):
-                [(_, _, terminated, truncated, _)] = go(monitor, 1)
-                assert monitor.get_total_steps() == steps
-                if terminated or truncated:
-                    monitor.reset()
-        stats = stats_of(tmp_path / name)
-        found.append((stats["episode_lengths"], stats["episode_rewards"]))
-    assert found[0] == found[1]
-    assert not list((tmp_path / "counted").glob("*trajectory*"))
-
-
 def test_a_reward_that_is_no_number_is_told(tmp_path):
     """The step is not recorded, and the next one is."""
     rewards = iter([1.0, 1.0, "much", 1.0, 1.0])

@@ -176,23 +176,6 @@ def test_an_environment_that_cannot_be_drawn_any_more(on_error, pendulum, out):
 
 
 @both_ways
-def test_a_first_frame_that_cannot_be_drawn(on_error, pendulum, out):
-    """States are recorded all the same; the metadata says what the video lacks."""
-    monitor = pendulum(render="live", on_error=on_error)
-    why = "no window yet"
-    with not_drawn(monitor, why), raised(on_error, RuntimeError, why):
-        run(monitor)
-    run(monitor)
-    monitor.close()
-    # With an error, the reset after it replaces the episode that was never whole.
-    assert len(frames_in(out, 0 if on_error == "raise" else 1)) == 9
-    if on_error == "warn":
-        assert faults_of(out) == [(0, "video")]
-        assert metadata_of(out, 0)["broken_reason"] == why
-        assert len(list(out.glob("*.h5"))) == 2
-
-
-@both_ways
 def test_videos_that_cannot_be_rendered(on_error, pendulum, out, monkeypatch, caplog):
     """They stay pending, and the trajectories are there."""
     monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", "/bin/false")
@@ -286,16 +269,3 @@ def test_a_directory_that_is_removed_during_the_run(render, on_error, pendulum, 
     out.mkdir()
     monitor.close()
     assert stats_of(out)["episode_lengths"] == [8, 8][: 1 + (on_error == "warn")]
-
-
-def test_a_directory_that_is_made_anew_is_noticed(pendulum, out):
-    """At the end of the next episode: the journal is another one, or none."""
-    monitor = pendulum(render="off", trajectory_callable=False)
-    run(monitor)
-    remove(out)
-    out.mkdir()
-    with pytest.raises(FileNotWritten, match="removed while it was written"):
-        run(monitor)
-    run(monitor)
-    monitor.close()
-    assert stats_of(out)["episode_lengths"] == [8, 8, 8]

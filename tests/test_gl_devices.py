@@ -144,25 +144,6 @@ def test_where_it_cannot_be_there_is_one_warning(gpu, variables, said):
     assert f"GLError: {said}" in done.stderr
 
 
-@pytest.mark.parametrize(
-    ("first", "variables", "expected"),
-    [
-        ("import mujoco", {"MUJOCO_GL": "off"}, ""),
-        ("import mujoco", {"MUJOCO_GL": ""}, "cannot change to egl any more"),
-        (
-            "import mujoco; context = mujoco.GLContext(16, 16)",
-            {"MUJOCO_GL": "egl"},
-            "has begun to draw by EGL",
-        ),
-    ],
-)
-def test_too_late_in_a_process(first, variables, expected):
-    """An error where what was imported cannot change any more."""
-    done = run(f"{first}\nrender_on_given_gpu('0')", DISPLAY="", **variables)
-    assert expected in done.stderr
-    assert (done.returncode == 0) is (not expected)
-
-
 @needs_gpu
 @pytest.mark.parametrize(
     "name", [lambda d: "0", lambda d: d.uuid, lambda d: d.uuid[:9]]

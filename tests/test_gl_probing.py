@@ -15,7 +15,6 @@ from other_python import without_gl
 
 from mjrec.gl import Probe, probe, probing
 from mjrec.gl.probing import probe_environment
-from mjrec.machine import gpu_device_files
 from mjrec.simulation import gl_probe
 
 _EGL_PACKAGES = "libegl1 libegl-mesa0 libgl1-mesa-dri libopengl0"
@@ -92,18 +91,6 @@ def test_variables_that_keep_a_backend_from_rendering(backend, variables, cause,
     assert not answer.renders
     assert cause in answer.cause
     assert fix in answer.fix
-
-
-@pytest.mark.skipif(
-    bool(gpu_device_files()), reason="where there is a GPU, its driver is missed first"
-)
-def test_vendor_file_of_a_library_that_is_missing(tmp_path):
-    """Both the file and the library that it names are named."""
-    file = tmp_path / "50_gone.json"
-    icd = {"file_format_version": "1.0.0", "ICD": {"library_path": "libgone.so.0"}}
-    file.write_text(json.dumps(icd))
-    answer = probe_with("egl", __EGL_VENDOR_LIBRARY_FILENAMES=str(file))
-    assert f"libgone.so.0, named in {file}, cannot be loaded" in answer.cause
 
 
 def test_driver_that_draws_nothing():

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import logging
 import signal
 import subprocess
@@ -265,25 +264,6 @@ def test_incomplete_episodes_are_never_chosen(tmp_path: Path, way: Any) -> None:
 
 
 # --- ends ----------------------------------------------------------------------------
-
-
-@parametrize("way", ["close", "exception"])
-def test_leaving_early_leaves_the_chosen_pending(tmp_path: Path, way: str) -> None:
-    """What fell out is gone then too, and so is a running episode."""
-    env = mjrec.Monitor(pendulum(), tmp_path, keep="worst:2", workers=1)
-    run(env, 7)
-    with contextlib.suppress(ZeroDivisionError), env:
-        if way == "exception":
-            env.reset()
-            raise ZeroDivisionError
-        run(env, 1)
-        env.close(wait=False)
-    assert logs_of(tmp_path) == pending_in(tmp_path) == [1, 3]
-    render(tmp_path)
-    assert videos_in(tmp_path) == [1, 3]
-    finished = 8 - (way == "exception")
-    assert metadata_of(tmp_path, 1)["selection"]["finished"] == finished
-    assert pending_in(tmp_path) == []
 
 
 def confused(episodes: Sequence[Any]) -> list[int]:

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Statistics and manifest follow from the journal, whoever computes them."""
 
-import json
-
 import gymnasium
 import pytest
 from recordings import events_of, manifest_of, stats_of
@@ -82,20 +80,3 @@ def test_an_episode_that_was_cut_is_in_the_journal(tmp_path, make_corridor):
     assert (second["episode_id"], second["reason"]) == (1, "close")
     assert manifest_of(tmp_path)["mjrec"]["schedule"]["recorded"] == [0, 1]
     assert stats_of(tmp_path)["timestamps"] == []
-
-
-def test_a_reason_goes_with_the_video_that_comes(tmp_path):
-    """It stands in the manifest as long as the video is pending, and no longer."""
-    record(tmp_path, OPTIONS["not waited for"])
-    [video, *_] = [e["video"] for e in manifest_of(tmp_path)["mjrec"]["pending"]]
-    said = tmp_path / video.replace(".mp4", ".failed.json")
-    said.write_text(json.dumps({"reason": "no paint"}))
-    [path] = tmp_path.glob("*.manifest.json")
-    infix = Infix.parse(path.name.split(".manifest.")[1])
-    assert infix is not None
-    write_manifest_and_stats(tmp_path, infix)
-    [entry] = [e for e in manifest_of(tmp_path)["mjrec"]["pending"] if "reason" in e]
-    assert (entry["video"], entry["reason"]) == (video, "no paint")
-    assert not mjrec.render_videos(tmp_path).failures
-    assert not said.exists()
-    assert manifest_of(tmp_path)["mjrec"]["pending"] == []

@@ -16,7 +16,7 @@ from trajectories_by_hand import (
     write_pending_manifest,
 )
 
-from mjrec import UnreadableFile, load_results
+from mjrec import UnreadableFile
 from mjrec.formats.locks import Lock
 from mjrec.formats.monitor_directory import (
     lock_name,
@@ -26,7 +26,7 @@ from mjrec.formats.monitor_directory import (
 from mjrec.formats.spans import is_in_flight
 from mjrec.formats.trajectory_file import open_trajectory
 from mjrec.rendering import finish as module
-from mjrec.rendering.jobs import RecordingKey, RenderedVideos
+from mjrec.rendering.jobs import RecordingKey
 from mjrec.rendering.recorded_facts import open_for_rendering
 from mjrec.rendering.recordings import claim, look_at, may_be_left
 from mjrec.results.manifest_writing import write_manifest_and_stats
@@ -69,19 +69,6 @@ def test_a_deferred_video_is_pending_until_it_and_its_metadata_are_there(
         assert look_at(tmp_path, KEY) is None
         assert not may_be_left(tmp_path, KEY)
         (tmp_path / f"{VIDEO}.meta.json").unlink()
-
-
-@pytest.mark.parametrize("video", [None, "live"])
-def test_a_log_without_a_deferred_video_gets_its_final_form_only(
-    video, tmp_path, painter, names
-):
-    """What was drawn live, or not wanted, is not drawn."""
-    log = write_log(tmp_path, video=video)
-    [result] = finish(tmp_path)
-    assert result == RenderedVideos(directory=tmp_path, trajectories=(log.name,))
-    assert [n for n in names(tmp_path) if "mp4" in n or "trajectory" in n] == [log.name]
-    assert painter.asked == []
-    assert finish(tmp_path) == []
 
 
 @pytest.mark.parametrize(("facts", "ended"), [({"candidate": True}, True), ({}, False)])
@@ -157,31 +144,6 @@ def test_what_cannot_be_rendered_stops_nothing_else(tmp_path, caplog, painter):
 
 
 # The manifest
-
-
-def test_the_manifest_of_a_closed_monitor_gets_the_videos(tmp_path):
-    """In the order of the episodes; what nothing can be rendered of is none."""
-    for episode_id in (0, 1):
-        write_finished(tmp_path, episode_id)
-    write_finished(tmp_path, 3, frames=False, broken_reason="a marker")
-    write_pending_manifest(tmp_path, 1, 0, 2, 3, schedule={"name": "cubic"})
-    (tmp_path / "openaigym.episode_batch.0.7.stats.json").write_text(
-        '{"initial_reset_timestamp": 1, "timestamps": [2], "episode_lengths": [4], '
-        '"episode_rewards": [2.0], "episode_types": ["t"]}'
-    )
-    finish(tmp_path)
-    manifest = manifest_in(tmp_path)
-    assert manifest["videos"] == [
-        [f"openaigym.video.0.7.video{k:06d}.{end}" for end in ("mp4", "meta.json")]
-        for k in (0, 1)
-    ]
-    assert manifest["mjrec"]["pending"] == []
-    assert manifest["mjrec"]["broken"] == ["openaigym.video.0.7.video000003.meta.json"]
-    assert manifest["mjrec"]["schedule"]["name"] == "cubic"
-    assert manifest["env_info"] == {"gym_version": "mjrec-1", "env_id": "Grey-v0"}
-    results = load_results(tmp_path)
-    assert results is not None
-    assert len(results["videos"]) == 2
 
 
 def test_the_manifest_of_an_open_monitor_is_left_to_it(tmp_path):

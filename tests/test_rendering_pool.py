@@ -19,7 +19,7 @@ from rides import FRAMES, HEIGHT, WIDTH, record
 
 from mjrec import child_python
 from mjrec.child_python import Child
-from mjrec.errors import Error, InvalidArgument, UnknownName, UnreadableFile
+from mjrec.errors import Error, UnreadableFile
 from mjrec.formats.trajectory_file import finish_trajectory
 from mjrec.rendering import pool as pool_module
 from mjrec.rendering.pool import WorkerPool
@@ -154,21 +154,6 @@ def test_the_plane_depends_on_the_picture_before(ride, one, tmp_path):
 
 
 # What goes wrong
-
-
-def test_errors_come_at_their_place(ride, three):
-    """The same class and facts as in the worker; the workers go on."""
-    with pytest.raises(UnknownName, match="no camera 'sid'") as caught:
-        three.frames(ride.path, range(FRAMES), View(camera="sid"))
-    assert caught.value.available == ["side", "rider"]
-    with pytest.raises(UnreadableFile) as lost:
-        three.frames(ride.path.with_name("lost.h5"), range(4))
-    assert lost.value.path == ride.path.with_name("lost.h5")
-    frames = three.frames(ride.path, [0, 1, 2, 3, 99])
-    assert np.array_equal([next(frames) for _ in range(4)], ride.frames[:4])
-    with pytest.raises(InvalidArgument, match="no picture 99"):
-        next(frames)
-    assert np.array_equal(list(three.frames(ride.path, [3])), [ride.frames[3]])
 
 
 def test_a_killed_worker_is_replaced(ride, caplog):

@@ -4,7 +4,6 @@
 import contextlib
 import hashlib
 import json
-from fractions import Fraction
 
 import av
 import pytest
@@ -37,7 +36,6 @@ from mjrec.rendering.render_video import render_video
 from mjrec.rendering.views import Variant, View
 
 STEM = "openaigym.video.0.7.video000000"
-ENDS = ("framehash", "meta.json", "mp4")
 KEY = RecordingKey(INFIX, 0)
 
 
@@ -67,27 +65,6 @@ def rate_of(video):
 # One camera
 
 
-@pytest.mark.parametrize("write", [write_log, write_finished])
-def test_every_frame_is_in_the_video(write, tmp_path, names):
-    """In order, at the rate of the steps; hashes and metadata are beside it."""
-    trajectory = write(tmp_path, steps=5)
-    before, counted = names(tmp_path), list[None]()
-    video = render(trajectory, on_frame=lambda: counted.append(None))
-    assert shown(video) == [0, 1, 2, 3, 4, 5]
-    assert len(counted) == 6
-    assert rate_of(video) == 20
-    assert names(tmp_path) == [*before, *(f"{STEM}.{end}" for end in ENDS)]
-
-
-def test_the_rate_asked_for_counts(tmp_path):
-    """At the recording or now; it is written into the file and selects nothing."""
-    trajectory = write_log(tmp_path, fps="5/2")
-    for asked, expected in ((None, Fraction(5, 2)), (50, 50)):
-        video = render(trajectory, variant=Variant(fps=asked))
-        assert rate_of(video) == expected
-        assert shown(video) == [0, 1, 2, 3, 4]
-
-
 @pytest.mark.parametrize(
     ("stride", "max_fps", "steps", "fps"),
     [
@@ -105,22 +82,6 @@ def test_max_fps_leaves_frames_out(stride, max_fps, steps, fps, tmp_path):
     assert metadata["frame_steps"] == steps
     assert metadata["playback_speed"] == 1.0
     assert rate_of(video) == fps
-
-
-@pytest.mark.parametrize(
-    ("facts", "said"),
-    [
-        (
-            {"ended": False},
-            {"complete": False, "reason": "killed", "length": 4, "reward": 2.0},
-        ),
-        ({"broken_reason": "a marker"}, {"broken": True, "broken_reason": "a marker"}),
-    ],
-)
-def test_what_broke_off_says_so(facts, said, tmp_path):
-    """The frames before are a video."""
-    metadata = metadata_of(render(write_log(tmp_path, **facts)))
-    assert {key: metadata[key] for key in said} == said
 
 
 def test_without_a_frame_there_is_metadata_or_an_error(tmp_path, names):
@@ -175,23 +136,6 @@ def facts_of_the_video(monkeypatch):
         return usual(self, name, {**facts, "video": video}, *rest, **more)
 
     monkeypatch.setattr(trajectories_by_hand.SpanLogs, "begin", begin)
-
-
-def test_each_camera_has_a_video(tmp_path, names):
-    """With metadata and hashes of its own; the first one's, by which they are, last."""
-    trajectory, painter = write_with_cameras(tmp_path), Painter()
-    assert render(trajectory, painter).name == FIRST
-    made = [name[:-3] + end for name in (FIRST, SIDE, SECOND) for end in ENDS]
-    assert names(tmp_path) == sorted([trajectory.name, *made])
-    views = [view.camera for _, _, view in painter.asked]
-    assert views == ["side", {"distance": 2.0}, None]
-    first, side, second = (metadata_of(tmp_path / n) for n in (FIRST, SIDE, SECOND))
-    assert first["camera"] == "eye"
-    assert first["further_videos"] == [SIDE, SECOND]
-    assert (side["camera"], second["camera"]) == ("side", {"distance": 2.0})
-    assert side["first_video"] == FIRST
-    assert side["frame_count"] == first["frame_count"] == 5
-    assert side["file_sha256"] != first["file_sha256"]
 
 
 @pytest.mark.parametrize("camera", [None, "side", {"distance": 2.0}])
