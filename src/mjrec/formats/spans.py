@@ -229,7 +229,7 @@ class _Spans:
 
 # A journal only grows, and each recording is looked for by itself.
 _known: dict[Path, _Spans] = {}
-_MOST_KNOWN = 64
+_MOST_KNOWN = 8
 _lock = threading.Lock()
 
 
