@@ -11,6 +11,7 @@ from collections.abc import Callable
 import gymnasium
 import pytest
 from recordings import frames_of
+from result_files import stats_of
 from trajectories_by_hand import (
     INFIX,
     write_finished,
@@ -20,6 +21,7 @@ from trajectories_by_hand import (
 
 from mjrec import Monitor, clear_monitor_files
 from mjrec.commands import main
+from mjrec.formats.manifest import read_manifest, write_stats_file
 from mjrec.rendering.jobs import RecordingKey
 from mjrec.rendering.recordings import claim
 from mjrec.rendering.render_videos import name_of_variant
@@ -48,7 +50,8 @@ def test_pending_videos_are_rendered(tmp_path, mjrec, painter):
     """Each is told when it is there, and where they are at the end."""
     write_finished(tmp_path, 0)
     write_log(tmp_path, 1)
-    write_pending_manifest(tmp_path, 0, 1)
+    manifest = write_pending_manifest(tmp_path, 0, 1)
+    write_stats_file(manifest.with_name(read_manifest(manifest).stats), stats_of(0, 1))
     status, out, err = mjrec(tmp_path)
     assert (status, err) == (0, "")
     assert out.splitlines() == [
