@@ -10,6 +10,7 @@ from typing import Any
 import h5py
 
 from mjrec.evaluation.evaluation import Evaluation
+from mjrec.formats.bundle import file_of, group_of
 from mjrec.formats.trajectory_file import open_trajectory
 
 
@@ -42,8 +43,9 @@ def datasets_in(path: Path) -> dict[str, tuple[str, tuple[int, ...], bytes]]:
         if isinstance(item, h5py.Dataset):
             found[name] = (str(item.dtype), item.shape, item[()].tobytes())
 
-    with h5py.File(path) as file:
-        file.visititems(note)
+    holder = file_of(path)
+    with h5py.File(holder) as file:
+        (file if holder == path else file[group_of(path)]).visititems(note)
     assert "states" in found
     return found
 

@@ -33,11 +33,13 @@ from mjrec import (
     PolicyError,
     UnknownName,
 )
+from mjrec.evaluation.chunk_results import recorded_results
 from mjrec.evaluation.evaluating import evaluate
 from mjrec.evaluation.evaluation import Evaluation, EvaluationProgress
 from mjrec.evaluation.plan import EvaluationPlan
 from mjrec.evaluation.planning import chunks_of
 from mjrec.evaluation.results_files import read_results
+from mjrec.formats.bundle import finished_trajectories
 from mjrec.formats.locks import try_lock
 from mjrec.formats.video_metadata import metadata_path
 
@@ -93,7 +95,8 @@ def test_every_episode_of_every_task_and_seed_is_there(reference: Path) -> None:
         for episode in (0, 1)
     ]
     assert all(each.failure is None and each.length <= 5 for each in results)
-    assert len(list(reference.glob("*/*/*.h5"))) == 8
+    files = [p for each in reference.glob("*/*") for p in finished_trajectories(each)]
+    assert len(files) == 8
     assert begun(reference) == 8
 
 
@@ -101,6 +104,17 @@ def test_results_do_not_depend_on_the_workers(reference: Path, tmp_path: Path) -
     """Byte for byte, and neither does the choice."""
     run(tmp_path / "two", tasks=[PENDULUM, DOUBLE], workers=2)
     assert contents(tmp_path / "two") == contents(reference)
+
+
+# Takes more than five seconds: 200 episodes.
+def test_a_large_evaluation_is_a_few_files(tmp_path: Path) -> None:
+    """Of 100 seeds with 2 episodes each at most 60; every trajectory is read back."""
+    evaluation = run(tmp_path / "e", num_seeds=100, max_steps=2)
+    assert sum(path.is_file() for path in evaluation.directory.rglob("*")) <= 60
+    for result in evaluation.results[::40]:
+        path = evaluation.file_of(result)
+        assert path is not None
+        assert len(mjrec.load_trajectory(path)) == 2
 
 
 @pytest.mark.thorough
@@ -237,7 +251,7 @@ def test_machines_with_other_homes_draw_what_others_recorded(tmp_path: Path) -> 
     )
     assert not list(evaluation.directory.rglob("*.model.*.zip"))
     assert len(list(evaluation.directory.rglob("*.mp4"))) == 1
-    for path in evaluation.directory.rglob("*.h5"):
+    for path in finished_trajectories(folders_of(evaluation)[0]):
         assert mjrec.load_trajectory(path).model().nv == 8
 
 
@@ -572,6 +586,12 @@ def test_a_killed_evaluation_goes_on_where_it_was(
     assert 24 <= begun(killed) <= 26
     assert ended(killed) == 24
     assert len(list(killed.glob("*/*/*.mp4"))) == 2
+    # What the killed ones left came into bundles, and is no log any more.
+    kinds = ("openaigym.states.*", "openaigym.trajectory.*")
+    assert not [path for kind in kinds for path in killed.rglob(kind)]
+    for folder, result in recorded_results(killed):
+        name = f"openaigym.trajectory.{result.monitor}.episode{result.episode_id:06d}"
+        assert len(mjrec.load_trajectory(folder / f"{name}.h5")) == result.length
 
 
 @pytest.mark.thorough

@@ -27,8 +27,9 @@ from ..errors import (
     InvalidArgument,
     PolicyError,
 )
+from ..formats.bundle import finished_trajectories
 from ..formats.locks import try_lock
-from ..formats.monitor_directory import names_in
+from ..formats.monitor_directory import iter_monitor_files, names_in
 from ..gl.choice import choose
 from ..provenance import versions
 from ..rendering.engine_jobs import environ_for_drawing
@@ -428,7 +429,8 @@ def _write(evaluation: Evaluation) -> None:
         folder = evaluation.folder_of(result)
         if folder not in names:
             names.clear()
-            names[folder] = {*names_in(folder)} if folder.is_dir() else set()
+            files = (*iter_monitor_files(folder), *finished_trajectories(folder))
+            names[folder] = {path.name for path in files}
         return evaluation.files_of(result, names[folder])
 
     write_results(

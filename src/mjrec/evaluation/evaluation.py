@@ -9,6 +9,7 @@ from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from ..formats.bundle import is_finished
 from ..formats.monitor_directory import Infix, trajectory_prefix, video_prefix
 from .episode_results import EpisodeResult
 from .plan import EvaluationPlan
@@ -91,7 +92,7 @@ class Evaluation:
         names = self.files_of(result, None)
         folder = self.folder_of(result)
         paths = [folder / each for each in (names.video, names.trajectory) if each]
-        return next((path for path in paths if path.exists()), None)
+        return next((p for p in paths if p.exists() or is_finished(p)), None)
 
     def files_of(
         self, result: EpisodeResult, names: Container[str] | None

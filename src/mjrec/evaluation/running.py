@@ -344,6 +344,7 @@ class _ChunkRun:
             )
             # A name is that of one environment, never of a vector environment.
             self._monitor = cast("_Monitor", monitor)
+            self._monitor.recorder.bundle_trajectories()
             self._monitor.leave_environment_open()
             self._open.enter_context(self._monitor)
             infix = Infix.parse(self._monitor.infix)

@@ -105,7 +105,7 @@ class EvaluationWorker:
             raise DirectoryNotWritable(folder, error.strerror) from error
         # That of a run whose driver was killed may be at it still.
         with wait_for_lock(folder / _LOCK), noting_models() as models:
-            recover(folder)
+            recover(folder, bundle=True)
             chunk = from_json(Chunk, arguments["chunk"])
             self._evaluator.complete(arguments["task"], folder, chunk)
         return {"models": list(dict.fromkeys(models))}

@@ -28,6 +28,7 @@ from ..errors import (
     UnknownName,
     UnreadableFile,
 )
+from ..formats.bundle import file_of, finished_trajectories, trajectories_in
 from ..formats.frame_hashes import frame_hash_path
 from ..formats.json_fields import base_name, unreadable
 from ..formats.locks import is_locked
@@ -36,6 +37,7 @@ from ..formats.monitor_directory import (
     FILE_PREFIX,
     episode_of,
     infix_of,
+    is_bundle,
     is_manifest,
     iter_monitor_files,
     where_recordings_are,
@@ -69,6 +71,7 @@ class Contents:
         packed_episodes: the numbers of the chosen episodes; None where all are packed.
         files: those that are packed as they are, by name.
         manifests: by name, those that are packed with other content.
+        bundled: trajectories that get a file of their own, by the name of that.
         without_states: trajectories that are packed without states and snapshots.
         surroundings: what the manifests say of where their recordings were made.
     """
@@ -77,6 +80,7 @@ class Contents:
     packed_episodes: tuple[int, ...] | None
     files: dict[str, Path] = field(default_factory=dict)
     manifests: dict[str, Manifest] = field(default_factory=dict)
+    bundled: dict[str, Path] = field(default_factory=dict)
     without_states: dict[str, Path] = field(default_factory=dict)
     surroundings: list[Mapping[str, Any]] = field(default_factory=list)
 
@@ -187,7 +191,8 @@ def _chosen(
             f"episodes is a list of the numbers of episodes, got {given!r}."
         )
     known = {episode.episode_id for episode in iter_episodes(directory)}
-    known |= {n for path in files if (n := episode_of(path.name)) is not None}
+    named = (*files, *finished_trajectories(directory))
+    known |= {n for path in named if (n := episode_of(path.name)) is not None}
     for number in numbers:
         if number not in known:
             there = [str(each) for each in sorted(known)]
@@ -202,6 +207,9 @@ def _add_monitor(contents: Contents, path: Path, files: list[Path]) -> None:
     for file in files:
         if file.name.endswith((".jsonl", ".monitor.csv")):
             contents.add(file)
+        elif is_bundle(file.name):
+            for bundled in trajectories_in(file):
+                _add_trajectory(contents, bundled)
         elif file.suffix == ".h5":
             _add_trajectory(contents, file)
     for video, metadata in manifest.videos:
@@ -248,7 +256,11 @@ def _add_trajectory(contents: Contents, path: Path) -> None:
         _check_name(path)
         contents.without_states[path.name] = path
         return
-    contents.add(path)
+    if is_bundle(file_of(path).name):
+        _check_name(path)
+        contents.bundled[path.name] = path
+    else:
+        contents.add(path)
     with open_for_rendering(path) as reader:
         model = reader.facts.get("model") or {}
     for name in filter(None, (model.get("mjb"), model.get("xml"))):

@@ -252,8 +252,9 @@ def _exists(path: Path) -> InvalidArgument:
 
 
 def _check_count(contents: Contents) -> None:
-    kinds = (contents.files, contents.manifests, contents.without_states)
-    count = sum(len(files) for files in kinds)
+    kinds = (contents.files, contents.manifests)
+    trajectories = (contents.bundled, contents.without_states)
+    count = sum(len(files) for files in (*kinds, *trajectories))
     if count > MOST_ENTRIES - _DESCRIPTIONS:
         raise PackError(
             f"The archive would hold {count} recorded files, and mjrec verify takes "
@@ -283,6 +284,9 @@ def _stage(contents: Contents, folder: Path) -> None:
         _link_or_copy(path, folder / name)
     for name, manifest in contents.manifests.items():
         write_manifest(folder / name, manifest)
+    for name, path in contents.bundled.items():
+        with open_hdf5(path) as reader:
+            write_hdf5(reader, folder / name)
     for name, path in contents.without_states.items():
         _write_without_states(path, folder / name)
 

@@ -25,6 +25,7 @@
     ├── openaigym.states.<infix>.000000.tail            ... the last of these
     ├── openaigym.states.<infix>.000000.looks           ... changes of the model
     ├── openaigym.trajectory.<infix>.episode000027.h5   a recorded episode, finished
+    ├── openaigym.trajectories.<infix>.h5               ... or many in one file
     ├── openaigym.model.<16 hex digits>.mjb.gz          its compiled model ...
     ├── openaigym.model.<16 hex digits>.zip             ... and what that was made from
     ├── openaigym.results.<infix>.monitor.csv           Stable-Baselines3's, if wanted
@@ -104,6 +105,7 @@ _VISIBLE = {
     "video": re.compile(rf"{_VIDEO}\.[^/\n\0]*(mp4|avi|json|framehash)"),
     "clip": re.compile(rf"{_CLIP}\.failed\.json"),
     "trajectory": re.compile(rf"{_TRAJECTORY}\.h5"),
+    "trajectories": re.compile(rf"openaigym\.trajectories\.{_INFIX_PART}\.h5"),
     "states": re.compile(rf"{_STATES}\.(spans|log|tail|looks)"),
     "model": re.compile(r"openaigym\.model\.[0-9a-f]{16}\.(zip|mjb\.gz)"),
     "results": re.compile(rf"openaigym\.results\.{_INFIX_PART}\.monitor\.csv"),
@@ -270,6 +272,16 @@ def video_prefix(infix: Infix | str, episode_id: int) -> str:
 def trajectory_prefix(infix: Infix, episode_id: int) -> str:
     """Return the name of an episode's trajectory without `.h5`."""
     return f"{FILE_PREFIX}.trajectory.{infix}.episode{episode_id:06d}"
+
+
+def bundle_name(infix: Infix | str) -> str:
+    """Return the name of the file that many trajectories of a monitor lie in."""
+    return f"{FILE_PREFIX}.trajectories.{infix}.h5"
+
+
+def is_bundle(name: str) -> bool:
+    """Tell whether `name` is that of a file with many trajectories."""
+    return _VISIBLE["trajectories"].fullmatch(name) is not None
 
 
 def video_lock_name(infix: Infix, episode_id: int) -> str:

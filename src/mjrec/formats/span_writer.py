@@ -21,10 +21,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import DirectoryNotWritable, FileNotWritten
+from .bundle import FINISHED
 from .monitor_directory import Infix, states_name
 from .row_log import TAIL_BYTES, RowLog
 from .spans import (
-    FINISHED,
     FORMAT,
     LOG,
     LOOKS,

@@ -36,6 +36,7 @@ import numpy as np
 from ..errors import DirectoryNotWritable, FileNotWritten, UnreadableFile
 from ..json_text import dumps
 from .appending import append_whole, open_for_appending
+from .bundle import FINISHED, is_finished
 from .json_fields import base_name, integer, json_object, mapping, unreadable
 from .locks import is_locked
 from .monitor_directory import (
@@ -51,7 +52,7 @@ from .row_log import tail_path
 from .trajectory import check_version, dtype_from_json
 
 FORMAT = "mjrec spans"
-SPANS, LOG, LOOKS, FINISHED = ".spans", ".log", ".looks", ".h5"
+SPANS, LOG, LOOKS = ".spans", ".log", ".looks"
 
 
 @dataclass
@@ -86,7 +87,7 @@ class Recording:
     def is_in_flight(self) -> bool:
         """Whether only the log has it."""
         return not self.is_dropped and not (
-            self.path.suffix == FINISHED and self.path.is_file()
+            self.path.suffix == FINISHED and is_finished(self.path)
         )
 
 
@@ -302,7 +303,7 @@ def is_in_flight(path: Path) -> bool:
     Raises:
         UnreadableFile: as `find_recording`.
     """
-    if path.suffix == FINISHED and path.is_file():
+    if path.suffix == FINISHED and is_finished(path):
         return False
     return find_recording(path) is not None
 

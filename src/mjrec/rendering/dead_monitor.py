@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import Error, FileNotWritten, UnreadableFile
+from ..formats.bundle import FINISHED, is_finished
 from ..formats.journal import (
     KILLED,
     JournalEntry,
@@ -37,6 +38,7 @@ from ..formats.monitor_directory import (
 )
 from ..formats.spans import drop_recording, read_list, remove_list
 from ..formats.trajectory_file import (
+    bundle_trajectories,
     find_trajectory,
     finish_trajectory,
     open_trajectory,
@@ -98,18 +100,21 @@ class Report:
                 self.note(stale.name, "left behind, removed")
 
 
-def finish_dead_monitor(directory: Path, infix: Infix, report: Report) -> None:
+def finish_dead_monitor(
+    directory: Path, infix: Infix, report: Report, *, bundles: bool
+) -> None:
     """Do all that is left to do of one monitor but drawing, unless it is open.
 
     Args:
         directory: where it recorded.
         infix: the monitor's.
         report: takes what was done.
+        bundles: its trajectories lie in one file.
     """
     path = directory / lock_name(infix)
     with report.attempt(path.name):
         was_killed = path.exists()
-        monitor = _DeadMonitor(directory, infix, report)
+        monitor = _DeadMonitor(directory, infix, report, bundles=bundles)
         # Before there is a lock, which is what a killed monitor leaves.
         is_behind = lacks_results(files_of(directory, infix))
         lock = try_lock(path)
@@ -132,10 +137,13 @@ def finish_dead_monitor(directory: Path, infix: Infix, report: Report) -> None:
 class _DeadMonitor:
     """A monitor that is not open."""
 
-    def __init__(self, directory: Path, infix: Infix, report: Report) -> None:
+    def __init__(
+        self, directory: Path, infix: Infix, report: Report, *, bundles: bool
+    ) -> None:
         self._directory = directory
         self._infix = infix
         self._report = report
+        self._bundles = bundles
 
     def _left(self, kind: Kind) -> list[Path]:
         """Return what is left to do now, of one kind."""
@@ -191,15 +199,29 @@ class _DeadMonitor:
         spans = read_list(path)
         if spans.is_headless:
             raise UnreadableFile(path, "it does not say what its rows are")
-        for recording in spans.in_flight():
-            log = recording.path
-            if log.suffix == ".h5":
+        logs = [each.path for each in spans.in_flight() if each.path.suffix == FINISHED]
+        if self._bundles:
+            self._bundle(logs)
+        else:
+            for log in logs:
                 with self._report.attempt(log.name), self._claimed(log) as is_ours:
-                    if is_ours and not log.exists():
+                    if is_ours and not is_finished(log):
                         self._report.note(log.name, _finish_log(log))
         if path.exists() and not read_list(path).in_flight():
             remove_list(path)
             self._report.note(path.name, "nothing in flight, removed")
+
+    def _bundle(self, logs: Iterable[Path]) -> None:
+        """Put episodes into the monitor's bundle."""
+        with contextlib.ExitStack() as claims:
+            ours = [p for p in logs if claims.enter_context(self._claimed(p))]
+            ours = [path for path in ours if not is_finished(path)]
+            failures = bundle_trajectories(ours)
+            for path in ours:
+                with self._report.attempt(path.name):
+                    if path in failures:
+                        raise failures[path]
+                    self._report.note(path.name, _how_long(path))
 
     @contextlib.contextmanager
     def _claimed(self, path: Path) -> Iterator[bool]:
@@ -367,14 +389,19 @@ class _DeadMonitor:
 
 def _finish_log(path: Path) -> str:
     """Give a recording in flight its final form; return what was done."""
-    with open_trajectory(path) as reader:
-        facts, steps = reader.facts, _counted(reader.step_count, "step")
+    facts = _facts_of(path)
     if not facts.get("kept", True) and is_done(video_path(path, facts)):
         # Its renderer died between the two.
         drop_recording(path)
         return "its video is there, removed"
     finish_trajectory(path)
-    is_cut = "complete" not in facts and _facts_of(path).get("reason") == KILLED
+    return _how_long(path)
+
+
+def _how_long(path: Path) -> str:
+    with open_trajectory(path) as reader:
+        steps = _counted(reader.step_count, "step")
+        is_cut = reader.facts.get("reason") == KILLED
     return f"{steps}, incomplete: killed" if is_cut else steps
 
 
