@@ -904,9 +904,9 @@ def test_a_time_limit_of_the_environment_is_part_of_its_scale(tmp_path: Path) ->
 @pytest.mark.parametrize(
     ("seeds", "episodes", "protocol", "names"),
     [
-        (range(100), 2, "seeded", ["seed-000-011", "seed-096-099"]),
+        (range(100), 2, "seeded", ["seeds-000-011", "seeds-096-099"]),
         ([3], 1, "seeded", ["seed-003", "seed-003"]),
-        ([1], 16, "seeded", ["seed-001-episode-000-001", "seed-001-episode-014-015"]),
+        ([1], 16, "seeded", ["seed-001-episodes-000-001", "seed-001-episodes-014-015"]),
         ([1], 60, "suite", ["seed-001", "seed-001"]),
     ],
 )

@@ -14,10 +14,7 @@ from ..errors import UnreadableFile
 from ..evaluation.chunk_results import recorded_results
 from ..evaluation.episode_results import EpisodeResult
 from ..evaluation.results_files import is_evaluation, read_results
-from ..formats.monitor_directory import (
-    iter_monitor_files,
-    monitor_directories_in,
-)
+from ..formats.monitor_directory import iter_monitor_files, recording_directories
 from ..formats.video_metadata import finished_videos, metadata_path
 from ..results import Episode, iter_episodes
 from .options import AsJson
@@ -53,9 +50,7 @@ def list_episodes(
             names = ("task", "seed", "episode", "steps", "return", "ended", "video")
             _print_table(directory, names, map(_row_of_result, results))
         return 0
-    has_own = not directory.is_dir() or any(iter_monitor_files(directory))
-    places = [directory] if has_own else monitor_directories_in(directory)
-    for place in places or [directory]:
+    for place in recording_directories(directory):
         more = {} if place == directory else {"directory": place.name}
         if as_json:
             _print_all({**more, **_fields(each)} for each in iter_episodes(place))

@@ -13,6 +13,7 @@ import contextlib
 import functools
 import logging
 import pickle
+import re
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -53,6 +54,8 @@ logger = logging.getLogger(__name__)
 
 _OF_EPISODES = (PolicyError, InvalidArgument)
 _LONGEST_FAILURE = 2000
+_LONGEST_UID = 100
+_OUTSIDE_UID = re.compile(r"[^A-Za-z0-9_.-]")
 
 _Begin: TypeAlias = Callable[[NamedEnvironment, Any, EpisodeSeeds], Any]
 
@@ -333,7 +336,7 @@ class _ChunkRun:
                 # removed when the choice is made.
                 record_all if acting.is_drawn_live else False,
                 resume=True,
-                uid=self._chunk.folder,
+                uid=_uid(self._folder),
                 mode="evaluation",
                 max_fps=plan.max_fps,
                 quality=plan.quality,
@@ -394,6 +397,16 @@ def _warnings(environment: Any) -> dict[str, int]:
     from ..simulation.warnings import warning_counts
 
     return warning_counts(simulation)
+
+
+def _uid(folder: Path) -> str:
+    """Return what a chunk's files have in their names, which no other chunk's have.
+
+    So those of a whole evaluation fit into one directory.
+    """
+    room = _LONGEST_UID - len(folder.name) - 1
+    task = _OUTSIDE_UID.sub("_", folder.parent.name)[:room].lstrip(".")
+    return f"{task}-{folder.name}"
 
 
 def _failed(unit: Unit, why: str, **facts: Any) -> dict[str, Any]:

@@ -414,6 +414,13 @@ def monitor_directories_in(directory: Path) -> list[Path]:
     return found
 
 
+def recording_directories(directory: Path) -> list[Path]:
+    """Return where the recordings of a directory are: in it, or else in those below."""
+    if not directory.is_dir() or any(iter_monitor_files(directory)):
+        return [directory]
+    return monitor_directories_in(directory) or [directory]
+
+
 def where_recordings_are(directory: Path) -> str:
     """Return what to tell whoever looks for recordings in a directory without any.
 
