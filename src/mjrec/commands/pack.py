@@ -35,14 +35,14 @@ def pack(
     anonymous: bool = False,
     max_size: str | None = None,
 ) -> int:
-    """Pack a monitor directory into one file that a stranger can verify.
+    """Pack recordings into one file that a stranger can verify.
 
     It is a zip file: a BagIt bag around an RO-Crate, with the recordings, their
     statistics as CSV, what they were made with, a README and a CITATION.cff. The same
     recordings give the same bytes. Whoever gets it checks it with mjrec verify.
 
     Args:
-        directory: the monitor directory.
+        directory: the monitor directory, or one that holds some, as an evaluation's.
         out: the archive, which must not exist; its name ends in .zip.
         title: of the run; what was recorded, if left out.
         author: "Name", "Name <address>" or "Name <ORCID>". May be given several times.

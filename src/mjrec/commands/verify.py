@@ -41,7 +41,8 @@ def verify(
     contradicts it and something is believed (PARTLY), 1 else (FAIL).
 
     Args:
-        path: what mjrec pack has made, that unpacked, or a monitor directory.
+        path: what mjrec pack has made, that unpacked, a monitor directory, or one that
+            holds some, such as an evaluation's.
         level: where to stop. files is the bag only; stats makes rewards, ends,
             statistics and the selection of episodes again; physics all states too;
             pixels all frames and files too.

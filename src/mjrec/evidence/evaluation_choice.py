@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The videos that an evaluation chose among the episodes of many recordings.
 
-Most of these are not in one archive, so that the choice cannot be made again.
+Most of these may not be in the archive: the choice is not made again.
 """
 
 from __future__ import annotations
@@ -47,8 +47,7 @@ def choose_for_evaluation(
     notes.add(
         recording.name,
         "rule",
-        "its videos were chosen among all episodes of an evaluation, which are not "
-        "here: that is believed",
+        "its videos were chosen among all episodes of an evaluation: that is believed",
         count=len(recording.episodes),
     )
 

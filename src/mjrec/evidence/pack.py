@@ -86,15 +86,15 @@ def pack(
         mjrec.verify("run.zip")
 
     Args:
-        directory: the monitor directory. Its monitors are closed, and its videos
-            rendered.
+        directory: the monitor directory, or one that holds some, such as an
+            evaluation's. Its monitors are closed, and its videos rendered.
         path: the archive; its name ends in `.zip`, and nothing of that name exists.
         title: of the run; what was recorded, if None.
         authors: each "Name", "Name <address>" or "Name <ORCID>", in their order.
         license: the SPDX identifier of the licence, such as "CC-BY-4.0", or its URL.
         episodes: the numbers of those whose videos and recorded states are packed;
-            all, if None. Statistics, actions and seeds are of all in any case, and the
-            archive says that a choice was made.
+            all, if None, as always of several directories. Statistics, actions and
+            seeds are of all in any case, and the archive says that a choice was made.
         anonymous: whether everything is taken out that names a user, a machine or an
             author; for blind reviews.
         max_size: the most bytes of the archive, as a number or as `"50M"` (50 million).
