@@ -195,6 +195,26 @@ def test_what_mujoco_warns_of_is_said_once(
     assert [path.name for path in tmp_path.iterdir()] == ["e"]
 
 
+UNSTABLE = """
+<mujoco>
+  <worldbody>
+    <body><joint name="slide" type="slide"/><geom size="0.1"/></body>
+  </worldbody>
+  <actuator><motor joint="slide" gear="1e30" ctrllimited="true" ctrlrange="-1 1"/>
+  </actuator>
+</mujoco>
+"""
+
+
+def test_what_a_model_of_ones_own_warns_of_is_counted(tmp_path: Path) -> None:
+    """As in other environments; and the results say what computed them."""
+    (tmp_path / "unstable.xml").write_text(UNSTABLE)
+    task = str(tmp_path / "unstable.xml")
+    evaluation = run(tmp_path / "e", tasks=[task], num_seeds=1, workers=1)
+    assert evaluation.summaries[0].warnings["BADQACC"] > 1
+    assert "scipy" in read_results(evaluation.directory).versions
+
+
 @pytest.mark.thorough
 def test_a_dask_cluster_changes_nothing(tmp_path: Path) -> None:
     """Results, trajectories and videos are those of one worker here."""

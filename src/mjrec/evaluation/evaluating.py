@@ -441,6 +441,7 @@ def _write(evaluation: Evaluation) -> None:
         across=evaluation.across,
         bootstrap=evaluation.bootstrap,
         selection=evaluation.selection,
-        versions=versions(),
+        # It computes the statistics.
+        versions=versions("scipy"),
         files=files,
     )

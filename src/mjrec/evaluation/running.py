@@ -31,7 +31,7 @@ from ..environments.from_name import environment_from_name
 from ..environments.named_environment import EnvironmentOptions, NamedEnvironment
 from ..environments.names import working_directory_importable
 from ..environments.policies import Policy, load_policy, policy_file, policy_from
-from ..environments.scenes import new_warnings
+from ..environments.scenes import new_warnings, simulation_below
 from ..errors import Error, InvalidArgument, PolicyError
 from ..formats.monitor_directory import Infix, journal_name
 from ..json_text import dumps
@@ -39,7 +39,6 @@ from ..monitors import Monitor
 from ..monitors.base import rendering_choice
 from ..recorder.options import LIVE
 from ..schedules import record_all
-from ..simulation.find_simulation import simulation_in
 from .chunk_results import read_chunk
 from .kept_episodes import keep_rule
 from .plan import SUITE, Chunk, EvaluationPlan, Unit
@@ -390,7 +389,7 @@ def _play(acting: Acting, env: Any, seeds: EpisodeSeeds, begin: _Begin) -> None:
 
 
 def _warnings(environment: Any) -> dict[str, int]:
-    simulation = simulation_in(environment)
+    simulation = simulation_below(environment)
     if simulation is None:
         return {}
     # Not at the top, because it loads MuJoCo, which not every task has.
