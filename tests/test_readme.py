@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Every block of the README, and every example, runs."""
+"""The README's blocks and the examples run."""
 
 from __future__ import annotations
 
@@ -14,7 +14,6 @@ from pathlib import Path
 
 import pytest
 import yaml
-from parts import parametrize
 
 ROOT = Path(__file__).parent.parent
 BLOCKS = re.findall(r"```(\w+)\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
@@ -59,73 +58,37 @@ def checkout(tmp_path: Path) -> Path:
     return tmp_path
 
 
-PYTHON = dict(zip(("gymnasium", "dm_control", "again"), blocks("python"), strict=True))
+def recorded_names(directory: Path) -> set[str]:
+    """Return the names of a directory's files, as a page shows them."""
+    return {
+        re.sub(r"\.0\.\d+\.", ".0.4711.", path.name) for path in directory.iterdir()
+    }
 
 
 # Takes more than five seconds: the README's own size, 480x480, drawn in software.
-@parametrize("name", PYTHON)
-def test_python_block_runs(name: str, checkout: Path) -> None:
-    """As it stands, after what it goes on from, and it leaves a video."""
-    code = PYTHON[name]
-    needs_extras(code)
-    if name == "again":
-        code = PYTHON["gymnasium"] + code
+def test_python_block_leaves_what_is_shown(checkout: Path) -> None:
+    """The program runs as it stands, and its directory holds the files below it."""
+    [code], [tree] = blocks("python"), blocks("text")
     run(sys.executable, "-c", code, cwd=checkout)
-    assert list(checkout.glob("recordings/*/*.mp4"))
-    assert name != "again" or list(checkout.glob("recordings/again/*.mp4"))
-
-
-def needed_by(line: str) -> list[str]:
-    """Return the lines that make what a line is about, in order."""
-    command, subject = (*line.split(), "")[1:3]
-    made_by = dict.fromkeys(("list", "render", "recover", "pack", "report"), "--out")
-    option = {**made_by, "verify": "-o"}.get(command)
-    if option is None:
-        return []
-    [maker] = [x for x in shell_lines() if f"{option} {subject} " in x]
-    return [*needed_by(maker), maker]
+    shown = set(re.findall(r"openaigym\.\S+", tree))
+    assert len(shown) == 4
+    assert shown <= recorded_names(checkout / "recordings" / "halfcheetah")
 
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("line", [x for x in shell_lines() if x.startswith("mjrec")])
 def test_command_runs(line: str, checkout: Path) -> None:
-    """As it stands, with the recordings that the ones before it made."""
-    needed = needed_by(line)
-    for each in (*needed, line):
-        needs_extras(each)
-    for earlier in needed:
-        run(sys.executable, "-m", *shlex.split(earlier), cwd=checkout)
+    """As it stands, and it says which videos it made."""
+    needs_extras(line)
     out = run(sys.executable, "-m", *shlex.split(line), cwd=checkout)
-    assert out.strip()
+    assert ".mp4" in out
 
 
-def test_system_packages_are_those_that_setup_installs() -> None:
-    """The README's apt line names what scripts/setup looks for."""
-    [line] = [x for x in shell_lines() if x.startswith("apt-get")]
-    packages = [word for word in line.split() if word.startswith("lib")]
-    setup = (ROOT / "scripts" / "setup").read_text()
-    assert packages
-    for package in packages:
-        assert package in setup
-
-
-def test_tree_is_what_a_recording_leaves(checkout: Path) -> None:
-    """Name by name, but for the process id."""
-    [tree] = blocks("text")
-    run(
-        *(sys.executable, "-m", "mjrec", "record", "HalfCheetah-v5"),
-        *("--out", "recordings/random", "--max-steps", "2", "--size", "32x32"),
-        cwd=checkout,
-    )
-    made = {
-        re.sub(
-            r"model\.[0-9a-f]{16}",
-            "model.9f86d081884c7d65",
-            re.sub(r"\.0\.\d+\.", ".0.4711.", path.name),
-        )
-        for path in (checkout / "recordings" / "random").iterdir()
-    }
-    assert made == set(re.findall(r"openaigym\.\S+", tree))
+def test_readme_is_short() -> None:
+    """It is read in two minutes: at most 450 words, and one picture."""
+    text = (ROOT / "README.md").read_text()
+    assert len(text.split()) <= 450
+    assert text.count("![") == 1
 
 
 def test_links_lead_somewhere() -> None:

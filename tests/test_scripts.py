@@ -10,9 +10,11 @@ import sys
 from pathlib import Path
 
 import pytest
+import yaml
 
 ROOT = Path(__file__).parents[1]
-COMMANDS = ["scripts/setup", "scripts/demo", "scripts/test", ".ci/run"]
+COMMANDS = [f"scripts/{name}" for name in ("setup", "demo", "test", "docs", "build")]
+COMMANDS += [".ci/run"]
 
 # Stands before a function call: the real file, sourced as demo and test do.
 SOURCE = "set -euo pipefail; source scripts/setup; libraries=; "
@@ -137,3 +139,13 @@ def test_failed_step_is_named(checkout: Path) -> None:
     assert answer.returncode == 1
     assert "stopped at: counting" in answer.stderr
     assert "exit status 1 of: false --quick" in answer.stderr
+
+
+def test_pull_requests_run_the_tests() -> None:
+    """The workflow runs the scripts that a contributor runs."""
+    text = (ROOT / ".github" / "workflows" / "test.yml").read_text()
+    workflow = yaml.safe_load(text)
+    [job] = workflow["jobs"].values()
+    commands = [step["run"] for step in job["steps"] if "run" in step]
+    assert commands == ["scripts/test", "scripts/docs"]
+    assert "pull_request:" in text

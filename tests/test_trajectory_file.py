@@ -155,18 +155,19 @@ def test_plain_h5py_finds_every_array_by_its_name(path: Path) -> None:
 def test_the_example_of_the_specification_runs(
     path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """What docs/format.md shows a stranger works on a real file."""
+    """What docs/reference/trajectories.md shows a stranger works on a real file."""
     record(path)
     finish_trajectory(path).rename(path.with_name("episode.h5"))
-    text = Path(__file__).parents[1].joinpath("docs", "format.md").read_text()
+    docs = Path(__file__).parents[1] / "docs"
+    text = (docs / "reference" / "trajectories.md").read_text()
     of_one, of_several = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
     monkeypatch.chdir(path.parent)
-    exec(compile(of_one, "docs/format.md", "exec"), {})
+    exec(compile(of_one, "trajectories.md", "exec"), {})
     assert "E-v0" in capsys.readouterr().out
     record(path)
     bundle_trajectories([path])
     bundle_of(path).rename(path.with_name("episodes.h5"))
-    exec(compile(of_several, "docs/format.md", "exec"), {})
+    exec(compile(of_several, "trajectories.md", "exec"), {})
     assert capsys.readouterr().out == "episode000027 7 (41, 2)\n"
 
 

@@ -22,10 +22,11 @@ _CAP = 1000
 def capped_cubic_video_schedule(episode_id: int) -> bool:
     """Tell whether an episode is a perfect cube below 1000 or a multiple of 1000.
 
-    >>> [n for n in range(3001) if capped_cubic_video_schedule(n)]
-    [0, 1, 8, 27, 64, 125, 216, 343, 512, 729, 1000, 2000, 3000]
-
     A negative number is never recorded.
+
+    Examples:
+        >>> [n for n in range(3001) if capped_cubic_video_schedule(n)]
+        [0, 1, 8, 27, 64, 125, 216, 343, 512, 729, 1000, 2000, 3000]
     """
     if episode_id < 0:
         return False

@@ -5,7 +5,8 @@ Every figure is of B against A: differences are B - A, and the probability of
 improvement is that of B having a higher return than A. Where each side is one
 evaluation, the figures are of its episodes, and say something of these two policies
 only. Where a side is several, one for each training, the figures are of the
-evaluations' means, and say something of the two methods: see `docs/statistics.md`.
+evaluations' means, and say something of the two methods: see
+`docs/reference/statistics.md`.
 """
 
 from __future__ import annotations

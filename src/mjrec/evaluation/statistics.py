@@ -2,9 +2,9 @@
 """The figures that are said of returns and scores, and their confidence intervals.
 
 Every figure is written down once, as a function of samples along their last axis, so
-that SciPy's bootstrap can give it thousands of resamples at once. `docs/statistics.md`
-has the formulas and their sources; the tests compare them with rliable, and figures by
-hand.
+that SciPy's bootstrap can give it thousands of resamples at once.
+`docs/reference/statistics.md` has the formulas and their sources; the tests compare
+them with rliable, and figures by hand.
 
 All of it takes finite numbers: `summaries` and `comparing` decide what becomes of
 others.

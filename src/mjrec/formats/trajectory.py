@@ -3,7 +3,7 @@
 
 A recorded episode is first a span of the monitor's row log (`trajectory_log`), then an
 HDF5 file (`trajectory_hdf5`). Both hold facts, rows and changes of the model. One NumPy
-structured dtype says what a row is. `docs/format.md` is the specification of both.
+structured dtype says what a row is. `docs/reference/trajectories.md` specifies both.
 """
 
 from __future__ import annotations
@@ -164,7 +164,7 @@ class TrajectoryReader:
 
     Attributes:
         path: of the file.
-        facts: what JSON can hold; `docs/format.md` lists the keys.
+        facts: what JSON can hold; `docs/reference/trajectories.md` lists the keys.
         dtype: of a row, as `row_dtype` makes it.
         row_count: how many states there are: T + 1, the first after the reset; 0 in
             the log of an episode that was killed before that was written.

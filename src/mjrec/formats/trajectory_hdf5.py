@@ -3,10 +3,10 @@
 
 An episode has a file of its own, or a group of a bundle (`bundle`).
 
-`docs/format.md` has every dataset. States and snapshots are rows of a compound type,
-whose members bear MuJoCo's names: `file["states"]["qpos"]` is an array. The shuffle
-filter, which goes by whole rows there, puts the same byte of one row after the other
-side by side, so that what does not change costs nothing.
+`docs/reference/trajectories.md` has every dataset. States and snapshots are rows of a
+compound type, whose members bear MuJoCo's names: `file["states"]["qpos"]` is an array.
+The shuffle filter, which goes by whole rows there, puts the same byte of one row after
+the other side by side, so that what does not change costs nothing.
 
 Nothing here bounds the memory or time that a file asks for: `foreign_files`
 does.

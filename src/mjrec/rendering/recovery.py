@@ -87,7 +87,7 @@ def recover(
     same; statistics and manifest are made of the journal; unfinished files that
     no process will finish are removed. What was to be rendered stays pending: `mjrec
     render DIR`. Files of monitors that are open, and of renderers at work, are left
-    alone. `docs/reliability.md` has the details.
+    alone. `docs/howto/recovery.md` has the details.
 
     It may be killed at any moment and run again; run once more, it does nothing.
 

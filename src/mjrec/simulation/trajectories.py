@@ -93,7 +93,8 @@ class Trajectory:
     Attributes:
         path: of the file that was read.
         trust_models: as given.
-        facts: all that is known besides arrays, as `docs/format.md` lists it.
+        facts: all that is known besides arrays, as
+            `docs/reference/trajectories.md` lists it.
         states: `(T + 1, n) float64`, the physics states (`mjSTATE_INTEGRATION`, in
             MuJoCo's units); n is 0 where there was no simulation. See `component`.
         actions: `(T, *shape)`; None where actions are no plain arrays.

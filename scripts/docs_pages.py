@@ -1,0 +1,213 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Pages that MkDocs takes from the program itself: a hook of mkdocs.yml.
+
+Commands come from their parsers, Python names from `mjrec.__all__` and their
+docstrings, OpenGL's errors from the table that `mjrec doctor` asks.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import inspect
+import io
+import os
+import re
+from pathlib import Path
+
+from mkdocs.config.defaults import MkDocsConfig
+from mkdocs.structure.files import File, Files
+
+ROOT = Path(__file__).resolve().parents[1]
+
+# How Python names are grouped on their page; a test of the documentation sees that each
+# public name is in one group.
+GROUPS = {
+    "Record": (
+        "Monitor GymnasiumMonitor VectorMonitor DmEnvMonitor use_gl exit_on_signals "
+        "Terminated capped_cubic_video_schedule disable_videos"
+    ),
+    "Render": (
+        "load_trajectory Trajectory render render_states render_videos RenderedVideos "
+        "recover Recovery film_strip VideoWriter save_video"
+    ),
+    "Read results": (
+        "load_results iter_episodes Episode detect_training_manifests "
+        "detect_monitor_files clear_monitor_files merge_stats_files"
+    ),
+    "Evaluate": "evaluate Evaluation compare Comparison Bootstrap write_report",
+    "Engines": "LocalEngine RayEngine SlurmEngine",
+    "Share": "pack verify Verification Verdict Finding write_archive",
+    "gym's recorders": "StatsRecorder VideoRecorder",
+}
+# What is public in modules of its own.
+MODULES = {
+    "Trackers": (
+        "mjrec.trackers",
+        "Tracker TensorBoardTracker WandbTracker MonitorCsvTracker Run FinishedEpisode "
+        "FinishedVideo",
+    ),
+    "OpenGL": ("mjrec.gl", "render_on_given_gpu diagnose Diagnosis Probe EglDevice"),
+    "What mjrec doctor finds": (
+        "mjrec.machine_report",
+        "MachineReport Package Ffmpeg Cpus",
+    ),
+}
+
+# Messages as people meet them, each with the backend that says it.
+GL_MESSAGES = (
+    ("glfw", "an OpenGL platform library has not been loaded into this process"),
+    ("glfw", "gladLoadGL error"),
+    ("glfw", "GLFWError: (65550) b'X11: The DISPLAY environment variable is missing'"),
+    ("glfw", "GLFWError: (65537) b'The GLFW library is not initialized'"),
+    ("glfw", "GLFWError: (65542) b'GLX: No GLXFBConfigs returned'"),
+    ("egl", "'NoneType' object has no attribute 'eglQueryString'"),
+    ("osmesa", "'NoneType' object has no attribute 'glGetError'"),
+    ("egl", "Cannot initialize a EGL device display"),
+    ("egl", "Cannot initialize a headless EGL display"),
+    ("egl", "Cannot use EGL rendering platform"),
+    ("", "'GLXPlatform' object has no attribute 'EGL'"),
+    (
+        "egl",
+        "The MUJOCO_EGL_DEVICE_ID environment variable must be an integer between 0 "
+        "and 3 (inclusive), got 7",
+    ),
+    ("", "invalid value for environment variable MUJOCO_GL: gpu"),
+    (
+        "",
+        "module 'mujoco.rendering.classic.gl_context' has no attribute 'GLContext'",
+    ),
+    ("", "'MjModel' object has no attribute 'flex_vertedge'"),
+    ("", "No module named 'OpenGL'"),
+    ("", "Image width 1280 > framebuffer width 640"),
+    ("", "Offscreen framebuffer is not complete, error 0x8cdd"),
+    ("", "OpenGL error 0x502 in or before mjr_makeContext"),
+    ("", "EGL_BAD_ACCESS"),
+    ("", "Cannot make context <EGLContext> current on thread"),
+    ("", "failed to open /dev/dri/renderD128: Permission denied"),
+    ("", "EGLError: <exception str() failed>"),
+)
+# Where a message needs it to mean what it says.
+_GL_ENVIRONMENTS = {
+    "GLContext'": {"MUJOCO_GL": "off"},
+    "Cannot use": {"MUJOCO_GL": "egl", "PYOPENGL_PLATFORM": "osmesa"},
+}
+
+
+def on_files(files: Files, config: MkDocsConfig) -> Files:
+    """Add the generated pages."""
+    pages = {
+        "reference/commands.md": commands_page(),
+        "reference/api.md": api_page(),
+        "reference/opengl-errors.md": gl_page(),
+        "changelog.md": (ROOT / "CHANGELOG.md").read_text(encoding="utf-8"),
+    }
+    for name, text in pages.items():
+        files.append(File.generated(config, name, content=text))
+    return files
+
+
+def commands_page() -> str:
+    """Return the page of the command line, in the words of its parsers."""
+    from mjrec.commands import COMMANDS
+
+    parts = ["# Commands\n", _block(_help())]
+    for name in COMMANDS:
+        parts += [f"## mjrec {name}\n", _block(_help(name))]
+    return "\n".join(parts)
+
+
+def _block(text: str) -> str:
+    return f"```text\n{text}\n```\n"
+
+
+def _help(*command: str) -> str:
+    """Return what `mjrec [COMMAND] --help` prints in a terminal of 80 columns."""
+    from mjrec.commands import main
+
+    out = io.StringIO()
+    # tyro and argparse ask the environment how wide a line is.
+    earlier = os.environ.get("COLUMNS")
+    os.environ["COLUMNS"] = "80"
+    try:
+        with contextlib.redirect_stdout(out), contextlib.suppress(SystemExit):
+            main([*command, "--help"])
+    finally:
+        os.environ.pop("COLUMNS")
+        if earlier is not None:
+            os.environ["COLUMNS"] = earlier
+    return re.sub(r"\x1b\[[0-9;]*m", "", out.getvalue()).strip()
+
+
+def api_page() -> str:
+    """Return the page of all public names, to be filled from their docstrings."""
+    import mjrec
+
+    lines = [
+        "# Python",
+        "",
+        "`import mjrec` loads nothing heavy; each name loads its own.",
+    ]
+    for group, names in GROUPS.items():
+        lines += ["", f"## {group}", ""]
+        for name in names.split():
+            lines.append(f"::: mjrec.{mjrec._LAZY[name]}.{name}\n")
+    for group, (module, names) in MODULES.items():
+        lines += ["", f"## {group}", ""]
+        lines += [f"::: {module}.{name}\n" for name in names.split()]
+    lines += ["", "## Errors", "", *_errors()]
+    return "\n".join(lines) + "\n"
+
+
+def _errors() -> list[str]:
+    from mjrec import errors
+
+    drawn = inspect.cleandoc(errors.__doc__ or "")
+    return ["```text", *drawn.splitlines(), "```"]
+
+
+def gl_page() -> str:
+    """Return the table of OpenGL's messages, causes and fixes."""
+    from mjrec.gl import diagnose
+
+    lines = [
+        "# OpenGL errors",
+        "",
+        "`mjrec doctor` explains these, and so does `mjrec.gl.diagnose(text)`.",
+        "",
+    ]
+    for backend, message in GL_MESSAGES:
+        environ = next(
+            (e for part, e in _GL_ENVIRONMENTS.items() if part in message), {}
+        )
+        found = diagnose(message, backend=backend or None, environ=environ)
+        assert found is not None, message
+        lines += [f"**`{message}`**", "", found.cause, "", *_fix(found.fix), ""]
+    lines += [
+        "**It hangs**",
+        "",
+        "A process that had drawn was forked (`AsyncVectorEnv` without "
+        '`context="spawn"`), or the driver hangs. Spawn instead; use fewer processes '
+        "for each GPU.",
+        "",
+        "**Black frames**",
+        "",
+        "They were drawn on another thread than the one that made the context.",
+        "",
+        "**Slow in spite of a GPU**",
+        "",
+        "llvmpipe, on the CPU, answers instead of the GPU's driver. See "
+        "[Choose a GPU](../howto/headless.md#choose-a-gpu).",
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def _fix(text: str) -> list[str]:
+    """Return a fix in Markdown: its commands are indented, each on a line."""
+    lines: list[str] = []
+    for line in text.strip().splitlines():
+        if line.startswith("  ") and (not lines or not lines[-1].startswith("    ")):
+            lines.append("")
+        lines.append(
+            f"    {line.strip()}" if line.startswith("  ") else f"{line.strip()}"
+        )
+    return lines
