@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from mjrec.evaluation.episode_results import EpisodeResult
+from mjrec.evaluation.evaluation import write_results
 from mjrec.evaluation.plan import EvaluatedTask, EvaluationPlan
-from mjrec.evaluation.results_files import write_results
 from mjrec.evaluation.statistics import Bootstrap
 from mjrec.evaluation.summaries import default_score_range, summarize_results
 

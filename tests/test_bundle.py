@@ -16,6 +16,7 @@ from trajectories_by_hand import new_logs
 from trajectory_contents import content_of
 
 import mjrec
+import mjrec.formats.trajectory_file as trajectory_file
 from mjrec.errors import FileNotWritten, InvalidArgument, UnreadableFile
 from mjrec.formats.bundle import (
     bundle_of,
@@ -152,3 +153,25 @@ def test_an_episode_that_only_the_index_has_cannot_be_opened(tmp_path: Path) -> 
         file["episode000001"] = h5py.ExternalLink("elsewhere.h5", "/")
     with pytest.raises(UnreadableFile, match=r"episode000001.* of its own"):
         open_trajectory(path)
+
+
+@pytest.mark.parametrize("is_written", [False, True])
+def test_what_a_killed_monitor_left_comes_into_its_bundle(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, is_written: bool
+) -> None:
+    """Also where it was killed after the bundle was there, before its logs were."""
+    paths = record(tmp_path, 4, 5)
+    if is_written:
+        with monkeypatch.context() as patched:
+            patched.setattr(trajectory_file, "remove_if_done", lambda _: None)
+            assert bundle_trajectories(paths) == {}
+        assert recordings_in_flight(tmp_path) == []
+    assert any("states" in path.name for path in tmp_path.iterdir())
+    recovery = mjrec.recover(tmp_path, bundle=True)
+    assert not recovery.failures
+    said = [file.what for file in recovery.files if "trajectory" in file.name]
+    assert said == ([] if is_written else ["4 steps", "5 steps, incomplete: killed"])
+    assert not any("states" in path.name for path in tmp_path.iterdir())
+    assert not any(path.is_file() for path in paths)
+    assert [len(mjrec.load_trajectory(path)) for path in paths] == [4, 5]
+    assert not mjrec.recover(tmp_path, bundle=True)

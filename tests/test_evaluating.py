@@ -35,10 +35,10 @@ from mjrec import (
 )
 from mjrec.evaluation.chunk_results import recorded_results
 from mjrec.evaluation.evaluating import evaluate
-from mjrec.evaluation.evaluation import Evaluation, EvaluationProgress
+from mjrec.evaluation.evaluation import Evaluation, read_results
+from mjrec.evaluation.following import EvaluationProgress
 from mjrec.evaluation.plan import EvaluationPlan
 from mjrec.evaluation.planning import chunks_of
-from mjrec.evaluation.results_files import read_results
 from mjrec.formats.bundle import finished_trajectories
 from mjrec.formats.locks import try_lock
 from mjrec.formats.video_metadata import metadata_path

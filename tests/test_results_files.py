@@ -12,14 +12,14 @@ import pytest
 
 from mjrec import UnreadableFile
 from mjrec.evaluation.episode_results import EpisodeResult
-from mjrec.evaluation.plan import EvaluatedTask, EvaluationPlan
-from mjrec.evaluation.result_tables import EpisodeFiles
-from mjrec.evaluation.results_files import (
+from mjrec.evaluation.evaluation import (
     ChosenEpisode,
     is_evaluation,
     read_results,
     write_results,
 )
+from mjrec.evaluation.plan import EvaluatedTask, EvaluationPlan
+from mjrec.evaluation.result_tables import EpisodeFiles
 from mjrec.evaluation.statistics import Bootstrap, Interval
 from mjrec.evaluation.summaries import AcrossTasks, Profile, TaskSummary
 

@@ -13,7 +13,7 @@ import tyro
 from ..errors import UnreadableFile
 from ..evaluation.chunk_results import recorded_results
 from ..evaluation.episode_results import EpisodeResult
-from ..evaluation.results_files import is_evaluation, read_results
+from ..evaluation.evaluation import is_evaluation, read_results
 from ..formats.monitor_directory import iter_monitor_files, recording_directories
 from ..formats.video_metadata import finished_videos, metadata_path
 from ..results import Episode, iter_episodes

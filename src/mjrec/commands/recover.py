@@ -8,7 +8,7 @@ from typing import Annotated
 
 import tyro
 
-from ..evaluation.results_files import is_evaluation
+from ..evaluation.evaluation import is_evaluation
 from ..formats.monitor_directory import monitor_directories_in
 from ..rendering.recovery import RecoveredFile, Recovery
 from ..rendering.recovery import recover as recover_directory

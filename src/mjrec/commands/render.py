@@ -14,7 +14,7 @@ import tyro
 from ..annotation import check_annotation
 from ..errors import InvalidArgument
 from ..evaluation.chunk_results import recorded_results
-from ..evaluation.results_files import is_evaluation
+from ..evaluation.evaluation import is_evaluation
 from ..formats.monitor_directory import (
     Infix,
     recording_directories,

@@ -21,9 +21,9 @@ import numpy as np
 
 from ..errors import InvalidArgument
 from . import statistics
+from .evaluation import Evaluation, read_results
 from .plan import SEEDED
 from .result_tables import ResultColumns
-from .results_files import ReadResults, read_results
 from .statistics import Bootstrap, Estimate, FloatArray
 from .summaries import scaled
 
@@ -308,7 +308,7 @@ def _overall_figures(
     return {name: figure.estimate(how) for name, figure in figures.items()}
 
 
-def _paired_differences(task: str, a: ReadResults, b: ReadResults) -> FloatArray:
+def _paired_differences(task: str, a: Evaluation, b: Evaluation) -> FloatArray:
     """Return B - A of the episodes that began in the same state in both."""
     if not (
         a.plan.protocol == b.plan.protocol == SEEDED
@@ -325,7 +325,7 @@ def _by_unit(columns: ResultColumns) -> dict[tuple[int, int], float]:
     return dict(zip(units, columns.total_reward[done].tolist(), strict=True))
 
 
-def _scales(results: Sequence[ReadResults]) -> dict[str, tuple[float, float]]:
+def _scales(results: Sequence[Evaluation]) -> dict[str, tuple[float, float]]:
     """Return the returns that count as 0 and as 1, of tasks where all say the same."""
     said: dict[str, set[tuple[float, float] | None]] = {}
     for each in results:
@@ -362,13 +362,13 @@ def _cautions(a: _Side, b: _Side, tasks: Sequence[TaskComparison]) -> Iterator[s
                 )
 
 
-def _conditions(results: ReadResults) -> Mapping[str, object]:
+def _conditions(results: Evaluation) -> Mapping[str, object]:
     """Return what changes returns though the policy is the same."""
     plan = results.plan
     return {"max_steps": plan.max_steps, "env_kwargs": plan.env_kwargs}
 
 
-def _choices(results: ReadResults) -> Mapping[str, object]:
+def _choices(results: Evaluation) -> Mapping[str, object]:
     """Return what chooses which episodes are seen, and what ran them."""
     plan = results.plan
     return {
@@ -380,7 +380,7 @@ def _choices(results: ReadResults) -> Mapping[str, object]:
 
 
 def _different(
-    a: _Side, b: _Side, facts: Callable[[ReadResults], Mapping[str, object]]
+    a: _Side, b: _Side, facts: Callable[[Evaluation], Mapping[str, object]]
 ) -> Iterator[tuple[str, str, str]]:
     """Yield the facts that are not the same everywhere, as each side says them."""
     said = [[facts(each) for each in side.results] for side in (a, b)]

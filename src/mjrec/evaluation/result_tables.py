@@ -308,7 +308,11 @@ def _read_rows(
                 row = next(reader, [])
                 if len(row) != len(header) or reader.line_num != line:
                     raise ValueError(f"it has not one row of {len(header)} values")
-                unit = [of.task, str(of.seed[index]), str(of.episode[index])]
+                unit = [
+                    _encodable(of.task),
+                    str(of.seed[index]),
+                    str(of.episode[index]),
+                ]
                 if row[:3] != unit:
                     raise ValueError(
                         f"the episode {', '.join(unit)} belongs there, not "

@@ -123,6 +123,9 @@ def _is_bundled(path: Path) -> bool:
 
 
 def _episodes_in(bundle: Path) -> frozenset[int]:
+    # Most directories have none.
+    if not bundle.is_file():
+        return frozenset()
     try:
         with unreadable(bundle):
             status = regular_path(bundle).stat()

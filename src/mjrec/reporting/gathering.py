@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InvalidArgument, UnreadableFile
-from ..evaluation.results_files import ReadResults, is_evaluation, read_results
+from ..evaluation.evaluation import Evaluation, is_evaluation, read_results
 from ..formats.json_fields import field as json_field
 from ..formats.json_fields import (
     list_of,
@@ -340,7 +340,7 @@ def _places_of_task(folder: Path) -> list[Path]:
 
 
 def _videos_of_task(
-    contents: ReportContents, results: ReadResults, task: str, provenance: Provenance
+    contents: ReportContents, results: Evaluation, task: str, provenance: Provenance
 ) -> list[ReportVideo]:
     """Return the videos of a task's episodes, with the places of these.
 
