@@ -39,6 +39,7 @@ from ..formats.json_fields import (
     unreadable,
 )
 from ..formats.monitor_directory import Infix, video_prefix
+from ..formats.notebook import shown
 from ..formats.trajectory_file import find_trajectory
 from ..json_text import dumps
 from .dataclass_json import from_json, to_json
@@ -51,7 +52,7 @@ from .result_tables import (
     write_results_table,
     write_timing_table,
 )
-from .statistics import Bootstrap
+from .statistics import Bootstrap, Interval
 from .summaries import AcrossTasks, TaskSummary
 
 RESULTS_NAME = "results.json"
@@ -113,6 +114,20 @@ class Evaluation:
     def results(self) -> Sequence[EpisodeResult]:
         """All episodes, in the order of the plan, without their warnings."""
         return list(self)
+
+    def _repr_html_(self) -> str:
+        """Show the evaluation in a notebook: a row per task, and the chosen videos."""
+        facts = {"episodes": len(self.results), "directory": self.directory}
+        level = f"{100 * self.bootstrap.confidence:g} %"
+        columns = ("task", "episodes", "mean", level, "IQM", "success", "failed")
+        rows = [
+            (
+                *(each.task, each.episodes, each.mean, _extent(each.mean_interval)),
+                *(each.iqm, each.success_rate, each.failed),
+            )
+            for each in self.summaries
+        ]
+        return shown("Evaluation", facts, self.videos, columns=columns, rows=rows)
 
     @property
     def failed(self) -> Sequence[EpisodeResult]:
@@ -318,3 +333,7 @@ def _chosen(value: Any) -> ChosenEpisode:
         raise ValueError("a chosen episode is seed, number and role")
     seed, episode, role = value
     return ChosenEpisode(integer(seed), integer(episode), text(role))
+
+
+def _extent(interval: Interval | None) -> str:
+    return f"{interval.low:.4g} to {interval.high:.4g}" if interval else ""

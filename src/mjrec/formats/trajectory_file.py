@@ -94,7 +94,7 @@ def finish_trajectory(path: Path) -> Path:
                 raise
             # Somebody else finished it just now.
     if recording is not None:
-        remove_if_done(recording.spans.path)
+        remove_if_done(recording.log)
     return path
 
 
@@ -129,8 +129,8 @@ def bundle_trajectories(paths: Iterable[Path]) -> dict[Path, Error]:
     added = {p: functools.partial(_ended, p, each) for p, each in recordings.items()}
     try:
         failures |= write_bundle(bundle_of(next(iter(added))), added, {})
-        for spans in {each.spans.path for each in recordings.values()}:
-            remove_if_done(spans)
+        for log in {each.log for each in recordings.values()}:
+            remove_if_done(log)
     except Error as error:
         failures |= dict.fromkeys(recordings, error)
     return failures
@@ -176,7 +176,7 @@ def _end_time(facts: Mapping[str, Any], recording: Recording | None) -> float:
     """
     start, last = facts.get("start_time"), 0.0
     if recording is not None:
-        last = recording.spans.last_write
+        last = recording.last_write
     return max(start, last) if isinstance(start, float) else last
 
 
