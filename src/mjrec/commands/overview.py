@@ -13,7 +13,15 @@ if TYPE_CHECKING:
 
 # Each command, in the group in which people look for it.
 GROUPS = {
-    "Record and render": ("record", "render", "list", "strip", "recover"),
+    "Record and render": (
+        "record",
+        "render",
+        "list",
+        "view",
+        "replay",
+        "strip",
+        "recover",
+    ),
     "Evaluate": ("evaluate", "compare", "report"),
     "Share": ("pack", "verify"),
     "Help": ("doctor", "completion"),
@@ -30,6 +38,8 @@ EXAMPLES = {
         "mjrec render recordings/first --episode 1 --camera side --size 640x480",
     ),
     "list": ("mjrec list recordings/first",),
+    "view": ("mjrec view recordings/first",),
+    "replay": ("mjrec replay recordings/first --episode 1 --out replay.html",),
     "strip": ("mjrec strip openaigym.video.0.4711.video000001.mp4 -o strip.png",),
     "recover": ("mjrec recover recordings/first",),
     "evaluate": (
