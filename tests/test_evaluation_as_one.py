@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """An evaluation's directory is one thing for the commands that take recordings."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import zipfile
@@ -19,7 +17,7 @@ TASKS = ("InvertedPendulum-v5", "InvertedDoublePendulum-v5")
 
 
 @pytest.fixture(scope="module")
-def evaluation(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def evaluation(tmp_path_factory):
     """Two tasks with two seeds each, one of which is drawn."""
     directory = tmp_path_factory.mktemp("evaluations") / "e"
     small = {"max_steps": 3, "height": 32, "width": 32}
@@ -31,13 +29,13 @@ def evaluation(tmp_path_factory: pytest.TempPathFactory) -> Path:
         episodes=1,
         keep="best",
         workers=1,
-        **small,  # type: ignore[arg-type]  # these are numbers
+        **small,
     )
     return directory
 
 
 # Takes more than five seconds: five processes, which load simulators.
-def test_it_is_packed_and_verified_as_one(evaluation: Path, tmp_path: Path) -> None:
+def test_it_is_packed_and_verified_as_one(evaluation, tmp_path):
     """One archive with a file for each trajectory, each model once, one verdict."""
     archive = mjrec.pack(evaluation, tmp_path / "e.zip")
     names = [Path(name).name for name in zipfile.ZipFile(archive).namelist()]
@@ -52,9 +50,7 @@ def test_it_is_packed_and_verified_as_one(evaluation: Path, tmp_path: Path) -> N
         assert counts["physics"] == 12
 
 
-def test_episodes_of_several_directories_are_not_chosen_from(
-    evaluation: Path, tmp_path: Path
-) -> None:
+def test_episodes_of_several_directories_are_not_chosen_from(evaluation, tmp_path):
     """Each directory counts its own; and each has names of its own."""
     with pytest.raises(InvalidArgument, match="holds 4 monitor directories"):
         mjrec.pack(evaluation, tmp_path / "e.zip", episodes=[0])
@@ -69,9 +65,7 @@ def test_episodes_of_several_directories_are_not_chosen_from(
         mjrec.pack(tmp_path / "both", tmp_path / "e.zip")
 
 
-def test_it_is_listed_and_drawn_as_one(
-    evaluation: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_it_is_listed_and_drawn_as_one(evaluation, capsys):
     """Also one episode of each task and seed, another way, and a single one by name."""
     assert commands.main(["list", str(evaluation), "--json"]) == 0
     listed = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
