@@ -123,8 +123,8 @@ def test_the_chosen_episodes_get_videos(tmp_path):
     """By rule, for each task; table, metadata and report of it agree."""
     evaluation = run(tmp_path / "e", keep="best,worst")
     read = read_results(tmp_path / "e")
-    columns = read.columns[PENDULUM]
-    returns = columns.total_reward.tolist()
+    columns = read.by_task[PENDULUM]
+    returns = columns.rows["total_reward"].tolist()
     best, worst = read.selection[PENDULUM]
     assert (best.role, worst.role) == ("best", "worst")
     assert best.seed * 2 + best.episode == returns.index(max(returns))
@@ -309,7 +309,7 @@ def test_without_opengl_videos_stay_pending(tmp_path, monkeypatch, caplog):
     (path,) = evaluation.pending
     assert "No video can be drawn here" in caplog.messages[0]
     assert f"mjrec render {path.parent}" in caplog.text
-    columns = read_results(tmp_path / "e").columns[PENDULUM]
+    columns = read_results(tmp_path / "e").by_task[PENDULUM]
     assert [*columns.videos.values()] == [path.name]
     monkeypatch.undo()
     assert run(tmp_path / "e", keep="best", resume=True).videos == [path]
@@ -643,7 +643,7 @@ def test_what_cannot_be_drawn_has_results_without_videos(tmp_path, caplog):
     assert not evaluation.pending
     # Nor is any announced.
     assert len(evaluation.selection["CartPole-v1"]) == is_drawn
-    assert len(read_results(tmp_path / "e").columns["CartPole-v1"].videos) == is_drawn
+    assert len(read_results(tmp_path / "e").by_task["CartPole-v1"].videos) == is_drawn
     said = [r.message for r in caplog.records if "no videos, only results" in r.message]
     assert len(said) == (not is_drawn)
 

@@ -80,7 +80,7 @@ def _fields_of_results(directory: Path) -> Iterator[dict[str, Any]]:
         for _, result in recorded_results(directory):
             yield _fields_of_result(result, None)
         return
-    for columns in results.columns.values():
+    for columns in results.by_task.values():
         for index, result in enumerate(columns):
             video = columns.video_path(index)
             path = None if video is None else results.directory / video

@@ -154,7 +154,7 @@ def _results(directory: Path) -> Iterator[EpisodeResult]:
     from ..evaluation.evaluation import read_results
 
     try:
-        columns = read_results(directory).columns.values()
+        columns = read_results(directory).by_task.values()
     except UnreadableFile:
         yield from (result for _, result in recorded_results(directory))
         return

@@ -23,7 +23,7 @@ from ..errors import InvalidArgument
 from . import statistics
 from .evaluation import Evaluation, read_results
 from .plan import SEEDED
-from .result_tables import ResultColumns
+from .result_tables import TaskResults
 from .statistics import Bootstrap, Estimate, FloatArray
 from .summaries import scaled
 
@@ -232,8 +232,8 @@ class _Side:
     @property
     def tasks(self) -> list[str]:
         """The tasks that are in all evaluations."""
-        rest = [each.columns for each in self.results[1:]]
-        first = self.results[0].columns
+        rest = [each.by_task for each in self.results[1:]]
+        first = self.results[0].by_task
         return [task for task in first if all(task in other for other in rest)]
 
     @property
@@ -246,8 +246,8 @@ class _Side:
 
     def returns(self, task: str) -> list[FloatArray]:
         """Return those of the completed episodes of each evaluation."""
-        columns = [each.columns[task] for each in self.results]
-        return [each.total_reward[~each.failed] for each in columns]
+        columns = [each.by_task[task] for each in self.results]
+        return [each.rows["total_reward"][~each.failed] for each in columns]
 
     def sample(self, task: str, is_single: bool) -> FloatArray:
         """Return what the figures are of: returns, or the mean of each evaluation."""
@@ -256,7 +256,7 @@ class _Side:
 
     def counts(self, task: str) -> tuple[int, int, int]:
         """Return how many episodes were completed, failed, and returned no number."""
-        failed = sum(len(each.columns[task].failures) for each in self.results)
+        failed = sum(len(each.by_task[task].failures) for each in self.results)
         returns = np.concatenate(self.returns(task))
         return len(returns), failed, _not_finite(returns)
 
@@ -315,14 +315,14 @@ def _paired_differences(task: str, a: Evaluation, b: Evaluation) -> FloatArray:
         and a.plan.env_kwargs == b.plan.env_kwargs
     ):
         return np.empty(0)
-    of_a, of_b = _by_unit(a.columns[task]), _by_unit(b.columns[task])
+    of_a, of_b = _by_unit(a.by_task[task]), _by_unit(b.by_task[task])
     return np.array([of_b[unit] - of_a[unit] for unit in of_a if unit in of_b])
 
 
-def _by_unit(columns: ResultColumns) -> dict[tuple[int, int], float]:
-    done = ~columns.failed
-    units = zip(columns.seed[done], columns.episode[done], strict=True)
-    return dict(zip(units, columns.total_reward[done].tolist(), strict=True))
+def _by_unit(columns: TaskResults) -> dict[tuple[int, int], float]:
+    done = columns.rows[~columns.failed]
+    units = zip(done["seed"], done["episode"], strict=True)
+    return dict(zip(units, done["total_reward"].tolist(), strict=True))
 
 
 def _scales(results: Sequence[Evaluation]) -> dict[str, tuple[float, float]]:

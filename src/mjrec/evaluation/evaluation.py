@@ -47,7 +47,7 @@ from .episode_results import EpisodeResult
 from .plan import FORMAT_VERSION, PLAN_NAME, EvaluationPlan
 from .result_tables import (
     EpisodeFiles,
-    ResultColumns,
+    TaskResults,
     read_tables,
     write_results_table,
     write_timing_table,
@@ -88,7 +88,7 @@ class Evaluation:
         bootstrap: how intervals were made.
         selection: which episodes were chosen to get a video, by task.
         versions: of what ran, by package.
-        columns: the episodes, by task, in the order of the plan.
+        by_task: the episodes of each task, in the order of the plan.
         videos: those that are there, where it was just run.
         pending: why videos that were chosen are not there, by the path they will have;
             likewise.
@@ -101,13 +101,13 @@ class Evaluation:
     bootstrap: Bootstrap
     selection: Mapping[str, Sequence[ChosenEpisode]]
     versions: Mapping[str, str]
-    columns: Mapping[str, ResultColumns]
+    by_task: Mapping[str, TaskResults]
     videos: Sequence[Path] = ()
     pending: Mapping[Path, str] = dataclasses.field(default_factory=dict)
 
     def __iter__(self) -> Iterator[EpisodeResult]:
         """Yield the episodes in the order of the plan, without their warnings."""
-        for columns in self.columns.values():
+        for columns in self.by_task.values():
             yield from columns
 
     @functools.cached_property
@@ -158,7 +158,7 @@ class Evaluation:
         infix = Infix.parse(result.monitor or "")
         if infix is None or result.episode_id is None:
             return None
-        folders = {of: folder for folder, of in self.columns[result.task].places}
+        folders = {of: folder for folder, of in self.by_task[result.task].places}
         folder = self.directory / folders[str(infix)]
         video = folder / f"{video_prefix(infix, result.episode_id)}.mp4"
         for each in (video, video.with_suffix(".json")):
@@ -244,8 +244,8 @@ def read_results(directory: Path, *, needs_timing: bool = False) -> Evaluation:
     """
     read = read_summaries(directory)
     table, timing = directory / _TABLE_NAME, directory / _TIMING_NAME
-    columns = read_tables(table, timing, read.plan, needs_timing=needs_timing)
-    return replace(read, columns=columns)
+    by_task = read_tables(table, timing, read.plan, needs_timing=needs_timing)
+    return replace(read, by_task=by_task)
 
 
 def read_summaries(directory: Path) -> Evaluation:
@@ -282,7 +282,7 @@ def read_summaries(directory: Path) -> Evaluation:
         bootstrap=bootstrap,
         selection=selection,
         versions=versions,
-        columns={},
+        by_task={},
     )
 
 
