@@ -27,7 +27,7 @@ import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Final, TextIO
+from typing import Any, Final, TextIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,6 +53,7 @@ _TIMING: Final = (
 _LONGEST_LINE: Final = 1 << 16
 _LONGEST_FAILURE: Final = 2000
 _MOST_ROWS: Final = 4_000_000
+_ROWS_AT_ONCE: Final = 4096
 
 _WHOLE: Final = re.compile(r"[0-9]{1,18}", re.ASCII)
 _NUMBER: Final = re.compile(
@@ -139,23 +140,25 @@ class TaskResults:
 
     def __iter__(self) -> Iterator[EpisodeResult]:
         """Yield each episode as a result; its warnings are not known."""
-        names, monitors = ROW.names or (), self.monitors
-        for index in range(len(self)):
-            # Python's own numbers.
-            row = dict(zip(names, self.rows[index].item(), strict=True))
+        monitors = self.monitors
+        for index, row in enumerate(self._rows_in_python()):
             failure, monitor = self.failures.get(index), row["monitor"]
-            yield EpisodeResult(
-                task=self.task,
-                failure=failure,
-                **{
-                    **row,
-                    **{k: _MEANING[row[k]] for k in _TRUTHS},
-                    **{k: None if math.isnan(row[k]) else row[k] for k in _TIMES},
-                    "total_reward": None if failure else row["total_reward"],
-                    "monitor": None if monitor < 0 else monitors[monitor],
-                    "episode_id": None if monitor < 0 else row["episode_id"],
-                },
-            )
+            for name in _TRUTHS:
+                row[name] = _MEANING[row[name]]
+            for name in _TIMES:
+                row[name] = None if math.isnan(row[name]) else row[name]
+            if failure:
+                row["total_reward"] = None
+            row["monitor"] = None if monitor < 0 else monitors[monitor]
+            if monitor < 0:
+                row["episode_id"] = None
+            yield EpisodeResult(task=self.task, failure=failure, **row)
+
+    def _rows_in_python(self) -> Iterator[dict[str, Any]]:
+        names = ROW.names or ()
+        for start in range(0, len(self), _ROWS_AT_ONCE):
+            for row in self.rows[start : start + _ROWS_AT_ONCE].tolist():
+                yield dict(zip(names, row, strict=True))
 
 
 def write_results_table(file: TextIO, results: Iterable[EpisodeResult]) -> None:
