@@ -87,15 +87,15 @@ def pack(
         mjrec.verify("run.zip")
 
     Args:
-        directory: the monitor directory. Its monitors are closed, and its videos
-            rendered.
+        directory: the monitor directory, or one that holds some, such as an
+            evaluation's. Its monitors are closed, and its videos rendered.
         path: the archive; its name ends in `.zip`, and nothing of that name exists.
         title: of the run; what was recorded, if None.
         authors: each "Name", "Name <address>" or "Name <ORCID>", in their order.
         license: the SPDX identifier of the licence, such as "CC-BY-4.0", or its URL.
         episodes: the numbers of those whose videos and recorded states are packed;
-            all, if None. Statistics, actions and seeds are of all in any case, and the
-            archive says that a choice was made.
+            all, if None, as always of several directories. Statistics, actions and
+            seeds are of all in any case, and the archive says that a choice was made.
         anonymous: whether everything is taken out that names a user, a machine or an
             author; for blind reviews.
         max_size: the most bytes of the archive, as a number or as `"50M"` (50 million).
@@ -253,8 +253,9 @@ def _exists(path: Path) -> InvalidArgument:
 
 
 def _check_count(contents: Contents) -> None:
-    kinds = (contents.files, contents.manifests, contents.without_states)
-    count = sum(len(files) for files in kinds)
+    kinds = (contents.files, contents.manifests)
+    trajectories = (contents.bundled, contents.without_states)
+    count = sum(len(files) for files in (*kinds, *trajectories))
     if count > MOST_ENTRIES - _DESCRIPTIONS:
         raise PackError(
             f"The archive would hold {count} recorded files, and mjrec verify takes "
@@ -286,6 +287,9 @@ def _stage(contents: Contents, folder: Path) -> None:
             _leave_rows_out(folder / name)
     for name, manifest in contents.manifests.items():
         write_manifest(folder / name, manifest)
+    for name, path in contents.bundled.items():
+        with open_hdf5(path) as reader:
+            write_hdf5(reader, folder / name)
     for name, path in contents.without_states.items():
         _write_without_states(path, folder / name)
 
