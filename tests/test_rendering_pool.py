@@ -119,13 +119,7 @@ def test_any_workers_give_what_was_seen(
 
 
 @pytest.mark.parametrize("is_there", [True, False])
-def test_prepared_workers_draw_the_same(
-    ride: Ride,
-    one: WorkerPool,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    is_there: bool,
-) -> None:
+def test_prepared_workers_draw_the_same(ride, one, tmp_path, monkeypatch, is_there):
     """They load a model before frames are asked for; that there is none is no harm."""
     noted = tmp_path / "noted"
     note = f"""
