@@ -50,7 +50,6 @@ _PREFIXES = (
 _OF_INSTALLATION = ("INSTALLER", "REQUESTED", "RECORD", "direct_url.json")
 _NAME_OR_VERSION = re.compile(r"^(Name|Version): *(.*?) *$", re.MULTILINE)
 _SECONDS_FOR_PACKAGES = 60.0
-_NICE = 15
 _SECONDS_FOR_GIT = 5.0
 # Leaving is quick.
 _SECONDS_AT_THE_END = 2.0
@@ -255,8 +254,6 @@ def _is_of_installation(line: str) -> bool:
 
 def _main() -> None:
     parent = Parent()
-    # It is asked for at the end; what draws begins at the same time.
-    os.setpriority(os.PRIO_PROCESS, 0, max(_NICE, os.getpriority(os.PRIO_PROCESS, 0)))
     parent.send(**_packages_in(parent.receive()["places"]))
 
 
