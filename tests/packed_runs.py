@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
 import urllib.parse
 import zipfile
 from collections.abc import Callable, Iterable, Iterator
@@ -16,6 +17,7 @@ import h5py
 import numpy as np
 
 import mjrec
+from mjrec.evidence.compare_descriptions import written_again
 from mjrec.formats.trajectory_file import open_trajectory
 from mjrec.formats.trajectory_hdf5 import write_hdf5
 from mjrec.json_text import dumps
@@ -62,7 +64,19 @@ def make_bag_fit(bag: Path) -> None:
     """Let the lists of a packed run say what is there, whatever that is."""
     if (bag / "data" / "ro-crate-metadata.json").exists():
         edit_json(bag / "data" / "ro-crate-metadata.json", _make_crate_fit(bag))
+    sizes = [path.stat().st_size for path in _files(bag / "data")]
+    info, count = bag / "bag-info.txt", f"{sum(sizes)}.{len(sizes)}"
+    info.write_text(re.sub(r"(?<=Oxum: )[\d.]+", count, info.read_text()))
     make_manifests_fit(bag)
+
+
+def describe_again(bag: Path) -> None:
+    """Let all descriptions of a packed run follow from its recordings."""
+    # The second time with the sizes that the first has made.
+    for _ in range(2):
+        for name, text in written_again(bag).items():
+            is_tag = (bag / name).exists()
+            (bag / name if is_tag else bag / "data" / name).write_text(text)
 
 
 def make_manifests_fit(bag: Path) -> None:

@@ -821,6 +821,11 @@ FORGERIES = (
         Forgery(f"{name} claimed", CLAIMS[name], "is claimed to be")
         for name in ("another MuJoCo", "another GPU")
     ),
+    Forgery(
+        "another MuJoCo claimed, the compiled model left out",
+        both(CLAIMS["another MuJoCo"], lambda run: run.the("*.mjb.gz").unlink()),
+        "mjb.gz",
+    ),
     # Additions.
     Forgery("a dataset added", add_to_hdf5, "success", quick=True),
     Forgery("an attribute added", add_an_attribute, "note"),
@@ -849,6 +854,19 @@ FORGERIES = (
         bag=replace_in("README.md", "## Videos", "All reached the goal.\n\n## Videos"),
         line="README",
         quick=True,
+    ),
+    Forgery(
+        "a line at the end of the README that begins as one of the bag's own",
+        bag=lambda bag: the(bag, "README.md").write_text(
+            the(bag, "README.md").read_text() + "Payload-Oxum: all goals reached\n"
+        ),
+        line="README",
+    ),
+    Forgery(
+        "a claim in the README beside versions, with another MuJoCo claimed",
+        CLAIMS["another MuJoCo"],
+        bag=replace_in("README.md", "- Versions: ", "- Versions: best policy, "),
+        line="README",
     ),
     Forgery(
         "citation claims more",

@@ -29,27 +29,26 @@ from ..formats.frame_hashes import frame_hash_path
 from ..formats.json_fields import json_object, read_object
 from ..formats.monitor_directory import episode_of, infix_of
 from ..formats.trajectory_hdf5 import open_hdf5
+from .archive import BAG_DECLARATION
 from .claims import claimed_excuses
+from .compare_descriptions import compare_descriptions
 from .compare_json import (
     KEYS,
     Rule,
     Rules,
-    compare_crates,
     compare_journals,
     compare_objects,
     same_journal,
 )
 from .compare_rows import compare_rewards, compare_trajectories, same_trajectory
-from .compare_text import compare_frame_hashes, compare_tables, compare_texts
-from .compare_video import compare_sampled, compare_videos
+from .compare_video import compare_frame_hashes, compare_sampled, compare_videos
 from .differences import Aspect, Difference, Same, short
 from .excuses import NUMERIC, Trial, applicable, believed, merged, with_allowed
 from .findings import Excuse, Finding, Level, Outcome, Topic
 from .honesty import read_metadata, remarks_on_video
-from .layout import CRATE, ENVIRONMENT, PAYLOAD, RECORDINGS, SAMPLED, STATISTICS
+from .layout import PAYLOAD, RECORDINGS, SAMPLED
 from .notes import REWARDS_FILE, read_notes
 
-_TAGS: Final = ("bagit.txt", "bag-info.txt")
 # What stands in the middle or at the end of a file's name, and what kind it is then.
 _KINDS: Final[Mapping[str, str]] = {
     ".mjb.gz": "model",
@@ -125,6 +124,7 @@ class Comparison:
         on_progress: Callable[[int, int], object] = lambda *_: None,
     ) -> None:
         self._given, self._made = given / PAYLOAD, made / PAYLOAD
+        self._is_bag = (given / BAG_DECLARATION).exists()
         self._level = Level.PHYSICS if sampled else level
         self._sampled = made / SAMPLED if sampled else None
         self._allow = tuple(allow)
@@ -168,8 +168,8 @@ class Comparison:
 
     def _compare(self) -> Iterator[Same | Difference | Finding]:
         self._renamed = _renamed_models(self._given, self._made)
-        for tag in _TAGS:
-            yield from self._compare_tags(tag)
+        if self._is_bag:
+            yield from compare_descriptions(self._given.parent)
         names = [self._names(folder) for folder in (self._given, self._made)]
         files = sorted(names[0].keys() | names[1].keys(), key=_order)
         total, done = sum(names[0].values()), 0
@@ -188,20 +188,15 @@ class Comparison:
         """Return the files that are compared, and their sizes."""
         found = {
             path.relative_to(folder).as_posix(): path.lstat().st_size
-            for path in folder.rglob("*")
+            for path in (folder / RECORDINGS).rglob("*")
             if path.is_symlink() or not path.is_dir()
         }
         kinds: tuple[str, ...] = tuple(_KINDS.values())
         if self._level is not Level.PIXELS:
             kinds = _UNDRAWN if self._level is Level.PHYSICS else _UNDRAWN[:-1]
-        elif (self._given.parent / _TAGS[0]).exists():
+        elif self._is_bag:
             kinds = (*kinds, "")
         return {f: size for f, size in found.items() if _kind(f) in kinds}
-
-    def _compare_tags(self, tag: str) -> _Found:
-        given, made = (folder.parent / tag for folder in (self._given, self._made))
-        if given.is_file() and made.is_file() and not _is_equal(given, made):
-            yield from compare_texts(given, made, tag, self._rules())
 
     def _compare_names(self, file: str, is_given: bool, is_made: bool) -> _Found:
         kind, model = _kind(file), _model(file)
@@ -281,17 +276,6 @@ class Comparison:
                 yield from self._compare_manifests(given, made, file, rules)
             case "statistics" | "metadata" | "text":
                 yield from compare_objects(given, made, file, rules)
-            case _ if file == CRATE:
-                yield from compare_crates(given, made, file, rules)
-            case _ if file == ENVIRONMENT:
-                yield from compare_objects(given, made, file, rules)
-            case _ if file == STATISTICS:
-                own = self._own_sha256
-                yield from compare_tables(
-                    given, made, file, lambda name, v: own(f"{RECORDINGS}/{name}", v)
-                )
-            case _ if Path(file).suffix in (".md", ".cff"):
-                yield from compare_texts(given, made, file, rules)
             case _:
                 yield Difference(topic=Topic.FILES, file=file, how="its bytes differ")
 
@@ -324,7 +308,6 @@ class Comparison:
                 "decoded_sha256": lambda file, value: (
                     self._decoded.get(_video_of(file)) == value
                 ),
-                "contentSize": self._own_size,
             },
             left_out=left_out if kind == "manifest" else frozenset(),
             renamed=self._renamed,
@@ -382,12 +365,6 @@ class Comparison:
     def _own_sha256(self, file: str, value: Any) -> bool:
         path = self._given / file
         return path.is_file() and file_sha256(path) == value
-
-    def _own_size(self, file: str, value: Any) -> bool:
-        for name, again in self._renamed.items():
-            file = file.replace(again, name)
-        path = self._given / file
-        return path.is_file() and str(path.stat().st_size) == value
 
 
 class _Sums:

@@ -18,7 +18,7 @@ from ..results import Episode, iter_episodes
 from ..results.journal_or_stats import MonitorResults
 from ..results.monitor_files import MonitorFiles, monitors_of
 from .layout import STATES_LEFT_OUT
-from .statements import Statements
+from .statements import Statements, state
 
 _SHOWN = 3
 _NEVER = "1970-01-01"
@@ -171,14 +171,16 @@ class PackedRun:
         return max(filter(None, ends), default=_NEVER)[:10]
 
 
-def read_run(
-    recordings: Path, *, options: PackingOptions, statements: Statements
-) -> PackedRun:
+def read_run(recordings: Path, *, options: PackingOptions) -> PackedRun:
     """Return what there is to say of the recordings in a folder.
 
     Raises:
         UnreadableFile: a file is damaged.
+        InvalidArgument: a title, an author or a licence that cannot be.
     """
+    statements = state(
+        title=options.title, authors=options.authors, license=options.license
+    )
     tallies: dict[str, Tally] = {}
     for episode in iter_episodes(recordings):
         tallies.setdefault(episode.monitor, Tally()).add(episode)
