@@ -18,7 +18,7 @@ from typing import Any
 import h5py
 import numpy as np
 import pytest
-from packed_runs import edit_json, make_bag_fit, the, unpacked
+from packed_runs import describe_again, edit_json, make_bag_fit, the, unpacked
 from parts import parametrize
 
 import honest_runs as honest
@@ -547,6 +547,7 @@ def pending_worst(bag: Path) -> None:
     run.remove_video(0)
     promise = {"episode_id": 0, "video": name, "trajectory": trajectory}
     run.edit_json("*.manifest.json", lambda s: s["mjrec"].update(pending=[promise]))
+    describe_again(bag)
 
 
 def say_it_was_made_smaller(bag: Path) -> None:
@@ -555,6 +556,7 @@ def say_it_was_made_smaller(bag: Path) -> None:
     run.edit_json(
         "*000001.meta.json", lambda s: s.update(packed_smaller={"from": [480, 480]})
     )
+    describe_again(bag)
 
 
 def edit_environment(**facts: Any) -> Callable[[Path], object]:
