@@ -15,6 +15,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, BinaryIO, Final, NamedTuple, TypeAlias
 
+from ..formats.journal import is_of_spans
 from ..formats.json_fields import json_object, read_object, unreadable
 from ..formats.regular_files import open_regular, read_regular
 from .differences import Aspect, Difference, Same, only_in, relative_error, unlike
@@ -292,4 +293,5 @@ def _lines(file: BinaryIO) -> Iterator[bytes]:
     while line := file.readline(_LONGEST_LINE):
         if len(line) >= _LONGEST_LINE:
             raise ValueError("a line is too long")
-        yield line
+        if not is_of_spans(line):
+            yield line
