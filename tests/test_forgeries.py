@@ -518,7 +518,7 @@ def add_to_manifest(run: ForgedRun) -> None:
 
 
 def add_a_line(run: ForgedRun) -> None:
-    run.edit_journal(lambda lines: lines.insert(-1, {"note": {"success": True}}))
+    run.edit_journal(lambda lines: lines.insert(-1, {"remark": {"success": True}}))
 
 
 def add_to_a_line(run: ForgedRun) -> None:
@@ -556,6 +556,15 @@ def say_it_was_made_smaller(bag: Path) -> None:
     run.edit_json(
         "*000001.meta.json", lambda s: s.update(packed_smaller={"from": [480, 480]})
     )
+    describe_again(bag)
+
+
+def add_a_line_about_rows(bag: Path) -> None:
+    """Which packing takes out."""
+    path = the(bag, "*.jsonl")
+    lines = path.read_text().splitlines()
+    rows = json.dumps({"note": {"name": "all goals reached"}})
+    path.write_text("\n".join([*lines[:2], rows, *lines[2:]]) + "\n")
     describe_again(bag)
 
 
@@ -835,7 +844,8 @@ FORGERIES = (
     Forgery("a key in the statistics", add_to("*.stats.json"), "success_rate"),
     Forgery("a key in metadata", add_to("*000001.meta.json"), "success_rate"),
     Forgery("a key in the manifest", add_to_manifest, "award"),
-    Forgery("a line in the journal", add_a_line, "note"),
+    Forgery("a line in the journal", add_a_line, "remark"),
+    Forgery("a line about rows", bag=add_a_line_about_rows, line="goals"),
     Forgery("a key in a line of the journal", add_to_a_line, "judged"),
     Forgery(
         "a note beside the data",

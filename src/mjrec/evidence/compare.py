@@ -303,6 +303,7 @@ class Comparison:
             },
             left_out=left_out if kind == "manifest" else frozenset(),
             renamed=self._renamed,
+            is_packed=self._is_bag,
         )
 
     def _compare_rewards(self) -> _Found:
