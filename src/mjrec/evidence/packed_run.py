@@ -14,6 +14,7 @@ from ..environments.scenes import shown_arguments
 from ..formats.json_fields import read_object, unreadable
 from ..formats.monitor_directory import infix_of, iter_monitor_files
 from ..formats.trajectory_hdf5 import open_hdf5
+from ..plain_text import counted
 from ..results import Episode, iter_episodes
 from ..results.journal_or_stats import MonitorResults
 from ..results.monitor_files import MonitorFiles, monitors_of
@@ -200,11 +201,6 @@ def read_run(recordings: Path, *, options: PackingOptions) -> PackedRun:
             for monitor in monitors_of(recordings)
         ),
     )
-
-
-def counted(number: int, noun: str) -> str:
-    """Return how many there are of a noun."""
-    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
 
 
 def facts_in(value: object) -> Mapping[str, Any]:
