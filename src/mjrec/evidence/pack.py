@@ -37,12 +37,10 @@ from ..rendering.jobs import Progress
 from .anonymity import make_anonymous
 from .bag import TRY_AGAIN, check_bagit, make_bag, write_zip
 from .contents import Contents, look_for_contents
-from .descriptions import write_descriptions
+from .descriptions import descriptions, packed_with
 from .identity import Identity, identity_of_user
 from .identity_traces import remaining_identity
 from .layout import (
-    FORMAT_KEY,
-    FORMAT_VERSION,
     MOST_ENTRIES,
     PAYLOAD,
     RECORDINGS,
@@ -206,20 +204,11 @@ def _make_bag(
         _link_or_copy(path, recordings / path.name)
     if identity is not None:
         make_anonymous(recordings, identity=identity)
-    statements = state(
-        title=options.title, authors=options.authors, license=options.license
-    )
-    run = read_run(recordings, options=options, statements=statements)
-    write_descriptions(run, bag / PAYLOAD)
-    make_bag(
-        bag,
-        {
-            FORMAT_KEY: str(FORMAT_VERSION),
-            "Bagging-Date": run.date,
-            "External-Description": run.title,
-            "Bag-Software-Agent": "mjrec <https://pypi.org/project/mjrec/>",
-        },
-    )
+    run = read_run(recordings, options=options)
+    texts = descriptions(run, recordings, packed_with=packed_with())
+    for name, text in texts.items():
+        (bag / PAYLOAD / name).write_text(text, encoding="utf-8", newline="\n")
+    make_bag(bag, date=run.date, title=run.title)
     found = [] if identity is None else remaining_identity(bag.parent, identity)
     if found:
         raise IdentityLeft(found)
