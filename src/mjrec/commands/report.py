@@ -25,6 +25,7 @@ def report(
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])] = Path("report"),
     single_file: bool = False,
     max_single_file_bytes: int = 50_000_000,
+    replay: bool = False,
     title: str | None = None,
     verification: tyro.conf.UseAppendAction[tuple[Path, ...]] = (),
     as_json: AsJson = False,
@@ -45,6 +46,8 @@ def report(
             --out may then be the name of the page.
         max_single_file_bytes: the most bytes of that page; videos that do not fit are
             left out, with a note.
+        replay: put a page in 3D beside the videos of the best, the median and the worst
+            episode; it needs MuJoCo and is loaded when it is opened.
         title: of the page.
         verification: a file that mjrec verify --json has printed. May be given several
             times; a verification.json in a directory is found by itself.
@@ -58,6 +61,7 @@ def report(
             title=title,
             single_file=single_file,
             max_single_file_bytes=max_single_file_bytes,
+            replays=replay,
             verifications=verification,
             on_progress=lambda progress: show(
                 progress.what,
