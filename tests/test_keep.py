@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import logging
 import signal
 import subprocess
@@ -175,7 +174,7 @@ def test_the_disk_holds_n_candidates_and_the_running_episode(
     with mjrec.Monitor(env, tmp_path, keep="worst:3", workers=0) as monitor:
         for _ in returns:
             monitor.reset()
-            assert len(list(tmp_path.glob("*.spans"))) <= 4
+            assert len(list(tmp_path.glob("*.log"))) <= 4
             assert len(list(tmp_path.glob("openaigym.states.*"))) <= 4 * 3
             monitor.step(monitor.action_space.sample())
     worst = sorted(range(episodes), key=lambda k: (returns[k], k))[:3]
@@ -267,25 +266,6 @@ def test_incomplete_episodes_are_never_chosen(tmp_path: Path, way: Any) -> None:
 # --- ends ----------------------------------------------------------------------------
 
 
-@parametrize("way", ["close", "exception"])
-def test_leaving_early_leaves_the_chosen_pending(tmp_path: Path, way: str) -> None:
-    """What fell out is gone then too, and so is a running episode."""
-    env = mjrec.Monitor(pendulum(), tmp_path, keep="worst:2", workers=1)
-    run(env, 7)
-    with contextlib.suppress(ZeroDivisionError), env:
-        if way == "exception":
-            env.reset()
-            raise ZeroDivisionError
-        run(env, 1)
-        env.close(wait=False)
-    assert logs_of(tmp_path) == pending_in(tmp_path) == [1, 3]
-    render(tmp_path)
-    assert videos_in(tmp_path) == [1, 3]
-    finished = 8 - (way == "exception")
-    assert metadata_of(tmp_path, 1)["selection"]["finished"] == finished
-    assert pending_in(tmp_path) == []
-
-
 def confused(episodes: Sequence[Any]) -> list[int]:
     """Return a number that is none of an episode."""
     return [len(episodes)]
@@ -320,32 +300,17 @@ def test_a_function_that_cannot_choose_loses_nothing(
     assert metadata_of(tmp_path, 0)["selection"] == selection
 
 
-def test_an_interrupted_choice_leaves_all_candidates(tmp_path: Path) -> None:
-    """Ctrl-C while the function runs: nothing is decided, and nothing is lost."""
-
-    def choose(episodes: Sequence[Any]) -> list[int]:
-        raise KeyboardInterrupt
-
-    env = mjrec.Monitor(pendulum(), tmp_path, keep=choose, workers=0)
-    run(env, 3)
-    with pytest.raises(KeyboardInterrupt):
-        env.close()
-    assert mjrec.recover(tmp_path)
-    assert pending_in(tmp_path) == [0, 1, 2]
-    assert manifest_of(tmp_path)["mjrec"]["keep"]["decided"] is False
-
-
 @parametrize("on_error", ["warn", "raise"])
 def test_a_full_disk_at_the_end_loses_no_chosen_video(
     tmp_path: Path, on_error: str
 ) -> None:
-    """Facts that its log has no room for are lost; it is pending all the same."""
+    """What the journal has no room for waits; it is pending all the same."""
     env = mjrec.Monitor(
         pendulum(), tmp_path, keep="worst:2", workers=0, on_error=on_error
     )
     run(env, 8)
-    size = max(path.stat().st_size for path in tmp_path.glob("*.spans"))
-    # Enough for all but what is added to the longer list.
+    [journal] = tmp_path.glob("*.jsonl")
+    size = journal.stat().st_size
     with file_size_limit(size + 20):
         if on_error == "raise":
             with pytest.raises(mjrec.FileNotWritten):

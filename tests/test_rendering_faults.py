@@ -129,26 +129,6 @@ def test_a_killed_encoder_gets_a_second_try(
     check_nothing_is_half(two)
 
 
-def test_an_encoder_that_is_killed_again_leaves_the_video_pending(
-    two: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """With what it said; the other video is rendered."""
-    use_encoder(tmp_path, monkeypatch, of="video000000", instead=KILLED)
-    first, second = finish(two)
-    [failure] = first.failures.values()
-    assert "video000000.mp4 could not be encoded" in failure
-    assert "exit status: -9" in failure
-    assert "no memory" in failure
-    assert second.videos == {VIDEO.format(1): FRAMES}
-    [(name, reason)] = reasons_in(two).items()
-    assert name == VIDEO.format(0)
-    assert reason is not None
-    assert reason.endswith("no memory")
-    check_nothing_is_half(two)
-    monkeypatch.delenv("IMAGEIO_FFMPEG_EXE")
-    check_all_is_there_after_another_try(two)
-
-
 # Takes more than five seconds: the encoder's timeout, twice.
 @parametrize("instead", ["exec sleep 60", "cat >/dev/null; sleep 60"])
 def test_an_encoder_that_hangs_leaves_the_video_pending(
@@ -200,21 +180,20 @@ def test_a_full_disk_is_one_clear_error_wherever_it_comes(
 # Damaged logs
 
 
-@pytest.mark.parametrize(
-    "damage", [b"?\n", b'{"format": "mjrec spans", "version": 99}\n']
-)
-def test_a_list_that_cannot_be_read_is_told_and_costs_no_other(
-    damage: bytes, two: Path
+@pytest.mark.parametrize("line", [b"?\n", b'{"rows": {"number": 0, "version": 99}}\n'])
+def test_a_log_of_unknown_rows_is_told_and_costs_no_other(
+    line: bytes, two: Path
 ) -> None:
     """It stays; what it was of is not known."""
-    damaged = min(two.glob("*.spans"))
-    damaged.write_bytes(damage)
+    [journal] = two.glob("*.jsonl")
+    _, *rest = journal.read_bytes().splitlines(keepends=True)
+    journal.write_bytes(line + b"".join(rest))
+    damaged = min(two.glob("*.log"))
     rendered = render_videos(two, workers=1)
     assert list(rendered.videos) == [VIDEO.format(1)]
     assert list(rendered.failures) == [damaged.name]
     assert "Cannot read" in rendered.failures[damaged.name]
-    [kept] = two.glob(f"{damaged.name}*")
-    assert kept.read_bytes() == damage
+    assert damaged.exists()
     assert list(reasons_in(two)) == [VIDEO.format(0)]
 
 
