@@ -252,7 +252,7 @@ def test_where_nothing_can_be_written(recordings, tmp_path):
         write_report(recordings, tmp_path / "file")
 
 
-def test_replays_stand_beside_the_videos(tmp_path: Path) -> None:
+def test_replays_stand_beside_the_videos(tmp_path):
     """With `replays` the best, median and worst episode have a page in 3D each."""
     pytest.importorskip("mjviser")
     env = gymnasium.make("Hopper-v5", max_episode_steps=3)
