@@ -138,6 +138,11 @@ def test_submitting_never_waits(others, tmp_path, start):
     assert is_finished(log)
 
 
+def make_unreadable(log):
+    log.unlink()
+    log.mkdir()
+
+
 def test_a_model_that_is_still_being_written_is_waited_for(recorded, start):
     """It is compressed beside the simulation; once nobody writes, it is an error."""
     [model] = recorded.glob("*.mjb.gz")
@@ -168,7 +173,7 @@ def test_several_monitors_share_one(tmp_path, start):
         for log in in_flight(tmp_path)[number:]:
             shares[number].submit(log)
     for rows in tmp_path.glob("*.log"):
-        rows.unlink()
+        make_unreadable(rows)
     with background.waiting_at_the_end(lambda _: None):
         for share in shares.values():
             share.wait()
@@ -329,9 +334,9 @@ def test_a_worker_beside_a_simulation_draws_with_one_thread(
     background.wait()
     [worker] = children(process)
     environ = Path(f"/proc/{worker}/environ").read_bytes().split(b"\0")
-    assert b"LP_NUM_THREADS=1" in environ
+    assert b"LP_NUM_THREADS=0" in environ
     names = [file.read_text() for file in Path(f"/proc/{worker}/task").glob("*/comm")]
-    assert len([name for name in names if name.startswith("llvmpipe")]) <= 1
+    assert not [name for name in names if name.startswith("llvmpipe")]
 
 
 # What it leaves alone
