@@ -112,8 +112,7 @@ def test_prepared_workers_draw_the_same(ride, one, tmp_path, monkeypatch, is_the
     use_process(monkeypatch, note)
     one.start()
     one.prepare(ride.path if is_there else tmp_path / ride.path.name)
-    while not noted.exists():
-        time.sleep(0.01)
+    wait_until(noted.exists)
     drawn = list(one.frames(ride.path, range(FRAMES)))
     assert np.array_equal(drawn, ride.frames)
 
