@@ -16,6 +16,7 @@ import pytest
 from interruption import ctrl_c_soon
 from processes import children
 from rides import FRAMES, HEIGHT, WIDTH, record
+from waiting import wait_until
 
 from mjrec import child_python
 from mjrec.child_python import Child
