@@ -1,53 +1,66 @@
 # SPDX-License-Identifier: Apache-2.0
 """What tests do with a run, on whichever engine."""
 
-from __future__ import annotations
-
 import contextlib
 import os
+import re
 import select
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
 
-from mjrec.engines.jobs import JobOutcome, Run, Work
+from mjrec.engines.jobs import Work
+
+# An environment variable, by which a test finds what it has started.
+MARK = "MJREC_TEST_MARK"
 
 
-def odd_work(
-    make: str = "make", *, shared: Path | None = None, **settings: Any
-) -> Work:
+def odd_work(make="make", *, shared=None, **settings):
     """Return work of `odd_jobs`."""
     return Work(entry=f"odd_jobs:{make}", settings=settings, shared_directory=shared)
 
 
-def submit(run: Run, *jobs: str, **arguments: Any) -> None:
+def submit(run, *jobs, **arguments):
     """Hand out jobs that differ in nothing but their keys."""
     for key in jobs:
         run.submit(key, **arguments)
 
 
-def outcomes(run: Run) -> dict[str, JobOutcome]:
+def outcomes(run):
     """Return what becomes of all jobs, in the order in which it comes."""
     return {outcome.key: outcome for outcome in run.results() if outcome is not None}
 
 
-def values(run: Run) -> list[dict[str, Any]]:
+def values(run):
     """Return what the handlers return; no job may fail."""
     found = outcomes(run).values()
     assert not [outcome.failure for outcome in found if outcome.failure]
     return [dict(outcome.value or {}) for outcome in found]
 
 
-def wait_for(path: Path, run: Run) -> int:
+def wait_for(path, run):
     """Return the number of the process that has begun a job, which notes it there."""
     for _ in run.results(patience_s=0.02):
         if path.exists() and path.read_text():
             break
-    return int(path.read_text())
+    return int(path.read_text().split()[-1])
 
 
-def wait_for_end(pid: int) -> None:
+def marked(mark):
+    """Return the commands of other processes in whose environment the mark stands.
+
+    Without Ray's agents, which tell a cluster for a minute that it is gone, and
+    without Python's own.
+    """
+    wanted, found = f"{MARK}={mark}".encode(), []
+    for process in Path("/proc").glob("[0-9]*"):
+        with contextlib.suppress(OSError):
+            if wanted in (process / "environ").read_bytes().split(b"\0"):
+                found.append((process / "cmdline").read_text().replace("\0", " "))
+    return [c for c in found if not re.match(r"ray::\w+Agent|.*resource_tracker", c)]
+
+
+def wait_for_end(pid):
     """Wait until a process that need not be a child is gone."""
     with contextlib.suppress(ProcessLookupError):
         descriptor = os.pidfd_open(pid)
@@ -56,12 +69,12 @@ def wait_for_end(pid: int) -> None:
         assert ready, f"process {pid} goes on"
 
 
-def lines(path: Path) -> list[str]:
+def lines(path):
     """Return the lines of a file; none where there is no file."""
     return path.read_text().splitlines() if path.exists() else []
 
 
-def run_python(*arguments: str, text: str | None = None, **environ: str) -> str:
+def run_python(*arguments, text=None, **environ):
     """Run Python, which finds these helpers, and return what it prints."""
     done = subprocess.run(
         [sys.executable, "-W", "error", *arguments],

@@ -1,19 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """What an evaluation has recorded, whoever ran it and under whatever names."""
 
-from __future__ import annotations
-
 import csv
-from pathlib import Path
-from typing import Any
 
 import h5py
 
-from mjrec.evaluation.evaluation import Evaluation
 from mjrec.formats.trajectory_file import open_trajectory
 
 
-def recorded_in(evaluation: Evaluation) -> dict[tuple[Any, ...], Any]:
+def recorded_in(evaluation):
     """Return what was recorded of each episode: every dataset, and videos as bytes.
 
     By task, seed and episode; what differs with each run (names, times, versions) is
@@ -21,7 +16,7 @@ def recorded_in(evaluation: Evaluation) -> dict[tuple[Any, ...], Any]:
     """
     with (evaluation.directory / "timing.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
-    found: dict[tuple[Any, ...], Any] = {}
+    found = {}
     for row in rows:
         of = (row["task"], row["seed"], row["episode"])
         folder = evaluation.directory / row["folder"]
@@ -34,11 +29,11 @@ def recorded_in(evaluation: Evaluation) -> dict[tuple[Any, ...], Any]:
     return found
 
 
-def datasets_in(path: Path) -> dict[str, tuple[str, tuple[int, ...], bytes]]:
+def datasets_in(path):
     """Return the datasets of a finished trajectory by name: type, shape, content."""
-    found: dict[str, tuple[str, tuple[int, ...], bytes]] = {}
+    found = {}
 
-    def note(name: str, item: Any) -> None:
+    def note(name, item):
         if isinstance(item, h5py.Dataset):
             found[name] = (str(item.dtype), item.shape, item[()].tobytes())
 
@@ -48,6 +43,6 @@ def datasets_in(path: Path) -> dict[str, tuple[str, tuple[int, ...], bytes]]:
     return found
 
 
-def hashes_of(video: Path) -> str:
+def hashes_of(video):
     """Return the hashes of a video's pictures, as its file has them."""
     return video.with_suffix(".framehash").read_text()

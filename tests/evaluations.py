@@ -1,59 +1,84 @@
 # SPDX-License-Identifier: Apache-2.0
 """Evaluations that were never run: their files, from returns by hand."""
 
-from __future__ import annotations
+import re
 
-from collections.abc import Mapping, Sequence
-from pathlib import Path
-from typing import Any
-
+from mjrec.evaluation.dataclass_json import to_json
 from mjrec.evaluation.episode_results import EpisodeResult
 from mjrec.evaluation.plan import EvaluatedTask, EvaluationPlan
-from mjrec.evaluation.results_files import write_results
+from mjrec.evaluation.result_tables import EpisodeFiles
+from mjrec.evaluation.results_files import ChosenEpisode, write_results
 from mjrec.evaluation.statistics import Bootstrap
-from mjrec.evaluation.summaries import default_score_range, summarize_results
+from mjrec.evaluation.summaries import (
+    AcrossTasks,
+    default_score_range,
+    summarize_results,
+)
+from mjrec.json_text import dumps
+from report_recordings import entry, write_journal
 
 
 def write_evaluation(
-    directory: Path,
-    returns: Mapping[str, Sequence[Sequence[float | None]]],
+    directory,
+    returns,
     *,
-    score_ranges: Mapping[str, tuple[float, float]] | None = None,
-    versions: Mapping[str, str] | None = None,
-    **plan: Any,
-) -> Path:
+    score_ranges=None,
+    across=None,
+    bootstrap=Bootstrap(resamples=10),  # noqa: B008  it is frozen
+    versions=None,
+    monitor=None,
+    videos=None,
+    finished=True,
+    **plan,
+):
     """Write the results of an evaluation, and return its directory.
 
     Args:
         directory: is made.
         returns: for each task and seed those of its episodes; None is a failed one.
         score_ranges: of tasks that have none of their own.
+        across: its figures across tasks.
+        bootstrap: of the intervals.
         versions: of what ran.
+        monitor: the infix of those that recorded; they have left a journal each.
+        videos: by task, the video of its first episode.
+        finished: whether there are results.
         plan: further fields of the plan.
     """
-    runs = max(map(len, returns.values()))
+    folders = {task: re.sub(r"[^\w.-]", "-", task) for task in returns}
     asked = EvaluationPlan(
         **{
-            "tasks": tuple(
-                EvaluatedTask(task, f"task{number}")
-                for number, task in enumerate(returns)
-            ),
+            "tasks": tuple(EvaluatedTask(*each) for each in folders.items()),
             "policy": "random",
-            "seeds": tuple(range(runs)),
+            "seeds": tuple(range(max(map(len, returns.values())))),
             "episodes": len(next(iter(returns.values()))[0]),
             **plan,
         }
     )
     results = {
         task: [
-            _result(task, seed, number, total)
-            for seed, totals in zip(asked.seeds, by_seed, strict=True)
+            _result(task, seed, number, total, monitor, index * len(totals) + number)
+            for index, (seed, totals) in enumerate(
+                zip(asked.seeds, by_seed, strict=True)
+            )
             for number, total in enumerate(totals)
         ]
         for task, by_seed in returns.items()
     }
-    ranges = score_ranges or {}
-    directory.mkdir(parents=True)
+    directory.mkdir(parents=True, exist_ok=True)
+    for task, of in results.items() if monitor else ():
+        write_journal(directory / folders[task], monitor, task, _entries(of))
+    if not finished:
+        content = {"format_version": 1, "plan": to_json(asked)}
+        (directory / "evaluation.json").write_text(dumps(content))
+        return directory
+    ranges, videos = score_ranges or {}, videos or {}
+
+    def files(result):
+        is_first = result is results[result.task][0]
+        video = videos.get(result.task) if is_first else None
+        return EpisodeFiles(folders[result.task] if monitor else None, video=video)
+
     write_results(
         directory,
         plan=asked,
@@ -65,20 +90,28 @@ def write_evaluation(
                 score_range=ranges.get(
                     task, default_score_range(task, asked.max_steps)
                 ),
-                bootstrap=Bootstrap(resamples=10),
+                bootstrap=bootstrap,
             )
             for task, each in results.items()
         ],
-        across=None,
-        bootstrap=Bootstrap(resamples=10),
-        selection={},
+        across=across,
+        bootstrap=bootstrap,
+        selection={task: [ChosenEpisode(asked.seeds[0], 0, "best")] for task in videos},
         versions=versions or {},
+        files=files,
     )
     return directory
 
 
-def _result(task: str, seed: int, number: int, total: float | None) -> EpisodeResult:
+def _result(task, seed, number, total, monitor, episode_id):
     has_failed = total is None
+    recorded = {
+        "success": None if has_failed else episode_id == 0,
+        "monitor": monitor,
+        "episode_id": episode_id,
+        "start_time": 1.79e9 + episode_id,
+        "seconds": 1.0,
+    }
     return EpisodeResult(
         task=task,
         seed=seed,
@@ -87,5 +120,33 @@ def _result(task: str, seed: int, number: int, total: float | None) -> EpisodeRe
         length=10,
         terminated=None if has_failed else False,
         truncated=None if has_failed else True,
-        failure="it raised" if has_failed else None,
+        failure="PolicyError: it gave <b>NaN</b>" if has_failed else None,
+        **(recorded if monitor else {}),
+    )
+
+
+def _entries(results):
+    return [
+        entry(
+            each.episode_id,
+            reward=each.total_reward,
+            seed=each.seed,
+            evaluation={"seed": each.seed, "episode": each.episode},
+        )
+        for each in results
+        if each.total_reward is not None
+    ]
+
+
+def write_recorded(directory, tasks, *, rewards=(3.0, 1.0, None, 2.0), **options):
+    """Write an evaluation of two seeds, whose monitors have left their journals."""
+    half = len(rewards) // 2
+    returns = {task: [rewards[:half], rewards[half:]] for task in tasks}
+    return write_evaluation(
+        directory,
+        returns,
+        **{"seeds": (0, 7), "monitor": "0.batch", **options},
+        bootstrap=Bootstrap(resamples=100, seed=3),
+        across=AcrossTasks(tasks=(), left_out=dict.fromkeys(tasks, "no scale")),
+        versions={"mjrec": "9.9", "mujoco": "8.8"},
     )

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Handlers of jobs that do what policies and environments do on a bad day."""
 
-from __future__ import annotations
-
 import contextlib
 import logging
 import os
@@ -10,9 +8,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import mjrec
 from mjrec.engines.worker import time_limit
@@ -21,32 +17,32 @@ from mjrec.engines.worker import time_limit
 class OddJobs:
     """Does what a job's `do` names."""
 
-    def __init__(self, settings: Mapping[str, Any]) -> None:
+    def __init__(self, settings):
         self._settings = settings
 
-    def __call__(self, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
-        job: Mapping[str, Any] = getattr(self, arguments["do"])(arguments)
-        return job
+    def __call__(self, arguments):
+        return getattr(self, arguments["do"])(arguments)
 
-    def leave(self) -> None:
+    def leave(self):
         if "left" in self._settings:
             with Path(self._settings["left"]).open("a") as file:
                 file.write(f"{os.getpid()}\n")
 
-    def echo(self, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
+    def echo(self, arguments):
         return {"arguments": dict(arguments), "settings": self._settings}
 
-    def where(self, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
+    def where(self, arguments):
         payload = self._settings.get("payload")
         return {
             "pid": os.getpid(),
             "directory": str(Path.cwd()),
             "session": os.getsid(0),
             "threads": os.environ.get("OMP_NUM_THREADS"),
+            "gpus": os.environ.get("CUDA_VISIBLE_DEVICES"),
             "payload": payload and Path(payload).read_text(),
         }
 
-    def die(self, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
+    def die(self, arguments):
         """End the process; where `once` names a file, only if there is none yet."""
         if "once" in arguments:
             try:
@@ -57,16 +53,16 @@ class OddJobs:
         os.kill(os.getpid(), signal.Signals[arguments["how"]])
         raise AssertionError("dead")
 
-    def fail(self, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
+    def fail(self, arguments):
         raise ValueError("not\n  today")
 
-    def leave_python(self, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
+    def leave_python(self, arguments):
         sys.exit("enough")
 
-    def no_json(self, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
+    def no_json(self, arguments):
         return {"path": Path()}
 
-    def talk(self, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
+    def talk(self, arguments):
         print('{"key": "a", "value": {"forged": true}}')
         print("to the error output", file=sys.stderr)
         subprocess.run(["echo", "of a child"], check=True)
@@ -75,24 +71,23 @@ class OddJobs:
         print("x" * arguments.get("more", 0))
         return {"read": sys.stdin.read()}
 
-    def meet(self, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
+    def meet(self, arguments):
         """Wait until another job has opened the other end of a pipe."""
         with Path(arguments["pipe"]).open(arguments["mode"]):
             gpus = os.environ.get("CUDA_VISIBLE_DEVICES")
             return {"pid": os.getpid(), "gpus": gpus}
 
-    def hold(self, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
-        """Keep at it until a file is there; a file says when it has begun."""
-        # A new file, so that nothing is ever replaced.
-        with Path(arguments["begun"]).open("x") as file:
-            file.write(str(os.getpid()))
+    def hold(self, arguments):
+        """Keep at it until a file is there; lines of another say who has begun."""
+        with Path(arguments["begun"]).open("a") as file:
+            file.write(f"{os.getpid()}\n")
         go = Path(arguments.get("go", "/no/such/file"))
         while not go.exists():
             with contextlib.suppress(SystemExit):
                 time.sleep(0.02)
         return {"pid": os.getpid()}
 
-    def hang(self, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
+    def hang(self, arguments):
         """Hold the interpreter for minutes, where there is no file yet."""
         import re
 
@@ -102,7 +97,7 @@ class OddJobs:
                 re.match(r"(a+)+b", "a" * 40)
         return {"mark": mark.read_text()}
 
-    def fork(self, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
+    def fork(self, arguments):
         """Die, and leave a child of another session that goes on."""
         child = subprocess.Popen(["sleep", "600"], start_new_session=True)
         with Path(arguments["children"]).open("a") as file:
@@ -111,24 +106,24 @@ class OddJobs:
         raise AssertionError("dead")
 
 
-def make(settings: Mapping[str, Any]) -> OddJobs:
+def make(settings):
     return OddJobs(settings)
 
 
-def make_nothing(settings: Mapping[str, Any]) -> OddJobs:
+def make_nothing(settings):
     raise ValueError("there is no handler")
 
 
-def make_no_name(settings: Mapping[str, Any]) -> OddJobs:
+def make_no_name(settings):
     raise mjrec.UnknownName("camera", "egocentric", ["back", "side"])
 
 
-def make_and_die(settings: Mapping[str, Any]) -> OddJobs:
+def make_and_die(settings):
     print("a library is missing", flush=True)
     os._exit(3)
 
 
-def make_one(settings: Mapping[str, Any]) -> OddJobs:
+def make_one(settings):
     """The first begins; all others die, each noting that."""
     place = Path(settings["place"])
     try:

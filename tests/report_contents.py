@@ -1,12 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Contents of reports, made by hand."""
 
-from __future__ import annotations
-
-from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -41,14 +37,8 @@ HOSTILE = (
 
 
 def task(
-    name: str,
-    returns: Sequence[float],
-    *,
-    seeds: int = 1,
-    failures: Mapping[int, str] | None = None,
-    score_range: tuple[float, float] | None = (0.0, 1000.0),
-    **changes: Any,
-) -> ReportTask:
+    name, returns, *, seeds=1, failures=None, score_range=(0.0, 1000.0), **changes
+):
     """Return a task of equally many episodes of each seed, or of monitors (`runs`)."""
     count = len(returns)
     each = max(1, count // seeds)
@@ -86,7 +76,7 @@ def task(
     return replace(made, **changes)
 
 
-def video(index: int | None = 0, **changes: Any) -> ReportVideo:
+def video(index=0, **changes):
     """Return a video, whose file need not be there."""
     made = ReportVideo(
         path=Path("evaluation/a b.mp4"),
@@ -104,7 +94,7 @@ def video(index: int | None = 0, **changes: Any) -> ReportVideo:
     return replace(made, **changes)
 
 
-def contents(*tasks: ReportTask, **changes: Any) -> ReportContents:
+def contents(*tasks, **changes):
     """Return a report of them, or of two tasks of five seeds."""
     if not tasks:
         tasks = (
@@ -122,7 +112,7 @@ def contents(*tasks: ReportTask, **changes: Any) -> ReportContents:
     return replace(made, **changes)
 
 
-def hostile_report() -> ReportContents:
+def hostile_report():
     """Return contents in which every text is one that means harm."""
     tasks = [
         task(
@@ -161,6 +151,5 @@ def hostile_report() -> ReportContents:
     )
 
 
-def _returns(mean: float, spread: float) -> list[float]:
-    values: list[float] = np.random.default_rng(0).normal(mean, spread, 50).tolist()
-    return values
+def _returns(mean, spread):
+    return np.random.default_rng(0).normal(mean, spread, 50).tolist()

@@ -1,6 +1,4 @@
 # SPDX-License-Identifier: Apache-2.0
-from __future__ import annotations
-
 import json
 import logging
 import os
@@ -8,10 +6,8 @@ import pty
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import gymnasium
 import pytest
@@ -19,9 +15,10 @@ from parts import parametrize
 from recordings import frames_in, metadata_of, videos_in
 from trajectories_by_hand import write_log
 
+from evaluations import write_recorded
 from mjrec import Monitor, load_results
 from mjrec.commands import COMMANDS, main
-from report_recordings import entry, write_evaluation, write_journal
+from report_recordings import entry, write_journal
 
 PENDULUM = """
 <mujoco>
@@ -55,10 +52,10 @@ class Built:
 
 
 @pytest.fixture
-def mjrec(capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str, str]]:
+def mjrec(capsys):
     """Run the command; returns the exit status and what it printed."""
 
-    def run(*arguments: object) -> tuple[int, str, str]:
+    def run(*arguments):
         status = main([str(argument) for argument in arguments])
         out, err = capsys.readouterr()
         return status, out, err
@@ -66,7 +63,7 @@ def mjrec(capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str, s
     return run
 
 
-def results_of(directory: Path) -> dict[str, Any]:
+def results_of(directory):
     results = load_results(directory)
     assert results is not None
     return results
@@ -76,7 +73,7 @@ CHEETAH = ("record", "HalfCheetah-v5", "--size", "64x48", "--max-steps", 3)
 
 
 # Takes more than five seconds: three videos, each by renderers that start for it.
-def test_record_gymnasium(mjrec: Any, tmp_path: Path) -> None:
+def test_record_gymnasium(mjrec, tmp_path):
     """Ten short episodes: videos of 0, 1 and 8, statistics of all, a line for each."""
     status, out, _ = mjrec(*CHEETAH, "--out", tmp_path, "--episodes", 10, "--seed", 0)
     assert status == 0
@@ -93,7 +90,7 @@ def test_record_gymnasium(mjrec: Any, tmp_path: Path) -> None:
     assert frames_in(tmp_path, 0)[0].shape == (48, 64, 3)
 
 
-def test_record_mjcf_file(mjrec: Any, tmp_path: Path) -> None:
+def test_record_mjcf_file(mjrec, tmp_path):
     """A model file is simulated and recorded at 60 frames a second."""
     model = tmp_path / "pendulum.xml"
     model.write_text(PENDULUM)
@@ -111,7 +108,7 @@ def test_record_mjcf_file(mjrec: Any, tmp_path: Path) -> None:
     assert (frames[0] != frames[-1]).any()
 
 
-def test_text_environment(mjrec: Any, tmp_path: Path) -> None:
+def test_text_environment(mjrec, tmp_path):
     """An environment that draws text gives an asciicast, without any OpenGL."""
     status, _, err = mjrec(
         *("record", "FrozenLake-v1", "--out", tmp_path, "--seed", 0),
@@ -123,7 +120,7 @@ def test_text_environment(mjrec: Any, tmp_path: Path) -> None:
 
 
 @pytest.mark.thorough
-def test_resume_goes_on_where_it_stopped(mjrec: Any, tmp_path: Path) -> None:
+def test_resume_goes_on_where_it_stopped(mjrec, tmp_path):
     """Episode 1 of a resumed run is episode 1 of an uninterrupted one."""
     for out, runs in (("whole", [2]), ("parts", [1, 1])):
         for episodes in runs:
@@ -136,7 +133,7 @@ def test_resume_goes_on_where_it_stopped(mjrec: Any, tmp_path: Path) -> None:
     assert metadata_of(tmp_path / "parts", 1)["episode_id"] == 1
 
 
-def test_keep_names_only_what_was_chosen(mjrec: Any, tmp_path: Path) -> None:
+def test_keep_names_only_what_was_chosen(mjrec, tmp_path):
     """The videos that are there in the end, in the summary and as JSON."""
     run = (*CHEETAH, "--seed", 0, "--episodes", 3, "--workers", 0, "--keep", "worst:1")
     _, out, _ = mjrec(*run, "--out", tmp_path / "a")
@@ -147,14 +144,15 @@ def test_keep_names_only_what_was_chosen(mjrec: Any, tmp_path: Path) -> None:
         number == worst for number in range(3)
     ]
     _, out, _ = mjrec(*run, "--out", tmp_path / "b", "--json")
-    pending = [episode["pending"] for episode in json.loads(out)["episodes"]]
+    said = json.loads(out)
+    assert (said["seed"], said["interrupted"]) == (0, False)
+    assert [episode["length"] for episode in said["episodes"]] == [3] * 3
+    pending = [episode["pending"] for episode in said["episodes"]]
     assert pending == [number == worst for number in range(3)]
 
 
 @pytest.mark.parametrize("policy", ["zero", "calm_policy:calm", "calm_policy:Built"])
-def test_policies(
-    mjrec: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, policy: str
-) -> None:
+def test_policies(mjrec, tmp_path, monkeypatch, policy):
     """A built-in, a function and a class of the working directory act alike."""
     (tmp_path / "calm_policy.py").write_text(POLICY)
     monkeypatch.chdir(tmp_path)
@@ -167,18 +165,6 @@ def test_policies(
     assert results_of(tmp_path / "out")["episode_rewards"] == [
         pytest.approx(0.0, abs=0.5)
     ]
-
-
-@pytest.mark.thorough
-def test_json_is_the_only_output(mjrec: Any, tmp_path: Path) -> None:
-    """One object with what a script wants to know."""
-    _, out, _ = mjrec(*CHEETAH, "--out", tmp_path, "--seed", 5, "--json")
-    summary = json.loads(out)
-    assert summary["seed"] == 5
-    assert summary["interrupted"] is False
-    [episode] = summary["episodes"]
-    assert episode["length"] == 3
-    assert (tmp_path / episode["video"]).exists()
 
 
 @pytest.mark.parametrize(
@@ -211,9 +197,7 @@ def test_json_is_the_only_output(mjrec: Any, tmp_path: Path) -> None:
         (["no_such.xml"], ["no_such.xml"]),
     ],
 )
-def test_bad_input_is_one_clear_error(
-    mjrec: Any, tmp_path: Path, arguments: list[str], said: list[str]
-) -> None:
+def test_bad_input_is_one_clear_error(mjrec, tmp_path, arguments, said):
     """It says what was asked and what there is, and leaves nothing behind."""
     status, _, err = mjrec("record", *arguments, "--out", tmp_path / "out")
     assert status == 1
@@ -224,7 +208,7 @@ def test_bad_input_is_one_clear_error(
     assert not (tmp_path / "out").exists()
 
 
-def test_existing_recordings_need_force_or_resume(mjrec: Any, tmp_path: Path) -> None:
+def test_existing_recordings_need_force_or_resume(mjrec, tmp_path):
     """The error names both; force replaces."""
     mjrec(*CHEETAH, "--out", tmp_path, "--seed", 0, "--schedule", "none")
     status, _, err = mjrec(*CHEETAH, "--out", tmp_path, "--seed", 0)
@@ -258,12 +242,8 @@ gymnasium.register("Nan-v0", Nan, disable_env_checker=True)
 
 @pytest.mark.parametrize(("allowed", "expected"), [([], 1), (["--allow-nan"], 0)])
 def test_a_return_that_is_nan_is_no_success(
-    mjrec: Any,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    allowed: list[str],
-    expected: int,
-) -> None:
+    mjrec, tmp_path, monkeypatch, allowed, expected
+):
     """It is said, and fails recording and evaluating unless it is allowed."""
     monkeypatch.chdir(tmp_path)
     Path("nan_env.py").write_text(NAN)
@@ -281,7 +261,7 @@ def test_a_return_that_is_nan_is_no_success(
     assert "best" not in out
 
 
-def test_messages_are_said_once(mjrec: Any, tmp_path: Path) -> None:
+def test_messages_are_said_once(mjrec, tmp_path):
     """However often the command ran in one process."""
     handlers = logging.getLogger("mjrec").handlers[:]
     mjrec("list", tmp_path)
@@ -289,7 +269,7 @@ def test_messages_are_said_once(mjrec: Any, tmp_path: Path) -> None:
     assert logging.getLogger("mjrec").handlers == handlers
 
 
-def test_wrong_usage_is_status_2(mjrec: Any) -> None:
+def test_wrong_usage_is_status_2(mjrec):
     """As every command line has it."""
     with pytest.raises(SystemExit) as left:
         mjrec("record", "HalfCheetah-v5", "--no-such-option")
@@ -297,48 +277,29 @@ def test_wrong_usage_is_status_2(mjrec: Any) -> None:
 
 
 @pytest.mark.thorough
-@pytest.mark.parametrize("env", ["HalfCheetah-v5", "model.xml"])
-def test_cameras_given_more_than_once_are_a_video_each(
-    mjrec: Any, tmp_path: Path, env: str
-) -> None:
-    """All are listed, whether the environment or the monitor shows the first."""
+def test_cameras_are_a_video_each_or_one_side_by_side(mjrec, tmp_path):
+    """All are listed; captions and second names are asked for likewise."""
     (tmp_path / "model.xml").write_text(PENDULUM)
-    name = str(tmp_path / env) if env.endswith(".xml") else env
-    first = "front" if env.endswith(".xml") else "track"
-    status, out, _ = mjrec(
-        *("record", name, "--out", tmp_path / "out", "--max-steps", 2),
-        *("--size", "64x48", "--camera", first, "--camera", -1),
-    )
+    run = ("record", tmp_path / "model.xml", "--max-steps", 2, "--size", "64x48")
+    run = (*run, "--camera", "front", "--camera", -1)
+    status, out, _ = mjrec(*run, "--out", tmp_path / "a")
     assert status == 0
-    videos = sorted(path.name for path in (tmp_path / "out").glob("*.mp4"))
+    videos = sorted(path.name for path in (tmp_path / "a").glob("*.mp4"))
     assert len(videos) == 2
     assert "2 videos:" in out
     assert all(video in out for video in videos)
-    assert metadata_of(tmp_path / "out", 0)["camera"] == first
-
-
-@pytest.mark.thorough
-def test_cameras_side_by_side_with_captions_and_a_second_name(
-    mjrec: Any, tmp_path: Path
-) -> None:
-    """One video, twice as wide, that says what it is."""
-    status, _, _ = mjrec(
-        *(*CHEETAH, "--out", tmp_path, "--camera", "track", "--camera", -1),
-        *("--tiled", "--annotate", "--name-prefix", "rl-video"),
-    )
-    assert status == 0
-    [frame, *_] = frames_in(tmp_path, 0)
+    assert metadata_of(tmp_path / "a", 0)["camera"] == "front"
+    more = ("--tiled", "--annotate", "--name-prefix", "rl-video")
+    assert mjrec(*run, "--out", tmp_path / "b", *more)[0] == 0
+    [frame, *_] = frames_in(tmp_path / "b", 0)
     assert frame.shape == (48, 128, 3)
-    about = metadata_of(tmp_path, 0)
-    assert about["tiled"]
-    assert about["annotated"]
-    assert (tmp_path / "rl-video-episode-0.mp4").exists()
+    about = metadata_of(tmp_path / "b", 0)
+    assert (about["tiled"], about["annotated"]) == (True, True)
+    assert (tmp_path / "b" / "rl-video-episode-0.mp4").exists()
 
 
 @pytest.mark.thorough
-def test_list_names_videos_of_more_or_less_than_an_episode(
-    mjrec: Any, tmp_path: Path
-) -> None:
+def test_list_names_videos_of_more_or_less_than_an_episode(mjrec, tmp_path):
     """Those that are counted in steps, and that of an episode that was cut off."""
     env = gymnasium.make("InvertedPendulum-v5", max_episode_steps=3)
     options = {"height": 32, "width": 32, "workers": 1}
@@ -355,7 +316,7 @@ def test_list_names_videos_of_more_or_less_than_an_episode(
     assert out.splitlines()[-2:] == ["Other videos:", f"  {video.name}"]
 
 
-def test_list_says_which_videos_are_pending(mjrec: Any, tmp_path: Path) -> None:
+def test_list_says_which_videos_are_pending(mjrec, tmp_path):
     """In place of the name that there is not yet."""
     entries = [entry(0), entry(1, recording="deferred")]
     write_journal(tmp_path, "0.7", "X-v0", entries)
@@ -370,7 +331,7 @@ def test_list_says_which_videos_are_pending(mjrec: Any, tmp_path: Path) -> None:
 
 
 @pytest.mark.thorough
-def test_list_shows_the_directories_in_one(mjrec: Any, tmp_path: Path) -> None:
+def test_list_shows_the_directories_in_one(mjrec, tmp_path):
     """As of an evaluation, which has one for each task; others are passed over."""
     for name, episodes in (("b", 1), ("a", 2)):
         mjrec(*CHEETAH, "--out", tmp_path / name, "--episodes", episodes)
@@ -392,10 +353,10 @@ def test_list_shows_the_directories_in_one(mjrec: Any, tmp_path: Path) -> None:
     assert isinstance(lines[0]["seed"], int)
 
 
-def test_list_shows_an_evaluation_as_one(mjrec: Any, tmp_path: Path) -> None:
+def test_list_shows_an_evaluation_as_one(mjrec, tmp_path):
     """Task, seed, return and video of each episode; what failed says so."""
     name = "openaigym.video.0.batch.video000000.mp4"
-    write_evaluation(tmp_path, ["a/x", "b/y"], videos={"a/x": name, "b/y": name})
+    write_recorded(tmp_path, ["a/x", "b/y"], videos={"a/x": name, "b/y": name})
     (tmp_path / "a-x" / name).touch()
     status, out, _ = mjrec("list", tmp_path)
     assert status == 0
@@ -412,11 +373,9 @@ def test_list_shows_an_evaluation_as_one(mjrec: Any, tmp_path: Path) -> None:
     assert (first["video"], first["pending"]) == (str(tmp_path / "a-x" / name), False)
 
 
-def test_list_shows_what_is_over_of_an_evaluation_that_is_not(
-    mjrec: Any, tmp_path: Path
-) -> None:
+def test_list_shows_what_is_over_of_an_evaluation_that_is_not(mjrec, tmp_path):
     """By task and seed, too; which get a video is not chosen yet."""
-    write_evaluation(tmp_path, ["a/x"], finished=False)
+    write_recorded(tmp_path, ["a/x"], finished=False)
     status, out, _ = mjrec("list", tmp_path)
     assert status == 0
     assert [line.split() for line in out.splitlines() if "/" in line] == [
@@ -428,16 +387,14 @@ def test_list_shows_what_is_over_of_an_evaluation_that_is_not(
     assert [json.loads(line)["seed"] for line in out.splitlines()] == [0, 0, 7]
 
 
-def test_a_long_list_is_printed_as_it_is_read(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_long_list_is_printed_as_it_is_read(tmp_path, monkeypatch):
     """The first rows are there before the last are read."""
     from mjrec.commands import terminal
 
-    printed: list[str] = []
+    printed = []
     monkeypatch.setattr(sys, "stdout", SimpleNamespace(write=printed.append))
 
-    def rows() -> Iterator[tuple[str, str]]:
+    def rows():
         for number in range(3000):
             assert len(printed) >= number - 1000
             yield str(number), "a" * (number % 7)
@@ -446,22 +403,18 @@ def test_a_long_list_is_printed_as_it_is_read(
     assert printed[-1] == f"  2999  {'a' * 3}\n"
 
 
-def test_list_says_that_there_is_nothing(mjrec: Any, tmp_path: Path) -> None:
+def test_list_says_that_there_is_nothing(mjrec, tmp_path):
     """Not an empty table, and no error: a run may not have come to an end yet."""
     status, out, _ = mjrec("list", tmp_path)
     assert (status, out) == (0, f"No episode is recorded in {tmp_path}.\n")
     assert mjrec("list", tmp_path, "--json")[:2] == (0, "")
-
-
-def test_list_of_nothing_is_an_error(mjrec: Any, tmp_path: Path) -> None:
-    """The directory is named."""
     status, _, err = mjrec("list", tmp_path / "nothing")
     assert status == 1
     assert "nothing" in err
 
 
 @pytest.mark.thorough
-def test_reader_may_leave_early(mjrec: Any, tmp_path: Path) -> None:
+def test_reader_may_leave_early(mjrec, tmp_path):
     """Whoever reads the list may have left: nothing is said on stderr."""
     mjrec(*CHEETAH, "--out", tmp_path, "--seed", 0, "--schedule", "none")
     reader, writer = os.pipe()
@@ -478,7 +431,7 @@ def test_reader_may_leave_early(mjrec: Any, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_help_flows(mjrec: Any, capsys: Any, command: str) -> None:
+def test_help_flows(mjrec, capsys, command):
     """Every command says what it does; descriptions break only at the margin."""
     with pytest.raises(SystemExit) as left:
         mjrec(command, "--help")
@@ -496,9 +449,7 @@ def test_help_flows(mjrec: Any, capsys: Any, command: str) -> None:
         (["list", "."], {"mujoco", "gymnasium", "h5py", "scipy", "imageio"}),
     ],
 )
-def test_a_command_loads_only_what_it_needs(
-    tmp_path: Path, arguments: list[str], unneeded: set[str]
-) -> None:
+def test_a_command_loads_only_what_it_needs(tmp_path, arguments, unneeded):
     """So that help is there at once, and a list nearly so."""
     code = (
         "import sys\n"
@@ -520,8 +471,8 @@ def test_a_command_loads_only_what_it_needs(
 
 
 def test_what_is_said_by_mujoco_and_of_a_policy_is_said_once(
-    mjrec: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    mjrec, tmp_path, monkeypatch
+):
     """Of many episodes, and of several workers of an evaluation."""
     monkeypatch.chdir(tmp_path)
     # A tenth of a second a step, with a spring that is far too stiff for it.
@@ -546,7 +497,7 @@ def test_what_is_said_by_mujoco_and_of_a_policy_is_said_once(
     assert err.count('crash_policy.py", line 2, in crash') == 1
 
 
-def _start(tmp_path: Path, **streams: Any) -> subprocess.Popen[bytes]:
+def _start(tmp_path, **streams):
     return subprocess.Popen(
         [
             *(sys.executable, "-m", "mjrec", "record", "HalfCheetah-v5"),
@@ -559,7 +510,7 @@ def _start(tmp_path: Path, **streams: Any) -> subprocess.Popen[bytes]:
 
 # Takes more than five seconds: a command is interrupted, and what it left is drawn.
 @pytest.mark.usefixtures("default_signals")
-def test_ctrl_c_keeps_everything_so_far(tmp_path: Path) -> None:
+def test_ctrl_c_keeps_everything_so_far(tmp_path):
     """Status 130; episodes and manifest are whole, and videos can be made of them."""
     process = _start(tmp_path, stdout=subprocess.PIPE)
     assert process.stdout is not None
@@ -580,9 +531,7 @@ def test_ctrl_c_keeps_everything_so_far(tmp_path: Path) -> None:
 
 @pytest.mark.usefixtures("default_signals")
 @parametrize(("signum", "status"), [(signal.SIGTERM, 143), (signal.SIGHUP, 129)])
-def test_being_told_to_end_keeps_everything_so_far(
-    signum: signal.Signals, status: int, tmp_path: Path
-) -> None:
+def test_being_told_to_end_keeps_everything_so_far(signum, status, tmp_path):
     """As a scheduler does at a time limit: files are closed, the rest is said."""
     process = _start(tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
     assert process.stdout is not None
@@ -598,7 +547,7 @@ def test_being_told_to_end_keeps_everything_so_far(
 
 
 @pytest.mark.usefixtures("default_signals")
-def test_terminal_shows_a_bar(tmp_path: Path) -> None:
+def test_terminal_shows_a_bar(tmp_path):
     """On a terminal there is a progress bar with episodes and steps."""
     reader, terminal = pty.openpty()
     process = _start(tmp_path, stdout=terminal, stderr=terminal)

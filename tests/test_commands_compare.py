@@ -1,10 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-from __future__ import annotations
-
 import json
 import math
-from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -15,7 +11,7 @@ WALK = "dm_control/walker-walk"
 
 
 @pytest.fixture
-def two(tmp_path: Path) -> list[str]:
+def two(tmp_path):
     """Return two evaluations; of the first task the second is better."""
     a = {
         WALK: [[100.0, 200, 300, 400]],
@@ -29,16 +25,13 @@ def two(tmp_path: Path) -> list[str]:
     ]
 
 
-def told(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> dict[str, Any]:
+def told(arguments, capsys):
     """Return what `--json` prints: one object, with nothing around it."""
     main(["compare", *arguments, "--json", "--resamples", "200"])
-    fields: dict[str, Any] = json.loads(capsys.readouterr().out)
-    return fields
+    return json.loads(capsys.readouterr().out)
 
 
-def test_a_table_and_a_sentence(
-    two: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_table_and_a_sentence(two, tmp_path, capsys):
     """What must be known first stands first, and what it comes to stands last."""
     assert main(["compare", *two]) == 0
     lines = capsys.readouterr().out.splitlines()
@@ -60,9 +53,7 @@ def test_a_table_and_a_sentence(
     )
 
 
-def test_the_same_figures_as_json(
-    two: list[str], capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_same_figures_as_json(two, capsys):
     """By the names that --require takes."""
     fields = told([*two, "--seed", "3", "--confidence", "0.9"], capsys)
     assert (fields["a"], fields["b"], fields["unmet"]) == ([two[0]], [two[1]], [])
@@ -74,9 +65,7 @@ def test_the_same_figures_as_json(
     assert fields["figures"]["probability of improvement"]["value"] == 0.75
 
 
-def test_sets_of_evaluations(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_sets_of_evaluations(tmp_path, capsys):
     """As a shell writes out `runs/a* --against runs/b*`."""
     paths = [
         str(write_evaluation(tmp_path / f"{side}{k}", {WALK: [[k + add, k + add]]}))
@@ -109,12 +98,7 @@ def test_sets_of_evaluations(
         ("p-value low < 0.05", "is not known"),
     ],
 )
-def test_what_is_required(
-    required: str,
-    reason: str | None,
-    two: list[str],
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_what_is_required(required, reason, two, capsys):
     """A figure of all tasks together, of each, or of one; or an end of an interval.
 
     Where it is not there the exit status is 1, and the reason stands last.
@@ -146,12 +130,7 @@ def test_what_is_required(
         (["more"], "--against"),
     ],
 )
-def test_what_cannot_be_required(
-    options: list[str],
-    reason: str,
-    two: list[str],
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_what_cannot_be_required(options, reason, two, capsys):
     """One error, which says what can."""
     assert main(["compare", *two, *options]) == 1
     err = capsys.readouterr().err
@@ -159,7 +138,7 @@ def test_what_cannot_be_required(
     assert "Traceback" not in err
 
 
-def test_no_worse_than(two: list[str]) -> None:
+def test_no_worse_than(two):
     """The interval decides: what is too wide is no evidence."""
     a, b = two
     demand = ["--no-worse-than", "A", "--margin"]
@@ -171,9 +150,7 @@ def test_no_worse_than(two: list[str]) -> None:
 
 
 @pytest.mark.parametrize("returns", [[None, 900.0], [math.nan, 900.0], [None, None]])
-def test_failed_episodes_and_nan_meet_no_requirement(
-    returns: list[float | None], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_failed_episodes_and_nan_meet_no_requirement(returns, tmp_path, capsys):
     """However good the others are; and without figures the status is always 1."""
     a = str(write_evaluation(tmp_path / "a", {WALK: [[1.0, 2.0]]}))
     b = str(write_evaluation(tmp_path / "b", {WALK: [returns]}))
@@ -189,9 +166,7 @@ def test_failed_episodes_and_nan_meet_no_requirement(
     assert allowed == (0 if has_figures or is_nan else 1)
 
 
-def test_text_of_files_is_no_order_to_the_terminal(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_text_of_files_is_no_order_to_the_terminal(tmp_path, capsys):
     """Neither escape sequences nor rich's markup."""
     task = "[red]\x1b[2Jx"
     a = write_evaluation(tmp_path / "a", {task: [[1.0, 2.0]]}, policy="[bold]\x1b[2J")

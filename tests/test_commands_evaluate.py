@@ -1,6 +1,4 @@
 # SPDX-License-Identifier: Apache-2.0
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -25,16 +23,12 @@ def raising(observation):
 
 
 @pytest.fixture
-def run(
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> Run:
+def run(tmp_path, monkeypatch, capsys):
     """Return what runs the command and gives its status and what it said."""
     (tmp_path / "few_policies.py").write_text(POLICIES)
     monkeypatch.chdir(tmp_path)
 
-    def run(*arguments: str) -> tuple[int, str, str]:
+    def run(*arguments):
         small = ["--episodes", "2", "--num-seeds", "1", "--max-steps", "5"]
         rest = ["--size", "32x32", "--workers", "1", "--out", "e"]
         status = commands.main(["evaluate", *arguments, *small, *rest])
@@ -44,7 +38,7 @@ def run(
     return run
 
 
-def test_a_table_says_what_came_of_it(run: Run, tmp_path: Path) -> None:
+def test_a_table_says_what_came_of_it(run, tmp_path):
     """Each task has a row, and the videos and the directory are named."""
     status, out, err = run(
         *(TASK, "--policy", "few_policies:zero"),
@@ -62,7 +56,7 @@ def test_a_table_says_what_came_of_it(run: Run, tmp_path: Path) -> None:
     assert "2/2 episodes" in err
 
 
-def test_json_is_one_object_and_nothing_else(run: Run) -> None:
+def test_json_is_one_object_and_nothing_else(run):
     """For programs; over tasks too."""
     status, out, err = run(
         *(TASK, "--policy", "zero", "--keep", "none", "--json"),
@@ -77,7 +71,7 @@ def test_json_is_one_object_and_nothing_else(run: Run) -> None:
 
 
 @parametrize(("least", "status"), [("5", 0), ("5.5", 1)])
-def test_fail_under_fails_below_a_mean(run: Run, least: str, status: int) -> None:
+def test_fail_under_fails_below_a_mean(run, least, status):
     """The mean itself is enough."""
     found, out, _ = run(
         TASK, "--policy", "zero", "--keep", "none", "--fail-under", f"{TASK}={least}"
@@ -86,7 +80,7 @@ def test_fail_under_fails_below_a_mean(run: Run, least: str, status: int) -> Non
     assert ("its mean return 5 is below 5.5" in out) is bool(status)
 
 
-def test_failed_episodes_fail_the_command(run: Run, tmp_path: Path) -> None:
+def test_failed_episodes_fail_the_command(run, tmp_path):
     """The results are there, and foreign text moves no cursor and paints nothing."""
     status, out, _ = run(
         *(TASK, "--policy", "few_policies:raising", "--keep", "none"),
@@ -100,9 +94,7 @@ def test_failed_episodes_fail_the_command(run: Run, tmp_path: Path) -> None:
     assert (tmp_path / "e" / "results.json").exists()
 
 
-def test_a_directory_is_enough_to_go_on(
-    run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_directory_is_enough_to_go_on(run, tmp_path, capsys):
     """Its best, median and worst episodes are named, each with a file."""
     assert run(TASK, "--policy", "zero", "--keep", "none")[0] == 0
     more = ["--seeds", "0-2", "--workers", "1", "--fail-under", "Inverted*=5"]
@@ -118,11 +110,8 @@ def test_a_directory_is_enough_to_go_on(
 
 
 def test_an_evaluation_is_recovered_and_rendered_as_one(
-    run: Run,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+    run, tmp_path, monkeypatch, capsys
+):
     """All folders in it; its table of files is right before and after."""
     monkeypatch.setenv("MUJOCO_GL", "glfw")
     monkeypatch.delenv("DISPLAY", raising=False)
@@ -168,9 +157,7 @@ def test_an_evaluation_is_recovered_and_rendered_as_one(
         ([TASK, "--policy", "few_policies:one"], "zero"),
     ],
 )
-def test_a_wrong_command_line_is_one_line(
-    run: Run, tmp_path: Path, arguments: list[str], words: str
-) -> None:
+def test_a_wrong_command_line_is_one_line(run, tmp_path, arguments, words):
     """It says what there is, and nothing is run."""
     if "--policy" not in arguments:
         arguments = [*arguments, "--policy", "zero"]
@@ -182,25 +169,13 @@ def test_a_wrong_command_line_is_one_line(
     assert not (tmp_path / "e").exists()
 
 
-def test_ctrl_c_says_how_to_go_on(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_ctrl_c_says_how_to_go_on(run, monkeypatch):
     """The exit status is that of an interruption."""
 
-    def interrupted(*_: object, **__: object) -> None:
+    def interrupted(*_, **__):
         raise KeyboardInterrupt
 
     monkeypatch.setattr("mjrec.commands.evaluate.evaluate_policy", interrupted)
     status, _, err = run(TASK, "--policy", "zero")
     assert status == 130
     assert "mjrec evaluate --resume e goes on" in err
-
-
-def test_it_goes_on_with_resume(run: Run, tmp_path: Path) -> None:
-    """Without it the directory is refused."""
-    arguments = [TASK, "--policy", "zero", "--keep", "none"]
-    assert run(*arguments)[0] == 0
-    before = (tmp_path / "e" / "results.csv").read_bytes()
-    status, _, err = run(*arguments)
-    assert status == 1
-    assert "--resume" in err
-    assert run(*arguments, "--resume")[0] == 0
-    assert (tmp_path / "e" / "results.csv").read_bytes() == before

@@ -1,12 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """`mjrec recover` reports what it did, in text or as JSON."""
 
-from __future__ import annotations
-
 import json
-from pathlib import Path
 
-import pytest
 from trajectories_by_hand import write_log
 
 from mjrec.commands import main
@@ -14,9 +10,7 @@ from mjrec.commands import main
 LOG = "openaigym.trajectory.0.7.episode00000"
 
 
-def test_what_was_done_is_listed(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_was_done_is_listed(tmp_path, capsys):
     """A line a file, and nothing the second time."""
     write_log(tmp_path, 0)
     write_log(tmp_path, 1, ended=False)
@@ -32,14 +26,14 @@ def test_what_was_done_is_listed(
     assert capsys.readouterr().out == f"Nothing to recover in {tmp_path}.\n"
 
 
-def test_failures_are_listed(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_failures_are_listed(tmp_path, capsys):
     """The exit status says so too. A newer version's log is left as it is."""
     write_log(tmp_path, 0)
-    [log] = tmp_path.glob("*.spans")
-    content = log.read_bytes().replace(b'"version": 1', b'"version": 9', 1)
-    log.write_bytes(content)
+    [log] = tmp_path.glob("*.log")
+    [journal] = tmp_path.glob("*.jsonl")
+    spoilt = journal.read_bytes().replace(b'"version": 1', b'"version": 9', 1)
+    journal.write_bytes(spoilt)
+    content = log.read_bytes()
     assert main(["recover", str(tmp_path)]) == 1
     said = capsys.readouterr().out
     assert "Not recovered:\n" in said
@@ -49,7 +43,7 @@ def test_failures_are_listed(
     assert capsys.readouterr().err.startswith("mjrec: There is no directory")
 
 
-def test_json_is_one_object(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_json_is_one_object(tmp_path, capsys):
     """With the same content."""
     write_log(tmp_path, 0)
     assert main(["recover", str(tmp_path), "--timeout", "0", "--json"]) == 0

@@ -1,22 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
 """`mjrec render`: what it says, and how it ends. `test_render_videos` has the rest."""
 
-from __future__ import annotations
-
 import json
 import os
 import pty
 import subprocess
 import sys
 from collections.abc import Callable
-from pathlib import Path
 
 import gymnasium
 import pytest
 from recordings import frames_of
 from trajectories_by_hand import (
     INFIX,
-    Painter,
     write_finished,
     write_log,
     write_pending_manifest,
@@ -34,23 +30,21 @@ Run = Callable[..., tuple[int, str, str]]
 
 
 @pytest.fixture
-def mjrec(capsys: pytest.CaptureFixture[str]) -> Run:
+def mjrec(capsys):
     """Run the command; returns the exit status and what it printed."""
 
-    def run(*arguments: object) -> tuple[int, str, str]:
+    def run(*arguments):
         status = main(["render", *(str(argument) for argument in arguments)])
         return status, *capsys.readouterr()
 
     return run
 
 
-def content_of(directory: Path) -> dict[str, bytes]:
+def content_of(directory):
     return {path.name: path.read_bytes() for path in directory.iterdir()}
 
 
-def test_pending_videos_are_rendered(
-    tmp_path: Path, mjrec: Run, painter: Painter
-) -> None:
+def test_pending_videos_are_rendered(tmp_path, mjrec, painter):
     """Each is told when it is there, and where they are at the end."""
     write_finished(tmp_path, 0)
     write_log(tmp_path, 1)
@@ -70,9 +64,7 @@ def test_pending_videos_are_rendered(
     assert "--camera" in err
 
 
-def test_what_is_not_rendered_is_listed_with_its_reason(
-    tmp_path: Path, mjrec: Run, painter: Painter
-) -> None:
+def test_what_is_not_rendered_is_listed_with_its_reason(tmp_path, mjrec, painter):
     """The others are; the exit status tells, and so does one JSON object."""
     for episode_id in (0, 1):
         write_finished(tmp_path, episode_id).write_bytes(b"torn")
@@ -98,9 +90,7 @@ def test_what_is_not_rendered_is_listed_with_its_reason(
     assert (report["elsewhere"], report["interrupted"]) == ([], False)
 
 
-def test_one_episode_can_be_finished_or_shown_another_way(
-    tmp_path: Path, mjrec: Run, painter: Painter
-) -> None:
+def test_one_episode_can_be_finished_or_shown_another_way(tmp_path, mjrec, painter):
     """By its number, its trajectory, or the video's name, which one sees and copies."""
     trajectories = [write_finished(tmp_path, k) for k in range(3)]
     assert mjrec(tmp_path, "--episode", 1)[0] == 0
@@ -112,9 +102,7 @@ def test_one_episode_can_be_finished_or_shown_another_way(
     assert video.with_suffix(".side.mp4").exists()
 
 
-def test_another_view_is_a_new_file_beside_the_original(
-    tmp_path: Path, mjrec: Run, painter: Painter
-) -> None:
+def test_another_view_is_a_new_file_beside_the_original(tmp_path, mjrec, painter):
     """Nothing that is there changes, and readers do not take it for the original."""
     write_finished(tmp_path)
     write_pending_manifest(tmp_path, 0)
@@ -142,9 +130,9 @@ def test_another_view_is_a_new_file_beside_the_original(
     assert not list(tmp_path.iterdir())
 
 
-def test_every_variant_has_a_name_of_its_own() -> None:
+def test_every_variant_has_a_name_of_its_own():
     """Also where a camera is called as a quality, a size or a rate would be."""
-    cameras: list[str | int] = ["side", 0]
+    cameras = ["side", 0]
     cameras += ["draft", "full", "64x32", "x32", "max10fps", "10fps", "camera-draft"]
     variants = [
         *(Variant(view=View(camera=camera)) for camera in cameras),
@@ -162,9 +150,7 @@ def test_every_variant_has_a_name_of_its_own() -> None:
 
 
 @pytest.mark.parametrize("name", ["trajectory.0.7.episode000000.h5", "copy.h5"])
-def test_out_names_the_file(
-    name: str, tmp_path: Path, mjrec: Run, painter: Painter
-) -> None:
+def test_out_names_the_file(name, tmp_path, mjrec, painter):
     """As recorded if nothing else is said, whatever the trajectory is called."""
     trajectory = write_finished(tmp_path).rename(tmp_path / name)
     out = tmp_path / "elsewhere" / "mine.mp4"
@@ -193,13 +179,8 @@ def test_out_names_the_file(
     ],
 )
 def test_what_cannot_be_is_one_clear_error(
-    arguments: list[str],
-    message: str,
-    tmp_path: Path,
-    mjrec: Run,
-    painter: Painter,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+    arguments, message, tmp_path, mjrec, painter, monkeypatch
+):
     """And nothing is written."""
     monkeypatch.chdir(tmp_path)
     for episode_id in (0, 1):
@@ -211,14 +192,12 @@ def test_what_cannot_be_is_one_clear_error(
     assert content_of(tmp_path) == before
 
 
-def test_ctrl_c_keeps_what_is_done(
-    tmp_path: Path, mjrec: Run, painter: Painter
-) -> None:
+def test_ctrl_c_keeps_what_is_done(tmp_path, mjrec, painter):
     """The exit status is the shells', and nothing half-done stays."""
     for episode_id in (0, 1):
         write_finished(tmp_path, episode_id)
 
-    def interrupt(trajectory: Path, *_: object) -> None:
+    def interrupt(trajectory, *_):
         if "000001" in trajectory.name:
             raise KeyboardInterrupt
 
@@ -231,9 +210,7 @@ def test_ctrl_c_keeps_what_is_done(
 
 
 @pytest.mark.parametrize("again_at", [(), ("--fps", "30")])
-def test_strict_fails_where_nothing_is_to_be_seen(
-    again_at: tuple[str, ...], tmp_path: Path, mjrec: Run, painter: Painter
-) -> None:
+def test_strict_fails_where_nothing_is_to_be_seen(again_at, tmp_path, mjrec, painter):
     """The videos are there, also in the manifest, and none is pending any more."""
     painter.plain = True
     write_finished(tmp_path, 0)
@@ -247,7 +224,7 @@ def test_strict_fails_where_nothing_is_to_be_seen(
     assert len(content["mjrec"]["pending"]) == bool(again_at)
 
 
-def test_an_engine_says_what_this_process_would(tmp_path: Path, mjrec: Run) -> None:
+def test_an_engine_says_what_this_process_would(tmp_path, mjrec):
     """Of what cannot be rendered too; nothing of it stays in the directory."""
     write_finished(tmp_path, 0, frames=False)
     write_log(tmp_path, 1, video=None)
@@ -260,7 +237,7 @@ def test_an_engine_says_what_this_process_would(tmp_path: Path, mjrec: Run) -> N
 
 
 @pytest.mark.thorough
-def test_a_terminal_shows_a_bar_and_a_recording_becomes_a_video(tmp_path: Path) -> None:
+def test_a_terminal_shows_a_bar_and_a_recording_becomes_a_video(tmp_path):
     """With workers and OpenGL; two commands at once share the work."""
     env = gymnasium.make(
         "InvertedPendulum-v5", width=40, height=32, max_episode_steps=3
@@ -297,7 +274,7 @@ def test_a_terminal_shows_a_bar_and_a_recording_becomes_a_video(tmp_path: Path) 
     assert not list(directory.glob(".*"))
 
 
-def _read_all(descriptor: int) -> str:
+def _read_all(descriptor):
     said = b""
     while True:
         try:

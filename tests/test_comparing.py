@@ -1,21 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-from __future__ import annotations
-
 import math
-from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy import stats
 
 from evaluations import write_evaluation
-from mjrec import (
-    Comparison,
-    InvalidArgument,
-    UnreadableFile,
-    compare,
-)
+from mjrec import InvalidArgument, UnreadableFile, compare
 from mjrec.evaluation.comparing import IMPROVEMENT, TASK_FIGURES, holm_adjusted
 from mjrec.evaluation.statistics import Interval
 
@@ -23,23 +14,22 @@ WALK = "dm_control/walker-walk"
 RUN = "dm_control/cheetah-run"
 
 
-def compared(a: Path | Sequence[Path], b: Path | Sequence[Path]) -> Comparison:
+def compared(a, b):
     return compare(a, b, resamples=500)
 
 
-def values(comparison: Comparison, task: int = 0) -> list[float | None]:
+def values(comparison, task=0):
     """Return the figures of a task, in the order of tables."""
     figures = comparison.tasks[task].figures
     return [figures[name].value if name in figures else None for name in TASK_FIGURES]
 
 
-def drawn(mean: float, *, seed: int, runs: int = 2) -> list[list[float]]:
+def drawn(mean, *, seed, runs=2):
     rng = np.random.default_rng(seed)
-    returns: list[list[float]] = rng.normal(mean, 50, (runs, 10)).tolist()
-    return returns
+    return rng.normal(mean, 50, (runs, 10)).tolist()
 
 
-def test_figures_of_a_task_by_hand(tmp_path: Path) -> None:
+def test_figures_of_a_task_by_hand(tmp_path):
     """The textbook's five and four ages, as returns; the other way round all turns."""
     women, men = [20.0, 11, 17, 12], [19.0, 22, 16, 29, 24]
     a = write_evaluation(tmp_path / "a", {"Hopper-v5": [women]}, seeds=(0,))
@@ -56,7 +46,7 @@ def test_figures_of_a_task_by_hand(tmp_path: Path) -> None:
     assert interval.low < 7 < interval.high
 
 
-def test_trainings_are_compared_by_their_means(tmp_path: Path) -> None:
+def test_trainings_are_compared_by_their_means(tmp_path):
     """Each evaluation is one value: many episodes of a training say no more of it."""
     rng = np.random.default_rng(0)
     x, y = rng.normal(500, 80, 5), rng.normal(620, 80, 4)
@@ -96,7 +86,7 @@ def test_trainings_are_compared_by_their_means(tmp_path: Path) -> None:
     assert single.tasks[0].figures["difference"].interval is None
 
 
-def test_an_evaluation_counts_once(tmp_path: Path) -> None:
+def test_an_evaluation_counts_once(tmp_path):
     """Two names of one directory are not two trainings; no directory is an error."""
     a = write_evaluation(tmp_path / "a", {WALK: [[1, 2]]})
     with pytest.raises(InvalidArgument, match="twice: B"):
@@ -107,7 +97,7 @@ def test_an_evaluation_counts_once(tmp_path: Path) -> None:
         compare(a, tmp_path)
 
 
-def test_an_evaluation_is_no_better_than_itself(tmp_path: Path) -> None:
+def test_an_evaluation_is_no_better_than_itself(tmp_path):
     """And the pairs show it without any doubt."""
     a = write_evaluation(tmp_path / "a", {WALK: drawn(500, seed=0)})
     comparison = compared(a, a)
@@ -118,7 +108,7 @@ def test_an_evaluation_is_no_better_than_itself(tmp_path: Path) -> None:
     assert comparison.cautions == comparison.remarks == ()
 
 
-def test_over_tasks(tmp_path: Path) -> None:
+def test_over_tasks(tmp_path):
     """The mean of the tasks' probabilities; scores of those that have a scale."""
     a = write_evaluation(
         tmp_path / "a",
@@ -141,9 +131,7 @@ def test_over_tasks(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("other", [(0, 20), (10, 10), (9, 1)])
-def test_scores_need_one_scale_everywhere(
-    other: tuple[float, float], tmp_path: Path
-) -> None:
+def test_scores_need_one_scale_everywhere(other, tmp_path):
     """A share of one range is not one of another; and a file may say anything."""
     a, b = (
         write_evaluation(
@@ -156,7 +144,7 @@ def test_scores_need_one_scale_everywhere(
     assert compared(b, b).scored == (("x",) if other == (0, 20) else ())
 
 
-def test_pairs_are_of_the_same_seed_and_number(tmp_path: Path) -> None:
+def test_pairs_are_of_the_same_seed_and_number(tmp_path):
     """However the seeds are ordered; what failed in one has no partner."""
     returns = {
         "a": {3: [10.0, 500, 900, None], 4: [300, 20, 800, 40]},
@@ -188,7 +176,7 @@ def test_pairs_are_of_the_same_seed_and_number(tmp_path: Path) -> None:
         assert compared(a, c).tasks[0].pairs == 0
 
 
-def test_other_conditions_are_a_caution(tmp_path: Path) -> None:
+def test_other_conditions_are_a_caution(tmp_path):
     """Other seeds are only told."""
     a = write_evaluation(
         tmp_path / "a",
@@ -222,9 +210,7 @@ def test_other_conditions_are_a_caution(tmp_path: Path) -> None:
         ([1.0, -math.inf], "1 of 2 returns of B are NaN or infinite"),
     ],
 )
-def test_a_task_that_cannot_be_compared_says_why(
-    returns: list[float | None], why: str, tmp_path: Path
-) -> None:
+def test_a_task_that_cannot_be_compared_says_why(returns, why, tmp_path):
     """And the others go on without it."""
     a = write_evaluation(tmp_path / "a", {WALK: [[1, 2]], RUN: [[1, 2]]})
     b = write_evaluation(tmp_path / "b", {WALK: [returns], RUN: [[3, 4]]})
@@ -237,7 +223,7 @@ def test_a_task_that_cannot_be_compared_says_why(
     assert of_trainings.tasks[0].unknown == why.replace("of B", f"of {b}")
 
 
-def test_equal_returns_are_no_evidence(tmp_path: Path) -> None:
+def test_equal_returns_are_no_evidence(tmp_path):
     """Of a single episode there is no interval either; scipy would divide by zero."""
     a = write_evaluation(tmp_path / "a", {WALK: [[1.0]], RUN: [[1.0]]})
     b = write_evaluation(tmp_path / "b", {WALK: [[2.0]], RUN: [[1.0]]})
@@ -247,14 +233,14 @@ def test_equal_returns_are_no_evidence(tmp_path: Path) -> None:
     assert values(comparison, 1) == [1, 1, 0, 0, 0.5, 1]
 
 
-def test_holm_by_hand() -> None:
+def test_holm_by_hand():
     """Four tests, as in Holm's own procedure; never more than 1."""
     adjusted = holm_adjusted({"a": 0.03, "b": 0.005, "c": 0.04, "d": 0.01})
     assert adjusted == pytest.approx({"a": 0.06, "b": 0.02, "c": 0.06, "d": 0.03})
     assert holm_adjusted({"a": 0.9, "b": 0.8}) == {"a": 1, "b": 1}
 
 
-def test_what_stops_a_comparison(tmp_path: Path) -> None:
+def test_what_stops_a_comparison(tmp_path):
     """No task in common, which lists all."""
     a = write_evaluation(tmp_path / "a", {WALK: [[1, 2]]})
     b = write_evaluation(tmp_path / "b", {RUN: [[3, 4]]})

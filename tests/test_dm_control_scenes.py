@@ -1,14 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """What is known of dm_control's environments, and their resets without OpenGL."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess
 import sys
-from pathlib import Path
-from typing import Any
 
 import mujoco
 import numpy as np
@@ -22,19 +18,18 @@ from dm_control.suite.wrappers import pixels
 
 from mjrec.environments.dm_control_contexts import ContextsOnDemand
 from mjrec.environments.dm_control_scenes import dm_control_scenes
-from mjrec.errors import UnknownName
 
 pytestmark = pytest.mark.dm_control
 
 
-def load(domain: str = "cheetah", task: str = "run", **kwargs: Any) -> Any:
+def load(domain="cheetah", task="run", **kwargs):
     env = suite.load(domain, task, task_kwargs={"random": 0}, **kwargs)
     quality = env.physics.model.vis.quality
     quality.shadowsize, quality.offsamples = 64, 0
     return env
 
 
-def begun(env: Any, directory: Path, **asked: Any) -> dict[str, Any]:
+def begun(env, directory, **asked):
     """Return the facts of the scene of an episode that begins now."""
     scenes = dm_control_scenes(env, **asked)
     assert scenes.states is not None
@@ -49,7 +44,7 @@ def begun(env: Any, directory: Path, **asked: Any) -> dict[str, Any]:
     return dict(start.scene)
 
 
-def test_shown_as_by_physics(tmp_path: Path) -> None:
+def test_shown_as_by_physics(tmp_path):
     """dm_control's size, number of geoms and option, and a new scene each time."""
     scene = begun(load(), tmp_path)
     assert (scene["height"], scene["width"], scene["label"]) == (240, 320, -1)
@@ -60,7 +55,7 @@ def test_shown_as_by_physics(tmp_path: Path) -> None:
     assert (named["camera"]["fixedcamid"], named["label"]) == (0, "side")
 
 
-def test_what_physics_cannot_draw_is_shown_as_it_is_live(tmp_path: Path) -> None:
+def test_what_physics_cannot_draw_is_shown_as_it_is_live(tmp_path):
     """Larger pictures than its buffer, and cameras of one's own."""
     camera = mujoco.MjvCamera()
     for asked in ({"width": 4000}, {"camera": camera}):
@@ -68,17 +63,11 @@ def test_what_physics_cannot_draw_is_shown_as_it_is_live(tmp_path: Path) -> None
         assert (scene["fresh"], scene["max_geom"]) == (False, 10000)
 
 
-def test_camera_is_checked_at_once() -> None:
-    """Not at the first picture."""
-    with pytest.raises(UnknownName, match="side"):
-        dm_control_scenes(load(), camera="sideways")
-
-
-def test_a_physics_that_overrides_is_named() -> None:
+def test_a_physics_that_overrides_is_named():
     """Of a class, or on the object."""
 
-    class Drawing(Physics):  # type: ignore[misc]  # untyped
-        def render(self, *args: Any, **kwargs: Any) -> Any:
+    class Drawing(Physics):
+        def render(self, *args, **kwargs):
             return 255 - super().render(*args, **kwargs)
 
     env = load()
@@ -91,7 +80,7 @@ def test_a_physics_that_overrides_is_named() -> None:
     assert "Physics overrides render()" in str(dm_control_scenes(env).obstacle)
 
 
-def test_name_and_random_state() -> None:
+def test_name_and_random_state():
     """The name is what the user says; a generator with that state draws the same."""
     env = load()
     scenes = dm_control_scenes(env, env_id="dm_control/cheetah-run")
@@ -109,7 +98,7 @@ def test_name_and_random_state() -> None:
     assert again.rand() == env.task.random.rand()
 
 
-def test_composers_model_is_stored_as_it_was_written(tmp_path: Path) -> None:
+def test_composers_model_is_stored_as_it_was_written(tmp_path):
     """With what makes it again in any version of MuJoCo."""
     from dm_control import manipulation
 
@@ -153,7 +142,7 @@ for make in (quadruped, rat):
 """
 
 
-def test_terrain_is_made_without_gl() -> None:
+def test_terrain_is_made_without_gl():
     """Where a reset asks for the context, and only inside a recorded reset."""
     run = subprocess.run(
         [sys.executable, "-c", WITHOUT_GL],
@@ -166,7 +155,7 @@ def test_terrain_is_made_without_gl() -> None:
     assert run.stdout.splitlines() == 2 * each
 
 
-def test_a_reset_that_draws_gets_its_pictures() -> None:
+def test_a_reset_that_draws_gets_its_pictures():
     """Pixel observations are the same, and the contexts are real ones by then."""
     seen = []
     for recorded in (False, True):
@@ -185,11 +174,11 @@ def test_a_reset_that_draws_gets_its_pictures() -> None:
     assert seen[0].std() > 5
 
 
-def test_an_error_in_a_reset_leaves_the_physics_as_it_was() -> None:
+def test_an_error_in_a_reset_leaves_the_physics_as_it_was():
     """No stand-in stays behind."""
     env = load()
 
-    def fail() -> None:
+    def fail():
         with ContextsOnDemand(env).resetting():
             assert env.physics._contexts is not None
             raise ZeroDivisionError
@@ -199,7 +188,7 @@ def test_an_error_in_a_reset_leaves_the_physics_as_it_was() -> None:
     assert env.physics._contexts is None
 
 
-def test_contexts_that_are_there_are_left_alone() -> None:
+def test_contexts_that_are_there_are_left_alone():
     """The user's own pictures need the terrain too."""
     env = load()
     env.physics.render(8, 8)

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """`mjrec doctor`: what it says, to people and to scripts, and its exit status."""
 
-from __future__ import annotations
-
 import dataclasses
 import importlib.metadata
 import io
@@ -12,7 +10,6 @@ import platform
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
 
 import pytest
 from rich.console import Console
@@ -32,7 +29,7 @@ _PATH = "/opt/" + "a-long-path/" * 8 + "ffmpeg"
 _APT = "apt-get install -y libegl1 libegl-mesa0 libgl1-mesa-dri libopengl0"
 
 
-def run_doctor(*arguments: str, **variables: str) -> subprocess.CompletedProcess[str]:
+def run_doctor(*arguments, **variables):
     unset = ("MUJOCO_GL", "PYOPENGL_PLATFORM", "DISPLAY", "WAYLAND_DISPLAY", "COLUMNS")
     environ = {k: v for k, v in os.environ.items() if k not in unset}
     return subprocess.run(
@@ -45,7 +42,7 @@ def run_doctor(*arguments: str, **variables: str) -> subprocess.CompletedProcess
 
 
 # Takes more than five seconds: each backend draws in a process of its own.
-def test_a_machine_that_renders() -> None:
+def test_a_machine_that_renders():
     """Status 0; what scripts may rely on is there, and what people need to go on."""
     healthy = run_doctor("--json")
     assert healthy.returncode == 0, healthy.stderr
@@ -95,7 +92,7 @@ def test_a_machine_that_renders() -> None:
 
 
 @pytest.mark.thorough
-def test_status_1_where_nothing_may_render() -> None:
+def test_status_1_where_nothing_may_render():
     """MUJOCO_GL=off: people read why, and what would render."""
     done = run_doctor(MUJOCO_GL="off")
     assert done.returncode == 1
@@ -105,7 +102,7 @@ def test_status_1_where_nothing_may_render() -> None:
     assert "Traceback" not in done.stderr
 
 
-def report_of(**changed: Any) -> MachineReport:
+def report_of(**changed):
     """Return a report of a machine with a bit of everything."""
     report = MachineReport(
         can_render=True,
@@ -146,14 +143,14 @@ def report_of(**changed: Any) -> MachineReport:
     return dataclasses.replace(report, **changed)
 
 
-def shown(report: MachineReport) -> str:
+def shown(report):
     console = Console(width=80, file=io.StringIO(), highlight=False)
     show_report(report, console)
     assert isinstance(console.file, io.StringIO)
     return console.file.getvalue()
 
 
-def test_what_people_see() -> None:
+def test_what_people_see():
     """Every fact once, brackets no markup, commands never broken."""
     text = shown(report_of())
     lines = [line.rstrip() for line in text.splitlines()]
@@ -187,9 +184,7 @@ def test_what_people_see() -> None:
         ("cpu-independent=1", "Error parsing option cpu-independent"),
     ],
 )
-def test_ffmpeg_that_cannot_encode(
-    refused: str, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_ffmpeg_that_cannot_encode(refused, said, tmp_path, monkeypatch):
     """It is found out, in its own words."""
     good = examine_ffmpeg()
     assert good.encodes
@@ -204,7 +199,7 @@ def test_ffmpeg_that_cannot_encode(
     assert (found.version, found.encodes, found.cause) == (good.version, False, said)
 
 
-def test_what_is_no_ffmpeg(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_is_no_ffmpeg(monkeypatch):
     """It is named, with a way out."""
     monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", "/bin/false")
     found = examine_ffmpeg()
@@ -226,7 +221,7 @@ def test_what_is_no_ffmpeg(monkeypatch: pytest.MonkeyPatch) -> None:
         ("import ctypes; ctypes.string_at(0)", "status -11", "pip install y"),
     ],
 )
-def test_a_package_that_does_not_work(program: str, cause: str, fix: str) -> None:
+def test_a_package_that_does_not_work(program, cause, fix):
     """A failure in a child process has a cause and a fix; even a crash."""
     lacking = examine_package("mjrec-there-is-no-such", "import nothing", "pip get x")
     assert (lacking.version, lacking.works) == (None, None)

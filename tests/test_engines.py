@@ -4,16 +4,12 @@
 `docs/howto/clusters.md` has the table of these guarantees.
 """
 
-from __future__ import annotations
-
 import contextlib
 import functools
 import os
 import signal
-from collections.abc import Callable, Iterator
-from concurrent.futures import Executor, ThreadPoolExecutor
-from pathlib import Path
-from typing import Any
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 from engine_runs import (
@@ -39,14 +35,14 @@ Begin = Callable[..., Run]
 
 pytestmark = [
     # Ray's own connections and pipes, of which it says so when they are collected.
-    pytest.mark.filterwarnings("ignore::ResourceWarning"),
+    pytest.mark.filterwarnings("ignore::ResourceWarning")
 ]
 # Real Ray, and Slurm jobs through submitit, take seconds each.
 on_each = parametrize("engine", ["local", "own", "slurm", "ray", "dask"], default=2)
 
 
 @pytest.fixture(scope="module")
-def ray(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+def ray(tmp_path_factory):
     """A Ray that this process has started, with room for two workers."""
     from ray_clusters import home_for_ray, own_ray
 
@@ -55,14 +51,14 @@ def ray(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 
 
 @pytest.fixture(scope="module")
-def dask() -> Iterator[Callable[[int], str]]:
+def dask():
     """The address of a Dask cluster with a number of workers."""
     import distributed
 
     with contextlib.ExitStack() as clusters:
 
         @functools.cache
-        def address(workers: int) -> str:
+        def address(workers):
             cluster = distributed.LocalCluster(
                 n_workers=workers, threads_per_worker=1, dashboard_address=":0"
             )
@@ -72,15 +68,13 @@ def dask() -> Iterator[Callable[[int], str]]:
 
 
 @pytest.fixture
-def begin(
-    engine: str, request: pytest.FixtureRequest, tmp_path: Path
-) -> Iterator[Begin]:
+def begin(engine, request, tmp_path):
     """Return what begins a run of `odd_jobs` on an engine."""
-    made: list[Executor] = []
+    made = []
     (tmp_path / "shared").mkdir()
 
-    def begun(workers: int = 1, make: str = "make", **settings: Any) -> Run:
-        executor: Executor
+    def begun(workers=1, make="make", **settings):
+
         if engine == "local":
             executor = LocalEngine(workers)
         elif engine == "own":
@@ -104,7 +98,7 @@ def begin(
 
 
 @on_each
-def test_jobs_get_settings_and_arguments(begin: Begin) -> None:
+def test_jobs_get_settings_and_arguments(begin):
     """Also those that are submitted while results come, and after."""
     with begin(2, seeds=[1, 2]) as run:
         submit(run, "0", do="echo", text="ß\n")
@@ -124,7 +118,7 @@ def test_jobs_get_settings_and_arguments(begin: Begin) -> None:
 
 
 @on_each
-def test_jobs_run_beside_each_other(begin: Begin, tmp_path: Path) -> None:
+def test_jobs_run_beside_each_other(begin, tmp_path):
     """Two that wait for each other both come to their end; the caller may look on."""
     os.mkfifo(tmp_path / "pipe")
     with begin(2) as run:
@@ -135,9 +129,7 @@ def test_jobs_run_beside_each_other(begin: Begin, tmp_path: Path) -> None:
 
 
 @on_each
-def test_children_are_where_the_driver_is(
-    begin: Begin, engine: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_children_are_where_the_driver_is(begin, engine, tmp_path, monkeypatch):
     """Out of Ctrl-C's reach; each stays for later jobs, in Slurm of the same array."""
     monkeypatch.chdir(tmp_path)
     with begin() as run:
@@ -149,9 +141,7 @@ def test_children_are_where_the_driver_is(
 
 
 @on_each
-def test_what_a_handler_raises_is_the_outcome(
-    begin: Begin, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_what_a_handler_raises_is_the_outcome(begin, caplog):
     """In one line; the child goes on, and the log has the traceback."""
     with begin() as run:
         submit(run, "bad", do="fail")
@@ -169,9 +159,7 @@ def test_what_a_handler_raises_is_the_outcome(
 
 
 @on_each
-def test_a_job_whose_child_dies_is_done_again(
-    begin: Begin, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_job_whose_child_dies_is_done_again(begin, tmp_path, caplog):
     """Three times in all; no other job fails."""
     with begin(2) as run:
         once = str(tmp_path / "once")
@@ -194,7 +182,7 @@ def test_a_job_whose_child_dies_is_done_again(
 
 
 @on_each
-def test_a_job_that_takes_too_long_is_ended(begin: Begin, tmp_path: Path) -> None:
+def test_a_job_that_takes_too_long_is_ended(begin, tmp_path):
     """Though it holds the interpreter; the next try finds what is said of it."""
     with begin() as run:
         submit(run, "a", do="hang", mark=str(tmp_path / "mark"))
@@ -204,7 +192,7 @@ def test_a_job_that_takes_too_long_is_ended(begin: Begin, tmp_path: Path) -> Non
 
 
 @on_each
-def test_a_handler_that_cannot_be_made(begin: Begin) -> None:
+def test_a_handler_that_cannot_be_made(begin):
     """An error of ours keeps its class and its facts; of others it is told."""
     with begin(make="make_no_name") as run:
         submit(run, *"abc", do="echo")
@@ -218,7 +206,7 @@ def test_a_handler_that_cannot_be_made(begin: Begin) -> None:
 
 
 @on_each
-def test_children_that_die_as_they_begin(begin: Begin) -> None:
+def test_children_that_die_as_they_begin(begin):
     """The run ends, and says of what."""
     with begin(make="make_and_die") as run:
         submit(run, "a", do="echo")
@@ -231,9 +219,7 @@ def test_children_that_die_as_they_begin(begin: Begin) -> None:
 
 
 @pytest.mark.parametrize("engine", ["local", "own"])
-def test_children_that_cannot_begin_do_not_end_one_at_work(
-    begin: Begin, tmp_path: Path
-) -> None:
+def test_children_that_cannot_begin_do_not_end_one_at_work(begin, tmp_path):
     """It does the jobs of all; how often others have died is no fault of theirs."""
     with begin(2, make="make_one", place=str(tmp_path)) as run:
         begun, go = str(tmp_path / "begun"), str(tmp_path / "go")
@@ -249,7 +235,7 @@ def test_children_that_cannot_begin_do_not_end_one_at_work(
 
 
 @on_each
-def test_warnings_come_home(begin: Begin, caplog: pytest.LogCaptureFixture) -> None:
+def test_warnings_come_home(begin, caplog):
     """Under their own name, each once; nothing that a job prints is an answer."""
     with begin() as run:
         submit(run, *"ab", do="talk")
@@ -259,7 +245,7 @@ def test_warnings_come_home(begin: Begin, caplog: pytest.LogCaptureFixture) -> N
 
 
 @on_each
-def test_cancelling_ends_what_is_at_work(begin: Begin, tmp_path: Path) -> None:
+def test_cancelling_ends_what_is_at_work(begin, tmp_path):
     """Each may leave a word; a second time is no more than once."""
     run = begin(left=str(tmp_path / "left"))
     submit(run, "a", "b", do="hold", begun=str(tmp_path / "begun"))
@@ -271,7 +257,7 @@ def test_cancelling_ends_what_is_at_work(begin: Begin, tmp_path: Path) -> None:
 
 
 @on_each
-def test_a_child_killed_from_outside(begin: Begin, tmp_path: Path) -> None:
+def test_a_child_killed_from_outside(begin, tmp_path):
     """Its job is done by another."""
     with begin() as run:
         submit(run, "a", do="hold", begun=str(tmp_path / "begun"))
@@ -282,7 +268,7 @@ def test_a_child_killed_from_outside(begin: Begin, tmp_path: Path) -> None:
 
 
 @parametrize("engine", ["own", "slurm", "ray"], default=1)
-def test_a_shared_directory_is_needed_elsewhere(begin: Begin, tmp_path: Path) -> None:
+def test_a_shared_directory_is_needed_elsewhere(begin, tmp_path):
     """And what others keep in it stays; two runs there do not know of each other."""
     with begin() as run:
         (tmp_path / "shared" / "results.csv").touch()

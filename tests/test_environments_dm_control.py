@@ -1,16 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """dm_control's environments by their names."""
 
-from __future__ import annotations
-
-import os
-import subprocess
-import sys
-from pathlib import Path
-from typing import Any
-
 import numpy as np
 import pytest
+from engine_runs import run_python
 
 import mjrec
 from mjrec.environments.episode_seeds import episode_seeds
@@ -21,20 +14,15 @@ pytest.importorskip("dm_control")
 
 from dm_control import suite
 
-from mjrec.environments.dm_control_environments import (
-    make_dm_control,
-)
+from mjrec.environments.dm_control_environments import make_dm_control
 from mjrec.environments.dm_control_scenes import dm_control_scenes
-from mjrec.environments.named_environment import (
-    is_terminated,
-    is_truncated,
-)
+from mjrec.environments.named_environment import is_terminated, is_truncated
 
 
-def test_a_task_is_made_with_its_own_limit() -> None:
+def test_a_task_is_made_with_its_own_limit():
     """All but lqr have one; max_steps lowers it; lqr gets 1000."""
 
-    def limit(name: str, **options: Any) -> int:
+    def limit(name, **options):
         made = EnvironmentOptions(pictures=False, **options)
         return environment_from_name(f"dm_control/{name}", made).step_limit
 
@@ -52,10 +40,10 @@ def test_a_task_is_made_with_its_own_limit() -> None:
     assert limited.step(np.zeros(2)).first()
 
 
-def test_the_run_seeds_what_is_drawn_when_a_task_is_made() -> None:
+def test_the_run_seeds_what_is_drawn_when_a_task_is_made():
     """The springs of lqr are part of its model."""
 
-    def springs(seed: int, **kwargs: Any) -> list[float]:
+    def springs(seed, **kwargs):
         options = EnvironmentOptions(seed=seed, kwargs=kwargs)
         env = make_dm_control("lqr", "lqr_2_1", options)
         return list(env.physics.model.jnt_stiffness)
@@ -64,7 +52,7 @@ def test_the_run_seeds_what_is_drawn_when_a_task_is_made() -> None:
     assert springs(1, task_kwargs={"random": 2}) == springs(2)
 
 
-def test_a_monitor_is_told_the_seed(tmp_path: Path) -> None:
+def test_a_monitor_is_told_the_seed(tmp_path):
     """dm_env's reset takes none that it could see."""
     named = environment_from_name("dm_control/ball_in_cup-catch")
     env = named.environment
@@ -73,7 +61,7 @@ def test_a_monitor_is_told_the_seed(tmp_path: Path) -> None:
         assert monitor.seed == episode_seeds(0, 0).environment
 
 
-def test_arguments_reach_the_task_and_the_environment() -> None:
+def test_arguments_reach_the_task_and_the_environment():
     """In suite.load's own form; another is an error that shows it."""
     kwargs = {
         "task_kwargs": {"time_limit": 1},
@@ -92,7 +80,7 @@ def test_arguments_reach_the_task_and_the_environment() -> None:
     assert isinstance(e.value.__cause__, TypeError)
 
 
-def test_unknown_names_list_those_there_are() -> None:
+def test_unknown_names_list_those_there_are():
     """Domains first, then the domain's tasks."""
     with pytest.raises(mjrec.UnknownName, match=r"domain 'cheeta'.*cheetah.*walker"):
         environment_from_name("dm_control/cheeta-run")
@@ -108,14 +96,14 @@ def test_unknown_names_list_those_there_are() -> None:
         ("dm_control/swimmer-swimmer6", "tracking1"),
     ],
 )
-def test_the_view_follows_the_robot(name: str, camera: str) -> None:
+def test_the_view_follows_the_robot(name, camera):
     """Or is the model's first camera; the monitor is given it, and the size."""
     named = environment_from_name(name, EnvironmentOptions(height=48, width=64))
     assert named.env_id == name
     assert named.view == {"camera": camera, "height": 48, "width": 64}
 
 
-def test_a_camera_that_is_asked_for_is_checked() -> None:
+def test_a_camera_that_is_asked_for_is_checked():
     """Before any episode begins; without pictures there is no view."""
     named = environment_from_name(
         "dm_control/cheetah-run", EnvironmentOptions(camera="back")
@@ -131,54 +119,51 @@ def test_a_camera_that_is_asked_for_is_checked() -> None:
     assert named.view == {}
 
 
-def error_with_dm_control(package: Path, suite: str) -> str:
-    """Return what is said of a task where `dm_control.suite` is `suite`."""
-    (package / "dm_control").mkdir(parents=True)
-    (package / "dm_control" / "__init__.py").touch()
-    (package / "dm_control" / "suite.py").write_text(suite)
-    code = (
+FLEX = "'MjModel' object has no attribute 'flex_vertedge'"
+
+
+@pytest.mark.parametrize(
+    ("suite", "fix", "cause"),
+    [
+        (
+            "raise ModuleNotFoundError('No module', name='dm_control')",
+            *('pip install "mjrec[dm-control]"', "needs dm_control"),
+        ),
+        # What dm_control 1.0.50 does with mujoco 4.0.
+        (f'raise AttributeError("{FLEX}")', 'pip install "mujoco<4"', FLEX),
+    ],
+)
+def test_without_a_dm_control_that_works_the_line_to_run_is_named(
+    tmp_path, suite, fix, cause
+):
+    """Whether it is not there, or does not know this mujoco."""
+    (tmp_path / "dm_control").mkdir()
+    (tmp_path / "dm_control" / "__init__.py").touch()
+    (tmp_path / "dm_control" / "suite.py").write_text(suite)
+    said = run_python(
+        "-c",
         "import mjrec.environments.from_name as f\n"
         "try: f.environment_from_name('dm_control/cheetah-run')\n"
-        "except Exception as error: print(type(error).__name__, error)\n"
+        "except Exception as error: print(type(error).__name__, error)\n",
+        PYTHONPATH=str(tmp_path),
     )
-    env = {**os.environ, "PYTHONPATH": str(package)}
-    run = subprocess.run(
-        [sys.executable, "-c", code],
-        env=env,
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    return run.stdout
-
-
-def test_without_dm_control_the_line_to_run_is_named(tmp_path: Path) -> None:
-    """`mjrec[dm-control]`, which holds the right mujoco too."""
-    suite = "raise ModuleNotFoundError('No module', name='dm_control')"
-    said = error_with_dm_control(tmp_path, suite)
-    assert said.startswith("MissingDependency dm_control/cheetah-run needs dm_control")
-    assert 'pip install "mjrec[dm-control]"' in said
-
-
-def test_a_mujoco_that_dm_control_does_not_know_names_the_fix(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """What dm_control 1.0.50 does with mujoco 4.0, imported or loading a task."""
-    what = "'MjModel' object has no attribute 'flex_vertedge'"
-    said = error_with_dm_control(tmp_path, f'raise AttributeError("{what}")')
     assert said.startswith("MissingDependency dm_control/cheetah-run")
-    assert 'pip install "mujoco<4"' in said
-    assert "flex_vertedge" in said
+    assert fix in said
+    assert cause in said
 
-    def load(*_: Any, **__: Any) -> None:
-        raise AttributeError(what)
+
+def test_a_mujoco_that_a_task_does_not_know_names_the_fix(monkeypatch):
+    """Though the package can be imported."""
+
+    def load(*_, **__):
+        raise AttributeError(FLEX)
 
     monkeypatch.setattr(suite, "load", load)
     with pytest.raises(mjrec.MissingDependency, match=r'pip install "mujoco<4"'):
         environment_from_name("dm_control/cheetah-run")
 
 
-def test_a_recording_says_with_what_its_task_was_made() -> None:
+def test_a_recording_says_with_what_its_task_was_made():
     """Also under the limit of ours; of somebody else's environment nobody knows."""
     options = EnvironmentOptions(
         seed=5, max_steps=3, kwargs={"task_kwargs": {"time_limit": 2}}
@@ -196,7 +181,7 @@ def test_a_recording_says_with_what_its_task_was_made() -> None:
 
 
 @pytest.mark.parametrize("task", ["lqr-lqr_2_1", "pendulum-swingup"])
-def test_a_stream_is_what_the_suites_users_have(task: str) -> None:
+def test_a_stream_is_what_the_suites_users_have(task):
     """Seeded once when it is loaded, then reset and reset, as `suite.load` is used."""
     domain, _, name = task.partition("-")
     theirs = suite.load(domain, name, task_kwargs={"random": 7})
@@ -212,7 +197,7 @@ def test_a_stream_is_what_the_suites_users_have(task: str) -> None:
         }
 
 
-def test_a_stream_of_another_seed_is_begun_anew() -> None:
+def test_a_stream_of_another_seed_is_begun_anew():
     """What the environment was made with does not matter then, nor what it drew."""
     options = EnvironmentOptions(seed=7, pictures=False)
     name = "dm_control/pendulum-swingup"

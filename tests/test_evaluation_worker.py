@@ -1,14 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a worker of an evaluation does with a chunk."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
-from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing
-from pathlib import Path
-from typing import Any
 
 import cloudpickle
 import gymnasium
@@ -24,7 +19,6 @@ from mjrec.environments.episode_seeds import episode_seeds
 from mjrec.environments.named_environment import EnvironmentOptions
 from mjrec.evaluation.chunk_results import read_chunk
 from mjrec.evaluation.dataclass_json import to_json
-from mjrec.evaluation.episode_results import EpisodeResult
 from mjrec.evaluation.plan import Chunk, EvaluatedTask, EvaluationPlan
 from mjrec.evaluation.worker import EvaluationWorker
 from mjrec.formats.trajectory_file import open_trajectory
@@ -36,10 +30,10 @@ ID = "MjrecEvaluated-v0"
 
 
 @pytest.fixture
-def register() -> Iterator[Callable[..., str]]:
+def register():
     """Register an environment's class, and forget it afterwards."""
 
-    def register_class(entry_point: Any) -> str:
+    def register_class(entry_point):
         gymnasium.register(ID, entry_point=entry_point, disable_env_checker=True)
         return ID
 
@@ -47,9 +41,9 @@ def register() -> Iterator[Callable[..., str]]:
     registry.pop(ID, None)
 
 
-def plan_of(task: str = PENDULUM, **changes: Any) -> EvaluationPlan:
+def plan_of(task=PENDULUM, **changes):
     """Return a plan for one task, with short episodes and small frames."""
-    options: dict[str, Any] = {
+    options = {
         "policy": "random",
         "seeds": (0,),
         "episodes": 3,
@@ -61,15 +55,10 @@ def plan_of(task: str = PENDULUM, **changes: Any) -> EvaluationPlan:
     return EvaluationPlan(tasks=tasks, **{**options, **changes})
 
 
-def run_chunk(
-    directory: Path,
-    plan: EvaluationPlan,
-    chunk: Chunk | None = None,
-    policy: Any = None,
-) -> dict[tuple[int, int], EpisodeResult]:
+def run_chunk(directory, plan, chunk=None, policy=None):
     """Run a chunk in this process, all of a plan if None, and return the results."""
     chunk = chunk or Chunk("chunk", plan.seeds, 0, plan.episodes)
-    settings: dict[str, Any] = {"directory": str(directory)}
+    settings = {"directory": str(directory)}
     if policy is not None:
         plan = dataclasses.replace(plan, policy="mine", is_object=True)
         settings["payload"] = str(directory / "policy")
@@ -85,12 +74,12 @@ def run_chunk(
     return read_chunk(directory / folder, task).results
 
 
-def outcome(result: EpisodeResult) -> tuple[Any, ...]:
+def outcome(result):
     """Return what does not depend on where and when an episode ran."""
     return (result.total_reward, result.length, result.terminated, result.failure)
 
 
-def states_of(folder: Path, result: EpisodeResult) -> Any:
+def states_of(folder, result):
     name = f"openaigym.trajectory.{result.monitor}.episode{result.episode_id:06d}.h5"
     with open_trajectory(folder / name) as reader:
         return reader.states(0, reader.row_count)
@@ -98,9 +87,7 @@ def states_of(folder: Path, result: EpisodeResult) -> Any:
 
 # The second draws its springs when it is made.
 @pytest.mark.parametrize("task", [PENDULUM, "dm_control/lqr-lqr_2_1"])
-def test_an_episode_is_the_one_that_a_session_records(
-    tmp_path: Path, task: str
-) -> None:
+def test_an_episode_is_the_one_that_a_session_records(tmp_path, task):
     """Bit for bit, whichever chunk it is in, and whatever ran before it."""
     if task.startswith("dm_control/"):
         pytest.importorskip("dm_control")
@@ -128,7 +115,7 @@ def test_an_episode_is_the_one_that_a_session_records(
         assert result.total_reward == expected[episode].reward
 
 
-def test_what_is_done_is_not_repeated(tmp_path: Path, names: Any) -> None:
+def test_what_is_done_is_not_repeated(tmp_path, names):
     """A chunk that is begun again is completed, and nothing is done where all is."""
     plan, folder = plan_of(), tmp_path / "task" / "chunk"
     first = run_chunk(tmp_path, plan, Chunk("chunk", (0,), 1, 2))[0, 1]
@@ -140,52 +127,35 @@ def test_what_is_done_is_not_repeated(tmp_path: Path, names: Any) -> None:
     assert names(folder) == before
 
 
-@pytest.mark.dm_control
-def test_by_the_suites_protocol_there_is_one_random_stream(tmp_path: Path) -> None:
-    """A task of the suite, evaluated as its users do; seed after seed."""
-    pytest.importorskip("dm_control")
-    from dm_control import suite
-
-    plan = plan_of("dm_control/pendulum-swingup", seeds=(3, 4), protocol="suite")
-    results = run_chunk(tmp_path, plan)
-    for seed in plan.seeds:
-        theirs = suite.load("pendulum", "swingup", task_kwargs={"random": seed})
-        for episode in range(3):
-            theirs.reset()
-            state = states_of(tmp_path / "task" / "chunk", results[seed, episode])[0]
-            assert state[1] == theirs.physics.data.qpos[0]
-
-
 class Stumbling:
     """Pushes gently; does something else in the third step of some episodes."""
 
-    def __init__(self, wrong: Mapping[int, Callable[[], Any]]) -> None:
+    def __init__(self, wrong):
         self.by_seed = {episode_seeds(0, n).policy: do for n, do in wrong.items()}
 
-    def reset(self, seed: int) -> None:
+    def reset(self, seed):
         self.wrong = self.by_seed.get(seed)
         self.steps = 0
 
-    def __call__(self, observation: Any) -> Any:
+    def __call__(self, observation):
         self.steps += 1
         if self.wrong is not None and self.steps == 3:
             return self.wrong()
         return np.full(1, 0.01)
 
 
-def raising() -> Any:
+def raising():
     raise RuntimeError("out of\nideas")
 
 
-def told_to_end() -> Any:
+def told_to_end():
     raise KeyboardInterrupt
 
 
-def leaving() -> Any:
+def leaving():
     raise SystemExit(3)
 
 
-@pytest.mark.parametrize("protocol", ["seeded", "suite"])
 @pytest.mark.parametrize(
     ("wrong", "failure"),
     [
@@ -195,11 +165,9 @@ def leaving() -> Any:
         (lambda: np.zeros(7), "action of Box"),
     ],
 )
-def test_a_policy_that_fails_loses_its_episode_only(
-    tmp_path: Path, wrong: Any, failure: str, protocol: Any
-) -> None:
+def test_a_policy_that_fails_loses_its_episode_only(tmp_path, wrong, failure):
     """Its reason is one line; its trajectory says that it is not complete."""
-    plan = plan_of(protocol=protocol, keep="none")
+    plan = plan_of(keep="none")
     results = run_chunk(tmp_path, plan, policy=Stumbling({1: wrong}))
     failed = results[0, 1]
     assert failure.lower() in str(failed.failure).lower()
@@ -216,9 +184,7 @@ def test_a_policy_that_fails_loses_its_episode_only(
 
 
 @pytest.mark.parametrize("fails_first", [False, True])
-def test_a_random_stream_goes_on_where_it_was(
-    tmp_path: Path, fails_first: bool
-) -> None:
+def test_a_random_stream_goes_on_where_it_was(tmp_path, fails_first):
     """Episodes that are done are run again unrecorded; a signal is no failure."""
     plan = plan_of(protocol="suite", episodes=4)
     wrong = {0: raising} if fails_first else {}
@@ -242,13 +208,13 @@ def test_a_random_stream_goes_on_where_it_was(
 class Unsteady(Corridor):
     """Raises in the reset of its second episode."""
 
-    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+    def reset(self, *, seed=None, options=None):
         if seed == episode_seeds(0, 1).environment:
             raise OSError("no such corridor")
         return super().reset(seed=seed, options=options)
 
 
-def test_a_reset_that_raises_fails_its_episode(tmp_path: Path, register: Any) -> None:
+def test_a_reset_that_raises_fails_its_episode(tmp_path, register):
     """There is no recording of it then; those around it have theirs."""
     results = run_chunk(tmp_path, plan_of(register(Unsteady), keep="none"))
     failed = results[0, 1]
@@ -260,26 +226,26 @@ def test_a_reset_that_raises_fails_its_episode(tmp_path: Path, register: Any) ->
 class Exploding(InvertedPendulumEnv):
     """Becomes unstable in its second step; has warned before each episode."""
 
-    def reset(self, **options: Any) -> Any:
+    def reset(self, **options):
         begun = super().reset(**options)
         self.data.warning[mujoco.mjtWarning.mjWARN_INERTIA].number = 5
         return begun
 
-    def step(self, action: Any) -> Any:
+    def step(self, action):
         self.steps = getattr(self, "steps", 0) + 1
         if self.steps == 2:
             self.data.qpos[0] = np.inf
         return super().step(action)
 
 
-def test_warnings_of_mujoco_are_counted(tmp_path: Path, register: Any) -> None:
+def test_warnings_of_mujoco_are_counted(tmp_path, register):
     """In the episode in which they came, by their names."""
     results = run_chunk(tmp_path, plan_of(register(Exploding), policy="zero"))
     counts = [dict(results[0, n].warnings) for n in range(3)]
     assert counts == [{"BADQPOS": 1}, {}, {}]
 
 
-def test_what_cannot_be_recorded_is_no_episodes_failure(tmp_path: Path) -> None:
+def test_what_cannot_be_recorded_is_no_episodes_failure(tmp_path):
     """It ends the job, and is done again with the next."""
     (tmp_path / "task").mkdir()
     (tmp_path / "task" / "chunk").write_text("in the way")

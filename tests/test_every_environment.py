@@ -1,13 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Monitors of every environment there is."""
 
-from __future__ import annotations
-
 import importlib.util
 import json
 from fractions import Fraction
-from pathlib import Path
-from typing import Any
 
 import av
 import gymnasium
@@ -24,7 +20,7 @@ GYMNASIUM = sorted(
 )
 
 
-def suite_tasks() -> list[str]:
+def suite_tasks():
     if importlib.util.find_spec("dm_control") is None:
         return []
     from dm_control import suite
@@ -32,7 +28,7 @@ def suite_tasks() -> list[str]:
     return [f"dm_control/{domain}-{task}" for domain, task in suite.ALL_TASKS]
 
 
-def record(name: str, directory: Path, *, steps: int = 3) -> dict[str, Any]:
+def record(name, directory, *, steps=3):
     """Record an episode; returns its metadata."""
     session = Session(
         environment=name,
@@ -43,12 +39,12 @@ def record(name: str, directory: Path, *, steps: int = 3) -> dict[str, Any]:
     [episode] = record_session(session)
     assert episode.length <= steps
     [path] = directory.glob("*.meta.json")
-    metadata: dict[str, Any] = json.loads(path.read_text())
+    metadata = json.loads(path.read_text())
     assert metadata["frame_count"] == episode.length + 1
     return metadata
 
 
-def check_pictures(directory: Path) -> None:
+def check_pictures(directory):
     """Frames have content: neither black nor of one colour."""
     [path] = directory.glob("*.mp4")
     with av.open(str(path)) as container:
@@ -56,7 +52,7 @@ def check_pictures(directory: Path) -> None:
             assert frame.to_ndarray(format="rgb24").std() > 5
 
 
-def test_all_of_gymnasiums_are_known() -> None:
+def test_all_of_gymnasiums_are_known():
     """The list is not empty by mistake."""
     assert len(GYMNASIUM) == 11
 
@@ -64,13 +60,13 @@ def test_all_of_gymnasiums_are_known() -> None:
 @parametrize(
     "env_id", GYMNASIUM, default=("HalfCheetah-v5",), part=pytest.mark.environments
 )
-def test_gymnasium(env_id: str, tmp_path: Path) -> None:
+def test_gymnasium(env_id, tmp_path):
     """Recorded in real time, with something to see."""
     metadata = record(env_id, tmp_path)
     check_pictures(tmp_path)
     env = gymnasium.make(env_id)
     assert Fraction(metadata["timestep"]) == Fraction(
-        env.unwrapped.dt  # type: ignore[attr-defined]  # MuJoCo environments have it
+        env.unwrapped.dt
     ).limit_denominator(10**6)
     assert metadata["playback_speed"] == 1.0
     env.close()
@@ -83,7 +79,7 @@ def test_gymnasium(env_id: str, tmp_path: Path) -> None:
     default=("dm_control/cheetah-run",),
     part=pytest.mark.environments,
 )
-def test_dm_control(name: str, tmp_path: Path) -> None:
+def test_dm_control(name, tmp_path):
     """Recorded in real time, with something to see."""
     from dm_control import suite
 

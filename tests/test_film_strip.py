@@ -1,12 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Film strips show the right pictures with the right times."""
 
-from __future__ import annotations
-
+import json
 import subprocess
 import sys
-from pathlib import Path
-from typing import Any
 
 import gymnasium
 import numpy as np
@@ -15,6 +12,7 @@ from PIL import Image
 from recordings import frames_of
 
 import mjrec
+from mjrec.commands.strip import strip
 from mjrec.errors import FileNotWritten, InvalidArgument, UnreadableFile
 from mjrec.reporting import film_strips as module
 from mjrec.reporting.film_strips import film_strip, write_film_strip
@@ -25,7 +23,7 @@ HEIGHT, WIDTH = 47, 64
 
 
 @pytest.fixture(scope="module")
-def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def recorded(tmp_path_factory):
     """An episode of ten steps of 0.05 s, of an odd height."""
     directory = tmp_path_factory.mktemp("strip")
     env = gymnasium.make(
@@ -40,18 +38,18 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def trajectory(recorded: Path) -> Path:
+def trajectory(recorded):
     [path] = recorded.glob("*.h5")
     return path
 
 
 @pytest.fixture
-def video(recorded: Path) -> Path:
+def video(recorded):
     [path] = recorded.glob("*.mp4")
     return path
 
 
-def cells(strip: Any, rows: int, columns: int, size: tuple[int, int]) -> list[Any]:
+def cells(strip, rows, columns, size):
     """Cut a strip's pictures out, by its margins of white."""
     height, width = size
     gap = max(2, round(0.03 * min(size)))
@@ -67,12 +65,12 @@ def cells(strip: Any, rows: int, columns: int, size: tuple[int, int]) -> list[An
 
 
 @pytest.fixture
-def labels(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+def labels(monkeypatch):
     """What is written under the pictures."""
-    written: list[str] = []
+    written = []
     labels_of = module._labels
 
-    def noting(seconds: Any) -> list[str]:
+    def noting(seconds):
         found = labels_of(seconds)
         written.extend(found)
         return found
@@ -82,9 +80,7 @@ def labels(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
 
 @pytest.mark.thorough
-def test_pictures_of_a_trajectory_are_those_rendered(
-    trajectory: Path, labels: list[str]
-) -> None:
+def test_pictures_of_a_trajectory_are_those_rendered(trajectory, labels):
     """Evenly spread, byte for byte, from any camera and of any size."""
     strip = film_strip(trajectory, frames=3)
     rendered = list(mjrec.render(trajectory))
@@ -92,12 +88,12 @@ def test_pictures_of_a_trajectory_are_those_rendered(
     for picture, index in zip(shown, (0, 5, 10), strict=True):
         np.testing.assert_array_equal(picture, rendered[index])
     assert labels == ["0.00 s", "0.25 s", "0.50 s"]
-    other: Any = {"height": 96, "width": 128, "camera": "track", "quality": "draft"}
+    other = {"height": 96, "width": 128, "camera": "track", "quality": "draft"}
     first, _ = cells(film_strip(trajectory, frames=2, **other), 1, 2, (96, 128))
     np.testing.assert_array_equal(first, next(mjrec.render(trajectory, **other)))
 
 
-def test_pictures_of_a_video_are_those_decoded(video: Path, labels: list[str]) -> None:
+def test_pictures_of_a_video_are_those_decoded(video, labels):
     """Without the row that made its height even, and with simulated times."""
     strip = film_strip(video, frames=6, columns=3)
     decoded = frames_of(video)
@@ -124,8 +120,8 @@ def test_pictures_of_a_video_are_those_decoded(video: Path, labels: list[str]) -
     ],
 )
 def test_without_metadata_that_fit_a_video_has_its_own_times(
-    video: Path, tmp_path: Path, text: str | None, labels: list[str]
-) -> None:
+    video, tmp_path, text, labels
+):
     """They may be anybody's, and claim any number of pictures."""
     copy = tmp_path / "copy.mp4"
     copy.write_bytes(video.read_bytes())
@@ -137,13 +133,13 @@ def test_without_metadata_that_fit_a_video_has_its_own_times(
 
 
 @pytest.mark.parametrize(("frames", "columns"), [(8, 8), (9, 5), (1, 1)])
-def test_usual_columns(video: Path, frames: int, columns: int) -> None:
+def test_usual_columns(video, frames, columns):
     """Up to eight stand in one row, more in rows of equal length."""
     strip = film_strip(video, frames=frames)
     assert strip.shape[1] == 2 + columns * (WIDTH + 2)
 
 
-def test_more_pictures_than_there_are(video: Path, trajectory: Path) -> None:
+def test_more_pictures_than_there_are(video, trajectory):
     """The error says how many there are."""
     for file in (video, trajectory):
         with pytest.raises(InvalidArgument, match="has 11 pictures, and 12"):
@@ -159,15 +155,13 @@ def test_more_pictures_than_there_are(video: Path, trajectory: Path) -> None:
         ({"camera": "track"}, "trajectory"),
     ],
 )
-def test_what_cannot_be_shown(video: Path, options: dict[str, Any], said: str) -> None:
+def test_what_cannot_be_shown(video, options, said):
     """Such numbers, and another camera of a video, are an error that says why."""
     with pytest.raises(InvalidArgument, match=said):
         film_strip(video, **options)
 
 
-def test_a_strip_that_is_too_large(
-    video: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_strip_that_is_too_large(video, monkeypatch):
     """It says what to ask for instead."""
     monkeypatch.setattr(module, "_MOST_PIXELS", 4 * HEIGHT * WIDTH)
     assert film_strip(video, frames=2).size
@@ -175,7 +169,7 @@ def test_a_strip_that_is_too_large(
         film_strip(video, frames=4)
 
 
-def test_other_files(video: Path, tmp_path: Path) -> None:
+def test_other_files(video, tmp_path):
     """Neither a video nor a trajectory, or damaged, or not there: it is named."""
     text, cut = tmp_path / "notes.txt", tmp_path / "cut.mp4"
     text.write_text("no video")
@@ -188,7 +182,7 @@ def test_other_files(video: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("ending", [".mp4", ".avi", ".mkv"])
-def test_each_picture_is_the_right_one(tmp_path: Path, ending: str) -> None:
+def test_each_picture_is_the_right_one(tmp_path, ending):
     """Of each kind of video, at a rate whose times are no round numbers."""
     path = tmp_path / f"grey{ending}"
     with mjrec.VideoWriter(path, fps=30) as writer:
@@ -202,7 +196,7 @@ def test_each_picture_is_the_right_one(tmp_path: Path, ending: str) -> None:
     np.testing.assert_allclose(means, [6 * i for i in indices], atol=2)
 
 
-def test_a_strip_is_a_whole_png_for_print(video: Path, tmp_path: Path) -> None:
+def test_a_strip_is_a_whole_png_for_print(video, tmp_path):
     """Of 300 dots per inch, with the very pixels; else nothing is written."""
     strip = film_strip(video, frames=2)
     with pytest.raises(InvalidArgument, match=r"strip\.png"):
@@ -216,7 +210,24 @@ def test_a_strip_is_a_whole_png_for_print(video: Path, tmp_path: Path) -> None:
         np.testing.assert_array_equal(np.asarray(image), strip)
 
 
-def test_without_pillow(video: Path) -> None:
+def test_the_command_writes_a_picture_and_says_its_size(video, tmp_path, capsys):
+    """In as many columns as asked for; nothing where a video cannot show it."""
+    out = tmp_path / "strip.png"
+    with pytest.raises(InvalidArgument, match="trajectory"):
+        strip(video, size="640x480", out=out)
+    with pytest.raises(InvalidArgument, match="11 pictures"):
+        strip(video, frames=13, out=out)
+    assert not out.exists()
+    assert strip(video, frames=6, columns=2, out=out) == 0
+    with Image.open(out) as image:
+        assert image.width == 2 + 2 * (WIDTH + 2)
+        assert f"{image.width}x{image.height} pixels" in capsys.readouterr().out
+    assert strip(video, frames=1, out=out, as_json=True) == 0
+    said = json.loads(capsys.readouterr().out)
+    assert said == {"strip": str(out), "width": 4 + WIDTH, "height": said["height"]}
+
+
+def test_without_pillow(video):
     """An error names the extra."""
     code = (
         "import sys; sys.modules['PIL'] = None\n"

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a report shows is gathered from directories of every kind."""
 
-from __future__ import annotations
-
 import json
 import os
 import shlex
@@ -11,7 +9,6 @@ import subprocess
 import sys
 import tracemalloc
 from pathlib import Path
-from typing import Any
 
 import gymnasium
 import numpy as np
@@ -19,6 +16,7 @@ import pytest
 from parts import parametrize
 
 import mjrec
+from evaluations import write_recorded
 from mjrec.commands import main
 from mjrec.errors import InvalidArgument, UnreadableFile
 from mjrec.evaluation.kept_episodes import keep_rule
@@ -27,11 +25,11 @@ from mjrec.formats.monitor_directory import infix_of
 from mjrec.reporting.contents import EPISODE
 from mjrec.reporting.episode_rows import episodes_with_roles
 from mjrec.reporting.gathering import gather
-from report_recordings import GYM, entry, record, write_evaluation, write_journal
+from report_recordings import GYM, entry, record, write_journal
 
 
 @pytest.fixture(scope="module")
-def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def recorded(tmp_path_factory):
     """Two recorded episodes of six steps, with two cameras, whose states are there."""
     directory = tmp_path_factory.mktemp("my recordings")
     env = gymnasium.make(
@@ -49,7 +47,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 # Takes more than five seconds: its fixture records what all tests of the file read.
-def test_a_monitor_directory_is_one_task(recorded: Path) -> None:
+def test_a_monitor_directory_is_one_task(recorded):
     """Episodes in the order of time, and videos with what their metadata say."""
     contents = gather(recorded)
     [task] = contents.tasks
@@ -70,9 +68,7 @@ def test_a_monitor_directory_is_one_task(recorded: Path) -> None:
 
 
 @parametrize("number", [0, 1])
-def test_the_command_renders_a_video_again(
-    recorded: Path, number: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_command_renders_a_video_again(recorded, number, tmp_path, monkeypatch):
     """As it stands there, for the first camera and a further one; the same pixels."""
     monkeypatch.chdir(tmp_path)
     video = gather(recorded).videos[number]
@@ -85,7 +81,7 @@ def test_the_command_renders_a_video_again(
     assert decoded == json.loads(metadata.read_text())["decoded_sha256"]
 
 
-def test_live_videos_have_no_command(corridor: Any, tmp_path: Path) -> None:
+def test_live_videos_have_no_command(corridor, tmp_path):
     """There is nothing that they could be rendered from, and that is said."""
     record(corridor, tmp_path, 1)
     [video] = gather(tmp_path).videos
@@ -94,7 +90,7 @@ def test_live_videos_have_no_command(corridor: Any, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("version", sorted(p.name for p in GYM.iterdir() if p.is_dir()))
-def test_recordings_of_every_gym_are_gathered(version: str) -> None:
+def test_recordings_of_every_gym_are_gathered(version):
     """Each directory is found one level below, with all episodes and text videos."""
     tasks = {Path(task.source).name: task for task in gather(GYM / version).tasks}
     assert tasks.keys() == {p.name for p in (GYM / version).iterdir()}
@@ -107,7 +103,7 @@ def test_recordings_of_every_gym_are_gathered(version: str) -> None:
             assert [video.path.suffix for video in task.videos] == [".json"] * 2
 
 
-def test_episodes_of_several_monitors_are_in_the_order_of_time(tmp_path: Path) -> None:
+def test_episodes_of_several_monitors_are_in_the_order_of_time(tmp_path):
     """What has no time comes last; what is not known of success stays unknown."""
     write_journal(
         tmp_path, "0.a", "X-v0", [entry(0, end_time=3.0e9, success=True), entry(1)]
@@ -126,7 +122,7 @@ def test_episodes_of_several_monitors_are_in_the_order_of_time(tmp_path: Path) -
     assert (summary.runs, summary.success_known, summary.success_rate) == (2, 2, 0.5)
 
 
-def test_several_environments_are_tasks_of_their_own(tmp_path: Path) -> None:
+def test_several_environments_are_tasks_of_their_own(tmp_path):
     """In one directory, which is told, and in several, by the directory's name."""
     write_journal(tmp_path / "a", "0.a", "X-v0", [entry(0)])
     write_journal(tmp_path / "a", "1.a", "Y-v0", [entry(0), entry(1)])
@@ -143,7 +139,7 @@ def test_several_environments_are_tasks_of_their_own(tmp_path: Path) -> None:
     assert contents.title == "Recordings: 3 tasks"
 
 
-def test_a_damaged_file_is_named_and_the_rest_shown(tmp_path: Path) -> None:
+def test_a_damaged_file_is_named_and_the_rest_shown(tmp_path):
     """A whole file, and a line of a journal, which is otherwise only in the log."""
     path = write_journal(tmp_path, "0.a", "X-v0", [entry(0), entry(1)])
     with path.open("a") as file:
@@ -157,9 +153,7 @@ def test_a_damaged_file_is_named_and_the_rest_shown(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("there", ["link", "pipe"])
-def test_what_stands_in_the_place_of_a_video_is_left_out(
-    corridor: Any, tmp_path: Path, there: str
-) -> None:
+def test_what_stands_in_the_place_of_a_video_is_left_out(corridor, tmp_path, there):
     """A link could put any file of the reader into a report; a pipe never ends."""
     directory = tmp_path / "run"
     record(corridor, directory, 1)
@@ -185,9 +179,7 @@ def test_what_stands_in_the_place_of_a_video_is_left_out(
         {"selection": {"rule": "best:1", "decided": True, "finished": "many"}},
     ],
 )
-def test_metadata_may_say_anything(
-    corridor: Any, tmp_path: Path, metadata: dict[str, Any]
-) -> None:
+def test_metadata_may_say_anything(corridor, tmp_path, metadata):
     """What is nonsense is not known; the video is shown."""
     record(corridor, tmp_path, 1)
     [path] = tmp_path.glob("*.meta.json")
@@ -199,9 +191,9 @@ def test_metadata_may_say_anything(
 # --- Evaluations ------------------------------------------------------------------
 
 
-def test_an_evaluation_has_its_results(tmp_path: Path) -> None:
+def test_an_evaluation_has_its_results(tmp_path):
     """Its summaries are those of its file, its episodes in the plan's order."""
-    write_evaluation(tmp_path / "e", ["a/x", "b/y"])
+    write_recorded(tmp_path / "e", ["a/x", "b/y"])
     write_journal(tmp_path / "m", "0.a", "X-v0", [entry(i) for i in range(20)])
     contents = gather([tmp_path / "e", tmp_path / "m"])
     assert [task.name for task in contents.tasks] == ["a/x", "b/y", "X-v0"]
@@ -227,9 +219,7 @@ def test_an_evaluation_has_its_results(tmp_path: Path) -> None:
     assert beside[0] != beside[1]
 
 
-def test_videos_of_an_evaluation_know_their_episode(
-    corridor: Any, tmp_path: Path
-) -> None:
+def test_videos_of_an_evaluation_know_their_episode(corridor, tmp_path):
     """By monitor and number; the best of the task is called so."""
     record(corridor, tmp_path / "a-x", 1, uid="batch")
     [journal] = (tmp_path / "a-x").glob("*.jsonl")
@@ -237,17 +227,17 @@ def test_videos_of_an_evaluation_know_their_episode(
     [path] = (tmp_path / "a-x").glob("*.mp4")
     infix = infix_of(path.name)
     assert infix is not None
-    write_evaluation(tmp_path, ["a/x"], videos={"a/x": path.name}, infix=infix)
+    write_recorded(tmp_path, ["a/x"], videos={"a/x": path.name}, monitor=infix)
     contents = gather(tmp_path)
     [video] = contents.videos
     assert (video.index, video.roles) == (0, ("best",))
     assert contents.problems == []
 
 
-def test_pending_videos_of_an_evaluation_are_told(tmp_path: Path) -> None:
+def test_pending_videos_of_an_evaluation_are_told(tmp_path):
     """With the command that makes them."""
     name = "openaigym.video.0.batch.video000000.mp4"
-    write_evaluation(tmp_path, ["a/x"], videos={"a/x": name})
+    write_recorded(tmp_path, ["a/x"], videos={"a/x": name})
     [problem] = gather(tmp_path).problems
     assert "1 of 1 videos of a/x are not there" in problem
     assert f"mjrec render {tmp_path / 'a-x'}" in problem
@@ -262,10 +252,10 @@ def test_pending_videos_of_an_evaluation_are_told(tmp_path: Path) -> None:
     ],
 )
 def test_an_evaluation_without_results_is_shown_by_its_monitors(
-    tmp_path: Path, broken: str | None, content: str | None, told: str
-) -> None:
+    tmp_path, broken, content, told
+):
     """Whether it is not finished or a file is damaged, which is said."""
-    write_evaluation(tmp_path, ["a/x", "b/y"], finished=broken is not None)
+    write_recorded(tmp_path, ["a/x", "b/y"], finished=broken is not None)
     if broken is not None and content is not None:
         (tmp_path / broken).write_text(content)
     contents = gather(tmp_path)
@@ -293,9 +283,7 @@ def test_an_evaluation_without_results_is_shown_by_its_monitors(
         ((1.0,), [0], {}),
     ],
 )
-def test_roles(
-    rewards: tuple[float, ...], failed: list[int], roles: dict[int, Any]
-) -> None:
+def test_roles(rewards, failed, roles):
     """Of equals the earlier, of an even number the lower, no number is the worst."""
     episodes = np.zeros(len(rewards), EPISODE)
     episodes["total_reward"] = rewards
@@ -303,23 +291,23 @@ def test_roles(
     assert episodes_with_roles(episodes) == roles
 
 
-def test_roles_are_those_of_an_evaluation(tmp_path: Path) -> None:
+def test_roles_are_those_of_an_evaluation(tmp_path):
     """The rule that chose the videos and the page call the same episodes the best."""
     rewards = (2.0, 5.0, 5.0, 1.0, 1.0, 2.0)
-    write_evaluation(tmp_path, ["a/x"], rewards=rewards)
+    write_recorded(tmp_path, ["a/x"], rewards=rewards)
     results = list(read_results(tmp_path))
-    expected: dict[int, tuple[str, ...]] = {}
+    expected = {}
     for result, role in keep_rule("best,median,worst").choose(results):
         index = results.index(result)
         expected[index] = (*expected.get(index, ()), role)
     assert episodes_with_roles(gather(tmp_path).tasks[0].episodes) == expected
 
 
-def test_verdicts_are_found_and_given(tmp_path: Path) -> None:
+def test_verdicts_are_found_and_given(tmp_path):
     """In the directory, and as a file."""
     write_journal(tmp_path / "run", "0.a", "X-v0", [entry(0)])
     findings = [{"outcome": each} for each in ("made again", "believed", "noted")]
-    said: dict[str, Any] = {"path": "run", "level": "physics", "verdict": "PARTLY"}
+    said = {"path": "run", "level": "physics", "verdict": "PARTLY"}
     said["findings"] = findings
     (tmp_path / "run" / "verification.json").write_text(json.dumps(said))
     bad = {**said, "verdict": "FAIL", "findings": [{"outcome": "different"}]}
@@ -340,7 +328,7 @@ def test_verdicts_are_found_and_given(tmp_path: Path) -> None:
         '{"path": "x", "level": "all", "verdict": "PASS", "findings": []}',
     ],
 )
-def test_a_verdict_that_is_none_is_not_shown(tmp_path: Path, text: str) -> None:
+def test_a_verdict_that_is_none_is_not_shown(tmp_path, text):
     """One that contradicts itself neither; a file that was given is an error."""
     write_journal(tmp_path, "0.a", "X-v0", [entry(0)])
     path = tmp_path / "verification.json"
@@ -352,7 +340,7 @@ def test_a_verdict_that_is_none_is_not_shown(tmp_path: Path, text: str) -> None:
         gather(tmp_path, verifications=[path])
 
 
-def test_a_directory_without_recordings_is_an_error(tmp_path: Path) -> None:
+def test_a_directory_without_recordings_is_an_error(tmp_path):
     """It is named, with what to do; so is one that is not there, or a file."""
     (tmp_path / "deep" / "deeper").mkdir(parents=True)
     write_journal(tmp_path / "deep" / "deeper", "0.a", "X-v0", [entry(0)])
@@ -371,7 +359,7 @@ def test_a_directory_without_recordings_is_an_error(tmp_path: Path) -> None:
         gather([])
 
 
-def test_gathering_needs_no_simulator_no_opengl_and_no_ffmpeg(recorded: Path) -> None:
+def test_gathering_needs_no_simulator_no_opengl_and_no_ffmpeg(recorded):
     """Where these cannot be imported, everything is there all the same."""
     code = (
         "import sys\n"
@@ -395,7 +383,7 @@ def test_gathering_needs_no_simulator_no_opengl_and_no_ffmpeg(recorded: Path) ->
 
 
 @pytest.mark.thorough
-def test_many_episodes_take_little_memory(tmp_path: Path) -> None:
+def test_many_episodes_take_little_memory(tmp_path):
     """A hundred bytes each: a million take a fifth of what is promised."""
     count = 10_000
     write_journal(tmp_path, "0.a", "X-v0", [entry(i) for i in range(count)])

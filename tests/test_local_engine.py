@@ -1,9 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Of the local engine, what `test_engines` does not try on every one."""
 
-from __future__ import annotations
-
-import json
 import os
 import signal
 import subprocess
@@ -26,6 +23,7 @@ from engine_runs import (
 from interruption import ctrl_c_soon
 from waiting import wait_until
 
+from mjrec.engines.gpu_shares import GpuShare
 from mjrec.engines.jobs import Run, Work
 from mjrec.engines.local import LocalEngine
 from mjrec.errors import ClosedError, Error, GLError, InvalidArgument
@@ -34,7 +32,7 @@ from mjrec.machine import usable_cpus
 pytestmark = pytest.mark.usefixtures("no_process_is_left")
 
 
-def test_a_thousand_small_jobs() -> None:
+def test_a_thousand_small_jobs():
     """Nothing is waited for but work."""
     keys = [str(number) for number in range(1000)]
     with Run(LocalEngine(2), odd_work()) as run:
@@ -44,16 +42,16 @@ def test_a_thousand_small_jobs() -> None:
     assert time.monotonic() - began < 10
 
 
-def test_workers_are_one_for_each_cpu() -> None:
+def test_workers_are_one_for_each_cpu():
     """Unless their number is given, which is refused before anything starts."""
     assert LocalEngine().workers == usable_cpus()
     assert repr(LocalEngine(3, gpus=0.5)) == "LocalEngine(workers=3, gpus=0.5)"
     for workers in (0, -1, 1.5, True, "2"):
         with pytest.raises(InvalidArgument, match="workers must be a whole number"):
-            LocalEngine(workers)  # type: ignore[arg-type]  # that is the test
+            LocalEngine(workers)
 
 
-def test_an_engine_that_was_shut_down_or_forgotten() -> None:
+def test_an_engine_that_was_shut_down_or_forgotten():
     """It takes no more jobs, and leaves no thread; those before are done."""
     engine = LocalEngine(2)
     calls = [engine.submit(len, "abc") for _ in range(5)]
@@ -65,7 +63,7 @@ def test_an_engine_that_was_shut_down_or_forgotten() -> None:
     wait_until(lambda: "mjrec-worker" not in str(threading.enumerate()))
 
 
-def test_children_have_more_environment() -> None:
+def test_children_have_more_environment():
     """And bytes that are the same for all, in a file."""
     environ = {"OMP_NUM_THREADS": "3"}
     work = Work(entry="odd_jobs:make", environ=environ, payload=b"weights")
@@ -76,9 +74,7 @@ def test_children_have_more_environment() -> None:
 
 
 @pytest.mark.thorough
-def test_children_share_the_gpus_that_there_are(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_children_share_the_gpus_that_there_are(tmp_path, monkeypatch, caplog):
     """Two share the first, and are told that they draw in software, or may not."""
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "3,5")
     os.mkfifo(tmp_path / "pipe")
@@ -95,7 +91,46 @@ def test_children_share_the_gpus_that_there_are(
             outcomes(run)
 
 
-def test_processes_that_a_child_leaves_are_not_waited_for(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("each", "gpus", "given"),
+    [
+        (0.25, ["0", "1"], ["0", "0", "0", "0", "1", "1", "1", "1"]),
+        (0.5, ["3", "5"], ["3", "3", "5", "5", "3", "3", "5", "5"]),
+        (1, ["0", "1"], ["0", "1", "0", "1", "0", "1", "0", "1"]),
+        (2, ["0", "1", "2", "3"], ["0,1", "2,3"] * 4),
+        (0.3, ["a", "b"], ["a", "a", "a", "b", "b", "b", "a", "a"]),
+        (1 / 3, ["a", "b"], ["a", "a", "a", "b", "b", "b", "a", "a"]),
+        (2, ["0"], ["0"] * 8),
+        (0.25, [], [None] * 8),
+        (0, ["0"], [None] * 8),
+    ],
+)
+def test_gpus_are_filled_one_after_the_other(each, gpus, given):
+    """As many workers as share one get the same; further ones go round again."""
+    share = GpuShare(each=each)
+    assert [share.of(seat, gpus) for seat in range(8)] == given
+
+
+@pytest.mark.parametrize("each", [-0.5, float("nan"), float("inf"), "1", None, True])
+def test_what_is_no_share_is_refused(each):
+    """The message says what would be one."""
+    with pytest.raises(InvalidArgument, match=r"such as 1, or 0\.25"):
+        GpuShare(each=each)
+
+
+def test_more_than_one_is_whole():
+    """Half of two GPUs each is not what anybody means."""
+    with pytest.raises(InvalidArgument, match=r"cannot be 1\.5"):
+        GpuShare(each=1.5)
+
+
+def test_who_requires_a_gpu_asks_for_one():
+    """Else nobody could say which."""
+    with pytest.raises(InvalidArgument, match="none is asked for"):
+        GpuShare(required=True)
+
+
+def test_processes_that_a_child_leaves_are_not_waited_for(tmp_path):
     """Its end is its end, whatever holds copies of what it had open."""
     with Run(LocalEngine(1), odd_work()) as run:
         submit(run, "a", do="fork", children=str(tmp_path / "children"))
@@ -105,7 +140,7 @@ def test_processes_that_a_child_leaves_are_not_waited_for(tmp_path: Path) -> Non
         wait_for_end(int(line))
 
 
-def test_what_cannot_be_started(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_cannot_be_started(monkeypatch):
     """The error names it."""
     for entry in ("no_such_module:make", "odd_jobs:no_such_name"):
         with Run(LocalEngine(1), Work(entry=entry)) as run:
@@ -119,9 +154,7 @@ def test_what_cannot_be_started(monkeypatch: pytest.MonkeyPatch) -> None:
             outcomes(run)
 
 
-def test_what_jobs_print_is_passed_on(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_jobs_print_is_passed_on(capsys, monkeypatch):
     """Line by line, more than a pipe holds; where there is a standard error."""
     with Run(LocalEngine(2), odd_work()) as run:
         submit(run, "a", do="talk", more=1_000_000)
@@ -141,7 +174,7 @@ def test_what_jobs_print_is_passed_on(
         assert values(run) == [{"read": ""}]
 
 
-def test_ctrl_c_while_results_come(tmp_path: Path) -> None:
+def test_ctrl_c_while_results_come(tmp_path):
     """It is raised at once, and leaving `with` ends what the children are at."""
     run = Run(LocalEngine(1), odd_work())
     submit(run, "a", do="hold", begun=str(tmp_path / "begun"))
@@ -162,7 +195,7 @@ with Run(LocalEngine(2), Work(entry="odd_jobs:make")) as run:
 SAID = f"{[str(number) for number in range(9)]}\n"
 
 
-def test_from_wherever_the_caller_is(tmp_path: Path) -> None:
+def test_from_wherever_the_caller_is(tmp_path):
     """From standard input, from a script without a guard, in a daemonic process."""
     assert run_python("-", text=CALLER) == SAID
     (tmp_path / "script.py").write_text(CALLER)
@@ -199,7 +232,7 @@ if sys.argv[2] == "killed":
 
 
 @pytest.mark.parametrize("how", ["killed", "left"])
-def test_children_end_with_their_driver(tmp_path: Path, how: str) -> None:
+def test_children_end_with_their_driver(tmp_path, how):
     """In mid-job; at interpreter exit nothing waits for them."""
     subprocess.run(
         [sys.executable, "-c", LEAVING, str(tmp_path / "begun"), how],
@@ -208,13 +241,3 @@ def test_children_end_with_their_driver(tmp_path: Path, how: str) -> None:
         check=False,
     )
     wait_for_end(int((tmp_path / "begun").read_text()))
-
-
-def test_import_is_inert() -> None:
-    """Neither driver nor child loads a simulator, NumPy, or another engine."""
-    heavy = ["mujoco", "numpy", "h5py", "ray", "submitit"]
-    script = (
-        "import json, sys, mjrec.engines.jobs, mjrec.engines.child; "
-        f"print(json.dumps([m for m in {heavy} if m in sys.modules]))"
-    )
-    assert json.loads(run_python("-c", script)) == []

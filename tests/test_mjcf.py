@@ -1,12 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """MJCF files, simulated and as an environment."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from fractions import Fraction
 from pathlib import Path
-from typing import Any
 
 import gymnasium
 import numpy as np
@@ -45,10 +42,8 @@ Write = Callable[..., Path]
 
 
 @pytest.fixture
-def write(tmp_path: Path) -> Write:
-    def write_model(
-        *, timestep: float = 0.002, cameras: str = "", follower: str = ""
-    ) -> Path:
+def write(tmp_path):
+    def write_model(*, timestep=0.002, cameras="", follower=""):
         path = tmp_path / "my rail (2).xml"
         options = {"timestep": timestep, "cameras": cameras, "follower": follower}
         path.write_text(MODEL.format(**options))
@@ -58,7 +53,7 @@ def write(tmp_path: Path) -> Write:
 
 
 @pytest.mark.parametrize("timestep", [0.0033, 0.0166667])
-def test_there_are_sixty_frames_to_the_second(write: Write, timestep: float) -> None:
+def test_there_are_sixty_frames_to_the_second(write, timestep):
     """No frame is more than half a timestep off, and nothing adds up; each episode."""
     env = MjcfEnvironment(write(timestep=timestep))
     assert env.metadata["render_fps"] == 60
@@ -72,7 +67,7 @@ def test_there_are_sixty_frames_to_the_second(write: Write, timestep: float) -> 
             assert off <= timestep / 2 + 1e-5 * frame / 60
 
 
-def test_a_long_timestep_makes_one_frame_a_step(write: Write) -> None:
+def test_a_long_timestep_makes_one_frame_a_step(write):
     """A simulation slower than 60 steps a second plays at its own rate."""
     env = MjcfEnvironment(write(timestep=0.025))
     assert env.simulation.frame_rate == Fraction(40)
@@ -84,7 +79,7 @@ def test_a_long_timestep_makes_one_frame_a_step(write: Write) -> None:
 
 # States have no bounds, and the actuators' ranges are the author's.
 @pytest.mark.filterwarnings("ignore:.*Box (action|observation) space:UserWarning")
-def test_the_environment_keeps_gymnasiums_contract(write: Write) -> None:
+def test_the_environment_keeps_gymnasiums_contract(write):
     """Actions are the controls in their ranges, observations positions and speeds."""
     check_env(MjcfEnvironment(write()), skip_render_check=True)
     env = MjcfEnvironment(write())
@@ -100,7 +95,7 @@ def test_the_environment_keeps_gymnasiums_contract(write: Write) -> None:
     assert rest == [0.0, False, False, {}]
 
 
-def test_a_model_without_actuators_is_simulated(tmp_path: Path) -> None:
+def test_a_model_without_actuators_is_simulated(tmp_path):
     """A passive model takes empty actions."""
     path = tmp_path / "falling.mjcf"
     body = '<body><freejoint/><geom size=".1"/></body>'
@@ -111,9 +106,7 @@ def test_a_model_without_actuators_is_simulated(tmp_path: Path) -> None:
     assert env.step(env.action_space.sample())[0][2] < 0
 
 
-def test_an_unstable_simulation_ends_where_it_was_sound(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_unstable_simulation_ends_where_it_was_sound(tmp_path, monkeypatch):
     """MuJoCo starts over by itself; the episode must not go on from there."""
     # MuJoCo writes MUJOCO_LOG.TXT where it is.
     monkeypatch.chdir(tmp_path)
@@ -137,7 +130,7 @@ def test_an_unstable_simulation_ends_where_it_was_sound(
 
 
 @pytest.mark.parametrize("action", [[0.0], [0, np.nan], [0, np.inf], np.zeros((2, 1))])
-def test_what_is_no_control_is_refused(write: Write, action: Any) -> None:
+def test_what_is_no_control_is_refused(write, action):
     """MuJoCo would go on with other controls, or raise something obscure."""
     env = MjcfEnvironment(write())
     env.reset()
@@ -146,9 +139,7 @@ def test_what_is_no_control_is_refused(write: Write, action: Any) -> None:
 
 
 @pytest.mark.parametrize(("asked", "expected"), [(None, 1000), (7, 7)])
-def test_episodes_end_after_max_steps(
-    write: Write, asked: int | None, expected: int
-) -> None:
+def test_episodes_end_after_max_steps(write, asked, expected):
     """A model has no end of its own; its id in recordings is the file's name."""
     env = make_mjcf(write(), EnvironmentOptions(max_steps=asked, pictures=False))
     env.reset()
@@ -159,11 +150,11 @@ def test_episodes_end_after_max_steps(
 
 
 class Draws(MjcfEnvironment):
-    def render(self) -> Any:
+    def render(self):
         return super().render()
 
 
-def test_pictures_follow_from_states(write: Write) -> None:
+def test_pictures_follow_from_states(write):
     """Wrapped or not, unless something overrides; cameras are checked at once."""
     path = write(cameras=FIXED)
     limited = gymnasium.wrappers.TimeLimit(MjcfEnvironment(path), 3)
@@ -181,9 +172,9 @@ def test_pictures_follow_from_states(write: Write) -> None:
         gymnasium_scenes(limited, camera="forward")
 
 
-def test_frames_show_the_camera_that_follows_or_the_first(write: Write) -> None:
+def test_frames_show_the_camera_that_follows_or_the_first(write):
     """The ball stays in the middle of the frame however far it goes."""
-    size: Any = {"render_mode": "rgb_array", "height": 32, "width": 48}
+    size = {"render_mode": "rgb_array", "height": 32, "width": 48}
     env = MjcfEnvironment(write(cameras=FIXED, follower=FOLLOWER), **size)
     assert env.camera == "follow"
     env.reset()
@@ -209,7 +200,7 @@ def test_frames_show_the_camera_that_follows_or_the_first(write: Write) -> None:
     assert (cameras[1].height, cameras[1].width) == (480, 480)
 
 
-def test_without_a_render_mode_nothing_is_rendered(write: Write) -> None:
+def test_without_a_render_mode_nothing_is_rendered(write):
     """Rendering is an error that says how to make the environment."""
     env = MjcfEnvironment(write())
     env.reset()
@@ -229,9 +220,7 @@ def test_without_a_render_mode_nothing_is_rendered(write: Write) -> None:
         ('<mujoco><asset><mesh file="nowhere.stl"/></asset></mujoco>', "nowhere.stl"),
     ],
 )
-def test_a_bad_file_gives_mujocos_reason_and_its_own_name(
-    tmp_path: Path, text: str, reason: str
-) -> None:
+def test_a_bad_file_gives_mujocos_reason_and_its_own_name(tmp_path, text, reason):
     """One sentence: which file, and what MuJoCo says is wrong in it."""
     path = tmp_path / "bad.xml"
     path.write_text(text)

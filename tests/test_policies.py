@@ -1,15 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Policies by their names, and the actions that they give."""
 
-from __future__ import annotations
-
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
-import gymnasium
 import numpy as np
 import pytest
 from gymnasium import spaces
@@ -17,7 +13,7 @@ from gymnasium import spaces
 import mjrec
 from mjrec.environments.actions import checked
 from mjrec.environments.episode_seeds import EpisodeSeeds, episode_seeds
-from mjrec.environments.policies import Policy, load_policy, policy_from
+from mjrec.environments.policies import load_policy, policy_from
 
 SEEDS = EpisodeSeeds(environment=1, actions=2, policy=3)
 
@@ -30,18 +26,18 @@ MIXED = spaces.Dict(
 )
 
 
-def acting_in(space: Any) -> Any:
+def acting_in(space):
     """Return something that has an action space, as a Gymnasium environment has."""
     return SimpleNamespace(action_space=space)
 
 
 @pytest.fixture
-def write(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
+def write(tmp_path, monkeypatch):
     """Write a module into the working directory; forget it afterwards."""
     monkeypatch.chdir(tmp_path)
     written = []
 
-    def write_module(text: str, name: str = "mjrec_test_policy") -> None:
+    def write_module(text, name="mjrec_test_policy"):
         (tmp_path / f"{name}.py").write_text(text)
         written.append(name)
 
@@ -54,17 +50,17 @@ Write = Callable[..., None]
 BOX = acting_in(spaces.Box(-1, 1, (2,), np.float32))
 
 
-def load(name: str, environment: Any = BOX, **kwargs: Any) -> Policy:
+def load(name, environment=BOX, **kwargs):
     return load_policy(f"mjrec_test_policy:{name}", environment, kwargs)
 
 
 @pytest.mark.parametrize(
     "space", [spaces.Box(-np.inf, np.inf, (2,), np.float64), MIXED]
 )
-def test_random_actions_are_the_episodes(space: gymnasium.Space[Any]) -> None:
+def test_random_actions_are_the_episodes(space):
     """They lie in the space, the same for a seed, and leave others' draws alone."""
 
-    def drawn(policy: Policy, episode: int) -> list[Any]:
+    def drawn(policy, episode):
         policy.reset(episode_seeds(0, episode))
         return [policy(None) for _ in range(20)]
 
@@ -79,6 +75,19 @@ def test_random_actions_are_the_episodes(space: gymnasium.Space[Any]) -> None:
     assert repr(space.sample()) == own
 
 
+def test_random_actions_are_those_that_gymnasium_draws() -> None:
+    """A policy draws bounded boxes in its own way, and gives what `sample` gives."""
+    bounds = np.array([[-1, 0.3, -7], [1, 0.30001, 1e6]], np.float32)
+    space = spaces.Box(*bounds)
+    policy = load_policy("random", acting_in(space))
+    policy.reset(SEEDS)
+    space.seed(SEEDS.actions)
+    for _ in range(100):
+        action, expected = policy(None), space.sample()
+        assert action.dtype == expected.dtype
+        assert np.array_equal(action, expected)
+
+
 @pytest.mark.parametrize(
     ("space", "zero"),
     [
@@ -89,7 +98,7 @@ def test_random_actions_are_the_episodes(space: gymnasium.Space[Any]) -> None:
         (spaces.MultiBinary(2), [0, 0]),
     ],
 )
-def test_zero_is_the_action_nearest_to_zero(space: Any, zero: Any) -> None:
+def test_zero_is_the_action_nearest_to_zero(space, zero):
     """Within the bounds, of the space's own type, also after one wrote into it."""
     policy = load_policy("zero", acting_in(spaces.Tuple([space])))
     for _ in range(2):
@@ -101,7 +110,7 @@ def test_zero_is_the_action_nearest_to_zero(space: Any, zero: Any) -> None:
             action[:] = 7
 
 
-def test_dm_envs_actions_are_drawn_within_their_bounds() -> None:
+def test_dm_envs_actions_are_drawn_within_their_bounds():
     """Nested ones too; a number without bounds is drawn around zero."""
     specs = pytest.importorskip("dm_env").specs
     endless = 1e10
@@ -114,7 +123,7 @@ def test_dm_envs_actions_are_drawn_within_their_bounds() -> None:
     environment = SimpleNamespace(action_spec=lambda: spec)
     policy = load_policy("random", environment)
 
-    def drawn() -> list[Any]:
+    def drawn():
         policy.reset(SEEDS)
         return [policy(None) for _ in range(300)]
 
@@ -148,7 +157,7 @@ def test_dm_envs_actions_are_drawn_within_their_bounds() -> None:
         (spaces.Dict(a=spaces.Discrete(3), b=BOX.action_space), {"a": 2, "b": [0, 9]}),
     ],
 )
-def test_actions_of_other_types_are_taken(space: Any, action: Any) -> None:
+def test_actions_of_other_types_are_taken(space, action):
     """Policies give float64, lists, and arrays of one number."""
     taken = checked(space, action)
     if isinstance(action, dict):
@@ -176,20 +185,18 @@ def test_actions_of_other_types_are_taken(space: Any, action: Any) -> None:
         (spaces.Tuple([spaces.Discrete(2)]), (1, 1)),
     ],
 )
-def test_what_is_no_action_is_refused(
-    write: Write, space: gymnasium.Space[Any], action: Any
-) -> None:
+def test_what_is_no_action_is_refused(write, space, action):
     """The message says what the space is and what came."""
     write("action = None\ndef policy(observation):\n    return action\n")
     policy = load("policy", acting_in(space))
-    sys.modules["mjrec_test_policy"].action = action  # type: ignore[attr-defined]  # of the test's module
+    sys.modules["mjrec_test_policy"].action = action
     with pytest.raises(mjrec.PolicyError, match="must give an action of ") as caught:
         policy(None)
     assert str(space) in str(caught.value)
     assert repr(action) in str(caught.value)
 
 
-def test_functions_classes_and_calls_are_policies(write: Write) -> None:
+def test_functions_classes_and_calls_are_policies(write):
     """A class is built with the environment and arguments, and gets the seeds."""
     write(
         "import mjrec_test_neighbour\n"
@@ -222,7 +229,7 @@ def test_functions_classes_and_calls_are_policies(write: Write) -> None:
             load_policy(name, BOX, {"scale": 3})
 
 
-def test_predict_is_understood(write: Write) -> None:
+def test_predict_is_understood(write):
     """Stable-Baselines3's: deterministic, with state and start of the episode."""
     write(
         "import numpy as np\n"
@@ -251,40 +258,41 @@ def test_predict_is_understood(write: Write) -> None:
     assert load("Short")(1) == [1, 0]
 
 
-def test_an_unknown_policy_says_what_there_is(write: Write) -> None:
-    """Built-in names, modules nearby, names in the module, files nearby."""
-    write("import math\ndef act(observation): pass\nclass Other: pass\n_x = 1\n")
-    with pytest.raises(mjrec.UnknownName, match=r"'rnd'.*random, zero.*module:name"):
-        load_policy("rnd", BOX)
-    for half in (":act", "mjrec_test_policy:", "mjrec_test_policy:()"):
-        with pytest.raises(mjrec.UnknownName, match="module:name"):
-            load_policy(half, BOX)
-    with pytest.raises(mjrec.UnknownName, match=r"'mjrec_test_plicy'.*test_policy"):
-        load_policy("mjrec_test_plicy:act", BOX)
-    with pytest.raises(mjrec.UnknownName, match=r"'atc'.*There are: Other, act"):
-        load("atc")
+REFUSED = [
+    # Built-in names, modules nearby, names in the module, files nearby.
+    ("", "rnd", mjrec.UnknownName, "'rnd'.*random, zero.*module:name"),
+    ("", ":act", mjrec.UnknownName, "module:name"),
+    ("", "mjrec_test_policy:", mjrec.UnknownName, "module:name"),
+    ("", "mjrec_test_policy:()", mjrec.UnknownName, "module:name"),
+    ("", "mjrec_test_plicy:act", mjrec.UnknownName, "'mjrec_test_plicy'.*test_policy"),
+    ("", "bst.zip", mjrec.UnknownName, r"'bst.zip'.*best.zip"),
+    (
+        *("import math\ndef act(o): pass\nclass Other: pass\n_x = 1\n", "atc"),
+        *(mjrec.UnknownName, "'atc'.*There are: Other, act"),
+    ),
+    # Where it happened.
+    (
+        *("def f(o): pass\n1 / 0\n", "f", mjrec.PolicyError),
+        r"ZeroDivisionError.*mjrec_test_policy.py, line 2",
+    ),
+    ("import no_such_module\n", "f", mjrec.PolicyError, "no_such_module"),
+    ("def f(o:\n", "f", mjrec.PolicyError, r"SyntaxError.*line 1\)\.$"),
+    ("number = 3\n", "number", mjrec.PolicyError, "3, which neither"),
+    ("number = 3\n", "number()", mjrec.PolicyError, "Leave the parentheses away"),
+    ("def f(env): return 3\n", "f()", mjrec.PolicyError, "3, which neither"),
+]
+
+
+@pytest.mark.parametrize(("text", "name", "kind", "words"), REFUSED)
+def test_what_is_no_policy_says_what_there_is(write, text, name, kind, words):
+    """Or what is wrong with it."""
+    write(text)
     Path("best.zip").touch()
-    with pytest.raises(mjrec.UnknownName, match=r"'bst.zip'.*best.zip"):
-        load_policy("bst.zip", BOX)
+    with pytest.raises(kind, match=words):
+        load_policy(f"mjrec_test_policy:{name}" if text else name, BOX)
 
 
-def test_a_module_that_cannot_be_imported_says_why(write: Write) -> None:
-    """Where it happened, and the exception for those who look."""
-    write("def f(o): pass\n1 / 0\n")
-    with pytest.raises(
-        mjrec.PolicyError, match=r"ZeroDivisionError.*mjrec_test_policy.py, line 2"
-    ) as caught:
-        load("f")
-    assert isinstance(caught.value.__cause__, ZeroDivisionError)
-    write("import no_such_module_at_all\n")
-    with pytest.raises(mjrec.PolicyError, match="no_such_module_at_all"):
-        load("f")
-    write("def f(o:\n")
-    with pytest.raises(mjrec.PolicyError, match=r"SyntaxError.*line 1\)\.$"):
-        load("f")
-
-
-def test_what_a_policy_raises_is_named(write: Write) -> None:
+def test_what_a_policy_raises_is_named(write):
     """While it is built, reset, or asked; with the line of its own file."""
     write(
         "class Late:\n"
@@ -304,24 +312,14 @@ def test_what_a_policy_raises_is_named(write: Write) -> None:
         load("Early")
 
 
-def test_what_is_no_policy_is_refused(write: Write) -> None:
-    """A number, and a call of what cannot be called."""
-    write("number = 3\ndef make(environment): return 3\n")
-    for name in ("number", "make()"):
-        with pytest.raises(mjrec.PolicyError, match="3, which neither"):
-            load(name)
-    with pytest.raises(mjrec.PolicyError, match="Leave the parentheses away"):
-        load("number()")
-
-
-def test_an_object_is_a_policy_as_what_a_name_names() -> None:
+def test_an_object_is_a_policy_as_what_a_name_names():
     """Functions, objects with `predict` and classes need no module to be found in."""
 
     class Still:
-        def __init__(self, environment: Any, value: float = 0) -> None:
+        def __init__(self, environment, value=0):
             self.action = np.full(environment.action_space.shape, value)
 
-        def predict(self, observation: Any) -> Any:
+        def predict(self, observation):
             return self.action, None
 
     assert policy_from(lambda _: [0.5, 0], "half", BOX)(None) == [0.5, 0]

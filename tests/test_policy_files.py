@@ -1,12 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Policies in files: model.zip, TorchScript and ONNX act as their libraries say."""
 
-from __future__ import annotations
-
 import json
 import sys
-from pathlib import Path
-from typing import Any
 
 import gymnasium
 import numpy as np
@@ -36,13 +32,7 @@ pytestmark = [
         ("a.onnx", "onnxruntime", "onnx"),
     ],
 )
-def test_a_missing_library_is_named(
-    name: str,
-    library: str,
-    extra: str,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_missing_library_is_named(name, library, extra, tmp_path, monkeypatch):
     """With the line that installs it."""
     for module in [m for m in sys.modules if m.partition(".")[0] == library]:
         monkeypatch.delitem(sys.modules, module)
@@ -65,9 +55,7 @@ def test_a_missing_library_is_named(
         ("DQN", "CartPole-v1", {}),
     ],
 )
-def test_a_saved_model_acts_as_it_predicts(
-    algorithm: str, env_id: str, options: dict[str, Any], tmp_path: Path
-) -> None:
+def test_a_saved_model_acts_as_it_predicts(algorithm, env_id, options, tmp_path):
     """Deterministically and within its bounds; also where observations are float64."""
     stable_baselines3 = pytest.importorskip("stable_baselines3")
     env = gymnasium.make(env_id)
@@ -97,7 +85,7 @@ def test_a_saved_model_acts_as_it_predicts(
 
 
 @pytest.mark.stable_baselines3
-def test_what_is_in_no_such_file_is_refused(tmp_path: Path) -> None:
+def test_what_is_in_no_such_file_is_refused(tmp_path):
     """Weights are no network; a zip file is no model."""
     torch = pytest.importorskip("torch")
     env = gymnasium.make("InvertedPendulum-v5")
@@ -112,7 +100,7 @@ def test_what_is_in_no_such_file_is_refused(tmp_path: Path) -> None:
 WEIGHTS = np.array([[2.0, 4.0]] * 3, np.float32)
 
 
-def exported(directory: Path, kind: str) -> Path:
+def exported(directory, kind):
     """Write the network that gives twice the sum of an observation, and its double."""
     path = directory / f"network.{kind}"
     if kind == "onnx":
@@ -142,9 +130,9 @@ def exported(directory: Path, kind: str) -> Path:
 
 @pytest.mark.stable_baselines3
 @pytest.mark.parametrize("kind", ["pt", "pt2", "onnx"])
-def test_a_network_gets_a_row_and_gives_one(kind: str, tmp_path: Path) -> None:
+def test_a_network_gets_a_row_and_gives_one(kind, tmp_path):
     """Of float32, whatever the observation is made of; actions are kept in bounds."""
-    env: Any = type("Env", (), {"action_space": spaces.Box(-1, 1, (2,), np.float32)})
+    env = type("Env", (), {"action_space": spaces.Box(-1, 1, (2,), np.float32)})
     policy = load_policy(str(exported(tmp_path, kind)), env)
     policy.reset(SEEDS)
     assert policy(np.array([0.1, 0.2, -0.1])).tolist() == pytest.approx([0.4, 0.8])
@@ -154,9 +142,7 @@ def test_a_network_gets_a_row_and_gives_one(kind: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.stable_baselines3
-def test_a_network_is_recorded(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_network_is_recorded(tmp_path, monkeypatch, capsys):
     """By its file's name, from the command line."""
     torch = pytest.importorskip("torch")
     monkeypatch.chdir(tmp_path)

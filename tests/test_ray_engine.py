@@ -1,18 +1,24 @@
 # SPDX-License-Identifier: Apache-2.0
 """Of the Ray engine, what `test_engines` does not try on every one."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from engine_runs import lines, odd_work, run_python, submit, values, wait_for
-from ray_clusters import MARK, home_for_ray, own_ray, ray_processes
+from engine_runs import (
+    MARK,
+    lines,
+    marked,
+    odd_work,
+    run_python,
+    submit,
+    values,
+    wait_for,
+)
+from ray_clusters import home_for_ray, own_ray
 from waiting import wait_until
 
 from mjrec.engines.jobs import Run
@@ -24,14 +30,14 @@ pytestmark = pytest.mark.filterwarnings("ignore::ResourceWarning")
 
 
 @pytest.fixture(scope="module", autouse=True)
-def home(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+def home(tmp_path_factory):
     """No process of Ray, and nothing in the home, is left by all tests of these."""
     with home_for_ray(tmp_path_factory.mktemp("home")):
         yield
 
 
 @pytest.mark.thorough
-def test_the_callers_ray_is_left_as_it_was(tmp_path: Path) -> None:
+def test_the_callers_ray_is_left_as_it_was(tmp_path):
     """A driver that uses Ray for other things goes on doing so."""
     with own_ray(cpus=2) as ray:
         remembered = ray.put("of the caller")
@@ -44,9 +50,7 @@ def test_the_callers_ray_is_left_as_it_was(tmp_path: Path) -> None:
 
 
 @pytest.mark.thorough
-def test_a_killed_worker_of_ray_counts_as_a_death(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_killed_worker_of_ray_counts_as_a_death(tmp_path, caplog):
     """Its child ends with it, and the job is begun again."""
     with own_ray(cpus=1):
         work = odd_work(shared=tmp_path / "shared", left=str(tmp_path / "left"))
@@ -60,7 +64,7 @@ def test_a_killed_worker_of_ray_counts_as_a_death(
     assert "job a, which is begun again" in caplog.text
 
 
-def parent_of(pid: int) -> int:
+def parent_of(pid):
     return int(Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[1])
 
 
@@ -75,7 +79,7 @@ place = Path(sys.argv[1])
 
 
 @pytest.mark.thorough
-def test_a_ray_of_our_own_leaves_nothing_behind(tmp_path: Path) -> None:
+def test_a_ray_of_our_own_leaves_nothing_behind(tmp_path):
     """No process, no token, no variable, no handler of a signal; twice in a row."""
     script = f"""{BEGIN}
 def state():
@@ -95,11 +99,11 @@ print(sorted(os.listdir(os.environ["HOME"])))
 """
     environ = {MARK: str(tmp_path), "HOME": str(tmp_path), "RAY_AUTH_TOKEN": ""}
     assert run_python("-c", script, str(tmp_path), **environ) == "[]\n"
-    wait_until(lambda: not ray_processes(f"{MARK}={tmp_path}"), seconds=10)
+    wait_until(lambda: not marked(tmp_path), seconds=10)
 
 
 @pytest.mark.thorough
-def test_a_ray_of_our_own_without_a_gpu(tmp_path: Path) -> None:
+def test_a_ray_of_our_own_without_a_gpu(tmp_path):
     """One warning, and the jobs are done; nobody waits for what will never be there."""
     script = f"""{BEGIN}
 import logging
@@ -118,7 +122,7 @@ except GLError as error:
     said = run_python("-c", script, str(tmp_path), **{MARK: str(tmp_path)})
     assert said.count("Ray finds none on this machine. They draw in software.") == 1
     assert "refused: Workers are to get GPUs" in said
-    wait_until(lambda: not ray_processes(f"{MARK}={tmp_path}"), seconds=10)
+    wait_until(lambda: not marked(tmp_path), seconds=10)
 
 
 HOLDING = f"""{BEGIN}
@@ -136,7 +140,7 @@ with exiting_on_signals():
 @pytest.mark.parametrize(
     ("signum", "status"), [(signal.SIGTERM, 128 + 15), (signal.SIGKILL, -9)]
 )
-def test_a_driver_that_is_ended(tmp_path: Path, signum: int, status: int) -> None:
+def test_a_driver_that_is_ended(tmp_path, signum, status):
     """Says so by its exit status, and leaves no process."""
     environ = {"PYTHONPATH": str(Path(__file__).parent), MARK: str(tmp_path)}
     with subprocess.Popen(
@@ -145,11 +149,11 @@ def test_a_driver_that_is_ended(tmp_path: Path, signum: int, status: int) -> Non
         wait_until(lambda: lines(tmp_path / "begun"), seconds=60)
         driver.send_signal(signum)
     assert driver.returncode == status
-    wait_until(lambda: not ray_processes(f"{MARK}={tmp_path}"), seconds=30)
+    wait_until(lambda: not marked(tmp_path), seconds=30)
     assert lines(tmp_path / "left") == lines(tmp_path / "begun")
 
 
-def test_ray_is_optional() -> None:
+def test_ray_is_optional():
     """It is heavy; without it there is an error that says what to install."""
     script = """
 import sys
@@ -176,9 +180,7 @@ except Exception as error:
         ("ray://127.0.0.1:10001", InvalidArgument, "--address auto"),
     ],
 )
-def test_an_address_at_which_nothing_is(
-    address: str, kind: type[Error], said: str
-) -> None:
+def test_an_address_at_which_nothing_is(address, kind, said):
     """The error says so soon, and what to look at."""
     with pytest.raises(kind, match=said):
         RayEngine(1, address=address).submit(len, "abc")

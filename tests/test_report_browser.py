@@ -1,24 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
 """The page of a report in a real browser: headless Chromium, driven by Playwright."""
 
-from __future__ import annotations
-
+import contextlib
 import re
 import shutil
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from axe_playwright_python.sync_playwright import Axe
 from parts import parametrize
-from playwright.sync_api import Browser, Page, expect, sync_playwright
+from playwright.sync_api import expect, sync_playwright
 from report_contents import HOSTILE, contents, hostile_report, task, video
 
 import mjrec
-from mjrec.reporting.contents import ReportContents, Verdict
+from mjrec.reporting.contents import Verdict
 from mjrec.reporting.page import page_of
 from mjrec.reporting.report_folder import write_report
 
@@ -35,7 +32,7 @@ _FRAMES = 50
 
 
 @pytest.fixture(scope="module")
-def browser() -> Iterator[Browser]:
+def browser():
     """Start the system's Chromium, or the one that Playwright has installed."""
     with sync_playwright() as playwright:
         found = shutil.which("chromium") or playwright.chromium.executable_path
@@ -45,15 +42,23 @@ def browser() -> Iterator[Browser]:
 
 
 @pytest.fixture
-def page(browser: Browser) -> Iterator[Page]:
-    """Open a page that must neither complain nor ask for anything but files."""
-    with browser.new_context(viewport={"width": 1280, "height": 900}) as context:
+def page(browser):
+    """A page of a usual size."""
+    with page_of_width(browser, 1280) as page:
+        yield page
+
+
+@contextlib.contextmanager
+def page_of_width(browser, width, **options):
+    """Have a page that must neither complain nor ask for anything but files."""
+    size = {"width": width, "height": 900}
+    with browser.new_context(viewport=size, **options) as context:
         yield from watched(context.new_page())
 
 
-def watched(page: Page) -> Iterator[Page]:
+def watched(page):
     """Yield a page, and then look at what it has said and asked for."""
-    complaints: list[str] = []
+    complaints = []
     page.on("console", lambda said: complaints.append(f"{said.type}: {said.text}"))
     page.on("pageerror", lambda error: complaints.append(str(error)))
     page.on("dialog", lambda shown: complaints.append(f"dialog: {shown.message}"))
@@ -69,7 +74,7 @@ def watched(page: Page) -> Iterator[Page]:
 
 
 @pytest.fixture(scope="module")
-def videos(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def videos(tmp_path_factory):
     """Make a folder of short videos: a bar that goes from left to right."""
     folder = tmp_path_factory.mktemp("report #1")
     frames = np.zeros((_FRAMES, 48, 64, 3), np.uint8)
@@ -82,7 +87,7 @@ def videos(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def usual_report() -> ReportContents:
+def usual_report():
     """Return two tasks of fifty episodes, and the best and the worst of each."""
     made = contents(problems=["b"])
     for of in made.tasks:
@@ -103,7 +108,7 @@ def usual_report() -> ReportContents:
     return made
 
 
-def open_report(page: Page, folder: Path, report: ReportContents) -> None:
+def open_report(page, folder, report):
     """Write a report into a folder, and open it from there."""
     file = folder / "index.html"
     file.write_text(page_of(report), encoding="utf-8")
@@ -111,7 +116,7 @@ def open_report(page: Page, folder: Path, report: ReportContents) -> None:
 
 
 @pytest.fixture
-def usual(page: Page, videos: Path) -> Page:
+def usual(page, videos):
     """Open the usual report."""
     open_report(page, videos, usual_report())
     return page
@@ -120,7 +125,7 @@ def usual(page: Page, videos: Path) -> Page:
 # --- Videos -----------------------------------------------------------------------
 
 
-def test_videos_play(usual: Page) -> None:
+def test_videos_play(usual):
     """Each at its size and for its time, one at a time, and by keyboard."""
     players = usual.locator("video")
     expect(players).to_have_count(0)
@@ -142,9 +147,7 @@ def test_videos_play(usual: Page) -> None:
 
 
 @parametrize("single_file", [False, True])
-def test_a_recordings_report_plays(
-    page: Page, tmp_path: Path, make_corridor: Any, play: Any, single_file: bool
-) -> None:
+def test_a_recordings_report_plays(page, tmp_path, make_corridor, play, single_file):
     """From the monitor's files to the picture in the browser."""
     directory = tmp_path / "recordings #1"
     with mjrec.Monitor(make_corridor(length=20), directory) as monitor:
@@ -167,7 +170,7 @@ def test_a_recordings_report_plays(
 
 
 @pytest.mark.thorough
-def test_tables_sort_by_mouse_and_by_keyboard(page: Page, tmp_path: Path) -> None:
+def test_tables_sort_by_mouse_and_by_keyboard(page, tmp_path):
     """Either way, and say which; what is not known comes last whichever way."""
     named = {"a": [3.0, 3.0], "b": [1.0, 1.0], "c": [2.0]}
     tasks = [
@@ -194,10 +197,10 @@ def test_tables_sort_by_mouse_and_by_keyboard(page: Page, tmp_path: Path) -> Non
 
 
 @pytest.mark.thorough
-def test_the_gallery_filters_by_mouse_and_by_keyboard(usual: Page) -> None:
+def test_the_gallery_filters_by_mouse_and_by_keyboard(usual):
     """By task, by best or worst, and by both; the table finds what it has hidden."""
 
-    def shown() -> list[str | None]:
+    def shown():
         cards = usual.locator(".card:not([hidden])").all()
         return [card.get_attribute("id") for card in cards]
 
@@ -216,7 +219,7 @@ def test_the_gallery_filters_by_mouse_and_by_keyboard(usual: Page) -> None:
 
 
 @pytest.mark.thorough
-def test_a_command_is_copied_or_selected(usual: Page) -> None:
+def test_a_command_is_copied_or_selected(usual):
     """Whatever the browser allows to a page from the disk."""
     card = usual.locator("#video-0")
     card.get_by_text("File, hash and command").click()
@@ -235,9 +238,7 @@ def test_a_command_is_copied_or_selected(usual: Page) -> None:
 
 
 @pytest.mark.thorough
-def test_of_ten_thousand_episodes_a_hundred_are_laid_out(
-    page: Page, tmp_path: Path
-) -> None:
+def test_of_ten_thousand_episodes_a_hundred_are_laid_out(page, tmp_path):
     """Opening, sorting, filtering and turning pages cost no more than what is shown."""
     shown = [video(i, file=f"{i}.mp4", poster=_PIXEL) for i in range(20)]
     returns = np.arange(2000.0)
@@ -269,66 +270,57 @@ def test_of_ten_thousand_episodes_a_hundred_are_laid_out(
 @pytest.mark.parametrize("width", [360, 1280])
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 @pytest.mark.parametrize("report", [usual_report, hostile_report])
-def test_nothing_keeps_people_out(
-    browser: Browser, videos: Path, width: int, scheme: Any, report: Any
-) -> None:
+def test_nothing_keeps_people_out(browser, videos, width, scheme, report):
     """axe-core finds nothing serious, and a phone scrolls in one direction only."""
-    size: Any = {"width": width, "height": 800}
-    with browser.new_context(viewport=size, color_scheme=scheme) as context:
-        for page in watched(context.new_page()):
-            open_report(page, videos, report())
-            page.evaluate(
-                "document.querySelectorAll('details').forEach(d => d.open = true)"
-            )
-            assert page.evaluate("document.scrollingElement.scrollWidth") <= width
-            found = Axe().run(page).response["violations"]
-            bad = [
-                (v["id"], v["impact"], [node["html"][:200] for node in v["nodes"]][:3])
-                for v in found
-                if v["impact"] in ("serious", "critical")
-            ]
-            assert bad == []
+    with page_of_width(browser, width, color_scheme=scheme) as page:
+        open_report(page, videos, report())
+        page.evaluate(
+            "document.querySelectorAll('details').forEach(d => d.open = true)"
+        )
+        assert page.evaluate("document.scrollingElement.scrollWidth") <= width
+        found = Axe().run(page).response["violations"]
+        bad = [
+            (v["id"], v["impact"], [node["html"][:200] for node in v["nodes"]][:3])
+            for v in found
+            if v["impact"] in ("serious", "critical")
+        ]
+        assert bad == []
 
 
 @pytest.mark.thorough
-def test_a_phone_shows_which_episodes_failed(browser: Browser, tmp_path: Path) -> None:
+def test_a_phone_shows_which_episodes_failed(browser, tmp_path):
     """And why, beside the task's name, without scrolling to the right."""
     reason = "PolicyError: " + "it gave an action of the wrong shape " * 4
     named = task("gymnasium/HalfCheetah-v5", [1.0] * 5, failures={0: reason})
-    size: Any = {"width": 360, "height": 800}
-    with browser.new_context(viewport=size) as context:
-        for page in watched(context.new_page()):
-            open_report(page, tmp_path, contents(named))
-            outcome = page.locator("#episodes-table tbody tr").first.locator(".bad")
-            expect(outcome).to_have_text(f"failed: {reason.strip()}")
-            box = outcome.bounding_box()
-            assert box is not None
-            assert box["x"] + box["width"] <= 360
+    with page_of_width(browser, 360) as page:
+        open_report(page, tmp_path, contents(named))
+        outcome = page.locator("#episodes-table tbody tr").first.locator(".bad")
+        expect(outcome).to_have_text(f"failed: {reason.strip()}")
+        box = outcome.bounding_box()
+        assert box is not None
+        assert box["x"] + box["width"] <= 360
 
 
 @pytest.mark.thorough
-def test_paper_has_the_whole_summary_pictures_and_no_buttons(
-    browser: Browser, videos: Path
-) -> None:
+def test_paper_has_the_whole_summary_pictures_and_no_buttons(browser, videos):
     """On A4 with margins of a centimetre."""
     known = {"success_known": 50, "success_rate": 0.5, "warnings": {"BADQACC": 12}}
     made = usual_report()
     for each in made.tasks:
         each.summary = replace(each.summary, **known)
-    with browser.new_context(viewport={"width": 718, "height": 900}) as context:
-        for page in watched(context.new_page()):
-            page.emulate_media(media="print")
-            open_report(page, videos, made)
-            assert page.evaluate("document.scrollingElement.scrollWidth") <= 718
-            expect(page.locator("#gallery-filter")).to_be_hidden()
-            expect(page.locator("nav")).to_be_hidden()
-            picture = page.locator(".play").first
-            expect(picture).to_be_visible()
-            signs = "['::before', '::after'].map(p => getComputedStyle(e, p).display)"
-            assert picture.evaluate(f"e => {signs}") == ["none", "none"]
+    with page_of_width(browser, 718) as page:
+        page.emulate_media(media="print")
+        open_report(page, videos, made)
+        assert page.evaluate("document.scrollingElement.scrollWidth") <= 718
+        expect(page.locator("#gallery-filter")).to_be_hidden()
+        expect(page.locator("nav")).to_be_hidden()
+        picture = page.locator(".play").first
+        expect(picture).to_be_visible()
+        signs = "['::before', '::after'].map(p => getComputedStyle(e, p).display)"
+        assert picture.evaluate(f"e => {signs}") == ["none", "none"]
 
 
-def test_what_a_stranger_wrote_stays_text(page: Page, videos: Path) -> None:
+def test_what_a_stranger_wrote_stays_text(page, videos):
     """Markup is read, not run."""
     open_report(page, videos, hostile_report())
     assert page.title() == HOSTILE[0]
@@ -340,9 +332,7 @@ def test_what_a_stranger_wrote_stays_text(page: Page, videos: Path) -> None:
     assert page.locator("script").count() == 2
 
 
-def test_the_policy_stops_what_is_not_the_pages_own(
-    browser: Browser, videos: Path
-) -> None:
+def test_the_policy_stops_what_is_not_the_pages_own(browser, videos):
     """Even if some markup came through, no script of it would run."""
     with browser.new_context() as context:
         page = context.new_page()
@@ -358,7 +348,7 @@ def test_the_policy_stops_what_is_not_the_pages_own(
 
 
 @pytest.mark.thorough
-def test_the_keyboard_reaches_the_content_first(usual: Page) -> None:
+def test_the_keyboard_reaches_the_content_first(usual):
     """By a link that shows itself only then."""
     usual.keyboard.press("Tab")
     skip = usual.get_by_role("link", name="Skip to the content")
@@ -369,9 +359,7 @@ def test_the_keyboard_reaches_the_content_first(usual: Page) -> None:
 
 
 @pytest.mark.thorough
-def test_without_scripts_everything_but_the_tools_is_there(
-    browser: Browser, videos: Path
-) -> None:
+def test_without_scripts_everything_but_the_tools_is_there(browser, videos):
     """And the page says what is missing."""
     with browser.new_context(java_script_enabled=False) as context:
         page = context.new_page()

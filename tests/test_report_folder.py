@@ -1,21 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
 """A report is a folder that stands on its own, or one file."""
 
-from __future__ import annotations
-
 import base64
 import hashlib
 import io
+import json
 import re
 import shutil
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from PIL import Image
 
 import mjrec
+from mjrec.commands.report import report
 from mjrec.errors import DirectoryNotWritable, InvalidArgument
 from mjrec.reporting.gathering import gather
 from mjrec.reporting.media import ReportProgress, posters_of
@@ -24,29 +22,27 @@ from report_recordings import GYM, entry, record, write_journal
 
 
 @pytest.fixture
-def recordings(corridor: Any, tmp_path: Path) -> Path:
+def recordings(corridor, tmp_path):
     """Two episodes with a video each."""
     directory = tmp_path / "recordings"
     record(corridor, directory, 2)
     return directory
 
 
-def names(folder: Path) -> list[str]:
+def names(folder):
     return sorted(
         str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()
     )
 
 
-def sha256(path: Path) -> str:
+def sha256(path):
     return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
-def test_a_report_is_a_page_with_copies_beside_it(
-    recordings: Path, tmp_path: Path
-) -> None:
+def test_a_report_is_a_page_with_copies_beside_it(recordings, tmp_path):
     """It names them, and outlives the recordings; each step is told."""
     hashes = [sha256(path) for path in sorted(recordings.glob("*.mp4"))]
-    told: list[ReportProgress] = []
+    told = []
     page = write_report(
         recordings, tmp_path / "report", title="Mine", on_progress=told.append
     )
@@ -72,7 +68,30 @@ def test_a_report_is_a_page_with_copies_beside_it(
         assert words in text
 
 
-def test_posters_show_the_middle(recordings: Path) -> None:
+def test_the_command_writes_a_folder_and_prints_its_page(tmp_path, capsys, monkeypatch):
+    """Of several directories, with a verdict; with --json its whole path."""
+    monkeypatch.chdir(tmp_path)
+    run = write_journal(tmp_path / "run", "0.a", "X-v0", [entry(0)]).parent
+    said = {"path": "run", "level": "stats", "verdict": "FAIL", "findings": []}
+    (tmp_path / "said.json").write_text(json.dumps(said))
+    page = tmp_path / "r" / "index.html"
+    directories = (run, GYM / "0.7.4" / "plain")
+    options = {"title": "Both", "verification": (tmp_path / "said.json",)}
+    assert report(directories, out=page.parent, **options) == 0
+    assert capsys.readouterr().out == f"{page}\n"
+    text = page.read_text()
+    for words in ("<title>Both</title>", "X-v0", "Tiny-v0", "said.json"):
+        assert words in text
+    assert report((run,), as_json=True) == 0
+    said = json.loads(capsys.readouterr().out)
+    assert said == {"page": str(tmp_path / "report" / "index.html")}
+    one = {"out": tmp_path / "one.html", "single_file": True}
+    assert report((run,), **one) == 0
+    with pytest.raises(InvalidArgument, match="max_single_file_bytes"):
+        report((run,), **one, max_single_file_bytes=10)
+
+
+def test_posters_show_the_middle(recordings):
     """At most 640 pixels wide, with the colours of the video."""
     first, second = sorted(recordings.glob("*.mp4"))
     for video, size in ((first, (400, 800)), (second, (48, 64))):
@@ -91,9 +110,7 @@ def test_posters_show_the_middle(recordings: Path) -> None:
     assert sizes == [(640, 320), (64, 48)]
 
 
-def test_a_video_that_is_none_is_named_and_the_rest_is_there(
-    recordings: Path, tmp_path: Path
-) -> None:
+def test_a_video_that_is_none_is_named_and_the_rest_is_there(recordings, tmp_path):
     """One that was cut off is copied; a page, which a browser would open, is not."""
     first, second = sorted(recordings.glob("*.mp4"))
     first.write_bytes(first.read_bytes()[:200])
@@ -112,9 +129,7 @@ def test_a_video_that_is_none_is_named_and_the_rest_is_there(
     assert f"The video {second} is left out" in page.read_text()
 
 
-def test_hostile_names_are_text_on_the_page_and_no_names_of_files(
-    tmp_path: Path,
-) -> None:
+def test_hostile_names_are_text_on_the_page_and_no_names_of_files(tmp_path):
     """Whatever an environment is called."""
     env_id = "../<script>alert(1)</script>\u202e"
     write_journal(tmp_path / "run", "0.a", env_id, [entry(0)])
@@ -130,7 +145,7 @@ def test_hostile_names_are_text_on_the_page_and_no_names_of_files(
     assert "<script>alert" not in page.read_text()
 
 
-def test_a_report_replaces_a_report(recordings: Path, tmp_path: Path) -> None:
+def test_a_report_replaces_a_report(recordings, tmp_path):
     """And an empty folder; nothing of the older one, or of the making, is left."""
     (tmp_path / "report").mkdir()
     write_report(recordings, tmp_path / "report")
@@ -145,9 +160,7 @@ def test_a_report_replaces_a_report(recordings: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["index.html", "videos/mine.mp4", "notes.txt"])
-def test_what_is_no_report_is_not_replaced(
-    recordings: Path, tmp_path: Path, name: str
-) -> None:
+def test_what_is_no_report_is_not_replaced(recordings, tmp_path, name):
     """Neither another folder, nor a report that somebody has put something into."""
     report = tmp_path / "report"
     if name != "index.html":
@@ -161,7 +174,7 @@ def test_what_is_no_report_is_not_replaced(
     assert (report / name).read_text() == "mine"
 
 
-def test_recordings_are_never_replaced_by_their_report(recordings: Path) -> None:
+def test_recordings_are_never_replaced_by_their_report(recordings):
     """Whoever names the same directory twice keeps it."""
     before = names(recordings)
     with pytest.raises(InvalidArgument, match="no report"):
@@ -169,14 +182,12 @@ def test_recordings_are_never_replaced_by_their_report(recordings: Path) -> None
     assert names(recordings) == before
 
 
-def test_a_failed_report_leaves_what_was_there(
-    recordings: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_failed_report_leaves_what_was_there(recordings, tmp_path, monkeypatch):
     """And nothing half-written."""
     page = write_report(recordings, tmp_path / "report")
     before = page.read_text()
 
-    def stop(progress: ReportProgress) -> None:
+    def stop(progress):
         if progress == ReportProgress("videos", 2, 2):
             raise KeyboardInterrupt
 
@@ -186,7 +197,7 @@ def test_a_failed_report_leaves_what_was_there(
     assert sorted(p.name for p in tmp_path.iterdir()) == ["recordings", "report"]
 
 
-def test_a_single_file_has_everything_in_it(recordings: Path, tmp_path: Path) -> None:
+def test_a_single_file_has_everything_in_it(recordings, tmp_path):
     """Byte for byte; it is replaced as a folder is, and may be in one."""
     for target in (tmp_path / "one.html", tmp_path / "one.html", tmp_path / "folder"):
         page = write_report(recordings, target, single_file=True)
@@ -198,17 +209,12 @@ def test_a_single_file_has_everything_in_it(recordings: Path, tmp_path: Path) ->
     assert names(tmp_path / "folder") == ["index.html"]
 
 
-def test_a_single_file_is_no_larger_than_allowed(
-    recordings: Path, tmp_path: Path
-) -> None:
+def test_a_single_file_is_no_larger_than_allowed(recordings, tmp_path):
     """Posters come first, then the videos in their order; what is missing is told."""
     whole = write_report(recordings, tmp_path / "whole.html", single_file=True)
     most = whole.stat().st_size - 100
     part = write_report(
-        recordings,
-        tmp_path / "part.html",
-        single_file=True,
-        max_single_file_bytes=most,
+        recordings, tmp_path / "part.html", single_file=True, max_single_file_bytes=most
     )
     assert part.stat().st_size <= most
     text = part.read_text()
@@ -225,9 +231,7 @@ def test_a_single_file_is_no_larger_than_allowed(
     assert not (tmp_path / "tiny.html").exists()
 
 
-def test_a_page_that_is_somebody_elses_is_not_replaced(
-    recordings: Path, tmp_path: Path
-) -> None:
+def test_a_page_that_is_somebody_elses_is_not_replaced(recordings, tmp_path):
     """Nor does a report that is a folder end in .html."""
     page = tmp_path / "mine.html"
     page.write_text("mine")
@@ -238,7 +242,7 @@ def test_a_page_that_is_somebody_elses_is_not_replaced(
     assert page.read_text() == "mine"
 
 
-def test_where_nothing_can_be_written(recordings: Path, tmp_path: Path) -> None:
+def test_where_nothing_can_be_written(recordings, tmp_path):
     """The error names the place."""
     (tmp_path / "file").write_text("")
     with pytest.raises(DirectoryNotWritable, match="file"):

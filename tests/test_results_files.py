@@ -1,12 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-from __future__ import annotations
-
 import dataclasses
 import json
 import math
 import tracemalloc
-from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -45,7 +41,7 @@ PLAN = EvaluationPlan(
 )
 
 
-def result(seed: int, episode: int, total: float | None, **more: Any) -> EpisodeResult:
+def result(seed, episode, total, **more):
     return EpisodeResult(
         task="a,b-v0",
         seed=seed,
@@ -73,8 +69,8 @@ RESULTS = [
 ]
 
 
-def written(directory: Path, **changed: Any) -> Path:
-    facts: dict[str, Any] = {
+def written(directory, **changed):
+    facts = {
         "plan": PLAN,
         "results": RESULTS,
         "summaries": [SUMMARY],
@@ -88,7 +84,7 @@ def written(directory: Path, **changed: Any) -> Path:
     return directory
 
 
-def files(result: EpisodeResult) -> EpisodeFiles:
+def files(result):
     if result.monitor is None:
         return EpisodeFiles()
     return EpisodeFiles(
@@ -96,7 +92,7 @@ def files(result: EpisodeResult) -> EpisodeFiles:
     )
 
 
-def test_what_is_written_is_read_back(tmp_path: Path) -> None:
+def test_what_is_written_is_read_back(tmp_path):
     """Plan, summaries, choice, versions, files, and each number bit for bit."""
     read = read_results(written(tmp_path))
     assert read.plan == PLAN
@@ -118,7 +114,7 @@ def test_what_is_written_is_read_back(tmp_path: Path) -> None:
     assert columns.failed.tolist() == [False, False, True, False]
 
 
-def test_the_files_are_what_the_documentation_says(tmp_path: Path) -> None:
+def test_the_files_are_what_the_documentation_says(tmp_path):
     """Header, order, truth, and a line for each episode; JSON for every reader."""
     written(tmp_path)
     assert (tmp_path / "results.csv").read_text().splitlines() == [
@@ -131,7 +127,7 @@ def test_the_files_are_what_the_documentation_says(tmp_path: Path) -> None:
     json.loads((tmp_path / "results.json").read_text(), parse_constant=pytest.fail)
 
 
-def test_results_without_timing_are_read(tmp_path: Path) -> None:
+def test_results_without_timing_are_read(tmp_path):
     """Results may be published without the times."""
     (written(tmp_path) / "timing.csv").unlink()
     first, *_ = read_results(tmp_path)
@@ -140,7 +136,7 @@ def test_results_without_timing_are_read(tmp_path: Path) -> None:
     assert first.monitor is None
 
 
-def test_an_unfinished_evaluation_is_told_from_none(tmp_path: Path) -> None:
+def test_an_unfinished_evaluation_is_told_from_none(tmp_path):
     """The way on is to resume it; where there is none, it says so."""
     with pytest.raises(UnreadableFile, match="there is no evaluation"):
         read_results(tmp_path)
@@ -151,7 +147,7 @@ def test_an_unfinished_evaluation_is_told_from_none(tmp_path: Path) -> None:
         read_results(tmp_path)
 
 
-def test_results_are_gone_while_they_are_rewritten(tmp_path: Path) -> None:
+def test_results_are_gone_while_they_are_rewritten(tmp_path):
     """Tables of one plan never stand beside the summaries of another."""
     written(tmp_path)
     with pytest.raises(ZeroDivisionError):
@@ -189,7 +185,7 @@ DAMAGE = {
 
 
 @pytest.mark.parametrize("damage", DAMAGE)
-def test_damage_is_told_and_names_the_file(tmp_path: Path, damage: str) -> None:
+def test_damage_is_told_and_names_the_file(tmp_path, damage):
     """Whatever is wrong is one error of ours."""
     name, good, bad = DAMAGE[damage]
     path = written(tmp_path) / name
@@ -202,7 +198,7 @@ def test_damage_is_told_and_names_the_file(tmp_path: Path, damage: str) -> None:
     assert caught.value.path.name in {name, "results.csv"}
 
 
-def test_a_link_out_of_the_directory_is_not_followed(tmp_path: Path) -> None:
+def test_a_link_out_of_the_directory_is_not_followed(tmp_path):
     """Results of strangers do not read the reader's files."""
     (tmp_path / "there").mkdir()
     path = written(tmp_path / "there") / "results.csv"
@@ -212,7 +208,7 @@ def test_a_link_out_of_the_directory_is_not_followed(tmp_path: Path) -> None:
         read_results(tmp_path / "there")
 
 
-def test_many_episodes_need_little_memory(tmp_path: Path) -> None:
+def test_many_episodes_need_little_memory(tmp_path):
     """A hundred bytes each at most, so that a million fit into 100 MB."""
     count = 20_000
     written(

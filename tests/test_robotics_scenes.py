@@ -1,11 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The moment in which Gymnasium-Robotics' environments draw themselves."""
 
-from __future__ import annotations
-
-from collections.abc import Iterator
-from typing import Any
-
 import gymnasium
 import mujoco
 import numpy as np
@@ -22,12 +17,12 @@ pytest.importorskip("gymnasium_robotics")
 
 
 @pytest.fixture(autouse=True)
-def _robots() -> Iterator[None]:
+def _robots():
     with robots_that_reset():
         yield
 
 
-def make(env_id: str, **kwargs: Any) -> Any:
+def make(env_id, **kwargs):
     env = gymnasium.make(env_id, **kwargs)
     env.reset(seed=0)
     for _ in range(3):
@@ -35,7 +30,7 @@ def make(env_id: str, **kwargs: Any) -> Any:
     return env
 
 
-def everything(env: Any) -> list[Any]:
+def everything(env):
     """Return the state, and what a callback moves."""
     model, data = env.unwrapped.model, env.unwrapped.data
     spec = int(mujoco.mjtState.mjSTATE_INTEGRATION)
@@ -56,7 +51,7 @@ def everything(env: Any) -> list[Any]:
         ("FetchReach-v4", None),
     ],
 )
-def test_what_is_shown(env_id: str, inside: str | None) -> None:
+def test_what_is_shown(env_id, inside):
     """A maze and a kitchen show what is inside them; all are known to be drawable."""
     env = gymnasium.make(env_id)
     base = env.unwrapped
@@ -68,15 +63,15 @@ def test_what_is_shown(env_id: str, inside: str | None) -> None:
     assert bool(scenes.random_state())
 
 
-def test_overriding_inside_a_maze_is_an_obstacle() -> None:
+def test_overriding_inside_a_maze_is_an_obstacle():
     """What the maze shows is not what it simulates."""
     env = gymnasium.make("PointMaze_UMaze-v3")
-    env.unwrapped.point_env.render = lambda: None  # type: ignore[attr-defined]  # it has one
+    env.unwrapped.point_env.render = lambda: None
     assert "PointEnv overrides render()" in str(gymnasium_scenes(env).obstacle)
 
 
 @pytest.mark.parametrize("mode", [None, "rgb_array"])
-def test_goal_is_shown_and_nothing_is_changed(mode: str | None) -> None:
+def test_goal_is_shown_and_nothing_is_changed(mode):
     """In the moment the marker is at the goal; afterwards all is bit for bit as was."""
     env = make("FetchPickAndPlace-v4", render_mode=mode)
     base = env.unwrapped
@@ -93,14 +88,14 @@ def test_goal_is_shown_and_nothing_is_changed(mode: str | None) -> None:
     assert base.mujoco_renderer.viewer is None
 
 
-def test_an_error_in_the_moment_leaves_all_as_it_was() -> None:
+def test_an_error_in_the_moment_leaves_all_as_it_was():
     """A full disk, for example."""
     env = make("HandReach-v3")
     moment = picture_moment(env.unwrapped)
     assert moment is not None
     before = everything(env)
 
-    def fail() -> None:
+    def fail():
         raise OSError("full")
 
     with pytest.raises(OSError, match="full"):
@@ -110,12 +105,12 @@ def test_an_error_in_the_moment_leaves_all_as_it_was() -> None:
     assert "render" not in vars(env.unwrapped.mujoco_renderer)
 
 
-def test_a_render_that_is_not_known_is_not_called() -> None:
+def test_a_render_that_is_not_known_is_not_called():
     """What it does, nobody knows."""
     from gymnasium_robotics.envs.fetch.reach import MujocoFetchReachEnv
 
-    class Robot(MujocoFetchReachEnv):  # type: ignore[misc]  # untyped
-        def render(self) -> Any:
+    class Robot(MujocoFetchReachEnv):
+        def render(self):
             raise AssertionError("called")
 
     env = Robot()

@@ -1,60 +1,24 @@
 # SPDX-License-Identifier: Apache-2.0
 """What is asked of an environment before its states are recorded, and what it costs."""
 
-from __future__ import annotations
-
-import functools
-import weakref
-from pathlib import Path
-from typing import Any
-
 import gymnasium
 import numpy as np
 import pytest
 from gymnasium.wrappers import ClipAction, RecordEpisodeStatistics, TransformReward
 
 import mjrec
-from mjrec.environments.scenes import has_own_method
 from mjrec.environments.wrapping import around_dm_env, around_gymnasium
 
 
-class Shown:
-    """Has a method of each kind."""
-
-    def render(self) -> str:
-        return "shown"
-
-    @staticmethod
-    def size() -> int:
-        return 3
-
-
-@pytest.mark.parametrize(
-    "method",
-    [lambda: "other", functools.partial(str, "other"), None, str.upper],
-    ids=["function", "partial", "none", "builtin"],
-)
-@pytest.mark.parametrize("name", ["render", "size"])
-def test_methods_set_on_an_instance_are_its_own(method: Any, name: str) -> None:
-    """Whatever they are; also where a proxy stands for the instance."""
-    instance = Shown()
-    setattr(instance, name, method)
-    assert has_own_method(instance, name)
-    assert has_own_method(weakref.proxy(instance), name)
-    assert not has_own_method(Shown(), name)
-
-
 @pytest.mark.parametrize("part", ["wrapper", "environment"])
-def test_an_environment_that_shows_another_is_drawn_live(
-    part: str, tmp_path: Path
-) -> None:
+def test_an_environment_that_shows_another_is_drawn_live(part, tmp_path):
     """Its pictures do not follow from its own states."""
-    options: dict[str, Any] = {"render_mode": "rgb_array", "width": 48, "height": 32}
+    options = {"render_mode": "rgb_array", "width": 48, "height": 32}
     env, other = (gymnasium.make("HalfCheetah-v5", **options) for _ in range(2))
     other.reset()
     changed = env if part == "wrapper" else env.unwrapped
-    changed.render = (other if part == "wrapper" else other.unwrapped).render  # type: ignore[method-assign]
-    monitor: Any = mjrec.Monitor(env, tmp_path, lambda _: True, workers=0)
+    changed.render = (other if part == "wrapper" else other.unwrapped).render
+    monitor = mjrec.Monitor(env, tmp_path, lambda _: True, workers=0)
     with monitor:
         monitor.reset(seed=0)
         monitor.step(np.zeros(6))
@@ -62,9 +26,9 @@ def test_an_environment_that_shows_another_is_drawn_live(
     other.close()
 
 
-def test_wrappers_that_change_something_are_named() -> None:
+def test_wrappers_that_change_something_are_named():
     """Outermost first; what only looks on is not among them; the least limit counts."""
-    env: Any = gymnasium.make("InvertedPendulum-v5", max_episode_steps=7)
+    env = gymnasium.make("InvertedPendulum-v5", max_episode_steps=7)
     for steps in (9, 5, 8):
         env = gymnasium.wrappers.TimeLimit(env, steps)
     assert around_gymnasium(env) == {"wrappers": [], "max_episode_steps": 5}
@@ -77,7 +41,7 @@ def test_wrappers_that_change_something_are_named() -> None:
 
 
 @pytest.mark.dm_control
-def test_dm_control_says_the_same() -> None:
+def test_dm_control_says_the_same():
     """Of the suite's own wrappers."""
     suite = pytest.importorskip("dm_control.suite")
     from dm_control.suite.wrappers import action_noise
@@ -90,7 +54,7 @@ def test_dm_control_says_the_same() -> None:
     }
 
 
-def test_what_hides_its_environment_is_named() -> None:
+def test_what_hides_its_environment_is_named():
     """Whoever reads it then knows that more than a task was recorded."""
 
     class Opaque:

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The commands that a new user runs first, as far as no download is needed."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess
@@ -21,16 +19,14 @@ SOURCE = "set -euo pipefail; source scripts/setup; libraries=; "
 
 
 @pytest.fixture
-def checkout(tmp_path: Path) -> Path:
+def checkout(tmp_path):
     """What the commands read of the repository, at a place of its own."""
     shutil.copytree(ROOT / "scripts", tmp_path / "scripts")
     shutil.copy(ROOT / "pyproject.toml", tmp_path)
     return tmp_path
 
 
-def bash(
-    checkout: Path, command: str, **environment: str
-) -> subprocess.CompletedProcess[str]:
+def bash(checkout, command, **environment):
     kept = {k: v for k, v in os.environ.items() if not k.startswith("MJREC_")}
     return subprocess.run(
         ["bash", "-c", command],
@@ -42,27 +38,27 @@ def bash(
     )
 
 
-def make_environment(checkout: Path) -> None:
+def make_environment(checkout):
     subprocess.run(
         [sys.executable, "-m", "venv", "--without-pip", checkout / ".venv"], check=True
     )
 
 
-def write_stamp(checkout: Path) -> None:
+def write_stamp(checkout):
     """Leave what a finished installation leaves."""
     stamp = '"$(stamp_of "$venv" demo)"'
     wrote = bash(checkout, SOURCE + f'describe_installation "$venv" -e . >{stamp}')
     assert wrote.returncode == 0, wrote.stderr
 
 
-def is_installed(checkout: Path) -> bool:
+def is_installed(checkout):
     answer = bash(checkout, SOURCE + 'is_installed "$venv" demo -e .')
     assert answer.returncode in (0, 1), answer.stderr
     return answer.returncode == 0
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_help_installs_nothing(checkout: Path, command: str) -> None:
+def test_help_installs_nothing(checkout, command):
     """A clone can run the commands; asking what one does changes nothing."""
     shutil.copytree(ROOT / ".ci", checkout / ".ci")
     answer = bash(checkout, f"{command} --help")
@@ -71,11 +67,11 @@ def test_help_installs_nothing(checkout: Path, command: str) -> None:
     assert not (checkout / ".venv").exists()
 
 
-def must_be_made_anew(checkout: Path) -> bool:
+def must_be_made_anew(checkout):
     return bash(checkout, SOURCE + 'must_be_made_anew "$venv"').returncode == 0
 
 
-def test_an_installation_is_repeated_only_where_it_must_be(checkout: Path) -> None:
+def test_an_installation_is_repeated_only_where_it_must_be(checkout):
     """When pyproject.toml has changed, or it was interrupted."""
     make_environment(checkout)
     assert not is_installed(checkout)
@@ -91,7 +87,7 @@ def test_an_installation_is_repeated_only_where_it_must_be(checkout: Path) -> No
     assert not is_installed(checkout)
 
 
-def test_moved_checkout_is_made_anew(checkout: Path, tmp_path: Path) -> None:
+def test_moved_checkout_is_made_anew(checkout, tmp_path):
     """An environment's scripts name the place where it was made."""
     make_environment(checkout)
     write_stamp(checkout)
@@ -102,7 +98,7 @@ def test_moved_checkout_is_made_anew(checkout: Path, tmp_path: Path) -> None:
     assert must_be_made_anew(moved)
 
 
-def test_directory_of_somebody_else_stays(checkout: Path) -> None:
+def test_directory_of_somebody_else_stays(checkout):
     """A directory that the scripts did not make is neither emptied nor changed."""
     mine = checkout / "mine"
     mine.mkdir()
@@ -113,7 +109,7 @@ def test_directory_of_somebody_else_stays(checkout: Path) -> None:
     assert [path.name for path in mine.iterdir()] == ["thesis.tex"]
 
 
-def test_python_that_does_not_fit_is_named(checkout: Path) -> None:
+def test_python_that_does_not_fit_is_named(checkout):
     """The error says what was looked for, what is there and what to do."""
     old = checkout / "old-python"
     old.write_text("#!/bin/sh\n[ $1 = --version ] && echo Python 3.9.2\nexit 1\n")
@@ -125,7 +121,7 @@ def test_python_that_does_not_fit_is_named(checkout: Path) -> None:
     assert "MJREC_PYTHON=" in answer.stderr
 
 
-def test_missing_libraries_are_named_with_the_line_to_run(checkout: Path) -> None:
+def test_missing_libraries_are_named_with_the_line_to_run(checkout):
     """Where packages may not be installed, one line does it."""
     no_root = "may_install() { false; }; in_package_lists() { false; }; "
     answer = bash(checkout, SOURCE + no_root + "install_required $(missing_egl)")
@@ -133,7 +129,7 @@ def test_missing_libraries_are_named_with_the_line_to_run(checkout: Path) -> Non
     assert "apt-get install -y --no-install-recommends libegl1 " in answer.stderr
 
 
-def test_failed_step_is_named(checkout: Path) -> None:
+def test_failed_step_is_named(checkout):
     """A stop names the step, the command and its exit status."""
     answer = bash(checkout, SOURCE + 'step "counting" false --quick')
     assert answer.returncode == 1

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Sessions whose pictures are drawn later, by others, or not at all."""
 
-from __future__ import annotations
-
 import contextlib
 import importlib.util
 import json
@@ -11,7 +9,6 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import pytest
 from recordings import manifest_of, videos_in
@@ -25,9 +22,7 @@ from mjrec.recorder.options import RecorderOptions
 from mjrec.sessions import Session, record_session
 
 
-def session(
-    directory: Path, *, name: str = "InvertedPendulum-v5", **options: Any
-) -> Any:
+def session(directory, *, name="InvertedPendulum-v5", **options):
     """Return a session of two steps an episode; options of the session or monitor."""
     own = {k: options.pop(k) for k in ("episodes", "schedule") if k in options}
     return Session(
@@ -41,33 +36,28 @@ def session(
 
 
 @pytest.fixture
-def no_probing(monkeypatch: pytest.MonkeyPatch) -> None:
+def no_probing(monkeypatch):
     """Fail where an OpenGL backend is looked for."""
 
-    def fail() -> None:
+    def fail():
         raise AssertionError("looked for OpenGL")
 
     monkeypatch.setattr(sessions, "use_gl", fail)
 
 
 @pytest.fixture
-def no_gl(monkeypatch: pytest.MonkeyPatch) -> None:
+def no_gl(monkeypatch):
     """Let no OpenGL backend be found."""
 
-    def fail() -> None:
+    def fail():
         raise GLError("Nothing renders here.")
 
     monkeypatch.setattr(sessions, "use_gl", fail)
 
 
 @pytest.mark.usefixtures("no_probing")
-@pytest.mark.parametrize(
-    "options",
-    [{"workers": 0}, {"render": "off"}],
-)
-def test_what_is_not_drawn_here_looks_for_no_gl(
-    options: dict[str, Any], tmp_path: Path
-) -> None:
+@pytest.mark.parametrize("options", [{"workers": 0}, {"render": "off"}])
+def test_what_is_not_drawn_here_looks_for_no_gl(options, tmp_path):
     """The states are recorded, and the videos are promised, or not wanted."""
     [episode] = record_session(session(tmp_path, **options))
     pending = manifest_of(tmp_path)["mjrec"]["pending"]
@@ -82,7 +72,7 @@ def test_what_is_not_drawn_here_looks_for_no_gl(
 
 @pytest.mark.parametrize("render", [None, "live"])
 @pytest.mark.usefixtures("no_gl")
-def test_without_gl_the_way_out_is_named(tmp_path: Path, render: str | None) -> None:
+def test_without_gl_the_way_out_is_named(tmp_path, render):
     """Where the pictures could be drawn elsewhere; nothing is written."""
     options = {"render": render} if render else {}
     with pytest.raises(GLError, match="Nothing renders here") as raised:
@@ -92,7 +82,7 @@ def test_without_gl_the_way_out_is_named(tmp_path: Path, render: str | None) -> 
     assert not (tmp_path / "out").exists()
 
 
-def test_an_iterator_that_is_left_waits_for_nothing(tmp_path: Path) -> None:
+def test_an_iterator_that_is_left_waits_for_nothing(tmp_path):
     """What is not rendered by then stays pending."""
     with contextlib.closing(
         record_session(session(tmp_path, episodes=3, schedule="all", workers=1))
@@ -105,9 +95,7 @@ def test_an_iterator_that_is_left_waits_for_nothing(tmp_path: Path) -> None:
 RECORD = ("record", "InvertedPendulum-v5", "--size", "32x32", "--max-steps", "9")
 
 
-def test_record_says_which_videos_are_pending(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_record_says_which_videos_are_pending(tmp_path, capsys):
     """And what makes them; also for programs."""
     command = [*RECORD, "--seed", "0", "--workers", "0", "--out"]
     assert main([*command, str(tmp_path / "a")]) == 0
@@ -123,9 +111,7 @@ def test_record_says_which_videos_are_pending(
     importlib.util.find_spec("pygame") is not None, reason="pygame is installed"
 )
 @pytest.mark.parametrize("options", [{}, {"keep": "best:1"}])
-def test_what_cannot_be_drawn_is_recorded_without_videos(
-    options: dict[str, Any], tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_what_cannot_be_drawn_is_recorded_without_videos(options, tmp_path, caplog):
     """CartPole needs pygame: one line says so, unless pictures were asked for."""
     asked = replace(
         session(tmp_path, name="CartPole", episodes=2, **options),
@@ -140,8 +126,19 @@ def test_what_cannot_be_drawn_is_recorded_without_videos(
         list(record_session(live))
 
 
+def test_record_chooses_a_backend_before_mujoco_is_loaded(tmp_path: Path) -> None:
+    """Where `MUJOCO_GL` says nothing, MuJoCo would take one that needs a screen."""
+    environ = {k: v for k, v in os.environ.items() if k not in ("MUJOCO_GL", "DISPLAY")}
+    subprocess.run(
+        [sys.executable, "-m", "mjrec", *RECORD, "--out", str(tmp_path)],
+        env=environ,
+        check=True,
+    )
+    assert videos_in(tmp_path)
+
+
 @pytest.mark.thorough
-def test_record_without_any_gl(tmp_path: Path) -> None:
+def test_record_without_any_gl(tmp_path):
     """On a machine, or in a process, that has none."""
     command = [*RECORD, "--seed", "0", "--workers", "0"]
     run = subprocess.run(

@@ -1,18 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
 """Of the Slurm engine, what only Slurm can show."""
 
-from __future__ import annotations
-
+import contextlib
 import functools
 import os
+import secrets
+import signal
+import socket
 import subprocess
 import sys
-from collections.abc import Iterator
+import time
 from pathlib import Path
-from typing import Any
 
 import pytest
-from slurm_cluster import slurm_cluster
+from engine_runs import lines, wait_for
 from waiting import wait_until
 
 from mjrec.engines.jobs import WORK_FOLDER, Run, Work
@@ -27,31 +28,127 @@ until = functools.partial(wait_until, seconds=60)
 pytestmark = pytest.mark.slurm
 
 
+# `low` gives way to `high`: SIGTERM, 20 seconds, SIGKILL.
+CONFIGURATION = """
+ClusterName=test
+SlurmctldHost={host}(127.0.0.1)
+SlurmUser=root
+SlurmdUser=root
+AuthType=auth/munge
+AuthInfo=socket={place}/munge.sock
+StateSaveLocation={place}/state
+SlurmdSpoolDir={place}/spool
+SlurmctldLogFile={place}/slurmctld.log
+SlurmdLogFile={place}/slurmd.log
+SlurmctldPidFile={place}/slurmctld.pid
+SlurmdPidFile={place}/slurmd.pid
+SlurmctldPort={ports[0]}
+SlurmdPort={ports[1]}
+ProctrackType=proctrack/linuxproc
+TaskPlugin=task/none
+SelectType=select/cons_tres
+SelectTypeParameters=CR_CPU
+SchedulerParameters=sched_interval=1,bf_interval=1
+PreemptType=preempt/partition_prio
+PreemptMode=REQUEUE
+KillWait=20
+SlurmdParameters=config_overrides
+NodeName={host} NodeAddr=127.0.0.1 CPUs=4 RealMemory=4000 State=UNKNOWN
+PartitionName=low Nodes={host} Default=YES PriorityTier=1 GraceTime=20
+PartitionName=high Nodes={host} PriorityTier=2 PreemptMode=OFF
+"""
+
+
 @pytest.fixture(scope="module")
-def configuration(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    with slurm_cluster(tmp_path_factory.mktemp("slurm")) as path:
-        yield path
+def configuration(tmp_path_factory):
+    """The configuration file of a cluster that is up: of one machine, this one."""
+    place = tmp_path_factory.mktemp("slurm")
+    (place / "state").mkdir()
+    (place / "spool").mkdir()
+    key = place / "munge.key"
+    key.touch(0o400)
+    key.write_bytes(secrets.token_bytes(1024))
+    configuration = place / "slurm.conf"
+    configuration.write_text(
+        CONFIGURATION.format(
+            host=socket.gethostname(), place=place, ports=_free_ports(2)
+        )
+    )
+    # By default slurmd looks for a mounted cgroup file system, which a change of root
+    # has none of, and ends where there is none.
+    (place / "cgroup.conf").write_text("CgroupPlugin=cgroup/v1\n")
+    environ = {**os.environ, "SLURM_CONF": str(configuration)}
+    daemons = [
+        [
+            *("munged", "--force", "--foreground", f"--key-file={key}"),
+            *(f"--socket={place}/munge.sock", f"--pid-file={place}/munge.pid"),
+            *(f"--seed-file={place}/munge.seed", f"--log-file={place}/munge.log"),
+        ],
+        ["slurmctld", "-D"],
+        ["slurmd", "-D"],
+    ]
+    with contextlib.ExitStack() as stack:
+        for command in daemons:
+            stack.enter_context(_running(command, environ, place))
+        _wait_until_up(environ)
+        yield configuration
+
+
+@contextlib.contextmanager
+def _running(command, environ, place):
+    with (
+        (place / f"{command[0]}.out").open("wb") as said,
+        subprocess.Popen(command, env=environ, stdout=said, stderr=said) as process,
+    ):
+        try:
+            yield
+        finally:
+            process.send_signal(signal.SIGTERM)
+            try:
+                process.wait(30)
+            except subprocess.TimeoutExpired:
+                process.kill()
+
+
+def _wait_until_up(environ):
+    deadline = time.monotonic() + 60
+    while True:
+        asked = subprocess.run(
+            ["sinfo", "--noheader", "--format=%T"],
+            env=environ,
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        if asked.stdout.split()[:1] == ["idle"]:
+            return
+        assert time.monotonic() < deadline, asked
+        time.sleep(0.1)
+
+
+def _free_ports(count):
+    with contextlib.ExitStack() as stack:
+        sockets = [stack.enter_context(socket.socket()) for _ in range(count)]
+        for each in sockets:
+            each.bind(("127.0.0.1", 0))
+        return [each.getsockname()[1] for each in sockets]
 
 
 @pytest.fixture(autouse=True)
-def cluster(configuration: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+def cluster(configuration, monkeypatch):
     """Nothing is left in its queue by any test."""
     monkeypatch.setenv("SLURM_CONF", str(configuration))
     yield
     until(lambda: not asked("squeue", "--noheader"))
 
 
-def asked(*command: str) -> str:
+def asked(*command):
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert not done.returncode, (command, done.stderr)
     return done.stdout.strip()
 
 
-def engine(workers: int = 1, **options: Any) -> SlurmEngine:
-    return SlurmEngine(workers, **options)
-
-
-def work(place: Path) -> Work:
+def work(place):
     return Work(
         entry="odd_jobs:make",
         settings={"left": str(place / "left")},
@@ -59,30 +156,18 @@ def work(place: Path) -> Work:
     )
 
 
-def hold(run: Run, place: Path) -> None:
+def hold(run, place):
     run.submit("held", do="hold", begun=str(place / "begun"))
 
 
-def wait_for(path: Path, run: Run) -> str:
-    """Return the number of the process that has begun a job, which notes it there."""
-    for _ in run.results(patience_s=0.02):
-        if path.exists() and path.read_text():
-            break
-    return path.read_text()
-
-
-def lines(path: Path) -> list[str]:
-    return path.read_text().splitlines() if path.exists() else []
-
-
-def slurm_job() -> str:
+def slurm_job():
     """Return the only one that runs."""
     return asked("squeue", "--noheader", "--array", "--states=running", "--format=%i")
 
 
-def test_jobs_are_done_in_slurm_jobs(tmp_path: Path) -> None:
+def test_jobs_are_done_in_slurm_jobs(tmp_path):
     """Which are submitted as one array, and have completed at the end."""
-    with Run(engine(3), work(tmp_path)) as run:
+    with Run(SlurmEngine(3), work(tmp_path)) as run:
         for number in range(50):
             run.submit(str(number), do="where")
         found = [outcome for outcome in run.results() if outcome is not None]
@@ -98,11 +183,9 @@ def test_jobs_are_done_in_slurm_jobs(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("how", ["preempted", "cancelled", "killed"])
-def test_a_slurm_job_that_is_ended(
-    tmp_path: Path, how: str, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_slurm_job_that_is_ended(tmp_path, how, caplog):
     """Files are closed where there is time; what it was at is done in another."""
-    with Run(engine(partition="low"), work(tmp_path)) as run:
+    with Run(SlurmEngine(1, partition="low"), work(tmp_path)) as run:
         hold(run, tmp_path)
         wait_for(tmp_path / "begun", run)
         first = slurm_job()
@@ -120,13 +203,11 @@ def test_a_slurm_job_that_is_ended(
     assert lines(tmp_path / "left")
 
 
-def test_what_the_drivers_slurm_job_was_given_is_not_passed_on(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_the_drivers_slurm_job_was_given_is_not_passed_on(tmp_path, monkeypatch):
     """Where the cluster is is."""
     monkeypatch.setenv("SLURM_JOB_ID", "9999")
     monkeypatch.setenv("SLURM_MEM_PER_GPU", "1")
-    made = engine(setup=[f"env > {tmp_path / 'environ'}"])
+    made = SlurmEngine(1, setup=[f"env > {tmp_path / 'environ'}"])
     with Run(made, work(tmp_path)) as run:
         run.submit("a", do="echo")
         assert next(run.results()) is not None
@@ -137,9 +218,9 @@ def test_what_the_drivers_slurm_job_was_given_is_not_passed_on(
     assert os.environ["SLURM_MEM_PER_GPU"] == "1"
 
 
-def test_what_slurm_refuses(tmp_path: Path) -> None:
+def test_what_slurm_refuses(tmp_path):
     """The error has its words."""
-    with Run(engine(partition="none"), work(tmp_path)) as run:
+    with Run(SlurmEngine(1, partition="none"), work(tmp_path)) as run:
         hold(run, tmp_path)
         with pytest.raises(Error, match=r"No job could be submitted: .*partition"):
             next(run.results())
@@ -150,14 +231,15 @@ import sys
 from pathlib import Path
 import test_slurm_cluster
 from mjrec.engines.jobs import Run
+from mjrec.engines.slurm import SlurmEngine
 place = Path(sys.argv[1])
-run = Run(test_slurm_cluster.engine(2), test_slurm_cluster.work(place))
+run = Run(SlurmEngine(2), test_slurm_cluster.work(place))
 test_slurm_cluster.hold(run, place)
 next(run.results())
 """
 
 
-def test_the_next_driver_ends_what_a_killed_one_has_left(tmp_path: Path) -> None:
+def test_the_next_driver_ends_what_a_killed_one_has_left(tmp_path):
     """Those that wait in the queue too."""
     driver = subprocess.Popen(
         [sys.executable, "-c", DRIVER, str(tmp_path)],
@@ -167,14 +249,14 @@ def test_the_next_driver_ends_what_a_killed_one_has_left(tmp_path: Path) -> None
         until(lambda: lines(tmp_path / "begun"))
         driver.kill()
     [pid] = lines(tmp_path / "begun")
-    with Run(engine(), work(tmp_path)) as run:
+    with Run(SlurmEngine(1), work(tmp_path)) as run:
         run.submit("a", do="echo")
         assert next(run.results()) is not None
         until(lambda: pid in lines(tmp_path / "left"))
     assert not (tmp_path / "shared" / WORK_FOLDER).exists()
 
 
-def test_an_evaluation_whose_driver_is_in_a_slurm_job(tmp_path: Path) -> None:
+def test_an_evaluation_whose_driver_is_in_a_slurm_job(tmp_path):
     """Byte for byte that of one process."""
     command = [
         *(sys.executable, "-m", "mjrec", "evaluate", "InvertedPendulum-v5"),

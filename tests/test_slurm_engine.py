@@ -5,21 +5,19 @@ submitit starts processes of this machine in place of Slurm jobs; `test_slurm_cl
 tries a real cluster.
 """
 
-from __future__ import annotations
-
 import os
 import secrets
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 import pytest
 from engine_runs import (
+    MARK,
     lines,
+    marked,
     odd_work,
     outcomes,
     submit,
@@ -27,8 +25,6 @@ from engine_runs import (
     wait_for,
     wait_for_end,
 )
-from evaluated_files import recorded_in
-from marked_processes import MARK, marked
 from waiting import wait_until
 
 import mjrec
@@ -36,14 +32,12 @@ from mjrec.engines.jobs import WORK_FOLDER, Run
 from mjrec.engines.slurm import DEFAULT_WORKERS, SlurmEngine, slurm_options
 from mjrec.errors import Error, InvalidArgument, MissingDependency
 from mjrec.machine import usable_cpus
-from test_evaluating import contents
-from test_evaluating import run as run_small
 
 pytest.importorskip("submitit")
 
 
 @pytest.fixture(autouse=True)
-def mark(monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
+def mark(monkeypatch):
     """Every process that a test has started, or they have, is gone at its end."""
     mark = secrets.token_hex(8)
     monkeypatch.setenv(MARK, mark)
@@ -52,22 +46,22 @@ def mark(monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
     wait_until(lambda: not marked(mark), seconds=90, told=lambda: marked(mark))
 
 
-def engine(workers: int = 1, **options: Any) -> SlurmEngine:
+def engine(workers=1, **options):
     return SlurmEngine(workers, cluster="local", **options)
 
 
-def begun(place: Path, workers: int = 1, **settings: Any) -> Run:
+def begun(place, workers=1, **settings):
     return Run(engine(workers), odd_work(shared=place / "shared", **settings))
 
 
-def submitted(place: Path) -> list[str]:
+def submitted(place):
     """Return the numbers of the Slurm jobs of the only run."""
     logs = (place / "shared" / WORK_FOLDER).glob("*/slurm/logs/*_0_log.err")
     return [path.name.removesuffix("_0_log.err") for path in logs]
 
 
 @pytest.mark.thorough
-def test_a_slurm_job_may_hold_several_workers(tmp_path: Path) -> None:
+def test_a_slurm_job_may_hold_several_workers(tmp_path):
     """Who wait for each other in one, and share what GPUs it was given."""
     os.mkfifo(tmp_path / "pipe")
     made = engine(2, workers_per_job=2)
@@ -80,7 +74,7 @@ def test_a_slurm_job_may_hold_several_workers(tmp_path: Path) -> None:
     made.shutdown()
 
 
-def test_jobs_given_at_once_are_one_array(tmp_path: Path) -> None:
+def test_jobs_given_at_once_are_one_array(tmp_path):
     """Of no more Slurm jobs than four for each worker, however many jobs."""
     with begun(tmp_path) as run:
         submit(run, *map(str, range(30)), do="echo")
@@ -90,7 +84,7 @@ def test_jobs_given_at_once_are_one_array(tmp_path: Path) -> None:
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("signum", [signal.SIGTERM, signal.SIGKILL, signal.SIGUSR2])
-def test_a_slurm_job_that_is_ended(signum: int, tmp_path: Path) -> None:
+def test_a_slurm_job_that_is_ended(signum, tmp_path):
     """What it was at is done in another, or in itself, back in the queue.
 
     By SIGUSR2, as before its time limit, it is put there.
@@ -106,7 +100,7 @@ def test_a_slurm_job_that_is_ended(signum: int, tmp_path: Path) -> None:
         wait_until(lambda: str(first) in lines(tmp_path / "left"))
 
 
-def test_slurm_jobs_that_end_as_soon_as_they_begin(tmp_path: Path) -> None:
+def test_slurm_jobs_that_end_as_soon_as_they_begin(tmp_path):
     """Three rounds are enough."""
     made = engine(setup=["echo no such module >&2; exit 1"])
     with Run(made, odd_work(shared=tmp_path / "shared")) as run:
@@ -132,7 +126,7 @@ with Run(SlurmEngine(2, cluster="local"), work) as run:
 
 
 @contextmanager
-def driver(place: Path) -> Iterator[subprocess.Popen[bytes]]:
+def driver(place):
     """Have a driver of whom a job is being done."""
     with subprocess.Popen(
         [sys.executable, "-c", DRIVER, str(place)],
@@ -145,7 +139,7 @@ def driver(place: Path) -> Iterator[subprocess.Popen[bytes]]:
 
 
 @pytest.mark.usefixtures("default_signals")
-def test_ctrl_c_in_a_terminal(tmp_path: Path) -> None:
+def test_ctrl_c_in_a_terminal(tmp_path):
     """It reaches all processes there; the driver ends those that are Slurm's."""
     with driver(tmp_path) as process:
         os.killpg(process.pid, signal.SIGINT)
@@ -155,7 +149,7 @@ def test_ctrl_c_in_a_terminal(tmp_path: Path) -> None:
 
 
 @pytest.mark.thorough
-def test_the_next_driver_ends_what_a_killed_one_has_left(tmp_path: Path) -> None:
+def test_the_next_driver_ends_what_a_killed_one_has_left(tmp_path):
     """Whose Slurm jobs have gone on until then; a living one's do."""
     with driver(tmp_path) as process:
         process.kill()
@@ -172,7 +166,7 @@ def test_the_next_driver_ends_what_a_killed_one_has_left(tmp_path: Path) -> None
     assert not list((tmp_path / "shared").iterdir())
 
 
-def test_how_many_workers() -> None:
+def test_how_many_workers():
     """What Slurm grants is not known; what this machine has is."""
     assert SlurmEngine(cluster="local").workers == usable_cpus()
     assert DEFAULT_WORKERS == 4
@@ -192,29 +186,27 @@ def test_how_many_workers() -> None:
         ({"gpus": -1}, "gpus is how many"),
     ],
 )
-def test_what_cannot_be(options: dict[str, Any], said: str) -> None:
+def test_what_cannot_be(options, said):
     """It is refused before anything starts."""
     with pytest.raises(InvalidArgument, match=said):
         SlurmEngine(**{"cluster": "local", **options})
 
 
-def test_a_machine_without_slurm(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_machine_without_slurm(tmp_path, monkeypatch):
     """The error says what is missing, and what to do."""
     monkeypatch.setenv("PATH", str(tmp_path))
     with pytest.raises(Error, match=r"no sbatch, squeue, .* login node"):
         SlurmEngine()
 
 
-def test_without_submitit(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_submitit(monkeypatch):
     """The error says how to get it."""
     monkeypatch.setitem(sys.modules, "submitit", None)
     with pytest.raises(MissingDependency, match=r"pip install \"mjrec\[slurm\]\""):
         SlurmEngine(cluster="local")
 
 
-def test_options_as_texts() -> None:
+def test_options_as_texts():
     """Of the command line; those of a GPU may be in the cluster's own words."""
     texts = {
         "partition": "gpu",
@@ -242,7 +234,7 @@ def test_options_as_texts() -> None:
     assert "gpus-per-node" not in script
 
 
-def sbatch_script(texts: dict[str, str], **options: Any) -> str:
+def sbatch_script(texts, **options):
     """Return what submitit would give to `sbatch`, for an array of three."""
     import submitit
 
@@ -256,7 +248,7 @@ def sbatch_script(texts: dict[str, str], **options: Any) -> str:
     return str(slurm._make_submission_file_text("command", "uid"))
 
 
-def test_texts_that_cannot_be() -> None:
+def test_texts_that_cannot_be():
     """A slip is told with what there is."""
     with pytest.raises(mjrec.UnknownName, match=r"'partitoin'.*partition.*sbatch.NAME"):
         slurm_options({"partitoin": "gpu"})
@@ -264,7 +256,7 @@ def test_texts_that_cannot_be() -> None:
         slurm_options({"time_min": "an hour"})
 
 
-def test_import_is_inert() -> None:
+def test_import_is_inert():
     """An engine needs submitit, which is to leave logging as it is."""
     script = """
 import logging, os, sys
@@ -280,18 +272,7 @@ assert "SUBMITIT_LOG_LEVEL" not in os.environ
     subprocess.run([sys.executable, "-W", "error", "-c", script], check=True)
 
 
-# Takes more than five seconds: the same evaluation here and through submitit.
-def test_an_evaluation_in_slurm_jobs_is_that_of_this_machine(tmp_path: Path) -> None:
-    """Results, trajectories and videos, however their jobs were handed out."""
-    there = run_small(tmp_path / "there", keep="best", engine=engine(2), workers=None)
-    here = run_small(tmp_path / "here", keep="best")
-    assert contents(there.directory) == contents(here.directory)
-    assert recorded_in(there) == recorded_in(here)
-    assert len(recorded_in(there)) == 4 + 1
-    assert not (tmp_path / "there" / WORK_FOLDER).exists()
-
-
-def test_it_does_jobs_only() -> None:
+def test_it_does_jobs_only():
     """Their outcomes are files, which other functions would not write."""
     with pytest.raises(InvalidArgument, match="executor of submitit's"):
         engine().submit(len, "abc")

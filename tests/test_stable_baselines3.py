@@ -1,15 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """With the real Stable-Baselines3: training, its vector environments, its readers."""
 
-from __future__ import annotations
-
 import importlib.util
 import json
 import math
 import os
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
 
 import gymnasium
 import numpy as np
@@ -46,7 +41,7 @@ STEPS = 256
 torch.set_num_threads(1)
 
 
-def make_env(directory: Path, *, steps: int = 20, **options: Any) -> Any:
+def make_env(directory, *, steps=20, **options):
     """Return a monitored pendulum; its pictures are drawn later."""
     env = gymnasium.make("InvertedPendulum-v5", max_episode_steps=steps)
     return mjrec.Monitor(
@@ -54,7 +49,7 @@ def make_env(directory: Path, *, steps: int = 20, **options: Any) -> Any:
     )
 
 
-def make_ppo(env: Any) -> PPO:
+def make_ppo(env):
     return PPO(
         "MlpPolicy",
         env,
@@ -67,16 +62,14 @@ def make_ppo(env: Any) -> PPO:
     )
 
 
-def rewards_in(directory: Path) -> list[float]:
+def rewards_in(directory):
     return [entry["reward"] for entry in journal_of(directory)]
 
 
-def test_training_is_recorded(tmp_path: Path) -> None:
+def test_training_is_recorded(tmp_path):
     """Every episode, with its videos; the algorithm sees the same returns."""
     env = make_env(
-        tmp_path,
-        video_callable=lambda n: n in (0, 3),
-        trackers=MonitorCsvTracker(),
+        tmp_path, video_callable=lambda n: n in (0, 3), trackers=MonitorCsvTracker()
     )
     with env:
         model = make_ppo(env).learn(STEPS)
@@ -94,7 +87,7 @@ def test_training_is_recorded(tmp_path: Path) -> None:
     assert list(returns) == rewards_in(tmp_path)
 
 
-def test_episode_info_is_what_stable_baselines3_logs(tmp_path: Path) -> None:
+def test_episode_info_is_what_stable_baselines3_logs(tmp_path):
     """Without a monitor of its own around, as in a vector environment."""
     venv = DummyVecEnv(
         [lambda: make_env(tmp_path, episode_info=True, video_callable=False)]
@@ -106,7 +99,7 @@ def test_episode_info_is_what_stable_baselines3_logs(tmp_path: Path) -> None:
     assert rewards_in(tmp_path) == pytest.approx(seen)
 
 
-def test_learning_again_begins_a_new_episode(tmp_path: Path) -> None:
+def test_learning_again_begins_a_new_episode(tmp_path):
     """`learn` resets in mid-episode, and what was cut off is an episode too."""
     with make_env(tmp_path, video_callable=False, allow_early_reset=True) as env:
         model = make_ppo(env)
@@ -119,14 +112,12 @@ def test_learning_again_begins_a_new_episode(tmp_path: Path) -> None:
 # From Python 3.12 on, `fork` beside any thread is warned of: torch's, for instance.
 @pytest.mark.filterwarnings("ignore:.*multi-threaded.*fork:DeprecationWarning")
 @pytest.mark.parametrize("kind", ["dummy", "spawn", "forkserver", "fork"])
-def test_each_environment_of_a_vector_has_its_monitor(
-    kind: str, tmp_path: Path
-) -> None:
+def test_each_environment_of_a_vector_has_its_monitor(kind, tmp_path):
     """All in one directory; what was chosen is there as a video after `close`."""
 
-    def make(index: int) -> Callable[[], Any]:
+    def make(index):
         # Sent to another process as code: nothing of this module may be named in it.
-        def make_monitored() -> Any:
+        def make_monitored():
             import gymnasium
 
             import mjrec
@@ -170,7 +161,7 @@ def test_each_environment_of_a_vector_has_its_monitor(
     )
 
 
-def test_own_monitor_outside_agrees(tmp_path: Path) -> None:
+def test_own_monitor_outside_agrees(tmp_path):
     """Its file and ours say the same, but for its six digits."""
     env = make_env(
         tmp_path / "ours", video_callable=False, trackers=MonitorCsvTracker()
@@ -185,7 +176,7 @@ def test_own_monitor_outside_agrees(tmp_path: Path) -> None:
     assert np.allclose(ours["t"], theirs["t"], atol=0.5)
 
 
-def test_evaluation_is_recorded(tmp_path: Path) -> None:
+def test_evaluation_is_recorded(tmp_path):
     """The returns that `evaluate_policy` gives are those in the directory."""
     model = make_ppo(gymnasium.make("InvertedPendulum-v5"))
     options = {"mode": "evaluation", "video_callable": lambda number: number == 1}
@@ -199,7 +190,7 @@ def test_evaluation_is_recorded(tmp_path: Path) -> None:
     assert videos_in(tmp_path) == [1]
 
 
-def test_files_of_several_runs_are_read_together(tmp_path: Path) -> None:
+def test_files_of_several_runs_are_read_together(tmp_path):
     """In the order of the ends; NaN and infinity too, and a run without episodes."""
     tracker = MonitorCsvTracker()
     runs = [
@@ -223,7 +214,7 @@ def test_files_of_several_runs_are_read_together(tmp_path: Path) -> None:
     assert list(steps) == [10, 20, 30, 40]
 
 
-def test_results_are_plotted(tmp_path: Path) -> None:
+def test_results_are_plotted(tmp_path):
     """By its own function, from our file."""
     from matplotlib import pyplot
 

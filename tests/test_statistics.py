@@ -1,12 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-from __future__ import annotations
-
-from collections.abc import Callable
 
 import numpy as np
 import pytest
-from hypothesis import strategies as st
-from hypothesis.extra import numpy as npst
 
 from mjrec import InvalidArgument
 from mjrec.evaluation import statistics
@@ -14,8 +9,6 @@ from mjrec.evaluation.statistics import (
     LARGE_SAMPLE,
     PERCENTILE_BOOTSTRAP,
     Bootstrap,
-    Figure,
-    FloatArray,
     Interval,
     average,
     improvement,
@@ -48,19 +41,16 @@ Y = [
     np.array([0.74, 0.59, 0.47, 0.19, 0.72, 0.71, 0.14, 0.67, 0.66, 0.49]),
 ]
 
-# Few different ones, so that many are equal.
-SAMPLE = npst.arrays(np.float64, st.integers(1, 12), elements=st.integers(-4, 4))
 
-
-def array(*values: float) -> FloatArray:
+def array(*values):
     return np.array(values, dtype=np.float64)
 
 
-def normal(count: int, center: float = 500.0, *, seed: int = 0) -> FloatArray:
+def normal(count, center=500.0, *, seed=0):
     return np.random.default_rng(seed).normal(center, 100, count)
 
 
-def ends(interval: Interval | None) -> list[float]:
+def ends(interval):
     assert interval is not None
     return [interval.low, interval.high]
 
@@ -74,12 +64,12 @@ def ends(interval: Interval | None) -> list[float]:
         ([0, 0, 0, 0, 1, 1, 1, 1], 0.5),
     ],
 )
-def test_interquartile_mean_by_hand(values: list[float], expected: float) -> None:
+def test_interquartile_mean_by_hand(values, expected):
     """A quarter, rounded down, is cut off at each end."""
     assert interquartile_mean([array(*values)]).value == expected
 
 
-def test_figures_across_tasks_are_rliables() -> None:
+def test_figures_across_tasks_are_rliables():
     """To the last digit but rounding."""
     assert interquartile_mean(X).value == pytest.approx(0.37966666666666665)
     assert optimality_gap(X).value == pytest.approx(0.6111666666666666)
@@ -89,7 +79,7 @@ def test_figures_across_tasks_are_rliables() -> None:
     assert performance_profile(X, TENTHS).values == pytest.approx([*profile, 0, 0])
 
 
-def test_intervals_across_tasks_are_rliables() -> None:
+def test_intervals_across_tasks_are_rliables():
     """Those of its stratified bootstrap of 20000 (profile: 5000), to their noise."""
     found = ends(interquartile_mean(X).interval(USUAL))
     assert found == pytest.approx([0.3243, 0.4340], abs=0.004)
@@ -105,7 +95,7 @@ def test_intervals_across_tasks_are_rliables() -> None:
     assert band[1] == pytest.approx(high, abs=0.018)
 
 
-def test_tasks_count_alike_however_many_episodes_they_have() -> None:
+def test_tasks_count_alike_however_many_episodes_they_have():
     """Gap and profile are means over tasks; the interquartile mean is of episodes."""
     scores = [array(1.0, 1.0), np.zeros(98)]
     assert optimality_gap(scores).value == 0.5
@@ -113,18 +103,11 @@ def test_tasks_count_alike_however_many_episodes_they_have() -> None:
     assert interquartile_mean(scores).value == 0
 
 
-def test_scores_at_a_threshold_and_above_one() -> None:
+def test_scores_at_a_threshold_and_above_one():
     """Equal is not above; more than 1 makes up for nothing."""
     profile = performance_profile([array(0.0, 0.5, 1.0, 1.0)], array(0, 0.5, 1))
     assert profile.values.tolist() == [0.75, 0.5, 0]
     assert optimality_gap([array(0, 1, 3)]).value == pytest.approx(1 / 3)
-
-
-def test_probability_of_improvement_by_hand() -> None:
-    """Ages of five men and four women with diabetes, of scipy's manual: U is 17."""
-    men, women = array(19, 22, 16, 29, 24), array(20, 11, 17, 12)
-    assert improvement(men, women).value == 17 / 20
-    assert improvement(men, men).value == 0.5
 
 
 @pytest.mark.parametrize(
@@ -132,9 +115,7 @@ def test_probability_of_improvement_by_hand() -> None:
     # Newcombe (1998), table I, method 3.
     [(81, 263, 0.2553, 0.3662), (15, 148, 0.0624, 0.1605), (1, 29, 0.0061, 0.1718)],
 )
-def test_wilson_interval_as_published(
-    successes: int, n: int, low: float, high: float
-) -> None:
+def test_wilson_interval_as_published(successes, n, low, high):
     """To the digits that were printed; it ends where all or none succeeded."""
     found = ends(wilson_interval(successes, n, 0.95))
     assert [round(end, 4) for end in found] == [low, high]
@@ -142,14 +123,14 @@ def test_wilson_interval_as_published(
     assert wilson_interval(0, n, 0.95).low == 0
 
 
-def test_bootstrap_of_two_values_by_hand() -> None:
+def test_bootstrap_of_two_values_by_hand():
     """The mean of two draws from 0 and 1 is 0, 1/2, 1 with chances 1/4, 1/2, 1/4."""
     figure = mean(array(0, 1))
     assert figure.interval(USUAL) == Interval(0, 1)
     assert figure.interval(Bootstrap(confidence=0.4)) == Interval(0.5, 0.5)
 
 
-FIGURES: dict[str, Callable[..., Figure]] = {
+FIGURES = {
     "mean": lambda x, _: mean(x),
     "difference": lambda x, y: mean(x) - mean(y),
     "iqm": lambda x, y: interquartile_mean([x, y]),
@@ -159,9 +140,7 @@ FIGURES: dict[str, Callable[..., Figure]] = {
 
 
 @pytest.mark.parametrize("name", FIGURES)
-def test_both_kinds_of_intervals_agree(
-    name: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_both_kinds_of_intervals_agree(name, monkeypatch):
     """That of large samples is the bootstrap's, to a tenth of its width."""
     figure = FIGURES[name](normal(60), normal(90, 550, seed=1))
     low, high = ends(figure.interval(USUAL))
@@ -173,7 +152,7 @@ def test_both_kinds_of_intervals_agree(
     )
 
 
-def test_large_sample_band_of_a_profile(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_large_sample_band_of_a_profile(monkeypatch):
     """That of the bootstrap, to a tenth of its width."""
     profile = performance_profile([normal(200) / 1000, normal(300) / 1000], array(0.5))
     resampled = np.array(profile.ends(USUAL))
@@ -182,7 +161,7 @@ def test_large_sample_band_of_a_profile(monkeypatch: pytest.MonkeyPatch) -> None
     assert found == pytest.approx(resampled, abs=0.1 * float(np.ptp(resampled)))
 
 
-def test_same_seed_same_interval() -> None:
+def test_same_seed_same_interval():
     """Whatever the order; and another seed another."""
     values = np.arange(10.0)
     first = interquartile_mean([values]).interval(QUICK)
@@ -191,13 +170,13 @@ def test_same_seed_same_interval() -> None:
     assert interquartile_mean([values]).interval(other) != first
 
 
-def test_a_single_value_has_no_interval() -> None:
+def test_a_single_value_has_no_interval():
     """One of no width would say that all is known."""
     for figure in (mean(array(1)), improvement(array(1, 2), array(3))):
         assert (figure.interval(QUICK), figure.interval_method) == (None, None)
 
 
-def covered(figure: Callable[[int], Figure], true: float, *, times: int) -> float:
+def covered(figure, true, *, times):
     """Return how often an interval of 95 % holds the true value."""
     inside = 0
     for k in range(times):
@@ -206,7 +185,7 @@ def covered(figure: Callable[[int], Figure], true: float, *, times: int) -> floa
     return inside / times
 
 
-SIMULATED: dict[str, tuple[Callable[[int], Figure], float]] = {
+SIMULATED = {
     "mean": (lambda k: mean(normal(30, seed=k)), 500),
     "iqm": (lambda k: interquartile_mean([normal(50, seed=k)]), 500),
     "difference": (
@@ -228,7 +207,7 @@ SIMULATED: dict[str, tuple[Callable[[int], Figure], float]] = {
 @pytest.mark.thorough
 @pytest.mark.parametrize("name", SIMULATED)
 @pytest.mark.parametrize("is_large", [False, True])
-def test_coverage(name: str, is_large: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_coverage(name, is_large, monkeypatch):
     """Of 2000 samples, by both methods."""
     # Takes more than five seconds: resamples each of them a thousand times.
     if is_large:
@@ -237,10 +216,9 @@ def test_coverage(name: str, is_large: bool, monkeypatch: pytest.MonkeyPatch) ->
 
 
 @pytest.mark.parametrize(
-    "wrong",
-    [{"resamples": 0}, {"resamples": 10**7}, {"confidence": 1.0}, {"seed": -1}],
+    "wrong", [{"resamples": 0}, {"resamples": 10**7}, {"confidence": 1.0}, {"seed": -1}]
 )
-def test_impossible_bootstraps_are_refused(wrong: dict[str, int]) -> None:
+def test_impossible_bootstraps_are_refused(wrong):
     """Before anything is read or run."""
     with pytest.raises(InvalidArgument, match="got"):
-        Bootstrap(**wrong)  # type: ignore[arg-type]
+        Bootstrap(**wrong)

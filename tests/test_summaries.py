@@ -1,11 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-from __future__ import annotations
-
 import math
 import time
 import tracemalloc
 import warnings
-from typing import Any
 
 import numpy as np
 import pytest
@@ -31,7 +28,7 @@ TASK = "dm_control/walker-walk"
 QUICK = Bootstrap(resamples=500)
 
 
-def result(seed: int, episode: int, total: float | None, **more: Any) -> EpisodeResult:
+def result(seed, episode, total, **more):
     return EpisodeResult(
         task=TASK,
         seed=seed,
@@ -44,7 +41,7 @@ def result(seed: int, episode: int, total: float | None, **more: Any) -> Episode
     )
 
 
-def test_figures_of_a_task_by_hand() -> None:
+def test_figures_of_a_task_by_hand():
     """Two seeds, five episodes, one of which failed."""
     summary = summarize_results(
         TASK,
@@ -74,7 +71,7 @@ def test_figures_of_a_task_by_hand() -> None:
     assert 2 <= summary.mean_interval.low < 5 < summary.mean_interval.high <= 10
 
 
-def test_nothing_is_said_of_nothing() -> None:
+def test_nothing_is_said_of_nothing():
     """No episode, no figures; of one, no spread; and no NaN."""
     nothing = summarize_task(TASK, total_rewards=[], runs=0)
     assert nothing == TaskSummary(task=TASK, runs=0, episodes=0)
@@ -87,7 +84,7 @@ def test_nothing_is_said_of_nothing() -> None:
 
 
 @pytest.mark.parametrize("wrong", [math.nan, math.inf])
-def test_returns_that_are_no_numbers_leave_no_figures(wrong: float) -> None:
+def test_returns_that_are_no_numbers_leave_no_figures(wrong):
     """Without them the mean would say too much; how many there are is said."""
     summary = summarize_task(
         TASK, total_rewards=[1, 2, wrong], runs=1, lengths=[5, 5, 5]
@@ -99,7 +96,7 @@ def test_returns_that_are_no_numbers_leave_no_figures(wrong: float) -> None:
     assert across.left_out == {TASK: "1 of 2 returns are NaN or infinite"}
 
 
-def test_huge_returns_do_no_harm() -> None:
+def test_huge_returns_do_no_harm():
     """What cannot be added up has no mean, and nobody is warned."""
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -107,7 +104,7 @@ def test_huge_returns_do_no_harm() -> None:
     assert (summary.mean, summary.mean_interval, summary.maximum) == (None, None, 1e308)
 
 
-def test_many_episodes_are_summarized_at_once() -> None:
+def test_many_episodes_are_summarized_at_once():
     """A million in a second and in little more memory than they have; and said so."""
     returns = np.random.default_rng(0).normal(500, 100, 1_000_000)
     begin = time.perf_counter()
@@ -134,22 +131,20 @@ def test_many_episodes_are_summarized_at_once() -> None:
         ("HalfCheetah-v5", None, None),
     ],
 )
-def test_default_score_range(
-    task: str, step_limit: int | None, score_range: tuple[float, float] | None
-) -> None:
+def test_default_score_range(task, step_limit, score_range):
     """The suite has one, but where rewards have no bound."""
     assert default_score_range(task, step_limit) == score_range
 
 
 @pytest.mark.dm_control
-def test_the_suites_episodes_have_a_thousand_steps() -> None:
+def test_the_suites_episodes_have_a_thousand_steps():
     """What the default range relies on, of a task of every domain."""
     suite = pytest.importorskip("dm_control.suite")
     for domain, task in dict(suite.BENCHMARKING).items():
         assert suite.load(domain, task)._step_limit == 1000, domain
 
 
-def test_figures_across_tasks_by_hand() -> None:
+def test_figures_across_tasks_by_hand():
     """Three tasks of two episodes; the others are left out, with the reason."""
     across = summarize_across(
         {
@@ -182,7 +177,7 @@ def test_figures_across_tasks_by_hand() -> None:
         assert low - 1e-12 <= share <= high + 1e-12
 
 
-def test_what_cannot_be_said_across_tasks() -> None:
+def test_what_cannot_be_said_across_tasks():
     """A task of one episode leaves no intervals; none with a scale, no figures."""
     scales = {"a": (0.0, 1.0), "b": (0.0, 1.0)}
     across = summarize_across({"a": [0.5], "b": [0.1, 0.9]}, scales, bootstrap=QUICK)

@@ -29,6 +29,8 @@ COMMANDS = {
     "recover": ("recover", "Finish what a killed run left."),
     "list": ("list_episodes", "List recorded episodes."),
     "strip": ("strip", "Put frames of an episode side by side."),
+    "replay": ("replay", "Show an episode in 3D, in one HTML file."),
+    "view": ("view", "Show a run in a browser while it goes on."),
     "evaluate": ("evaluate", "Evaluate a policy on tasks and seeds."),
     "compare": ("compare", "Compare evaluations."),
     "report": ("report", "Make a web page of recordings or results."),

@@ -13,7 +13,9 @@ if TYPE_CHECKING:
 
 # Each command, in the group in which people look for it.
 GROUPS = {
-    "Record and render": ("record", "render", "list", "strip", "recover"),
+    "Record and render": (
+        *("record", "render", "list", "strip", "replay", "view", "recover"),
+    ),
     "Evaluate": ("evaluate", "compare", "report"),
     "Share": ("pack", "verify"),
     "Help": ("doctor", "completion"),
@@ -31,6 +33,8 @@ EXAMPLES = {
     ),
     "list": ("mjrec list recordings/first",),
     "strip": ("mjrec strip openaigym.video.0.4711.video000001.mp4 -o strip.png",),
+    "replay": ("mjrec replay recordings/first --episode 1 --out episode1.html",),
+    "view": ("mjrec view recordings/first",),
     "recover": ("mjrec recover recordings/first",),
     "evaluate": (
         "mjrec evaluate dm_control/walker-walk --policy module:Policy --out results",
