@@ -39,18 +39,18 @@ class RayEngine(Executor):
     """Runs jobs on a Ray cluster.
 
     Args:
-        workers: how many at once at most; None is as many as the cluster has room for,
-            also when it grows.
-        address: of the cluster; None is the one that `RAY_ADDRESS` names, else a Ray
-            that is started on this machine and ends with the engine. Where this process
-            is connected to Ray already, that is used, and left as it is.
-        gpus: how much of a GPU each worker gets: with 0.25 four share one.
-        require_gpu: a worker that renders in software though it was given a GPU is an
-            error, and not only a warning.
+        workers: how many at once. None is as many as the cluster has room for, also
+            while it grows.
+        address: of the cluster. None is `RAY_ADDRESS`, else a Ray is started on this
+            machine and ends with the engine. An existing connection of this process is
+            used and left open.
+        gpus: part of a GPU for each worker; with 0.25 four share one.
+        require_gpu: a worker that was given a GPU but renders in software is an error,
+            not only a warning.
 
     Raises:
-        InvalidArgument: `workers` is not a whole number of at least 1, or `gpus` is no
-            share of GPUs.
+        InvalidArgument: `workers` is not a whole number of at least 1, or `gpus` is not
+            a valid share.
         MissingDependency: Ray is not installed.
     """
 
