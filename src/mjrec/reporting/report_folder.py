@@ -57,34 +57,32 @@ def write_report(
     verifications: Iterable[str | os.PathLike[str]] = (),
     on_progress: OnProgress | None = None,
 ) -> Path:
-    """Write a page that shows recordings, and return its path.
+    """Write a web page about recordings, and return its path.
 
-    It has a summary of each task, curves, a gallery of the videos, all episodes, and
-    how they came about. It works for evaluations and for any monitor directory, also
-    one that old gym wrote, on a machine without MuJoCo and OpenGL. A file that cannot
-    be read is named on the page, and the rest is shown.
+    It has a summary of each task, curves, videos, all episodes, and their provenance.
+    It works for evaluations and for any monitor directory, also of old gym, without
+    MuJoCo and OpenGL. An unreadable file is named on the page.
 
     Args:
-        directories: of evaluations, of monitors, or folders with such directories
-            directly in them; one, or several.
-        path: of the folder to write. A report that is there is replaced, another
-            folder that is not empty is not. With `single_file` it may end in `.html`
-            and is then the page itself.
-        title: of the page; what was recorded, if None.
-        single_file: put posters and videos into the page. Those that are too large
-            for `max_single_file_bytes` are left out, with a note: the posters come
-            first, then the videos in the order of the gallery.
-        max_single_file_bytes: the most bytes of the page with `single_file`.
-        verifications: files that `mjrec verify --json` has printed; a
-            `verification.json` in a directory is found by itself.
+        directories: evaluations, monitor directories, or folders that contain some; one
+            or several.
+        path: the folder to write. An existing report is replaced; another folder that
+            is not empty is left alone. With `single_file` it may end in `.html`, and is
+            then the page.
+        title: of the page. None is what was recorded.
+        single_file: put images and videos into the page: posters first, then videos in
+            order, up to `max_single_file_bytes`; the rest is named.
+        max_single_file_bytes: size limit of the page with `single_file`.
+        verifications: outputs of `mjrec verify --json`. A `verification.json` in a
+            directory is found by itself.
         on_progress: called with a `ReportProgress` for each poster and video.
 
     Raises:
-        InvalidArgument: a directory has no recordings; `path` is something else than
-            a report; or the page alone is larger than `max_single_file_bytes`.
-        UnreadableFile: one of `verifications`.
+        InvalidArgument: a directory has no recordings, `path` is not a report, or the
+            page alone is larger than `max_single_file_bytes`.
+        UnreadableFile: one of `verifications` cannot be read.
         MissingDependency: Jinja2 is not installed.
-        FileNotWritten, DirectoryNotWritable: the disk is full, or read-only.
+        FileNotWritten, DirectoryNotWritable: the disk is full or read-only.
     """
     target = Path(os.path.realpath(path))
     is_page = target.suffix.lower() in _PAGE_ENDINGS
