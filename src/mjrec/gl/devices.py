@@ -177,15 +177,15 @@ def _found(gpu: str, environ: Mapping[str, str]) -> tuple[EglDevice, int]:
     """
     if not gpu:
         raise GLError(
-            "This process was given no GPU for rendering: CUDA_VISIBLE_DEVICES names "
-            "none. Ask whoever starts it for one."
+            "This process was given no GPU for rendering: CUDA_VISIBLE_DEVICES is "
+            "empty. Ask your scheduler for one."
         )
     asked = f"GPU {gpu} was given for rendering"
     backend = None if rendering_is_off(environ) else backend_in_environment(environ)
     if backend not in (None, "egl"):
         raise GLError(
-            f"{asked}, and MUJOCO_GL={backend} cannot be told on which GPU to render: "
-            "unset MUJOCO_GL, or set it to egl."
+            f"{asked}, but MUJOCO_GL={backend} cannot choose a GPU: unset MUJOCO_GL, "
+            "or set it to egl."
         )
     device, alone = _device(gpu, environ)
     if device is None:

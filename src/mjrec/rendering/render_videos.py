@@ -164,8 +164,8 @@ def iter_rendered_videos(
         if not keys and not target.is_dir():
             raise InvalidArgument(
                 f"No video of {target.name} is pending: no recording has such a name. "
-                "To render it again, say what is to be other (camera, size, max_fps, "
-                "quality, fps, annotate) or where to write it (out, --out)."
+                "To render it once more, say what should change (camera, size, "
+                "max_fps, quality, fps, annotate) or where to write it (out, --out)."
             )
         results = finish(
             directory,
@@ -244,8 +244,7 @@ def _variant_jobs(
         names = [path.name for key in episodes for path in parts_of(directory, key)]
     if not names:
         raise InvalidArgument(
-            f"There are no recorded states of {target}, from which it could be "
-            "rendered again."
+            f"{target} has no recorded states, so it cannot be rendered again."
         )
     if out is not None:
         if len(names) > 1:

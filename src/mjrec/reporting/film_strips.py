@@ -186,8 +186,8 @@ def _spread(available: int, count: int, path: Path) -> list[int]:
     """
     if count > available:
         raise InvalidArgument(
-            f"{path} has {available} pictures, and {count} were asked for: ask for at "
-            f"most {available} (frames, --frames)."
+            f"{path} has only {available} frames, not {count}: ask for at most "
+            f"{available} (frames, --frames)."
         )
     return [int(index) for index in np.linspace(0, available - 1, count).round()]
 

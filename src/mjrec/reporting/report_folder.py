@@ -120,7 +120,7 @@ def _single_page(
             return page
         if room <= 0:
             raise InvalidArgument(
-                f"The page has {size} bytes without any picture or video, and "
+                f"The page has {size} bytes without any image or video, and "
                 f"max_single_file_bytes allows {most_bytes}. Allow more, or write a "
                 "folder."
             )
@@ -135,7 +135,7 @@ def _check_target(target: Path, *, is_page: bool) -> None:
     if is_page:
         if not _is_own_page(target):
             raise InvalidArgument(
-                f"{target} is there and is no report. It is not replaced: choose "
+                f"{target} exists and is no report, so it is not replaced: choose "
                 "another name, or remove it."
             )
         return
@@ -158,8 +158,9 @@ def _check_target(target: Path, *, is_page: bool) -> None:
     if foreign:
         more = f" and {len(foreign) - _SHOWN} more" if len(foreign) > _SHOWN else ""
         raise InvalidArgument(
-            f"{target} holds what is no report: {', '.join(foreign[:_SHOWN])}{more}. "
-            "It is not replaced: choose another folder, or move that away."
+            f"{target} holds files that are no report: "
+            f"{', '.join(foreign[:_SHOWN])}{more}. It is not replaced: choose another "
+            "folder, or move them away."
         )
 
 
