@@ -32,9 +32,9 @@ EXAMPLES = {
         "mjrec render recordings/first --episode 1 --camera side --size 640x480",
     ),
     "list": ("mjrec list recordings/first",),
-    "strip": ("mjrec strip openaigym.video.0.4711.video000001.mp4 -o strip.png",),
-    "replay": ("mjrec replay recordings/first --episode 1 --out episode1.html",),
     "view": ("mjrec view recordings/first",),
+    "replay": ("mjrec replay recordings/first --episode 1 --out replay.html",),
+    "strip": ("mjrec strip openaigym.video.0.4711.video000001.mp4 -o strip.png",),
     "recover": ("mjrec recover recordings/first",),
     "evaluate": (
         "mjrec evaluate dm_control/walker-walk --policy module:Policy --out results",
