@@ -173,7 +173,7 @@ def test_a_job_whose_child_dies_is_done_again(begin, tmp_path, caplog):
         value=None,
         failure=(
             "Its worker died, which was try 3 of 3: it was killed by SIGKILL. "
-            "The end of what it said: SIGKILL is near"
+            "Its last output: SIGKILL is near"
         ),
         tries=3,
     )
@@ -213,7 +213,7 @@ def test_children_that_die_as_they_begin(begin):
         with pytest.raises(
             Error,
             match=r"No worker can begin. The last one ended with status 3. "
-            r"The end of what it said: a library is missing",
+            r"Its last output: a library is missing",
         ):
             outcomes(run)
 

@@ -142,7 +142,7 @@ def test_usual_columns(video, frames, columns):
 def test_more_pictures_than_there_are(video, trajectory):
     """The error says how many there are."""
     for file in (video, trajectory):
-        with pytest.raises(InvalidArgument, match="has 11 pictures, and 12"):
+        with pytest.raises(InvalidArgument, match="has only 11 frames, not 12"):
             film_strip(file, frames=12)
 
 
@@ -215,7 +215,7 @@ def test_the_command_writes_a_picture_and_says_its_size(video, tmp_path, capsys)
     out = tmp_path / "strip.png"
     with pytest.raises(InvalidArgument, match="trajectory"):
         strip(video, size="640x480", out=out)
-    with pytest.raises(InvalidArgument, match="11 pictures"):
+    with pytest.raises(InvalidArgument, match="11 frames"):
         strip(video, frames=13, out=out)
     assert not out.exists()
     assert strip(video, frames=6, columns=2, out=out) == 0

@@ -222,7 +222,7 @@ def test_a_single_file_is_no_larger_than_allowed(recordings, tmp_path):
     assert len(re.findall("<img[^>]* src=.data:image/jpeg;base64,", text)) == 2
     assert len(re.findall("<a[^>]* href=.data:video/mp4;base64,", text)) == 1
     assert "1 of 2 videos are not embedded" in text
-    with pytest.raises(InvalidArgument, match="without any picture or video"):
+    with pytest.raises(InvalidArgument, match="without any image or video"):
         write_report(
             recordings,
             tmp_path / "tiny.html",
