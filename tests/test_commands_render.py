@@ -6,7 +6,6 @@ import os
 import pty
 import subprocess
 import sys
-from collections.abc import Callable
 
 import gymnasium
 import pytest
@@ -26,7 +25,6 @@ from mjrec.rendering.render_videos import name_of_variant
 from mjrec.rendering.views import Variant, View
 
 VIDEO = "openaigym.video.0.7.video000000"
-Run = Callable[..., tuple[int, str, str]]
 
 
 @pytest.fixture
@@ -72,7 +70,6 @@ def test_what_is_not_rendered_is_listed_with_its_reason(tmp_path, mjrec, painter
     write_finished(tmp_path, 3, frames=False)
     write_finished(tmp_path, 4)
     lock = claim(tmp_path, RecordingKey(INFIX, 4))
-    assert lock is not None
     status, out, _ = mjrec(tmp_path)
     assert status == 1
     assert "1 video rendered" in out

@@ -32,13 +32,11 @@ def load(domain="cheetah", task="run", **kwargs):
 def begun(env, directory, **asked):
     """Return the facts of the scene of an episode that begins now."""
     scenes = dm_control_scenes(env, **asked)
-    assert scenes.states is not None
     scenes.states.open(directory)
     with scenes.states.resetting():
         env.reset()
     start = scenes.states.begin_episode()
     assert start.refusal is None
-    assert start.scene is not None
     scenes.states.finish()
     scenes.states.close()
     return dict(start.scene)
