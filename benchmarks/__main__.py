@@ -34,6 +34,10 @@ MEASUREMENTS = (
 )
 
 
+# Those that can also be measured part by part.
+_PHASES = {"time_to_video": "video_phases"}
+
+
 @dataclass(frozen=True)
 class Report:
     """What a run of the benchmarks found.
@@ -72,7 +76,10 @@ def main(arguments: list[str] | None = None) -> int:
     seconds: dict[str, float] = {}
     for line in machine.lines():
         console.print(line, highlight=False)
-    for name in options.only or MEASUREMENTS:
+    names = [*(options.only or MEASUREMENTS)]
+    if options.phases:
+        names = [_PHASES.get(name, name) for name in names]
+    for name in names:
         module = importlib.import_module(f".{name}", __package__)
         start = time.monotonic()
         results[name] = _measured(name, module, options.quick, waiting)
@@ -113,6 +120,11 @@ def _parser() -> argparse.ArgumentParser:
         "--quick",
         action="store_true",
         help="fewer rounds and steps: minutes, and numbers to be taken with care",
+    )
+    parser.add_argument(
+        "--phases",
+        action="store_true",
+        help="the parts of time_to_video, in its place",
     )
     parser.add_argument(
         "--json", type=Path, metavar="FILE", help="write every sample to this file"

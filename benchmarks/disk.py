@@ -89,8 +89,7 @@ def record_and_finish(name: str, steps: int) -> dict[str, float]:
         else:
             env = _recorded_gymnasium(name, steps, directory)
         [recording] = recordings_in_flight(Path(directory))
-        assert recording.spans.dtype is not None
-        row = recording.spans.dtype.itemsize
+        row = recording.dtype.itemsize
         with open_trajectory(recording.path) as reader:
             sizes = {"log": reader.row_count * row}
         start = time.perf_counter()

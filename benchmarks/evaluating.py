@@ -1,9 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How much faster two workers evaluate a policy than one."""
+"""How much faster two workers evaluate a policy than one, and than bare processes."""
 
 from __future__ import annotations
 
 import functools
+import subprocess
+import sys
 import tempfile
 import time
 from collections.abc import Callable
@@ -16,7 +18,7 @@ from .children import call
 from .results import Reference, Result, at_most
 from .rounds import Say, take_turns
 
-TITLE = "Evaluating: the random policy in the suite, without videos"
+TITLE = "Evaluating: the random policy, without videos"
 
 # Of all sizes, in the order of the alphabet: what takes long does not come first.
 _TASKS = (
@@ -25,6 +27,21 @@ _TASKS = (
     *("quadruped-walk", "reacher-easy", "swimmer-swimmer6", "walker-walk"),
 )
 _PROMISE = at_most(1 / 1.7)
+
+_BARE = "2 bare processes"
+# What evaluates nothing: it steps the environment, with random actions.
+_STEPPING = """
+import sys
+import gymnasium
+
+env = gymnasium.make("HalfCheetah-v5")
+for seed in range(int(sys.argv[1])):
+    env.reset(seed=seed)
+    is_over = False
+    while not is_over:
+        _, _, terminated, truncated, _ = env.step(env.action_space.sample())
+        is_over = terminated or truncated
+"""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,20 +53,34 @@ class Settings:
         tasks: of the suite.
         episodes: of each task.
         steps: of each episode; None is all of them.
+        bare: how many episodes of HalfCheetah two workers evaluate, beside two
+            processes that only step it.
     """
 
     rounds: int = 5
     tasks: int = len(_TASKS)
     episodes: int = 2
     steps: int | None = None
+    bare: tuple[int, ...] = (40, 200)
 
 
 FULL = Settings()
-QUICK = Settings(rounds=3, steps=250)
+QUICK = Settings(rounds=3, steps=250, bare=(40,))
 
 
 def measure(settings: Settings, say: Say) -> list[Result]:
-    """Return how long one worker takes, and two."""
+    """Return how long one worker takes, and two, and bare processes."""
+    return [
+        *_measure_workers(settings, say),
+        *(
+            result
+            for episodes in settings.bare
+            for result in _measure_bare(episodes, settings, say)
+        ),
+    ]
+
+
+def _measure_workers(settings: Settings, say: Say) -> list[Result]:
     variants: dict[int, Callable[[], float]] = {
         workers: functools.partial(
             call,
@@ -91,5 +122,53 @@ def seconds_to_evaluate(
             workers=workers,
             keep="none",
             max_steps=steps,
+        )
+        return time.perf_counter() - start
+
+
+def _measure_bare(episodes: int, settings: Settings, say: Say) -> list[Result]:
+    variants: dict[str, Callable[[], float]] = {
+        _BARE: functools.partial(call, seconds_to_step_bare, episodes=episodes),
+        "2 workers": functools.partial(
+            call, seconds_to_evaluate_cheetah, episodes=episodes
+        ),
+    }
+    samples = take_turns(variants, rounds=settings.rounds, say=say)
+    return [
+        Result(
+            subject=f"HalfCheetah-v5, {episodes} episodes, from start to end",
+            variant=name,
+            unit="s",
+            samples=tuple(values),
+            reference=None
+            if name == _BARE
+            else Reference(_BARE, tuple(samples[_BARE])),
+        )
+        for name, values in samples.items()
+    ]
+
+
+def seconds_to_step_bare(episodes: int) -> float:
+    """Return how long two processes take that step half of the episodes each."""
+    start = time.perf_counter()
+    command = [sys.executable, "-c", _STEPPING, str(episodes // 2)]
+    processes = [subprocess.Popen(command) for _ in range(2)]
+    if any(process.wait() for process in processes):
+        raise RuntimeError("A process that steps has failed.")
+    return time.perf_counter() - start
+
+
+def seconds_to_evaluate_cheetah(episodes: int) -> float:
+    """Return how long two workers take, with all that is written."""
+    with tempfile.TemporaryDirectory() as place:
+        start = time.perf_counter()
+        mjrec.evaluate(
+            "HalfCheetah-v5",
+            policy="random",
+            directory=Path(place) / "evaluation",
+            episodes=4,
+            num_seeds=episodes // 4,
+            workers=2,
+            keep="none",
         )
         return time.perf_counter() - start

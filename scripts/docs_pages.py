@@ -28,7 +28,7 @@ GROUPS = {
     ),
     "Render": (
         "load_trajectory Trajectory render render_states render_videos RenderedVideos "
-        "recover Recovery film_strip VideoWriter save_video"
+        "recover Recovery film_strip write_replay Replay VideoWriter save_video"
     ),
     "Read results": (
         "load_results iter_episodes Episode detect_training_manifests "

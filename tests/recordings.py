@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import re
 from pathlib import Path
@@ -10,7 +11,9 @@ from typing import Any
 
 import av
 
-from mjrec.formats.spans import append_line, get_recording, recordings_in_flight
+from mjrec.formats.journal import JournalWriter
+from mjrec.formats.monitor_directory import infix_of, journal_name
+from mjrec.formats.spans import recordings_in_flight
 
 
 def in_flight(directory: Path) -> list[Path]:
@@ -80,5 +83,16 @@ def _json(pattern: str, directory: Path) -> dict[str, Any]:
 
 def add_facts(path: Path, facts: dict[str, Any]) -> None:
     """Add to the facts of a recording in flight, as its monitor does."""
-    recording = get_recording(path)
-    append_line(recording.spans.path, {"note": recording.name, "facts": facts})
+    say(path, "note", {"name": path.name.removesuffix(".h5"), "facts": facts})
+
+
+def drop(path: Path) -> None:
+    """Give up a recording in flight, as its monitor does."""
+    say(path, "drop", path.name.removesuffix(".h5"))
+
+
+def say(path: Path, kind: str, facts: Any) -> None:
+    """Add an event to the journal of the monitor that a recording is of."""
+    journal = path.with_name(journal_name(infix_of(path.name) or ""))
+    with contextlib.closing(JournalWriter(journal)) as writer:
+        writer.note(kind, facts)

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import itertools
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -12,17 +11,16 @@ from typing import Any
 import mujoco
 import numpy as np
 from result_files import write_journal, write_saved
-from trajectories_by_hand import INFIX, add_row, write_log
+from trajectories_by_hand import INFIX, add_row, new_logs, write_log
 
-from mjrec.formats.monitor_directory import trajectory_prefix
-from mjrec.formats.span_writer import SpanLogs
-from mjrec.formats.spans import list_paths
+from mjrec.formats.monitor_directory import journal_name, trajectory_prefix
+from mjrec.formats.spans import log_paths
 from mjrec.formats.trajectory import ModelChange, row_dtype
 from mjrec.formats.trajectory_file import finish_trajectory
 from mjrec.simulation.model_sources import authored_from_file
 from mjrec.simulation.model_store import ModelStore
 
-PARTS = (".spans", ".log", ".tail", ".looks")
+PARTS = (".log", ".tail", ".looks")
 SPHERE = '<mujoco><worldbody><geom size=".1"/></worldbody></mujoco>'
 
 
@@ -86,9 +84,9 @@ def video(directory: Path) -> Path:
 
 
 def killed(directory: Path) -> Path:
-    """Record an episode and be killed; return its list."""
+    """Record an episode and be killed; return its log."""
     dtype = row_dtype(observation=np.dtype(("<f8", (9,))))
-    logs = SpanLogs(directory, INFIX, numbers=itertools.count(), tail_bytes=1)
+    logs = new_logs(directory, tail_bytes=1)
     span = logs.begin(trajectory_prefix(INFIX, 0), {}, dtype)
     for step in range(10):
         if step == 5:
@@ -96,8 +94,12 @@ def killed(directory: Path) -> Path:
         add_row(span, step, observation=step)
     span.note({"rate": "20"})
     logs.release()
-    [spans] = list_paths(directory)
-    return spans
+    [log] = log_paths(directory)
+    return log
+
+
+def journal_of_killed(directory: Path) -> Path:
+    return killed(directory).with_name(journal_name(INFIX))
 
 
 def killed_with(part: str) -> Callable[[Path], Path]:
@@ -115,5 +117,6 @@ FILES: dict[str, tuple[str, Callable[[Path], Path]]] = {
     "zip": ("model", source),
     "mjcf": ("mjcf", mjcf),
     "video for an archive": ("archive", video),
+    "spans": ("finish", journal_of_killed),
     **{part: ("finish", killed_with(part)) for part in PARTS},
 }

@@ -20,6 +20,7 @@ from benchmarks import (
     stepping,
     time_to_video,
     verifying,
+    video_phases,
 )
 from benchmarks.children import ChildFailed, call
 from benchmarks.results import Reference, Result, at_least, at_most
@@ -125,6 +126,13 @@ MEASURED = [
         marks=thorough,
     ),
     pytest.param(
+        video_phases,
+        {**SMALL, "steps": (2,), "workers": 1},
+        None,
+        set(),
+        marks=thorough,
+    ),
+    pytest.param(
         memory,
         {**SMALL, "short": 2, "long": 4, "recorders": ("bare", "workers=0")},
         None,
@@ -157,8 +165,8 @@ MEASURED = [
     ),
     pytest.param(
         evaluating,
-        {"rounds": 1, "tasks": 1, "episodes": 1, "steps": 2},
-        ["1 worker", "2 workers"],
+        {"rounds": 1, "tasks": 1, "episodes": 1, "steps": 2, "bare": (4,)},
+        ["1 worker", "2 workers", "2 bare processes", "2 workers"],
         {"≤ 0.588235"},
         marks=(thorough, dm_control),
     ),

@@ -29,9 +29,11 @@ def test_what_was_done_is_listed(tmp_path, capsys):
 def test_failures_are_listed(tmp_path, capsys):
     """The exit status says so too. A newer version's log is left as it is."""
     write_log(tmp_path, 0)
-    [log] = tmp_path.glob("*.spans")
-    content = log.read_bytes().replace(b'"version": 1', b'"version": 9', 1)
-    log.write_bytes(content)
+    [log] = tmp_path.glob("*.log")
+    [journal] = tmp_path.glob("*.jsonl")
+    spoilt = journal.read_bytes().replace(b'"version": 1', b'"version": 9', 1)
+    journal.write_bytes(spoilt)
+    content = log.read_bytes()
     assert main(["recover", str(tmp_path)]) == 1
     said = capsys.readouterr().out
     assert "Not recovered:\n" in said

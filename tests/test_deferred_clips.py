@@ -304,7 +304,7 @@ def test_a_full_disk_ends_a_clip_and_not_the_simulation(tmp_path: Path) -> None:
     [outcome] = finish(tmp_path)
     assert outcome.videos == {details["pending"][0]["video"]: 4}
     [about] = metadata_in(tmp_path)
-    assert "states" in about["broken_reason"]
+    assert "Cannot write" in about["broken_reason"]
 
 
 @pytest.mark.parametrize(

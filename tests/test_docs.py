@@ -56,7 +56,8 @@ def test_every_public_name_has_its_place(pages: ModuleType) -> None:
     """Each name of the package is in one group of the reference; errors have theirs."""
     listed = [name for names in pages.GROUPS.values() for name in names.split()]
     errors = set(mjrec.errors.KINDS)
-    assert sorted(listed) == sorted({*mjrec.__all__, "DmEnvMonitor"} - errors)
+    of_extras = {"DmEnvMonitor", "Replay", "write_replay"}
+    assert sorted(listed) == sorted({*mjrec.__all__, *of_extras} - errors)
 
 
 def test_every_known_message_of_opengl_is_explained(pages: ModuleType) -> None:
@@ -67,12 +68,12 @@ def test_every_known_message_of_opengl_is_explained(pages: ModuleType) -> None:
 
 
 def test_pages_stay_short() -> None:
-    """Written pages have at most 12,000 words, the decisions 1,500."""
+    """Written pages have at most 12,600 words, the decisions 1,500."""
     words = {
         path: len([w for w in path.read_text().split() if re.search(r"\w", w)])
         for path in DOCS.rglob("*.md")
     }
-    assert sum(words.values()) <= 12_000
+    assert sum(words.values()) <= 12_600
     assert words[DOCS / "decisions.md"] <= 1_500
 
 

@@ -33,7 +33,7 @@ EXCUSES = {
 
 
 def difference(aspect: Aspect, size: float | None = None, **changes: Any) -> Difference:
-    usual: dict[str, Any] = {"topic": Topic.PHYSICS, "file": TRAJECTORY}
+    usual: dict[str, Any] = {"topic": Topic.PHYSICS, "file": TRAJECTORY, "how": ""}
     return Difference(**{**usual, **changes}, aspect=aspect, size=size)
 
 
@@ -104,11 +104,11 @@ def test_the_widest_excuse_decides() -> None:
     assert (finding.outcome, finding.excuse) == (WITHIN, "mujoco")
 
 
-def test_excuses_that_nothing_needed_are_not_shown() -> None:
+def test_excuses_that_nothing_needed_are_told_apart() -> None:
     """Other versions that change nothing cost nothing."""
     trial = Trial([excuse_of(*EXCUSES["python"]), excuse_of(*EXCUSES["mujoco"])])
     trial.judge(difference(Aspect.CLAIM, claim="python"))
-    assert trial.excuses == ()
+    assert [each.is_needed for each in trial.excuses] == [False, False]
 
 
 def test_turns_by_rk4_differ_between_major_versions_only() -> None:

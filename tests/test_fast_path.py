@@ -498,18 +498,25 @@ import os, signal, sys
 import gymnasium, mjrec
 from mjrec.recorder import fast_path
 
-class Head:
-    rows = 0
-    def pack_into(self, *values):
-        self.rows += 1
-        if self.rows < 7:
-            head.pack_into(*values)
-        else:
-            if sys.argv[2] == "filled":
-                head.pack_into(*values)
-            os.kill(os.getpid(), signal.SIGKILL)
+rows = 0
 
-head, fast_path.ROW_HEAD = fast_path.ROW_HEAD, Head()
+class Words:
+    def take(self, *arguments):
+        global rows
+        rows += 1
+        words.take(*arguments)
+        kill_at("being filled")
+
+def add(*rewards):
+    kill_at("filled")
+    return total(*rewards)
+
+def kill_at(moment):
+    if rows == 7 and sys.argv[2] == moment:
+        os.kill(os.getpid(), signal.SIGKILL)
+
+words, fast_path.WORDS = fast_path.WORDS, Words()
+total, fast_path._sum = fast_path._sum, add
 env = gymnasium.make("InvertedPendulum-v5", max_episode_steps=3)
 env = mjrec.Monitor(env, sys.argv[1], lambda _: True, workers=0)
 while True:

@@ -242,7 +242,7 @@ def test_a_full_disk_while_an_episode_is_recorded(
     run(monitor)
     # A thread stores it, and this is not about that.
     wait_until(lambda: list(out.glob("*.mjb.gz")))
-    with file_size_limit(200), raised(on_error, FileNotWritten, "states"):
+    with file_size_limit(200), raised(on_error, FileNotWritten, "Cannot write"):
         run(monitor)
     while not monitor.stats_recorder.done:
         go_on(monitor, 1)
@@ -305,7 +305,7 @@ def test_a_directory_that_is_removed_during_the_run(
     monitor = pendulum(render=render, workers=0, on_error=on_error)
     run(monitor)
     remove(out)
-    with raised(on_error, FileNotWritten, "states"):
+    with raised(on_error, FileNotWritten, "Cannot write"):
         run(monitor)
         run(monitor, 3)
     with pytest.raises(FileNotWritten, match=r"stats\.json|\.jsonl"):

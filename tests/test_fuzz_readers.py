@@ -35,7 +35,7 @@ from mjrec.formats.manifest import (
     write_manifest,
     write_stats_file,
 )
-from mjrec.formats.monitor_directory import states_name, trajectory_prefix
+from mjrec.formats.monitor_directory import journal_name, log_name, trajectory_prefix
 from mjrec.formats.row_log import TAIL_HEAD
 from mjrec.formats.trajectory import ModelChange
 from mjrec.formats.trajectory_file import open_trajectory
@@ -235,21 +235,20 @@ def test_keys_that_would_be_written_as_the_same_come_back(value: Any) -> None:
 # --- a recording in flight -----------------------------------------------------------
 
 NAME = trajectory_prefix(INFIX, 0)
-SPANS = states_name(INFIX, 0)
-PARTS = (".spans", ".log", ".looks")
+JOURNAL, LOG = journal_name(INFIX), log_name(INFIX, 0)
+LOOKS, TAIL = LOG.replace(".log", ".looks"), LOG.replace(".log", ".tail")
 
 Files = dict[str, bytes]
 
 
 @pytest.fixture(scope="module")
 def sound_log(tmp_path_factory: pytest.TempPathFactory) -> Files:
-    """The files of a recording, by their suffixes."""
+    """The files of a recording, by their names."""
     directory = tmp_path_factory.mktemp("log")
     write_log(directory)
-    spans = directory / SPANS
     packed = pack_change(1, ModelChange(step=1, fields={"geom_rgba": np.ones((2, 2))}))
-    spans.with_suffix(".looks").write_bytes(packed)
-    return {part: spans.with_suffix(part).read_bytes() for part in PARTS}
+    (directory / LOOKS).write_bytes(packed)
+    return {name: (directory / name).read_bytes() for name in (JOURNAL, LOG, LOOKS)}
 
 
 _numbers = itertools.count()
@@ -259,8 +258,8 @@ def put_log(tmp_path: Path, files: Files) -> Path:
     """Write files into a directory of their own; return the recording's path."""
     directory = tmp_path / str(next(_numbers))
     directory.mkdir()
-    for part, content in files.items():
-        (directory / SPANS).with_suffix(part).write_bytes(content)
+    for name, content in files.items():
+        (directory / name).write_bytes(content)
     return directory / f"{NAME}.h5"
 
 
@@ -284,17 +283,17 @@ def read_log(path: Path) -> Any:
 def test_every_line_with_one_thing_wrong(
     tmp_path: Path, sound_log: Files, number: int
 ) -> None:
-    """Of a list; what is relied on in rendering is looked at there."""
-    lines = sound_log[".spans"].splitlines()
+    """Of a journal; what is relied on in rendering is looked at there."""
+    lines = sound_log[JOURNAL].splitlines()
     assert len(lines) == 4
     for value in spoilt(json.loads(lines[number])):
         changed = [*lines[:number], json.dumps(value).encode(), *lines[number + 1 :]]
         content = b"".join(line + b"\n" for line in changed)
-        read_log(put_log(tmp_path, {**sound_log, ".spans": content}))
+        read_log(put_log(tmp_path, {**sound_log, JOURNAL: content}))
 
 
 @FEW
-@given(part=st.sampled_from(PARTS), damage=DAMAGE)
+@given(part=st.sampled_from([JOURNAL, LOG, LOOKS]), damage=DAMAGE)
 def test_any_damaged_log(
     tmp_path: Path, sound_log: Files, part: str, damage: Any
 ) -> None:
@@ -306,7 +305,7 @@ def test_any_damaged_log(
         assert len(found.rewards) == max(0, len(found.states) - 1)
         assert np.isin(found.frame_steps, np.arange(len(found.states))).all()
         assert (np.diff(found.frame_steps) > 0).all()
-    if found is not None and part != ".log":
+    if found is not None and part != LOG:
         assert (found.rewards == 0.5).all()
 
 
@@ -316,14 +315,14 @@ def test_any_damaged_tail(
     tmp_path: Path, sound_log: Files, damage: Any, written: int
 ) -> None:
     """Rows are taken from it as far as they say that they are the next ones."""
-    rows = sound_log[".log"]
+    rows = sound_log[LOG]
     size = len(rows) // 5
     head = struct.pack("=QQQ", 5, size // 8, 5).ljust(TAIL_HEAD, b"\0")
     # Where it counts: most of a head is nothing.
     place = [(p / 20 if p < 0.5 else p, *rest) for p, *rest in damage]
     tail = damaged(head[:24] + rows, place)  # type: ignore[arg-type]
     tail = tail[:24].ljust(TAIL_HEAD, b"\0") + tail[24:]
-    files = {**sound_log, ".log": rows[: written * size], ".tail": tail}
+    files = {**sound_log, LOG: rows[: written * size], TAIL: tail}
     found = read_log(put_log(tmp_path, files))
     assert found is None or written <= len(found.states) <= 5
 

@@ -27,7 +27,15 @@ import numpy as np
 import pytest
 from hostile_reading import SECONDS, Inspector
 from random_rows import DTYPE
-from sound_files import FILES, SPHERE, finished, killed, manifest, metadata, stored
+from sound_files import (
+    FILES,
+    SPHERE,
+    finished,
+    journal_of_killed,
+    manifest,
+    metadata,
+    stored,
+)
 from trajectories_by_hand import INFIX, add_row, new_logs, write_log
 
 from mjrec import UnreadableFile, load_trajectory
@@ -37,6 +45,8 @@ from mjrec.formats.monitor_directory import (
     clip_part_name,
     episode_of,
     infix_of,
+    journal_name,
+    log_name,
     trajectory_prefix,
 )
 from mjrec.formats.spans import is_in_flight, recordings_in_flight, remove_if_done
@@ -157,7 +167,7 @@ def test_other_content_is_refused(
     if kind == "journal":
         os.truncate(path, min(path.stat().st_size, 1 << 28))
     # MuJoCo reads what the user has named as it likes.
-    may_be_read = {"mjcf", ".spans"} if "hole" in spoil else set()
+    may_be_read = {"mjcf", "spans"} if "hole" in spoil else set()
     if kind in {"journal", ".log", ".tail", ".looks"} | may_be_read:
         outcome = inspector.read(reader, path)
         assert outcome.kind in ("value", "refused"), outcome
@@ -271,9 +281,9 @@ HDF5: list[tuple[Callable[[h5py.File], object], str]] = [
 
 
 def head(rows: Any, version: int = 1) -> bytes:
-    """Return the first line of somebody else's list."""
-    values = {"format": "mjrec spans", "version": version, "rows": rows, "facts": {}}
-    return json.dumps(values).encode() + b"\n"
+    """Return the first line of somebody else's journal."""
+    values = {"number": 0, "version": version, "dtype": rows, "facts": {}}
+    return json.dumps({"rows": values}).encode() + b"\n"
 
 
 def beginning_with(line: bytes, path: Path) -> None:
@@ -400,10 +410,10 @@ HARMS: list[tuple[str, Harm, str]] = [
     ),
     *(("h5", functools.partial(in_hdf5, change), said) for change, said in HDF5),
     *(
-        (".spans", functools.partial(beginning_with, head(rows)), said)
+        ("spans", functools.partial(beginning_with, head(rows)), said)
         for said, rows in ROWS.items()
     ),
-    (".spans", functools.partial(beginning_with, b"[" * 10**7 + b"\n"), "nested"),
+    ("spans", functools.partial(beginning_with, b"[" * 10**7 + b"\n"), "does not say"),
     *(
         (".looks", functools.partial(with_change, header), "change of the model")
         for header in CHANGES
@@ -442,30 +452,31 @@ def test_harm_is_one_error(
     "lines",
     [
         b"[" * 1_000_000,
-        b'{"note": "%s", "facts": {"a": 1, "a": 2}}\n' % NAME.encode(),
-        b'{"note": "%s", "facts": {"a": "%s"}}\n' % (NAME.encode(), b"a" * (30 << 20)),
+        b'{"note": {"name": "%s", "facts": {"a": 1, "a": 2}}}\n' % NAME.encode(),
+        b'{"note": {"name": "%s", "facts": {"a": "%s"}}}\n'
+        % (NAME.encode(), b"a" * (30 << 20)),
         b"a" * (200 << 20),
         b"{\n" * 50_000,
     ],
     ids=["nested", "a fact twice", "large facts", "an endless line", "no lines"],
 )
-def test_hostile_lines_of_a_list_take_little(
+def test_hostile_lines_about_rows_take_little(
     inspector: Inspector, directory: Path, lines: bytes
 ) -> None:
     """Time and memory; what was said before counts."""
-    spans = killed(directory)
-    with spans.open("ab") as file:
+    journal = journal_of_killed(directory)
+    with journal.open("ab") as file:
         file.write(lines)
-    inspector.reads("finish", spans)
+    inspector.reads("finish", journal)
 
 
-def put_list(directory: Path, name: str, version: int = 1) -> Path:
-    """Put a list of somebody else's there that names a recording."""
-    begin = {"begin": name, "row": 0, "look": 0, "facts": {}}
-    found = directory / "openaigym.states.0.7.000000.spans"
-    found.write_bytes(head(DTYPE.descr, version) + json.dumps(begin).encode() + b"\n")
-    found.with_suffix(".log").touch()
-    return found
+def put_journal(directory: Path, name: str, version: int = 1) -> Path:
+    """Put a journal of somebody else's there that names a recording."""
+    begin = {"name": name, "log": 0, "rows": 0, "row": 0, "look": 0, "facts": {}}
+    path, line = directory / journal_name(INFIX), json.dumps({"begin": begin})
+    path.write_bytes(head(DTYPE.descr, version) + line.encode() + b"\n")
+    (directory / log_name(INFIX, 0)).touch()
+    return path
 
 
 def test_only_names_of_the_monitor_are_believed(directory: Path) -> None:
@@ -475,23 +486,23 @@ def test_only_names_of_the_monitor_are_believed(directory: Path) -> None:
         trajectory_prefix(Infix(0, "2"), 27),
         clip_part_name(Infix(1, "7"), 0, 0),
     ):
-        put_list(directory, name)
+        put_journal(directory, name)
         assert recordings_in_flight(directory) == [], name
         assert not is_in_flight(directory / f"{NAME}.h5")
-    put_list(directory, NAME)
+    put_journal(directory, NAME)
     assert is_in_flight(directory / f"{NAME}.h5")
 
 
 def test_a_newer_format_is_refused_with_the_way_out(directory: Path) -> None:
     """Nothing of it is guessed at, and it is not removed."""
-    found = put_list(directory, NAME, version=12)
+    journal, log = put_journal(directory, NAME, version=12), log_name(INFIX, 0)
     with pytest.raises(UnreadableFile, match=r"newer mjrec, in .* 12.* 1: update mjr"):
         load_trajectory(directory / f"{NAME}.h5")
-    remove_if_done(found)
-    assert found.exists()
+    remove_if_done(directory / log)
+    assert (directory / log).exists()
     # One that was cut within its first line is of nothing.
     for size in (100, 0):
-        os.truncate(found, size)
+        os.truncate(journal, size)
         assert recordings_in_flight(directory) == []
 
 

@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 
 import mjrec
-from mjrec.evidence.inputs import ARRAYS_FILE, EpisodeInputs, Inputs
-from mjrec.evidence.play_actions import given_actions
-from mjrec.evidence.read_inputs import NotReadable, read_inputs
+from mjrec.errors import Error
+from mjrec.evidence.inputs import ARRAYS_FILE, EpisodeInputs, Inputs, given_actions
+from mjrec.evidence.read_inputs import read_inputs
 
 
 @pytest.fixture(scope="module")
@@ -128,5 +128,5 @@ def test_what_is_no_input_is_refused(
             change(said["run"])
             content = json.dumps(said).encode() + b"\n" + rest
         (folder / path.name).write_bytes(content)
-    with pytest.raises(NotReadable):
+    with pytest.raises(Error, match="inputs cannot be read"):
         read_inputs(tmp_path)

@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 from full_disk import file_size_limit
 
-from mjrec.errors import ClosedError, UnreadableFile
+from mjrec.errors import ClosedError, FileNotWritten, UnreadableFile
 from mjrec.formats import journal
 from mjrec.formats.journal import (
     JournalEntry,
@@ -205,7 +205,7 @@ def test_a_line_that_does_not_fit_is_taken_back(path: Path) -> None:
     # As on a full disk, the first part of the line is written, and then no more.
     with (
         file_size_limit(path.stat().st_size + 10),
-        pytest.raises(OSError, match="space"),
+        pytest.raises(FileNotWritten, match="space"),
     ):
         writer.append(NEXT)
     assert len(path.read_bytes().splitlines()) == 1
@@ -216,7 +216,7 @@ def test_a_line_that_does_not_fit_is_taken_back(path: Path) -> None:
     assert read(path) == [ENTRY, NEXT, third]
     # One that is removed is noticed, and the entry after that begins another.
     path.unlink()
-    with pytest.raises(FileNotFoundError, match="removed while it was written"):
+    with pytest.raises(FileNotWritten, match="removed while it was written"):
         writer.append(ENTRY)
     assert not path.exists()
     writer.append(NEXT)

@@ -175,7 +175,7 @@ def test_the_disk_holds_n_candidates_and_the_running_episode(
     with mjrec.Monitor(env, tmp_path, keep="worst:3", workers=0) as monitor:
         for _ in returns:
             monitor.reset()
-            assert len(list(tmp_path.glob("*.spans"))) <= 4
+            assert len(list(tmp_path.glob("*.log"))) <= 4
             assert len(list(tmp_path.glob("openaigym.states.*"))) <= 4 * 3
             monitor.step(monitor.action_space.sample())
     worst = sorted(range(episodes), key=lambda k: (returns[k], k))[:3]
@@ -339,13 +339,13 @@ def test_an_interrupted_choice_leaves_all_candidates(tmp_path: Path) -> None:
 def test_a_full_disk_at_the_end_loses_no_chosen_video(
     tmp_path: Path, on_error: str
 ) -> None:
-    """Facts that its log has no room for are lost; it is pending all the same."""
+    """What the journal has no room for waits; it is pending all the same."""
     env = mjrec.Monitor(
         pendulum(), tmp_path, keep="worst:2", workers=0, on_error=on_error
     )
     run(env, 8)
-    size = max(path.stat().st_size for path in tmp_path.glob("*.spans"))
-    # Enough for all but what is added to the longer list.
+    [journal] = tmp_path.glob("*.jsonl")
+    size = journal.stat().st_size
     with file_size_limit(size + 20):
         if on_error == "raise":
             with pytest.raises(mjrec.FileNotWritten):

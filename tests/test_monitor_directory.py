@@ -31,7 +31,7 @@ VISIBLE = {
     "openaigym.trajectory.0.1.episode000027.h5": ("0.1", 27),
     **{
         f"openaigym.states.0.1.000000.{end}": ("0.1", None)
-        for end in ("spans", "log", "tail", "looks")
+        for end in ("log", "tail", "looks")
     },
     "openaigym.model.0123456789abcdef.zip": (None, None),
     "openaigym.results.0.1.monitor.csv": ("0.1", None),

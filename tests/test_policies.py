@@ -73,6 +73,19 @@ def test_random_actions_are_the_episodes(space):
     assert repr(space.sample()) == own
 
 
+def test_random_actions_are_those_that_gymnasium_draws() -> None:
+    """A policy draws bounded boxes in its own way, and gives what `sample` gives."""
+    bounds = np.array([[-1, 0.3, -7], [1, 0.30001, 1e6]], np.float32)
+    space = spaces.Box(*bounds)
+    policy = load_policy("random", acting_in(space))
+    policy.reset(SEEDS)
+    space.seed(SEEDS.actions)
+    for _ in range(100):
+        action, expected = policy(None), space.sample()
+        assert action.dtype == expected.dtype
+        assert np.array_equal(action, expected)
+
+
 @pytest.mark.parametrize(
     ("space", "zero"),
     [

@@ -19,7 +19,7 @@ ROWS = (
     {
         *("errors", "json_text", "rates", "frames", "schedules", "atomic_files"),
         *("worker_thread", "gl", "machine", "blank_frames", "patience", "signals"),
-        *("annotation", "provenance"),
+        *("annotation", "plain_text", "provenance"),
         *("child_python", "messages", "parent", "sandbox", "confined"),
     },
     {"engines"},
@@ -33,13 +33,14 @@ ROWS = (
     {"monitors"},
     {"sessions", "machine_report"},
     {"evidence", "evaluation"},
+    {"viewing"},
     {"reporting"},
     {"commands"},
 )
 
 # The frameworks and programs that only one row, or one file, may import.
 CONFINED = {
-    "mujoco": {"simulation"},
+    "mujoco": {"simulation", "viewing"},
     "OpenGL": {"simulation"},
     "gymnasium": {"environments", "monitors"},
     "dm_env": {"environments", "monitors"},
@@ -48,15 +49,18 @@ CONFINED = {
     "imageio_ffmpeg": {"formats"},
     "h5py": {"formats", "evidence"},
     "tyro": {"commands"},
-    "scipy": {"evaluation"},
+    "scipy": {"evaluation", "viewing"},
     "rich": {"commands", "monitors"},
     "ray": {"engines.ray"},
     "submitit": {"engines.slurm"},
+    "viser": {"viewing"},
+    "mjviser": {"viewing"},
+    "trimesh": {"viewing"},
 }
 
 HEAVY = (
     *("mujoco", "gymnasium", "dm_control", "dm_env", "OpenGL", "imageio_ffmpeg"),
-    *("h5py", "imageio", "ray", "submitit"),
+    *("h5py", "imageio", "ray", "submitit", "viser", "mjviser", "trimesh"),
 )
 
 

@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -35,7 +36,7 @@ from mjrec.formats.locks import Lock, is_locked, try_lock
 from mjrec.formats.monitor_directory import (
     Infix,
     lock_name,
-    states_name,
+    log_name,
     video_lock_name,
     video_prefix,
 )
@@ -136,7 +137,7 @@ def assert_in_order(directory: Path) -> None:
     assert not again
     assert str(again) == f"Nothing to recover in {directory}."
     assert {path.name: path.read_bytes() for path in directory.iterdir()} == before
-    ends = (".spans", ".log", ".tail")
+    ends = (".log", ".tail", ".looks")
     assert not [name for name in before if name.startswith(".") or name.endswith(ends)]
 
 
@@ -297,22 +298,25 @@ def test_a_clip_whose_encoder_wrote_nothing(
 def test_an_encoder_that_outlives_its_process_is_waited_for(
     killed: Callable[[str], Path],
 ) -> None:
-    """As long as asked for; then it is reported, and the next time it is done."""
+    """As long as asked for, holding up no other, who reports it; then it is done."""
     directory = killed(
         "env = monitor()\nrun(env, 7)\npid = encoding(env)._process.pid\n"
         "os.kill(pid, signal.SIGSTOP)\nopen(sys.argv[1] + '.pid', 'w')"
         ".write(str(pid))\n"
         "die()"
     )
-    try:
-        recovery = mjrec.recover(directory, timeout=0.1)
-        [failure] = recovery.failures
-        assert failure.name.endswith("video000000.mp4")
-        assert "still finishing" in str(recovery)
-        assert videos_in(directory) == []
-    finally:
-        os.kill(int(directory.with_suffix(".pid").read_text()), signal.SIGCONT)
-    assert mjrec.recover(directory).failures == ()
+    with ThreadPoolExecutor() as threads:
+        patient = threads.submit(mjrec.recover, directory, timeout=60)
+        try:
+            recovery = mjrec.recover(directory, timeout=0.1)
+            [failure] = recovery.failures
+            assert failure.name.endswith("video000000.mp4")
+            assert "still finishing" in str(recovery)
+            assert videos_in(directory) == []
+            assert not patient.done()
+        finally:
+            os.kill(int(directory.with_suffix(".pid").read_text()), signal.SIGCONT)
+        assert patient.result().failures == ()
     assert len(frames_in(directory, 0)) == 8
     assert len(manifest_of(directory)["videos"]) == 1
     assert_in_order(directory)
@@ -432,20 +436,20 @@ def test_an_episode_whose_last_row_is_there_is_complete(
     assert_in_order(tmp_path)
 
 
-def test_an_unreadable_list_stays_and_is_reported(tmp_path: Path) -> None:
-    """With its rows; an empty one is removed."""
+def test_a_log_of_unknown_rows_stays_and_is_reported(tmp_path: Path) -> None:
+    """Of which no journal has a line; without rows it is removed."""
     write_log(tmp_path, 0)
-    [headless] = tmp_path.glob("*.spans")
-    headless.write_bytes(b"")
-    empty, garbage = (tmp_path / states_name(INFIX, number) for number in (1, 2))
+    [journal] = tmp_path.glob("*.jsonl")
+    journal.write_bytes(b"")
+    unknown, empty, stray = (tmp_path / log_name(INFIX, number) for number in range(3))
     empty.touch()
-    garbage.write_bytes(b'{"format": "else"}\n' + bytes(203))
+    stray.with_suffix(".tail").touch()
     recovery = mjrec.recover(tmp_path)
-    assert f"{empty.name}: nothing in flight, removed" in str(recovery)
-    assert not empty.exists()
-    assert [file.name for file in recovery.failures] == [headless.name, garbage.name]
-    assert headless.with_suffix(".log").stat().st_size
-    assert garbage.stat().st_size == 222
+    for log in (empty, stray):
+        assert f"{log.name}: nothing in flight, removed" in str(recovery)
+    assert [path.name for path in tmp_path.glob("*.states.*")] == [unknown.name]
+    assert [file.name for file in recovery.failures] == [unknown.name]
+    assert unknown.stat().st_size
     mjrec.clear_monitor_files(tmp_path)
     assert not list(tmp_path.iterdir())
 

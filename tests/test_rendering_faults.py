@@ -200,21 +200,20 @@ def test_a_full_disk_is_one_clear_error_wherever_it_comes(
 # Damaged logs
 
 
-@pytest.mark.parametrize(
-    "damage", [b"?\n", b'{"format": "mjrec spans", "version": 99}\n']
-)
-def test_a_list_that_cannot_be_read_is_told_and_costs_no_other(
-    damage: bytes, two: Path
+@pytest.mark.parametrize("line", [b"?\n", b'{"rows": {"number": 0, "version": 99}}\n'])
+def test_a_log_of_unknown_rows_is_told_and_costs_no_other(
+    line: bytes, two: Path
 ) -> None:
     """It stays; what it was of is not known."""
-    damaged = min(two.glob("*.spans"))
-    damaged.write_bytes(damage)
+    [journal] = two.glob("*.jsonl")
+    _, *rest = journal.read_bytes().splitlines(keepends=True)
+    journal.write_bytes(line + b"".join(rest))
+    damaged = min(two.glob("*.log"))
     rendered = render_videos(two, workers=1)
     assert list(rendered.videos) == [VIDEO.format(1)]
     assert list(rendered.failures) == [damaged.name]
     assert "Cannot read" in rendered.failures[damaged.name]
-    [kept] = two.glob(f"{damaged.name}*")
-    assert kept.read_bytes() == damage
+    assert damaged.exists()
     assert list(reasons_in(two)) == [VIDEO.format(0)]
 
 

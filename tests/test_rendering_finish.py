@@ -249,10 +249,12 @@ def test_the_manifest_says_why_a_video_is_still_pending(tmp_path: Path) -> None:
     write_pending_manifest(tmp_path, 0)
     [rows] = tmp_path.glob("*.log")
     hidden = rows.rename(tmp_path / "hidden")
+    rows.mkdir()
     result, *_ = finish(tmp_path)
     [entry] = manifest_in(tmp_path)["mjrec"]["pending"]
     assert [entry["reason"]] == list(result.failures.values())
     assert "Cannot read" in entry["reason"]
+    rows.rmdir()
     hidden.rename(rows)
     assert not [each for each in finish(tmp_path) if each.failures]
     assert manifest_in(tmp_path)["mjrec"]["pending"] == []

@@ -118,6 +118,35 @@ def test_any_workers_give_what_was_seen(
     assert os.getpriority(os.PRIO_PROCESS, pids(one)[0]) == 10
 
 
+@pytest.mark.parametrize("is_there", [True, False])
+def test_prepared_workers_draw_the_same(
+    ride: Ride,
+    one: WorkerPool,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    is_there: bool,
+) -> None:
+    """They load a model before frames are asked for; that there is none is no harm."""
+    noted = tmp_path / "noted"
+    note = f"""
+        import pathlib
+        import mjrec.rendering.worker as worker
+        open_drawing = worker.open_drawing
+        def note(*arguments):
+            pathlib.Path({str(noted)!r}).touch()
+            return open_drawing(*arguments)
+        worker.open_drawing = note
+        worker.main()
+    """
+    use_process(monkeypatch, note)
+    one.start()
+    one.prepare(ride.path if is_there else tmp_path / ride.path.name)
+    while not noted.exists():
+        time.sleep(0.01)
+    drawn = list(one.frames(ride.path, range(FRAMES)))
+    assert np.array_equal(drawn, ride.frames)
+
+
 def test_few_frames_are_kept_here(ride: Ride, three: WorkerPool) -> None:
     """However slow the caller is: two of each worker, besides what its pipe holds."""
     indices = [number % FRAMES for number in range(60)]

@@ -125,6 +125,17 @@ def test_what_cannot_be_drawn_is_recorded_without_videos(options, tmp_path, capl
         list(record_session(live))
 
 
+def test_record_chooses_a_backend_before_mujoco_is_loaded(tmp_path: Path) -> None:
+    """Where `MUJOCO_GL` says nothing, MuJoCo would take one that needs a screen."""
+    environ = {k: v for k, v in os.environ.items() if k not in ("MUJOCO_GL", "DISPLAY")}
+    subprocess.run(
+        [sys.executable, "-m", "mjrec", *RECORD, "--out", str(tmp_path)],
+        env=environ,
+        check=True,
+    )
+    assert videos_in(tmp_path)
+
+
 @pytest.mark.thorough
 def test_record_without_any_gl(tmp_path):
     """On a machine, or in a process, that has none."""

@@ -16,21 +16,24 @@ import pytest
 from full_disk import file_size_limit
 from processes import forked, kill_self
 from random_rows import ACTION, DTYPE, FACTS, INFIX, NAME, STATE, check, write
-from recordings import add_facts
+from recordings import add_facts, drop
 from trajectories_by_hand import add_row, new_logs
 from trajectory_contents import TrajectoryContent, content_of
 
 from mjrec.errors import FileNotWritten, InvalidArgument, UnreadableFile
 from mjrec.formats import row_log, span_writer, spans
 from mjrec.formats.locks import Lock
-from mjrec.formats.monitor_directory import lock_name, trajectory_prefix
+from mjrec.formats.monitor_directory import (
+    journal_name,
+    lock_name,
+    trajectory_prefix,
+)
 from mjrec.formats.row_log import TAIL_HEAD, RowLog, tail_path
 from mjrec.formats.span_writer import SpanLogs
 from mjrec.formats.spans import (
-    drop_recording,
     is_in_flight,
-    list_paths,
-    read_list,
+    log_paths,
+    recordings_in,
     recordings_in_flight,
     remove_if_done,
 )
@@ -49,9 +52,7 @@ def path(tmp_path: Path) -> Path:
 @pytest.fixture
 def logs(tmp_path: Path) -> SpanLogs:
     """Logs whose tails hold eight rows."""
-    return SpanLogs(
-        tmp_path, INFIX, numbers=itertools.count(), tail_bytes=CAPACITY * ROW
-    )
+    return new_logs(tmp_path, INFIX, tail_bytes=CAPACITY * ROW)
 
 
 def read(path: Path) -> TrajectoryContent:
@@ -64,10 +65,10 @@ def episode(directory: Path, number: int) -> Path:
 
 
 def files_of(directory: Path) -> tuple[Path, Path, Path, Path]:
-    """Return the list, the log, its tail and the changes of the only log there is."""
-    [found] = list_paths(directory)
-    log = found.with_suffix(".log")
-    return found, log, tail_path(log), found.with_suffix(".looks")
+    """Return the journal, and the only log there is, its tail and its changes."""
+    [log] = log_paths(directory)
+    journal = directory / journal_name(INFIX)
+    return journal, log, tail_path(log), log.with_suffix(".looks")
 
 
 def change(step: int, **fields: Any) -> ModelChange:
@@ -123,7 +124,7 @@ def test_recordings_of_one_log_come_back_bit_for_bit(
             check(content, steps, every=2)
             ending = {"complete": True} if number % 2 else {}
             assert (content.facts, content.dropped) == ({**said[number], **ending}, 0)
-        assert len(list(list_paths(tmp_path))) == 1
+        assert len(list(log_paths(tmp_path))) == 1
         logs.close()
 
 
@@ -175,7 +176,7 @@ def test_a_reader_beside_a_writer_sees_whole_recordings(tmp_path: Path) -> None:
     path, enough = episode(tmp_path, 0), tmp_path / "enough"
 
     def record() -> None:
-        logs = SpanLogs(tmp_path, INFIX, numbers=itertools.count(), tail_bytes=1)
+        logs = new_logs(tmp_path, INFIX, tail_bytes=1)
         span = logs.begin(path.stem, {}, row_dtype(state=STATE))
         step = 0
         while step % 100 or step < 1000 or not enough.exists():
@@ -333,7 +334,7 @@ def test_a_tail_of_something_else_is_passed_over(
 
 
 def kill_in_line(number: int, part: Callable[[bytes], bytes]) -> None:
-    """Have this process die in the writing of a line of a list."""
+    """Have this process die in the writing of a line of the journal."""
     real, lines = os.write, itertools.count(1)
 
     def write_part(descriptor: int, data: bytes) -> int:
@@ -356,11 +357,11 @@ PARTS: dict[str, Callable[[bytes], bytes]] = {
 
 @pytest.mark.parametrize("part", PARTS)
 @pytest.mark.parametrize("line", range(1, 6))
-def test_a_process_killed_in_a_line_of_the_list_loses_nothing_else(
+def test_a_process_killed_in_a_line_of_the_journal_loses_nothing_else(
     logs: SpanLogs, tmp_path: Path, line: int, part: str
 ) -> None:
     """What was recorded before is there; what was being said is said or is not."""
-    lines = ["head", "begin 0", "end 0", "begin 1", "end 1"]
+    lines = ["rows", "begin 0", "end 0", "begin 1", "end 1"]
 
     def record(tell: Callable[[], object]) -> None:
         kill_in_line(line, PARTS[part])
@@ -385,16 +386,18 @@ def test_a_process_killed_in_a_line_of_the_list_loses_nothing_else(
     for each in found.values():
         add_facts(each, {"later": 1})
         assert read(each).facts["later"] == 1
-        drop_recording(each)
-    for left in list_paths(tmp_path):
+    for number in range(2):
+        # Also one whose line lacked its end only, which it has by now.
+        drop(episode(tmp_path, number))
+    for left in log_paths(tmp_path):
         remove_if_done(left)
-    assert list(tmp_path.iterdir()) == []
+    assert [path.suffix for path in tmp_path.iterdir()] == [".jsonl"]
 
 
 def test_lost_rows_of_an_ended_recording_are_counted(
     logs: SpanLogs, path: Path
 ) -> None:
-    """Cut at every word; the list says how many rows there were."""
+    """Cut at every word; the journal says how many rows there were."""
     write(logs, 5).end({"complete": True})
     write(logs, 5, episode=28).end({"complete": True})
     logs.close()
@@ -447,14 +450,11 @@ def test_a_log_that_changes_while_it_is_read_is_an_error(
 def test_a_full_disk_when_a_log_is_made_leaves_nothing(
     logs: SpanLogs, path: Path
 ) -> None:
-    """Neither its list nor its tail finds room; with room again it is begun."""
+    """Its tail finds no room, or the journal; with room again it is begun."""
     for room in (0, 100, 4096):
-        with (
-            file_size_limit(room),
-            pytest.raises(FileNotWritten, match=r"openaigym\.states\.0\.1\.\d+\."),
-        ):
+        with file_size_limit(room), pytest.raises(FileNotWritten, match=r"openaigym\."):
             logs.begin(path.stem, FACTS, DTYPE)
-        assert list(path.parent.iterdir()) == []
+        assert list(log_paths(path.parent)) == []
     write(logs, 3)
     check(read(path), 3)
 
@@ -463,7 +463,7 @@ def test_a_full_disk_when_a_log_is_made_leaves_nothing(
 def test_what_a_full_disk_did_not_let_be_said_is_said_later(
     logs: SpanLogs, path: Path, room: int
 ) -> None:
-    """The list stays as it was; the end of a recording may stand behind the next."""
+    """The journal stays as it was; an end may stand behind the next beginning."""
     span = write(logs, 3)
     found, *_ = files_of(path.parent)
     before = found.read_bytes()
@@ -472,7 +472,7 @@ def test_what_a_full_disk_did_not_let_be_said_is_said_later(
             lambda: add_facts(path, {"candidate": False, "text": "x" * 100}),
             lambda: span.note({"noted": 1, "text": "x" * 100}),
             lambda: span.end({"complete": True}),
-            lambda: write(logs, 3, episode=28),
+            lambda: logs.begin("x", FACTS, DTYPE),
         ):
             with pytest.raises(FileNotWritten, match=rf"{found.name}: "):
                 fail()
@@ -528,7 +528,7 @@ def test_a_change_on_a_full_disk_can_be_added_again(logs: SpanLogs, path: Path) 
     assert [list(c.fields) for c in content.model_changes] == [["a"], ["tex_data"]]
 
 
-# --- logs and their lists ------------------------------------------------------------
+# --- logs and what is in them --------------------------------------------------------
 
 
 def test_a_log_ends_where_the_next_rows_do_not_belong(
@@ -546,42 +546,48 @@ def test_a_log_ends_where_the_next_rows_do_not_belong(
     for number in (5, 6, 7):
         name = trajectory_prefix(INFIX, number)
         add_row(logs.begin(name, FACTS, other, alone=number < 7), 0)
-    lists = [read_list(each) for each in list_paths(tmp_path)]
-    numbers = [[int(name[-6:]) for name in each.recordings] for each in lists]
+    found = [recordings_in(log) for log in log_paths(tmp_path)]
+    numbers = [[int(recording.name[-6:]) for recording in each] for each in found]
     assert numbers == [[0, 1], [2], [3], [4], [5], [6], [7]]
-    assert [each.is_closed for each in lists] == [True] * 6 + [False]
+    tails = [tail_path(log).exists() for log in log_paths(tmp_path)]
+    assert tails == [False] * 6 + [True]
     check(read(episode(tmp_path, 1)), 5)
     check(read(episode(tmp_path, 4)), 0, dtype=other)
 
 
-def test_a_list_of_which_nothing_is_needed_is_removed(
+def test_a_log_of_which_nothing_is_needed_is_removed(
     logs: SpanLogs, tmp_path: Path
 ) -> None:
-    """With all of its files, when the last of its recordings is dropped or a file."""
+    """With its files, when the last of its recordings is dropped, a file, a video."""
     write(logs, 3, episode=0).log.add_change(change(4))
-    paths = [episode(tmp_path, number) for number in range(3)]
-    for number in (1, 2):
-        write(logs, 3, episode=number)
+    video = {"kept": False, "video": {"name": "v.mp4"}}
+    paths = [episode(tmp_path, number) for number in range(4)]
+    for number in (1, 2, 3):
+        write(logs, 3, episode=number, facts=video if number == 3 else FACTS)
     logs.close()
-    drop_recording(paths[1])
-    drop_recording(paths[1])
+    log = files_of(tmp_path)[1]
     paths[0].write_bytes(b"a file")
-    remove_if_done(files_of(tmp_path)[0])
-    assert [each.path for each in recordings_in_flight(tmp_path)] == paths[2:]
-    assert [is_in_flight(each) for each in paths] == [False, False, True]
+    drop(paths[1])
+    (tmp_path / "v.mp4").touch()
+    assert is_in_flight(paths[3])
+    (tmp_path / "v.meta.json").touch()
+    remove_if_done(log)
+    assert [each.path for each in recordings_in_flight(tmp_path)] == paths[2:3]
+    assert [is_in_flight(each) for each in paths] == [False, False, True, False]
     check(read(paths[2]), 3)
-    drop_recording(paths[2])
-    assert list(tmp_path.iterdir()) == paths[:1]
+    drop(paths[2])
+    remove_if_done(log)
+    assert list(tmp_path.glob("openaigym.states.*")) == []
 
 
-def test_a_list_that_an_open_monitor_writes_is_not_removed(
+def test_a_log_that_an_open_monitor_writes_is_not_removed(
     logs: SpanLogs, path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Its next recording goes there; also one that begins while it is looked at."""
     lock = Lock(path.parent / lock_name(INFIX), "")
     write(logs, 3)
-    drop_recording(path)
-    found, *_ = files_of(path.parent)
+    drop(path)
+    _, log, *_ = files_of(path.parent)
     real = spans._is_open
 
     def record_late(name: Path) -> bool:
@@ -591,15 +597,16 @@ def test_a_list_that_an_open_monitor_writes_is_not_removed(
         return real(name)
 
     monkeypatch.setattr(spans, "_is_open", record_late)
-    remove_if_done(found)
+    remove_if_done(log)
     check(read(episode(path.parent, 28)), 5)
     monkeypatch.undo()
-    drop_recording(episode(path.parent, 28))
-    assert list(path.parent.iterdir()) == []
+    drop(episode(path.parent, 28))
+    remove_if_done(log)
+    assert not log.exists()
 
 
 @pytest.mark.parametrize("more", [-1, 1])
-def test_a_list_by_the_name_of_one_that_was_removed_is_another(
+def test_a_journal_by_the_name_of_one_that_was_removed_is_another(
     tmp_path: Path, more: int
 ) -> None:
     """As where `force` empties a directory; shorter or longer."""
@@ -614,3 +621,56 @@ def test_a_list_by_the_name_of_one_that_was_removed_is_another(
         logs.release()
         for file in files_of(tmp_path):
             file.unlink(missing_ok=True)
+
+
+def test_files_that_are_removed_while_they_are_written_cost_one_recording(
+    logs: SpanLogs, tmp_path: Path
+) -> None:
+    """The next one begins another log and another journal, which says all again."""
+    write(logs, 3, episode=0)
+    for file in files_of(tmp_path):
+        file.unlink(missing_ok=True)
+    with pytest.raises(FileNotWritten, match="it was removed"):
+        write(logs, 3, episode=1)
+    write(logs, 3, episode=2)
+    assert [each.path for each in recordings_in_flight(tmp_path)] == [
+        episode(tmp_path, 2)
+    ]
+    check(read(episode(tmp_path, 2)), 3)
+
+
+def test_facts_that_no_line_holds_are_cut_off(logs: SpanLogs, path: Path) -> None:
+    """Of the options; what comes behind is read as ever."""
+    write(logs, 3, facts={"options": "x" * (1 << 24), "seed": 7})
+    write(logs, 3, episode=28, facts={"seed": 8})
+    assert len(read(path).facts["options"]["repr"]) == 1000
+    assert read(episode(path.parent, 28)).facts == {"seed": 8}
+
+
+def test_rows_of_a_newer_version_are_no_rows(logs: SpanLogs, path: Path) -> None:
+    """They stay, and are told of where they are asked for."""
+    write(logs, 3)
+    journal, log, *_ = files_of(path.parent)
+    journal.write_bytes(journal.read_bytes().replace(b'"version": 1', b'"version": 9'))
+    for look in (lambda: read(path), lambda: recordings_in(log)):
+        with pytest.raises(UnreadableFile, match="newer mjrec, in format version 9"):
+            look()
+    logs.release()
+    remove_if_done(log)
+    assert log.exists()
+
+
+@pytest.mark.parametrize("is_gone", [True, False])
+def test_rows_that_no_journal_has_stay(
+    logs: SpanLogs, path: Path, is_gone: bool
+) -> None:
+    """In the tail as in the log; the journal is gone, or its lines are damaged."""
+    write(logs, 3)
+    journal, log, *_ = files_of(path.parent)
+    journal.unlink() if is_gone else journal.write_bytes(b'{"rows": 3}\n{"begin": 4}\n')
+    logs.release()
+    with pytest.raises(UnreadableFile, match="no journal says what its rows are"):
+        recordings_in(log)
+    remove_if_done(log)
+    assert log.exists()
+    assert recordings_in_flight(path.parent) == []

@@ -41,7 +41,10 @@ def gl_frames(outcome: Outcome = Outcome.WITHIN_TOLERANCE) -> Finding:
             "is equal, or allowed (gl).",
         ),
         (verification(finding(), gl_frames()), "PARTLY  run.zip: nothing contradicts"),
-        (verification(level=Level.FILES), "PARTLY  run.zip: files are unchanged"),
+        (
+            verification(finding(Outcome.NOTED, topic=Topic.FILES), level=Level.FILES),
+            "PARTLY  run.zip: files are unchanged",
+        ),
         (verification(finding(Outcome.DIFFERENT)), "it is not what its inputs give"),
         (verification(), "FAIL  run.zip: nothing could be made again"),
     ],
@@ -65,11 +68,20 @@ def test_an_excuse_says_what_it_costs() -> None:
     """The claim, the reader's own, and how much was believed for it."""
     made = verification(finding(), gl_frames(), excuses=(excuse(items=tuple("abcde")),))
     assert summary.excuses(made) == [
-        "gl: NVIDIA H100, here llvmpipe (a, b, c and 2 more). frames are alike: "
+        "gl NVIDIA H100 (here llvmpipe) of a, b, c and 2 more: frames are alike; "
         "500 frames within tolerance, the worst 33.1 dB"
     ]
     refuted = verification(excuses=(excuse(refuted=True),))
-    assert "Refuted" in summary.excuses(refuted)[0]
+    assert "refuted" in summary.excuses(refuted)[0]
+
+
+def test_claims_that_nothing_needs_share_a_line() -> None:
+    """They cost nothing."""
+    names = ("python", "zlib")
+    idle = [excuse(name=n, claimed="1", here="2", is_needed=False) for n in names]
+    assert summary.excuses(verification(excuses=tuple(idle))) == [
+        "not needed, as nothing differs: python 1 (here 2); zlib 1 (here 2)"
+    ]
 
 
 def test_each_topic_has_a_line_with_counts() -> None:

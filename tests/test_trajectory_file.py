@@ -31,7 +31,7 @@ from trajectory_contents import TrajectoryContent, content_of
 import mjrec.formats.trajectory_file as trajectory_file
 from mjrec.errors import FileNotWritten, UnreadableFile
 from mjrec.formats import trajectory_hdf5
-from mjrec.formats.spans import list_paths
+from mjrec.formats.spans import log_paths
 from mjrec.formats.trajectory import ModelChange, added_up, packed, row_dtype
 from mjrec.formats.trajectory_file import (
     finish_trajectory,
@@ -55,6 +55,11 @@ CHANGES = (
 def path(tmp_path: Path) -> Path:
     """The file of the episode, which is not there yet."""
     return tmp_path / f"{NAME}.h5"
+
+
+def files_in(directory: Path) -> list[str]:
+    """Return the names of the files there but the journal."""
+    return [path.name for path in directory.iterdir() if path.suffix != ".jsonl"]
 
 
 def record(path: Path, steps: int = 40, *, ended: bool = True, **more: Any) -> None:
@@ -102,7 +107,7 @@ def test_the_finished_file_holds_what_the_log_held(
     facts = {**FACTS, "long": "x" * 10**5}
     record(path, steps, every=every, dtype=dtype, facts=facts)
     assert finish_trajectory(path) == path
-    assert list(path.parent.iterdir()) == [path]
+    assert sorted(files_in(path.parent)) == [path.name]
     content = read(path)
     check(content, steps, every=every, dtype=dtype)
     assert content.facts == {**facts, "complete": True, "length": steps}
@@ -184,7 +189,7 @@ def test_what_is_finished_meanwhile_is_read(
         with open_trajectory(path) as before:
             monkeypatch.setattr(trajectory_file, "open_recording", open_late)
             with use(path) as reader:
-                assert list(path.parent.iterdir()) == [path]
+                assert sorted(files_in(path.parent)) == [path.name]
                 for each in (before, reader):
                     content = content_of(each)
                     check(content, 40)
@@ -197,12 +202,12 @@ def test_nothing_to_finish_is_one_clear_error(path: Path) -> None:
     with pytest.raises(UnreadableFile, match=r"\.h5: there is no such file, and no l"):
         finish_trajectory(path)
     record(path)
-    [spans] = list_paths(path.parent)
-    spans.write_bytes(b"something else\n")
+    [log], [journal] = log_paths(path.parent), path.parent.glob("*.jsonl")
+    journal.write_bytes(b"something else\n")
     for _ in range(2):
-        with pytest.raises(UnreadableFile, match=r"\.spans: it is not whole JSON"):
+        with pytest.raises(UnreadableFile, match="no log of it"):
             finish_trajectory(path)
-    assert spans.with_suffix(".log").exists()
+    assert log.exists()
 
 
 @pytest.mark.parametrize("room", [0, 700, 5000])
@@ -214,7 +219,7 @@ def test_a_full_disk_leaves_the_log_and_nothing_else(path: Path, room: int) -> N
         pytest.raises(FileNotWritten, match=r"\.h5: File too large"),
     ):
         finish_trajectory(path)
-    assert not [name for name in path.parent.iterdir() if ".states." not in name.name]
+    assert not [name for name in files_in(path.parent) if ".states." not in name]
     finish_trajectory(path)
 
 
@@ -250,7 +255,7 @@ def test_ctrl_c_leaves_the_log_and_nothing_else(
     with pytest.raises(KeyboardInterrupt):
         finish_trajectory(path)
     monkeypatch.undo()
-    assert not [name for name in path.parent.iterdir() if ".states." not in name.name]
+    assert not [name for name in files_in(path.parent) if ".states." not in name]
     finish_trajectory(path)
 
 

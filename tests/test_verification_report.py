@@ -70,7 +70,7 @@ def test_the_verdict_comes_first_and_then_what_differs(tmp_path: Path) -> None:
         "FAIL run.zip: it is not what its inputs give",
         "one is missing",
         "frame 3 is another",
-        "NVIDIA H100, here llvmpipe",
+        "NVIDIA H100 (here llvmpipe)",
         "What was made again",
         "max_episode_steps 12",
         "All findings",

@@ -14,15 +14,19 @@ from typing import Any
 
 import numpy as np
 
+from mjrec.formats.journal import JournalWriter
 from mjrec.formats.manifest import Manifest, write_manifest
 from mjrec.formats.monitor_directory import (
     Infix,
+    journal_name,
+    log_number,
     manifest_name,
     trajectory_prefix,
     video_prefix,
 )
+from mjrec.formats.row_log import TAIL_BYTES
 from mjrec.formats.span_writer import SpanLogs, SpanWriter
-from mjrec.formats.spans import list_paths
+from mjrec.formats.spans import log_paths
 from mjrec.formats.trajectory import packed, row_dtype
 from mjrec.formats.trajectory_file import finish_trajectory, open_trajectory
 from mjrec.rendering.views import View
@@ -96,11 +100,18 @@ class Painter:
     def close(self) -> None: ...
 
 
-def new_logs(directory: Path, infix: Infix = INFIX) -> SpanLogs:
+def new_logs(
+    directory: Path, infix: Infix = INFIX, *, tail_bytes: int = TAIL_BYTES
+) -> SpanLogs:
     """Return what writes recordings beside those that others have written."""
-    used = [int(path.suffixes[-2][1:]) for path in list_paths(directory, infix)]
-    first = max(used, default=-1) + 1
-    return SpanLogs(directory, infix, numbers=itertools.count(first))
+    used = [log_number(path.name) or 0 for path in log_paths(directory, infix)]
+    return SpanLogs(
+        directory,
+        infix,
+        journal=JournalWriter(directory / journal_name(infix)),
+        numbers=itertools.count(max(used, default=-1) + 1),
+        tail_bytes=tail_bytes,
+    )
 
 
 def add_row(span: SpanWriter, step: int, **values: Any) -> None:

@@ -61,6 +61,8 @@ if TYPE_CHECKING:
     from .signals import exit_on_signals as exit_on_signals
     from .simulation.trajectories import Trajectory as Trajectory
     from .simulation.trajectories import load_trajectory as load_trajectory
+    from .viewing.replay import Replay as Replay
+    from .viewing.replay import write_replay as write_replay
 
 # Where each name is, which is imported when it is first used.
 _NAMES = {
@@ -96,12 +98,13 @@ _NAMES = {
     "schedules": "capped_cubic_video_schedule disable_videos",
     "signals": "Terminated exit_on_signals",
     "simulation.trajectories": "Trajectory load_trajectory",
+    "viewing.replay": "Replay write_replay",
 }
 _LAZY = {name: module for module, names in _NAMES.items() for name in names.split()}
 
 # What can be had without any extra, so that `from mjrec import *` works there too;
-# `DmEnvMonitor` needs dm_env.
-__all__ = sorted({*errors.KINDS, *_LAZY} - {"DmEnvMonitor"})
+# `DmEnvMonitor` needs dm_env, and replays need viser.
+__all__ = sorted({*errors.KINDS, *_LAZY} - {"DmEnvMonitor", "Replay", "write_replay"})
 
 
 def __getattr__(name: str) -> Any:

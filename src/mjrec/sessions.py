@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import contextlib
 import logging
-import sys
 from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -28,6 +27,7 @@ from .gl import use_gl
 from .monitors.monitor import monitored
 from .recorder.options import DEFERRED, LIVE, OFF, RecorderOptions
 from .schedules import disable_videos, schedule_from_text
+from .simulation.find_simulation import simulation_in
 
 if TYPE_CHECKING:
     from .monitors.dm_env_monitor import DmEnvMonitor
@@ -215,10 +215,14 @@ def _environment(session: Session, *, pictures: bool) -> NamedEnvironment:
             use_gl()
         except GLError as error:
             no_gl = error
+    # Not before: MuJoCo takes its backend when it is loaded.
+    from .simulation.warnings import log_mujoco_warnings
+
+    log_mujoco_warnings()
     named = environment_from_name(
         session.environment, replace(session.made, pictures=pictures, seed=session.seed)
     )
-    if no_gl is None or "mujoco" not in sys.modules:
+    if no_gl is None or simulation_in(named.environment) is None:
         return named
     with contextlib.closing(named.environment):
         if render == LIVE or not named.has_deferrable_pictures():

@@ -25,6 +25,8 @@ COMMANDS = {
     "render": ("render", "Render pending videos, or recorded episodes again."),
     "recover": ("recover", "Put a directory in order after a kill."),
     "list": ("list_episodes", "List recorded episodes."),
+    "replay": ("replay", "Write a page that shows an episode in 3D."),
+    "view": ("view", "Show a run in a browser while it goes on."),
     "strip": ("strip", "Make a film strip of an episode."),
     "evaluate": ("evaluate", "Evaluate a policy on tasks and seeds."),
     "compare": ("compare", "Compare evaluations."),

@@ -161,10 +161,6 @@ def _run(
     session: Session, console: rich.console.Console
 ) -> tuple[list[SessionEpisode], bool]:
     """Return the recorded episodes, and whether Ctrl-C ended them early."""
-    # Not at the top: it loads MuJoCo, and help is there at once without.
-    from ..simulation.warnings import log_mujoco_warnings
-
-    log_mujoco_warnings()
     recorded: list[SessionEpisode] = []
     steps, total = 0, session.episodes
     with progress_bar(console) as show:

@@ -5,11 +5,12 @@ from __future__ import annotations
 
 import copy
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, TypeAlias
 
 import numpy as np
 from gymnasium import Space, spaces
+from numpy.typing import NDArray
 
 from ..errors import PolicyError
 
@@ -35,6 +36,30 @@ def action_space(environment: Any) -> Space[Any]:
         own: Space[Any] = copy.deepcopy(environment.action_space)
         return own
     return _space_of(environment.action_spec())
+
+
+def sampler(space: Space[Any]) -> Callable[[], Any]:
+    """Return what draws as `space.sample` does, and the same actions.
+
+    That of a `Box` takes half as long as a step of HalfCheetah: it sorts the bounds
+    anew each time. Where all are finite a tenth of the time is enough.
+    """
+    if type(space) is not spaces.Box or not (space.shape and space.is_bounded()):
+        return space.sample
+    if space.dtype.kind != "f":
+        # Whole numbers are rounded, and up to the upper bound.
+        return space.sample
+    shape, dtype = space.shape, space.dtype
+    low, high = space.low.astype(np.float64), space.high.astype(np.float64)
+    widths = high - low
+
+    def draw() -> NDArray[Any]:
+        values = space.np_random.random(shape)
+        values *= widths
+        values += low
+        return values.astype(dtype)
+
+    return draw
 
 
 def zero(space: Space[Any]) -> Any:

@@ -61,6 +61,7 @@ class Policy:
         from . import actions
 
         self._space = actions.action_space(environment)
+        self._draw = actions.sampler(self._space)
         self._zero = actions.zero(self._space) if name == "zero" else None
         self._checked = actions.checked
 
@@ -75,7 +76,7 @@ class Policy:
             PolicyError: the policy raised, or gave something that is no action.
         """
         if self._zero is None:
-            return self._space.sample()
+            return self._draw()
         # Environments may keep, or write into, the action that they are given.
         return copy.deepcopy(self._zero)
 

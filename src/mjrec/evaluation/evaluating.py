@@ -52,7 +52,7 @@ from .planning import check_score_ranges, plan_from
 from .policy_objects import SentPolicy, sent_policy
 from .result_tables import EpisodeFiles
 from .results_files import PLAN_NAME, RESULT_NAMES, write_results
-from .statistics import Bootstrap
+from .statistics import Bootstrap, load_scipy
 from .summaries import default_score_range, summarize_across, summarize_results
 
 logger = logging.getLogger(__name__)
@@ -222,7 +222,9 @@ def evaluate(
         work = _work(plan, sent, place, chooses_gl=given is not None)
         # What is quick is done here: nothing has to wait in a cluster's queue.
         with Run(executor if is_here else local, work) as home:
-            plan, velocities = check_tasks(home, plan)
+            load_scipy()
+            needed = min(local.workers, len(plan.tasks) * len(plan.chunks))
+            plan, velocities = check_tasks(home, plan, workers=needed if is_here else 1)
             if begun is None:
                 _make(place)
                 stack.enter_context(_held(place))

@@ -87,9 +87,15 @@ class Choice:
 
 
 def check_tasks(
-    run: Run, plan: EvaluationPlan
+    run: Run, plan: EvaluationPlan, *, workers: int = 1
 ) -> tuple[EvaluationPlan, Mapping[str, int]]:
     """Let workers make the environment and the policy of each new task, and no step.
+
+    Args:
+        run: the workers.
+        plan: what is evaluated.
+        workers: how many begin, where there are new tasks: all will make one of them
+            anyway, and so they do it at once.
 
     Returns:
         The plan with their step limits; and how much work a step is, roughly.
@@ -98,13 +104,16 @@ def check_tasks(
         Error: the one that making them raised, such as an `UnknownName`.
     """
     unknown = {task.name: task for task in plan.tasks if task.step_limit is None}
-    for name in unknown:
-        run.submit(name, kind="check", task=name)
+    if unknown:
+        for number in range(max(len(unknown), workers)):
+            name = [*unknown][number % len(unknown)]
+            run.submit(f"{number}", kind="check", task=name)
     velocities: dict[str, int] = {}
     for outcome in run.results():
         # Without patience there is always one.
         assert outcome is not None
-        name, said = outcome.key, outcome.value or {}
+        said = outcome.value or {}
+        name = [*unknown][int(outcome.key) % len(unknown)]
         if outcome.failure is not None:
             # No error of ours, which would have been carried: its worker died.
             raise EnvironmentNotMade(name, outcome.failure)

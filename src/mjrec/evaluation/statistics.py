@@ -12,7 +12,9 @@ others.
 
 from __future__ import annotations
 
+import contextlib
 import importlib
+import threading
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from statistics import NormalDist
@@ -304,6 +306,18 @@ def two_sided_p_value(x: FloatArray, y: FloatArray) -> float:
         # SciPy would divide zero by zero.
         return 1.0
     return float(_stats().mannwhitneyu(y, x, alternative="two-sided").pvalue)
+
+
+def load_scipy() -> None:
+    """Load SciPy on a thread: it takes a second, in which workers do their jobs."""
+
+    def load() -> None:
+        # Who needs it says what is missing.
+        with contextlib.suppress(ImportError):
+            _stats()
+
+    # No daemon: the interpreter must not end in the midst of loading C++ modules.
+    threading.Thread(target=load, name="mjrec-scipy").start()
 
 
 def _stats() -> Any:

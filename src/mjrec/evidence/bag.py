@@ -1,30 +1,37 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A folder as a BagIt bag (RFC 8493), and as a zip file of always the same bytes.
+"""A folder as a BagIt bag (RFC 8493), made and checked; and as a zip file.
 
 The files of the bag are written here, because `bagit.make_bag` writes version 0.97, in
 the directory's own order, and changes the working directory of the whole process. The
 `bagit` package, which knows nothing of this one, then validates the bag.
 
-Of the zip file, times, modes, owners, order and machine are left out. What is
-compressed already is stored; the rest is deflated, so that the same zlib gives the same
-bytes.
+Of the zip file, times, modes, owners, order and machine are left out, so that it has
+always the same bytes. What is compressed already is stored; the rest is deflated, which
+the same zlib does alike.
+
+A bag is read strictly: what is not said in its manifests is not there, and what is
+there is said.
 """
 
 from __future__ import annotations
 
-import hashlib
 import importlib
 import importlib.util
 import os
+import re
 import shutil
 import stat
 import zipfile
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 from ..errors import FileNotWritten, MissingDependency, PackError
-from .layout import PAYLOAD
+from ..formats.regular_files import read_regular
+from .archive import BAG_DECLARATION, digest_of
+from .findings import Finding, Outcome, Topic
+from .layout import FORMAT_KEY, FORMAT_VERSION, PAYLOAD
+from .portable_names import check_distinct, portable_parts
 
 # The endings of files in which nothing is left to be compressed.
 STORED = (".mp4", ".avi", ".h5", ".gz", ".zip")
@@ -38,6 +45,20 @@ _MODE = (stat.S_IFREG | 0o644) << 16
 # The first moment that a zip file can name.
 _TIME = (1980, 1, 1, 0, 0, 0)
 _BLOCK = 1 << 20
+
+_INFO = "bag-info.txt"
+_MANIFESTS = ("manifest-sha512.txt", "tagmanifest-sha512.txt")
+
+_DECLARATION = re.compile(
+    r"BagIt-Version: (1\.0|0\.97)\r?\nTag-File-Character-Encoding: UTF-8(\r?\n)?"
+)
+_LINE = re.compile(r"(?P<digest>[0-9a-fA-F]{128})[ \t]+\*?(?P<name>.+)")
+# RFC 8493: the characters that would end a line, and the percent sign itself.
+_ENCODED = re.compile("%(0[AaDd]|25)")
+_LONGEST_TEXT = 1 << 26
+_MOST_FAILURES = 100
+
+_OnProgress = Callable[[int, int], object]
 
 
 def check_bagit() -> None:
@@ -69,10 +90,10 @@ def make_bag(folder: Path, info: Mapping[str, str]) -> None:
     version = "0.97" if any("%" in path.name for path in payload) else "1.0"
     tags = {**info, "Payload-Oxum": f"{size}.{len(payload)}"}
     _write_tags(
-        folder / "bagit.txt",
+        folder / BAG_DECLARATION,
         {"BagIt-Version": version, "Tag-File-Character-Encoding": "UTF-8"},
     )
-    _write_tags(folder / "bag-info.txt", dict(sorted(tags.items())))
+    _write_tags(folder / _INFO, dict(sorted(tags.items())))
     _write_manifest(folder, "manifest", payload)
     _write_manifest(folder, "tagmanifest", sorted(folder.glob("*.txt")))
     # Optional, so it is not imported with this module; it has no types.
@@ -106,6 +127,39 @@ def write_zip(folder: Path, path: Path) -> None:
         raise FileNotWritten(path, error.strerror or error, then=TRY_AGAIN) from error
 
 
+def check_bag(bag: Path, on_progress: _OnProgress) -> Iterator[Finding]:
+    """Yield what is found about a bag as a whole.
+
+    Args:
+        bag: its folder.
+        on_progress: told how many bytes are checked, and of how many.
+    """
+    objections = list(_objections(bag, on_progress))
+    for name, reason in objections[:_MOST_FAILURES]:
+        yield Finding(
+            topic=Topic.FILES, item=name, outcome=Outcome.DIFFERENT, reason=reason
+        )
+    if len(objections) > _MOST_FAILURES:
+        yield Finding(
+            topic=Topic.FILES,
+            item="",
+            outcome=Outcome.DIFFERENT,
+            reason="further files that are missing, changed or too many",
+            count=len(objections) - _MOST_FAILURES,
+        )
+
+
+def unchanged(bag: Path) -> Finding:
+    """Return that a bag to which nothing is to be objected is what it says."""
+    return Finding(
+        topic=Topic.FILES,
+        item="",
+        outcome=Outcome.NOTED,
+        reason="they are those that the bag lists, and have the SHA-512 that it says",
+        count=sum(path.is_file() for path in bag.rglob("*")),
+    )
+
+
 def _files(folder: Path) -> list[Path]:
     found = (path for path in folder.rglob("*") if path.is_file())
     # By the names as they are in the archive, whatever the system's own order.
@@ -118,14 +172,10 @@ def _write_tags(path: Path, tags: Mapping[str, str]) -> None:
 
 def _write_manifest(folder: Path, kind: str, files: Iterable[Path]) -> None:
     lines = (
-        f"{_digest(path)}  {path.relative_to(folder).as_posix()}" for path in files
+        f"{digest_of(path, _ALGORITHM)}  {path.relative_to(folder).as_posix()}"
+        for path in files
     )
     _write_lines(folder / f"{kind}-{_ALGORITHM}.txt", lines)
-
-
-def _digest(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, _ALGORITHM).hexdigest()
 
 
 def _write_lines(path: Path, lines: Iterable[str]) -> None:
@@ -144,3 +194,74 @@ def _add(archive: zipfile.ZipFile, source: Path, name: str) -> None:
     info._compresslevel = None if stored else _LEVEL  # type: ignore[attr-defined]  # see above
     with source.open("rb") as file, archive.open(info, "w") as entry:
         shutil.copyfileobj(file, entry, _BLOCK)
+
+
+def _objections(bag: Path, on_progress: _OnProgress) -> Iterator[tuple[str, str]]:
+    try:
+        if not _DECLARATION.fullmatch(_text_of(bag / BAG_DECLARATION)):
+            yield BAG_DECLARATION, "it is not that of a bag of BagIt 1.0 or 0.97"
+        yield from ((_INFO, reason) for reason in _objections_to_info(bag))
+        said = {
+            **_said_in(bag, _MANIFESTS[0], is_payload=True),
+            **_said_in(bag, _MANIFESTS[1], is_payload=False),
+        }
+    except (OSError, ValueError) as error:
+        yield "", _because(error)
+        return
+    paths = [path for path in bag.rglob("*") if not path.is_dir()]
+    there = {path.relative_to(bag).as_posix(): path.stat().st_size for path in paths}
+    for name in sorted(said.keys() - there.keys()):
+        yield name, "it is missing"
+    known = {BAG_DECLARATION, _INFO, *_MANIFESTS}
+    for name in sorted(said.keys() - known):
+        if not name.startswith(f"{PAYLOAD}/"):
+            yield name, "no packed run has such a file beside its data"
+    # No manifest can hold its own digest.
+    for name in sorted(there.keys() - said.keys() - {_MANIFESTS[1]}):
+        yield name, "nothing says that it belongs there"
+    total, done = sum(there.values()), 0
+    for name in sorted(said.keys() & there.keys()):
+        if digest_of(bag / name, "sha512") != said[name]:
+            yield name, "it was changed: its SHA-512 is another one"
+        done += there[name]
+        on_progress(done, total)
+
+
+def _objections_to_info(bag: Path) -> Iterator[str]:
+    lines = _text_of(bag / _INFO).splitlines()
+    fields = [
+        (key.strip(), v.strip()) for key, _, v in (x.partition(":") for x in lines)
+    ]
+    versions = [value for key, value in fields if key == FORMAT_KEY]
+    if versions != [str(FORMAT_VERSION)]:
+        yield (
+            f"it says {FORMAT_KEY} {', '.join(versions)[:80] or '(nothing)'}, and this "
+            f"mjrec knows version {FORMAT_VERSION}: it was packed by another one"
+        )
+
+
+def _said_in(bag: Path, manifest: str, *, is_payload: bool) -> dict[str, str]:
+    """Return the digests that a manifest says, by the names of the files."""
+    said: dict[str, str] = {}
+    for number, line in enumerate(_text_of(bag / manifest).splitlines(), 1):
+        match = _LINE.fullmatch(line)
+        if match is None:
+            raise ValueError(f"{manifest}, line {number}: no SHA-512 and a name")
+        name = _ENCODED.sub(lambda found: chr(int(found[1], 16)), match["name"])
+        if (portable_parts(name)[0] == PAYLOAD) is not is_payload or name in said:
+            raise ValueError(f"{manifest}, line {number}: {name[:200]!r} is misplaced")
+        said[name] = match["digest"].lower()
+    check_distinct(said)
+    return said
+
+
+def _text_of(path: Path) -> str:
+    return read_regular(path, limit=_LONGEST_TEXT).decode("utf-8")
+
+
+def _because(error: Exception) -> str:
+    if isinstance(error, OSError):
+        return f"{Path(str(error.filename)).name}: {error.strerror}"
+    return (
+        "it is not UTF-8 text" if isinstance(error, UnicodeDecodeError) else str(error)
+    )

@@ -117,7 +117,7 @@ def _machine(
     for facts in (given, made):
         machine = _mapping(facts.get("machine"))
         # Of the flags of a CPU the beginning tells them apart.
-        values.append(" ".join(str(value)[:16] for value in machine.values()))
+        values.append(" ".join(str(v)[:16] for v in machine.values()).strip())
     yield from _claim("machine", *values, *items)
 
 

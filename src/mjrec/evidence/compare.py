@@ -43,11 +43,11 @@ from .compare_rows import compare_rewards, compare_trajectories, same_trajectory
 from .compare_text import compare_frame_hashes, compare_tables, compare_texts
 from .compare_video import compare_sampled, compare_videos
 from .differences import Aspect, Difference, Same, short
-from .excuses import Trial, applicable, believed, merged, with_allowed
+from .excuses import NUMERIC, Trial, applicable, believed, merged, with_allowed
 from .findings import Excuse, Finding, Level, Outcome, Topic
+from .honesty import read_metadata, remarks_on_video
 from .layout import CRATE, ENVIRONMENT, PAYLOAD, RECORDINGS, SAMPLED, STATISTICS
 from .notes import REWARDS_FILE, read_notes
-from .videos_shown import read_metadata, remarks_on_video
 
 _TAGS: Final = ("bagit.txt", "bag-info.txt")
 # What stands in the middle or at the end of a file's name, and what kind it is then.
@@ -83,8 +83,8 @@ _TOPICS: Final = {
     "text": Topic.PICTURES,
 }
 _OF_MANIFEST: Final = (Topic.SELECTION, Topic.IDENTITY)
+_NOT_MADE: Final = "nothing made this file again"
 _NO_DIFFERENCES: Final = (Aspect.CLAIM, Aspect.STATEMENT)
-_NOTHING: Final = "nothing made it"
 # Excuses of what was not played.
 _UNPLAYED: Final = ("environment", "wrappers", "actions not kept")
 _MOST_FAILURES: Final = 100
@@ -140,7 +140,7 @@ class Comparison:
         claims = claimed_excuses(self._given, self._made)
         excuses = applicable(merged([*claims, *(excuse for excuse, _ in noted)]))
         trial = Trial(with_allowed(excuses, self._allow))
-        sums = _Sums()
+        sums, is_other_code = _Sums(), False
         for _, finding in noted:
             if finding is not None:
                 trial.use(str(finding.excuse))
@@ -154,13 +154,17 @@ class Comparison:
                     continue
                 if finding.outcome is not Outcome.DIFFERENT:
                     sums.add(finding)
-                elif sums.fail(finding):
+                    continue
+                is_other_code |= found.aspect in (Aspect.STATE, Aspect.DERIVED)
+                if sums.fail(finding):
                     yield finding
             elif not trial.same(found):
                 sums.same(found)
         yield from trial.refutations()
         yield from sums
         self.excuses = trial.excuses
+        if is_other_code and not any(e.name in NUMERIC for e in self.excuses):
+            yield _other_code()
 
     def _compare(self) -> Iterator[Same | Difference | Finding]:
         self._renamed = _renamed_models(self._given, self._made)
@@ -216,9 +220,9 @@ class Comparison:
         yield Difference(
             topic=_TOPICS.get(kind, Topic.FILES),
             file=file,
-            aspect=Aspect.MODEL if kind == "model" else Aspect.EXACT,
-            given="this file" if is_given else "no such file",
-            made="one" if is_made else _NOTHING,
+            # A compiled model that is not there is none that was compiled elsewhere.
+            aspect=Aspect.MODEL if kind == "model" and is_given else Aspect.EXACT,
+            how=_NOT_MADE if is_given else "no such file, but one was made again",
         )
 
     def _compare_file(self, file: str) -> Iterator[Same | Difference | Finding]:
@@ -289,7 +293,7 @@ class Comparison:
             case _ if Path(file).suffix in (".md", ".cff"):
                 yield from compare_texts(given, made, file, rules)
             case _:
-                yield Difference(topic=Topic.FILES, file=file, where="its bytes")
+                yield Difference(topic=Topic.FILES, file=file, how="its bytes differ")
 
     def _compare_manifests(
         self, given: Path, made: Path, file: str, rules: Rules
@@ -515,8 +519,7 @@ def _compare_sources(given: Path, made: Path, file: str) -> _Found:
         file=file,
         # The name of the main file is a statement.
         aspect=Aspect.STATEMENT if is_equal else Aspect.EXACT,
-        given="these sources",
-        made="others",
+        how="its sources are not those of the model that was made again",
     )
 
 
@@ -534,17 +537,36 @@ def _compare_models(given: Path, made: Path, file: str) -> _Found:
     if contents[0] != contents[1]:
         yield _recompiled(file)
     else:
-        yield Difference(topic=Topic.FILES, file=file, aspect=Aspect.STORED)
+        yield Difference(
+            topic=Topic.FILES,
+            file=file,
+            aspect=Aspect.STORED,
+            how="the same model, compressed otherwise",
+        )
 
 
 def _damaged(file: str, error: Error) -> Difference:
+    # Without the path, which is that of a temporary folder.
+    reason = error.reason if isinstance(error, UnreadableFile) else str(error)
     topic = _TOPICS.get(_kind(file), Topic.FILES)
-    return Difference(topic=topic, file=file, given=str(error), made="a whole file")
+    return Difference(topic=topic, file=file, how=f"it cannot be read: {reason}")
 
 
 def _not_made(file: str) -> Difference:
     topic = _TOPICS.get(_kind(file), Topic.FILES)
-    return Difference(topic=topic, file=file, given="this file", made=_NOTHING)
+    return Difference(topic=topic, file=file, how=_NOT_MADE)
+
+
+def _other_code() -> Finding:
+    return Finding(
+        topic=Topic.PHYSICS,
+        item="",
+        outcome=Outcome.NOTED,
+        reason="it claims the versions and the machine that are here, so other code or "
+        "other numbers were at work",
+        unit="verification",
+        is_headline=True,
+    )
 
 
 def _recompiled(file: str) -> Difference:
@@ -553,8 +575,7 @@ def _recompiled(file: str) -> Difference:
         file=file,
         aspect=Aspect.MODEL,
         unit="compiled model",
-        given="one compiled model",
-        made="another",
+        how="it was compiled otherwise",
     )
 
 
@@ -577,8 +598,8 @@ def _other_choice(given: set[int], made: set[int], file: str) -> Difference:
         topic=Topic.SELECTION,
         file=file,
         where="episodes with a video",
-        given=f"{_listed(given - made)} that nothing chose",
-        made=f"{_listed(made - given)} besides",
+        how=f"only the archive has {_listed(given - made)}, only what was made again "
+        f"has {_listed(made - given)}",
     )
 
 

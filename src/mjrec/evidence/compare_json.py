@@ -15,9 +15,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, BinaryIO, Final, NamedTuple, TypeAlias
 
+from ..formats.journal import is_of_spans
 from ..formats.json_fields import json_object, read_object, unreadable
 from ..formats.regular_files import open_regular, read_regular
-from .differences import Aspect, Difference, Same, relative_error, short
+from .differences import Aspect, Difference, Same, only_in, relative_error, unlike
 from .findings import Topic
 
 _LONGEST_LINE: Final = 1 << 24
@@ -187,13 +188,11 @@ def compare_journals(
         pairs = itertools.zip_longest(_lines(one), _lines(other))
         for number, (a, b) in enumerate(pairs, start=1):
             if a is None or b is None:
-                said = ["no more" if each is None else "a line" for each in (a, b)]
                 yield Difference(
                     topic=Topic.REWARDS,
                     file=file,
                     where=f"line {number}",
-                    given=said[0],
-                    made=said[1],
+                    how=only_in(b is None, (a or b or b"").decode(errors="replace")),
                 )
                 return
             yield from _compare_lines(number, rules.translated(a), b, file, rules)
@@ -314,13 +313,15 @@ def _leaf(
         size = error if math.isfinite(error) else None
     aspect = rule.aspect
     is_gone = given is _ABSENT or made is _ABSENT
+    how = unlike(given, made)
+    if is_gone:
+        how = only_in(made is _ABSENT, given if made is _ABSENT else made)
     if (is_gone and aspect not in (Aspect.CLAIM, Aspect.STATEMENT)) or (
         aspect is Aspect.DERIVED and size is None
     ):
         # No version makes a number of what is none, nor leaves a key out. But a
         # package may be missing here.
         aspect = Aspect.EXACT
-    values = ["nothing" if each is _ABSENT else short(each) for each in (given, made)]
     return Difference(
         topic=rule.topic,
         file=file,
@@ -328,8 +329,7 @@ def _leaf(
         episode=episode,
         aspect=aspect,
         where=where,
-        given=values[0],
-        made=values[1],
+        how=how,
         size=size,
         claim=rule.claim,
     )
@@ -352,8 +352,7 @@ def _or_bytes(found: Any, file: str) -> Iterator[Same | Difference]:
             topic=Topic.FILES,
             file=file,
             aspect=Aspect.STORED,
-            given="the same values, written otherwise",
-            made="as mjrec writes them",
+            how="the same values, written otherwise",
         )
 
 
@@ -361,4 +360,5 @@ def _lines(file: BinaryIO) -> Iterator[bytes]:
     while line := file.readline(_LONGEST_LINE):
         if len(line) >= _LONGEST_LINE:
             raise ValueError("a line is too long")
-        yield line
+        if not is_of_spans(line):
+            yield line

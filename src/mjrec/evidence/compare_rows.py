@@ -16,12 +16,11 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from ..atomic_files import file_sha256
 from ..errors import UnreadableFile
 from ..formats.json_fields import json_object
 from ..formats.trajectory_hdf5 import open_hdf5
 from .compare_json import Rules, json_differences
-from .differences import Aspect, Difference, Same, short
+from .differences import Aspect, Difference, Same, unlike
 from .findings import Topic
 
 _BLOCK_BYTES: Final = 1 << 22
@@ -75,9 +74,7 @@ def compare_trajectories(
             topic=Topic.FILES,
             file=file,
             aspect=Aspect.STORED,
-            where="its bytes",
-            given=f"sha256 {file_sha256(given)[:16]}",
-            made=f"sha256 {file_sha256(made)[:16]}",
+            how="the same contents, stored otherwise",
         )
 
 
@@ -166,9 +163,7 @@ def _compare_attributes(
             made = json_object(bytes(b.attrs[key]))
             yield from json_differences(given, made, file, rules)
         else:
-            yield _difference(
-                Topic.FILES, file, f"{where}{key}", short(left[-1]), short(right[-1])
-            )
+            yield _difference(Topic.FILES, file, f"{where}{key}", left[-1], right[-1])
 
 
 def _raw_attribute(owner: Any, key: str) -> tuple[Any, ...]:
@@ -187,7 +182,7 @@ def _compare_datasets(
         raise ValueError(f"its {name} is stored outside it")
     kinds = [f"{each.dtype} of {each.shape}" for each in (a, b)]
     if kinds[0] != kinds[1]:
-        yield _difference(topic, file, name, *map(short, kinds))
+        yield _difference(topic, file, name, *kinds)
         return
     found = _Rows(name, topic, aspect, file)
     rows = a.shape[0] if a.shape else 0
@@ -295,8 +290,7 @@ class _Rows:
             unit=unit,
             aspect=aspect if is_finite else Aspect.EXACT,
             where=f"{self._name}[{first + row}]" + (f".{member}" if member else ""),
-            given=short(left[row, column].item()),
-            made=short(right[row, column].item()),
+            how=unlike(left[row, column].item(), right[row, column].item()),
             size=size if is_finite else None,
         )
 
@@ -327,6 +321,6 @@ def _bits(values: NDArray[Any]) -> NDArray[Any]:
 
 
 def _difference(
-    topic: Topic, file: str, where: str, given: str, made: str
+    topic: Topic, file: str, where: str, given: Any, made: Any
 ) -> Difference:
-    return Difference(topic=topic, file=file, where=where, given=given, made=made)
+    return Difference(topic=topic, file=file, where=where, how=unlike(given, made))

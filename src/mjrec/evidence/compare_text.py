@@ -16,7 +16,7 @@ from typing import Any, BinaryIO, Final
 from ..formats.json_fields import unreadable
 from ..formats.regular_files import open_regular
 from .compare_json import KEYS, Own, Rule, Rules
-from .differences import Aspect, Difference, Same, relative_error, short
+from .differences import Aspect, Difference, Same, only_in, relative_error, unlike
 from .findings import Topic
 from .layout import STATISTICS_COLUMNS
 
@@ -38,11 +38,9 @@ def compare_texts(
 ) -> Iterator[Same | Difference]:
     """Yield how two texts differ, line by line."""
     for number, a, b in _different_lines(given, made):
-        if a is not None and rules.translated(a) == b:
+        if a is not None and (rules.translated(a) == b or a.startswith(_COUNTED)):
             continue
-        if a is not None and a.startswith(_COUNTED):
-            continue
-        yield _line_difference(file, f"line {number}", _text(a), _text(b))
+        yield _line_difference(file, f"line {number}", a, b)
 
 
 def compare_tables(
@@ -58,16 +56,16 @@ def compare_tables(
     """
     columns = STATISTICS_COLUMNS
     for number, a, b in _different_lines(given, made):
-        cells = [_text(line).split(",") for line in (a, b)]
+        cells = [_text(line or b"").split(",") for line in (a, b)]
         if any(len(each) < len(columns) for each in cells):
-            yield _line_difference(file, f"line {number}", _text(a), _text(b))
+            yield _line_difference(file, f"line {number}", a, b)
             continue
         # A seed may have commas of its own: it is a list. The last columns have none.
         for name, one, other in _cells(columns, *cells):
             is_own = name == "video_sha256" and own(cells[0][-3], one)
             if one != other and not is_own:
                 where = f"line {number}: {name}"
-                yield _line_difference(file, where, one, other, KEYS.get(name))
+                yield _difference(file, where, one, other, KEYS.get(name))
 
 
 def compare_frame_hashes(
@@ -80,7 +78,7 @@ def compare_frame_hashes(
     for number, a, b in _different_lines(given, made):
         begins = [_HASH_BEGINS.match(line or b"") for line in (a, b)]
         if not all(begins) or begins[0][0] != begins[1][0]:  # type: ignore[index]
-            yield _line_difference(file, f"line {number}", _text(a), _text(b))
+            yield _line_difference(file, f"line {number}", a, b)
         elif a is not None and b is not None:
             differing += 1
             first = first or _text(a).split(",")[1].strip()
@@ -92,8 +90,7 @@ def compare_frame_hashes(
             unit="frame hash",
             aspect=Aspect.HASH,
             where=f"frame {first}",
-            given="one hash",
-            made="another",
+            how="its hash is another",
         )
     if total > differing:
         count = total - differing
@@ -128,8 +125,15 @@ def _cells(
 
 
 def _line_difference(
-    file: str, where: str, a: str, b: str, rule: Rule | None = None
+    file: str, where: str, a: bytes | None, b: bytes | None
 ) -> Difference:
+    if a is not None and b is not None:
+        return _difference(file, where, _text(a), _text(b), None)
+    how = only_in(b is None, _text(a or b or b""))
+    return Difference(topic=Topic.FILES, file=file, unit="value", where=where, how=how)
+
+
+def _difference(file: str, where: str, a: str, b: str, rule: Rule | None) -> Difference:
     found: dict[str, Any] = {"topic": rule.topic if rule else Topic.FILES}
     claims = [claim for begin, claim in _CLAIMS.items() if a.startswith(begin)]
     if claims and b.startswith(a.partition(":")[0]):
@@ -139,9 +143,7 @@ def _line_difference(
     ):
         # Only its numbers differ.
         found |= {"aspect": Aspect.DERIVED, "size": _error(a, b)}
-    return Difference(
-        file=file, unit="value", where=where, given=short(a), made=short(b), **found
-    )
+    return Difference(file=file, unit="value", where=where, how=unlike(a, b), **found)
 
 
 def _error(a: str, b: str) -> float:
@@ -149,9 +151,5 @@ def _error(a: str, b: str) -> float:
     return max((relative_error(x, y) for x, y in pairs), default=0.0)
 
 
-def _text(line: bytes | None) -> str:
-    return (
-        "no more"
-        if line is None
-        else line.decode(errors="backslashreplace").rstrip("\n")
-    )
+def _text(line: bytes) -> str:
+    return line.decode(errors="backslashreplace").rstrip("\n")

@@ -10,6 +10,7 @@ from __future__ import annotations
 import hashlib
 import itertools
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
@@ -19,7 +20,7 @@ import numpy as np
 from ..formats.json_fields import unreadable
 from ..formats.regular_files import read_regular
 from .decoded_video import DecodedVideo
-from .differences import Aspect, Difference, Same, short
+from .differences import Aspect, Difference, Same, short, unlike
 from .findings import Topic
 from .mp4_boxes import Box, read_boxes, shown_times
 from .picture_similarity import (
@@ -75,9 +76,7 @@ def compare_videos(
         file=file,
         unit="encoding",
         aspect=Aspect.ENCODED,
-        where="its bytes",
-        given="one encoding",
-        made="another",
+        how="it was encoded otherwise",
     )
     frames = list(_compare_frames(given, made, file, on_decoded))
     yield from frames
@@ -160,7 +159,7 @@ def compare_sampled(
         yield _differs(file, f"frame {min(wanted)}", "no such frame", "one")
     if shipped.strain > 1:
         for difference in shipped.differences():
-            yield _differs(file, difference.where, difference.given, difference.made)
+            yield replace(difference, topic=Topic.VIDEOS, aspect=Aspect.EXACT)
     yield from worst.differences()
     if equal:
         yield Same(topic=Topic.PICTURES, file=file, count=equal, unit="frame")
@@ -203,8 +202,8 @@ class Worst:
             unit="frame",
             aspect=Aspect.PICTURE,
             where=f"frame {self._worst}",
-            given=f"{plain.psnr:.1f} dB from it, {plain.block:.0f} levels in a block",
-            made="another frame",
+            how=f"{plain.psnr:.1f} dB from the one made again, "
+            f"{plain.block:.0f} levels in the worst block",
             figures={
                 **plain._asdict(),
                 **{f"{name}_lit": value for name, value in lit._asdict().items()},
@@ -228,6 +227,5 @@ def _differs(file: str, where: str, given: str, made: str) -> Difference:
         file=file,
         unit="video",
         where=where,
-        given=short(given),
-        made=short(made),
+        how=unlike(given, made),
     )

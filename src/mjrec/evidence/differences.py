@@ -102,8 +102,7 @@ class Difference(Place):
     Attributes:
         aspect: how.
         where: "states[12].qpos", "frame 13", "mjrec.schedule".
-        given: what the archive has there, short and printable.
-        made: what was made again.
+        how: a clause, as of `unlike`, short and printable.
         size: of numbers the largest `abs(x - y) / (1 + abs(x))`; None where it is no
             matter of degree.
         claim: of a CLAIM, whose: "mujoco", "gl", "ffmpeg", "machine".
@@ -112,8 +111,7 @@ class Difference(Place):
 
     aspect: Aspect = Aspect.EXACT
     where: str = ""
-    given: str = ""
-    made: str = ""
+    how: str
     size: float | None = None
     claim: str = ""
     figures: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
@@ -121,8 +119,18 @@ class Difference(Place):
     @property
     def reason(self) -> str:
         """The difference as a clause."""
-        place = f"{self.where}: " if self.where else ""
-        return f"{place}the archive has {self.given}, made again it is {self.made}"
+        return f"{self.where}: {self.how}" if self.where else self.how
+
+
+def unlike(given: Any, made: Any) -> str:
+    """Return how two values differ, as a clause."""
+    return f"the archive has {short(given)}, made again it is {short(made)}"
+
+
+def only_in(is_given: bool, value: Any) -> str:
+    """Return that only one of the two has a value, as a clause."""
+    who = "the archive" if is_given else "what was made again"
+    return f"only {who} has it: {short(value)}"
 
 
 def relative_error(given: float, made: float) -> float:

@@ -26,22 +26,18 @@ from ..rendering.views import View
 _OnProgress = Callable[[int, int], object]
 
 
-class NotDrawn(Exception):
-    """A video could not be drawn; the text is a clause that names it."""
-
-
 def draw_all(directory: Path, on_progress: _OnProgress) -> None:
     """Draw and encode all pending videos of a directory.
 
     Raises:
-        NotDrawn: one could not be.
+        Error: one could not be.
     """
     rendered = render_videos(
         directory,
         on_progress=lambda now: on_progress(now.frames_done, now.frames or 0),
     )
     for name, reason in rendered.failures.items():
-        raise NotDrawn(f"the video {name} could not be drawn: {reason}")
+        raise Error(f"The video {name} could not be drawn: {reason}")
 
 
 def draw_sample(
@@ -59,7 +55,7 @@ def draw_sample(
         on_progress: told how many frames are drawn, and of how many.
 
     Raises:
-        NotDrawn: one could not be drawn.
+        Error: one could not be drawn.
     """
     chosen = np.random.default_rng(seed)
     videos = list(_pending(directory))
@@ -77,9 +73,7 @@ def draw_sample(
                     done += 1
                     on_progress(done, count * len(videos))
             except Error as error:
-                raise NotDrawn(
-                    f"the video {name} could not be drawn: {error}"
-                ) from error
+                raise Error(f"The video {name} could not be drawn: {error}") from error
 
 
 def _pending(directory: Path) -> Iterator[tuple[str, Path, int, Any]]:

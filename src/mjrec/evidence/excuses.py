@@ -148,6 +148,11 @@ _BY_NAME: Final[Mapping[str, _Rule]] = {
         ),
     ),
 }
+# Claims of what makes the numbers of a step.
+NUMERIC: Final = (
+    *("mujoco", "machine", "numpy", "gymnasium", "gymnasium-robotics", "dm-control"),
+    "environment",
+)
 _ANY_VERSION: Final = _Rule(
     kind=ExcuseKind.VERSION, costs="nothing but its own version", allows=_RESTORED
 )
@@ -171,6 +176,7 @@ _BELIEVED: Final = {
 # How many of the frames may be equal bit for bit: of another rasteriser, next to none;
 # of the same one on another CPU, those in which nothing was rounded otherwise.
 _MOST_EQUAL_FRAMES: Final = {"gl": 0.5, "machine": 0.8}
+_ELSEWHERE: Final = (ExcuseKind.VERSION, ExcuseKind.HARDWARE)
 _FAMILIES: Final = ("llvmpipe", "softpipe", "nvidia", "amd", "radeon", "intel", "apple")
 
 
@@ -301,15 +307,19 @@ class Trial:
 
     @property
     def excuses(self) -> tuple[Excuse, ...]:
-        """The excuses that were used, or are refuted."""
+        """The excuses, those of versions and hardware also where nothing needs them."""
         tried = (
-            dataclasses.replace(excuse, refuted=self._refutation(index) is not None)
+            dataclasses.replace(
+                excuse,
+                is_needed=self._used[index] > 0,
+                refuted=self._refutation(index) is not None,
+            )
             for index, excuse in enumerate(self._excuses)
         )
         return tuple(
             excuse
-            for index, excuse in enumerate(tried)
-            if self._used[index] or excuse.refuted
+            for excuse in tried
+            if excuse.is_needed or excuse.refuted or excuse.kind in _ELSEWHERE
         )
 
     def refutations(self) -> Iterator[Finding]:

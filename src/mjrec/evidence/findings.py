@@ -132,6 +132,7 @@ class Excuse:
         items: what it applies to: infixes of recordings, files' names below
             `recordings/`, or "episode 27 of 0.4711"; empty for the whole archive.
         costs: what it takes away from the proof, a clause.
+        is_needed: something differs that it allows.
         refuted: the difference that it claims ought to show, and nothing differs.
         allowed: the reader takes it (`--allow`), so that it does not lower the verdict.
     """
@@ -142,6 +143,7 @@ class Excuse:
     here: str = ""
     items: tuple[str, ...] = ()
     costs: str = ""
+    is_needed: bool = True
     refuted: bool = False
     allowed: bool = False
 
@@ -182,7 +184,7 @@ class Verification:
         """PASS, PARTLY or FAIL."""
         if self.failures or any(excuse.refuted for excuse in self.excuses):
             return Verdict.FAIL
-        if self.level is Level.FILES:
+        if self.level is Level.FILES and self.findings:
             return Verdict.PARTLY
         if not any(map(_is_proof, self.findings)):
             return Verdict.FAIL

@@ -12,8 +12,10 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import functools
+import json
 import os
 import signal
+import zipfile
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -24,12 +26,13 @@ from numpy.typing import NDArray
 from ..environments.recreate import NotRecreated, Recreated, checked_options, recreate
 from ..environments.scenes import new_warnings
 from ..environments.stand_ins import RecordedSteps
+from ..errors import UnreadableFile
 from ..formats.journal import KILLED
 from ..recorder.ending_reasons import EXCEPTION, INTERRUPT, RESET
+from ..simulation.model_sources import read_authored
 from .evaluation_choice import choose_for_evaluation
-from .inputs import EpisodeInputs, RecordingInputs
+from .inputs import EpisodeInputs, RecordingInputs, given_actions
 from .notes import Notes, read_notes
-from .play_actions import given_actions
 from .recorder_again import monitor_again
 
 # Steps that an archive only claims are counted one by one.
@@ -43,6 +46,7 @@ _EVENTS = {
     INTERRUPT: "fault",
     KILLED: "kill",
 }
+_SOURCE = "source/"
 _MODES = {"e": "evaluation"}
 
 
@@ -52,7 +56,7 @@ def play_recording(
     *,
     arrays: Mapping[str, NDArray[Any]],
     trust: frozenset[str],
-    mjcf: tuple[Path, Any] | None,
+    sources: Path,
     only_counted: bool,
     notes: Notes,
     on_steps: Callable[[int], object],
@@ -64,7 +68,7 @@ def play_recording(
         directory: where others of the same run may be already.
         arrays: actions and first states by the names in the inputs.
         trust: ids of environments that may be made besides those of the registries.
-        mjcf: the author's MJCF file and its model, where one was simulated.
+        sources: the folder with what the author's models were made from.
         only_counted: only rewards and ends are asked for: no states are kept but of
             episodes with a video.
         notes: what could not be made again, and why.
@@ -80,6 +84,9 @@ def play_recording(
     """
     if recording.environment is None:
         raise NotRecreated("the journal does not say which environment it is of")
+    mjcf = None
+    if recording.sources is not None:
+        mjcf = _unpack_sources(sources / recording.sources, directory.parent)
     recreated = recreate(
         recording.environment,
         own_camera=recording.options.get("own_camera"),
@@ -121,6 +128,10 @@ def play_recording(
     if os.waitstatus_to_exitcode(status) != -signal.SIGKILL:
         raise NotRecreated("the recording that was killed could not be played")
     notes.all = list(read_notes(directory.parent))
+    if not recording.has_sources:
+        # A thread may have stored them just before.
+        for path in directory.glob("openaigym.model.*.zip"):
+            path.unlink()
     return {}
 
 
@@ -359,3 +370,29 @@ def _exception_kind(name: str) -> type[BaseException]:
     """Return an exception whose name in files is this one; nothing is imported."""
     module, _, qualified = name.rpartition(".")
     return type(qualified, (Exception,), {"__module__": module or "builtins"})
+
+
+def _unpack_sources(path: Path, into: Path) -> tuple[Path, Any]:
+    """Return an MJCF file, with all that it refers to beside it, and its model.
+
+    Args:
+        path: of the zip file that a recorder wrote.
+        into: a folder.
+
+    Raises:
+        NotRecreated: it is not there, damaged or dangerous, or MuJoCo refuses it.
+    """
+    try:
+        # It looks at all names in it.
+        model = read_authored(path)
+    except (OSError, UnreadableFile) as error:
+        raise NotRecreated(f"its model cannot be compiled: {error}") from error
+    folder = into / path.stem
+    with zipfile.ZipFile(path) as archive:
+        main = json.loads(archive.read("contents.json"))["main"]
+        for name in archive.namelist():
+            if name.startswith(_SOURCE):
+                target = folder / name.removeprefix(_SOURCE)
+                target.parent.mkdir(parents=True, exist_ok=True)
+                target.write_bytes(archive.read(name))
+    return folder / main, model

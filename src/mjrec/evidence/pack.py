@@ -28,6 +28,7 @@ from ..errors import (
     PackError,
     UnreadableFile,
 )
+from ..formats.journal import is_of_spans
 from ..formats.manifest import write_manifest
 from ..formats.monitor_directory import FILE_PREFIX
 from ..formats.trajectory import row_dtype
@@ -281,10 +282,22 @@ def _stage(contents: Contents, folder: Path) -> None:
     folder.mkdir()
     for name, path in contents.files.items():
         _link_or_copy(path, folder / name)
+        if name == path.name and path.suffix == ".jsonl":
+            _leave_rows_out(folder / name)
     for name, manifest in contents.manifests.items():
         write_manifest(folder / name, manifest)
     for name, path in contents.without_states.items():
         _write_without_states(path, folder / name)
+
+
+def _leave_rows_out(journal: Path) -> None:
+    """Leave out of a copy of a journal what it says of logs, which are gone."""
+    lines = journal.read_bytes().splitlines(keepends=True)
+    rest = [line for line in lines if not is_of_spans(line)]
+    if len(rest) < len(lines):
+        # It may be a link.
+        journal.unlink()
+        journal.write_bytes(b"".join(rest))
 
 
 def _write_without_states(source: Path, target: Path) -> None:

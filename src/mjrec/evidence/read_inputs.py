@@ -15,7 +15,7 @@ from typing import Any
 from numpy.typing import NDArray
 
 from .. import json_text
-from ..errors import UnreadableFile
+from ..errors import Error, UnreadableFile
 from ..formats.journal import JournalEntry, JournalReader
 from ..formats.json_fields import read_object, unreadable
 from ..formats.monitor_directory import FILE_PREFIX, Infix
@@ -32,15 +32,12 @@ from .packed_run import PackingOptions
 from .portable_names import portable_parts
 
 _SOURCES = re.compile(r"openaigym\.model\.[0-9a-f]{16}\.zip", re.ASCII)
+_UNREADABLE = "Its inputs cannot be read"
 _LONGEST_HEADER = 10_000
 _MOST_EPISODES = 1_000_000
 _DTYPES = frozenset(
     f"{kind}{bits}" for kind in ("float", "int", "uint") for bits in (8, 16, 32, 64)
 ) | {"bool"}
-
-
-class NotReadable(Exception):
-    """The inputs cannot be read; its text is a clause that says why."""
 
 
 def read_inputs(data: Path) -> tuple[Inputs, dict[str, NDArray[Any]]]:
@@ -51,7 +48,7 @@ def read_inputs(data: Path) -> tuple[Inputs, dict[str, NDArray[Any]]]:
             descriptions.
 
     Raises:
-        NotReadable: a file is damaged, or says what cannot be.
+        Error: a file is damaged, or says what cannot be.
     """
     arrays: dict[str, NDArray[Any]] = {}
     try:
@@ -60,9 +57,9 @@ def read_inputs(data: Path) -> tuple[Inputs, dict[str, NDArray[Any]]]:
         ]
         packing = _packing(data / ENVIRONMENT)
     except UnreadableFile as error:
-        raise NotReadable(f"{error.path.name}: {error.reason}") from error
-    except (TypeError, ValueError, KeyError) as error:
-        raise NotReadable(str(error)) from error
+        raise Error(f"{_UNREADABLE}: {error.path.name}: {error.reason}") from error
+    except (AttributeError, LookupError, TypeError, ValueError) as error:
+        raise Error(f"{_UNREADABLE}: {error!s:.300}") from error
     return Inputs(recordings=tuple(sorted(recordings, key=_begun)), packing=packing), (
         arrays
     )
@@ -78,10 +75,10 @@ def _packing(path: Path) -> Mapping[str, Any]:
         return {}
     with unreadable(path):
         packed_with = read_object(path).get("packed_with")
-    said = packed_with.get("options") if isinstance(packed_with, Mapping) else None
-    if not isinstance(said, Mapping):
-        return {}
-    packing_options(said)
+        said = packed_with.get("options") if isinstance(packed_with, Mapping) else None
+        if not isinstance(said, Mapping):
+            return {}
+        packing_options(said)
     return said
 
 
@@ -89,19 +86,22 @@ def packing_options(said: Mapping[str, Any]) -> PackingOptions:
     """Return the options of packing that an archive says.
 
     Raises:
-        ValueError, TypeError: they cannot be.
+        ValueError: they cannot be.
     """
-    name, authors, episodes = said["name"], said["authors"], said["episodes"]
+    name, episodes = said.get("name"), said.get("episodes")
     if not isinstance(name, str) or len(portable_parts(name)) != 1:
         raise ValueError(f"an archive cannot be called {name!r:.80}")
-    if episodes is not None:
-        episodes = tuple(map(_count, episodes))
-    return PackingOptions(**{**said, "authors": tuple(authors), "episodes": episodes})
+    try:
+        chosen = None if episodes is None else tuple(map(_count, episodes))
+        lists = {"authors": tuple(said.get("authors", ())), "episodes": chosen}
+        return PackingOptions(**{**said, **lists})
+    except TypeError as error:
+        raise ValueError(f"its options of packing cannot be: {error}") from error
 
 
 def _recording(files: MonitorFiles, arrays: dict[str, NDArray[Any]]) -> RecordingInputs:
     if Infix.parse(files.infix) is None:
-        raise NotReadable(f"{files.infix!r} is no name that a monitor has")
+        raise ValueError(f"{files.infix!r} is no name that a monitor has")
     journal = _Journal(files.journal)
     run = journal.run
     env_info, keep = run.get("env_info"), run.get("keep")
@@ -164,7 +164,7 @@ class _Journal:
             self._lines += 1
             self.entries[entry.episode_id] = entry
             if len(self.entries) > _MOST_EPISODES:
-                raise NotReadable(f"more than {_MOST_EPISODES} episodes")
+                raise ValueError(f"more than {_MOST_EPISODES} episodes")
 
     def clip_starts(self) -> Iterator[int]:
         """Yield the numbers of steps at which a trigger began clips."""
@@ -347,14 +347,14 @@ def _options(said: Any) -> dict[str, Any]:
         return {}
     for name, value in said.items():
         if name not in OPTIONS or type(value) not in OPTIONS[name]:
-            raise NotReadable(f"the option {name!r:.80} cannot be {value!r:.80}")
+            raise ValueError(f"the option {name!r:.80} cannot be {value!r:.80}")
     return dict(said)
 
 
 def _dtypes(said: Any) -> Iterator[tuple[int, str]]:
     for step, name in said or ():
         if name not in _DTYPES:
-            raise NotReadable(f"actions cannot be of dtype {name!r:.80}")
+            raise ValueError(f"actions cannot be of dtype {name!r:.80}")
         yield _count(step), name
 
 
@@ -369,7 +369,7 @@ def _text(value: Any) -> str | None:
 
 def _count(value: Any) -> int:
     if type(value) is not int or value < 0:
-        raise NotReadable(f"{value!r:.80} is no count")
+        raise ValueError(f"{value!r:.80} is no count")
     return value
 
 

@@ -76,22 +76,22 @@ def main() -> int:
 
 
 def _open(request: Mapping[str, Any], say: _Say) -> None:
-    from .archive import bring_in
-    from .checked_bag import check_bag
+    from .archive import BAG_DECLARATION, bring_in
+    from .bag import check_bag, unchanged
     from .honesty import remarks
-    from .read_inputs import NotReadable, read_inputs
+    from .read_inputs import read_inputs
 
     given, counter = Path(request["given"]), _Counter(say)
     say(facts=dict(bring_in(Path(request["path"]), given)))
-    if (given / "bagit.txt").exists():
-        for finding in check_bag(given, counter):
-            say(finding=finding.as_json())
+    is_bag = (given / BAG_DECLARATION).exists()
+    objections = list(check_bag(given, counter)) if is_bag else []
+    for finding in objections:
+        say(finding=finding.as_json())
     if request["level"] == Level.FILES:
+        if is_bag and not objections:
+            say(finding=unchanged(given).as_json())
         return
-    try:
-        inputs, arrays = read_inputs(given / PAYLOAD)
-    except NotReadable as error:
-        raise Error(f"its inputs cannot be read: {error}") from error
+    inputs, arrays = read_inputs(given / PAYLOAD)
     folder = Path(request["inputs"])
     folder.mkdir()
     inputs.write(folder, arrays)
@@ -112,7 +112,6 @@ def _make(request: Mapping[str, Any], say: _Say) -> None:
     from ..rendering.recovery import recover
     from .draw_again import draw_all, draw_sample
     from .make_again import play_recording
-    from .model_sources import unpack_sources
     from .pack import pack_folder
     from .read_inputs import packing_options
 
@@ -135,15 +134,12 @@ def _make(request: Mapping[str, Any], say: _Say) -> None:
     with np.load(folder / ARRAYS_FILE, allow_pickle=False) as arrays:
         for recording in inputs.recordings:
             try:
-                mjcf = None
-                if recording.sources is not None:
-                    mjcf = unpack_sources(folder / recording.sources, place)
                 rewards |= play_recording(
                     recording,
                     played,
                     arrays=arrays,
                     trust=frozenset(request["trust"]),
-                    mjcf=mjcf,
+                    sources=folder,
                     only_counted=level is Level.STATS,
                     notes=notes,
                     on_steps=count_steps,

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 from .. import json_text
+from ..formats.monitor_directory import FILE_PREFIX
 from .findings import Excuse, Finding, Level, Outcome, Topic, Verdict, Verification
 
 _MOST_ITEMS: Final = 3
@@ -24,6 +25,8 @@ _ORDER: Final = (
     Outcome.MADE_AGAIN,
 )
 _NOT_LOOKED_AT: Final = "not looked at"
+# At the level of files.
+_UNCHANGED: Final = "unchanged"
 # What counts best for people, where a topic is counted in several ways.
 _UNITS: Final = {
     Topic.REWARDS: "episode",
@@ -76,8 +79,12 @@ def failures(verification: Verification) -> list[str]:
 
 
 def excuses(verification: Verification) -> list[str]:
-    """Return the excuses, each with its cost."""
-    return [_excuse(each, verification) for each in verification.excuses]
+    """Return the excuses, each with its cost; those that cost nothing in one line."""
+    known = verification.excuses
+    needed = [each for each in known if each.is_needed or each.refuted]
+    others = dict.fromkeys(_claim(each) for each in known if each not in needed)
+    idle = [f"not needed, as nothing differs: {'; '.join(others)}"] if others else []
+    return [*(_excuse(each, verification) for each in needed), *idle]
 
 
 def lines(verification: Verification) -> list[Line]:
@@ -120,7 +127,8 @@ def _line(topic: Topic, found: list[Finding]) -> tuple[str, str]:
     outcomes = [each.outcome for each in found]
     worst = next((outcome for outcome in _ORDER if outcome in outcomes), None)
     if worst is None:
-        return _NOT_LOOKED_AT, "; ".join(_notes(found))
+        is_bag = topic is Topic.FILES and found
+        return _UNCHANGED if is_bag else _NOT_LOOKED_AT, "; ".join(_notes(found))
     texts = [
         f"{_counts(topic, (f for f in found if f.outcome is outcome))}"
         + (f" {outcome}" if outcome is not worst else "")
@@ -162,20 +170,35 @@ def _said(finding: Finding) -> str:
 
 
 def _excuse(excuse: Excuse, verification: Verification) -> str:
-    here = f", here {excuse.here}" if excuse.here else ""
-    claimed = f" {excuse.claimed}{here}" if excuse.claimed else ""
     if excuse.refuted:
-        return f"{excuse.name}:{claimed}. Refuted: what it claims would show"
-    found = [each for each in verification.findings if each.excuse == excuse.name]
-    costs = [
-        f"{counted(each.count, each.unit)} {each.outcome}{_worst(each)}"
-        for each in found
-        if each.outcome is not Outcome.NOTED and each.unit != "value"
+        return f"{_claim(excuse)}: refuted, what it claims would show"
+    found = [
+        each
+        for each in verification.findings
+        if each.excuse == excuse.name
+        and each.outcome is not Outcome.NOTED
+        and each.unit != "value"
     ]
-    of = "" if not excuse.items else f" ({_some(excuse.items)})"
+    counts: Counter[tuple[str, str]] = Counter()
+    for each in found:
+        counts[each.unit, each.outcome] += each.count
+    costs = [
+        f"{counted(count, unit)} {outcome}"
+        + max(_worst(each) for each in found if (each.unit, each.outcome) == key)
+        for key, count in counts.items()
+        for unit, outcome in (key,)
+    ]
+    # Of a recording that it reaches it need not name the files.
+    items = tuple(i for i in excuse.items if not i.startswith(FILE_PREFIX))
+    of = f" of {_some(items or excuse.items)}" if excuse.items else ""
     allowed = ", allowed" if excuse.allowed else ""
-    told = f": {', '.join(costs)}" if costs else ""
-    return f"{excuse.name}{allowed}:{claimed}{of}. {excuse.costs}{told}"
+    told = f"; {', '.join(costs)}" if costs else ""
+    return f"{_claim(excuse)}{of}{allowed}: {excuse.costs}{told}"
+
+
+def _claim(excuse: Excuse) -> str:
+    here = f" (here {excuse.here})" if excuse.here else ""
+    return f"{excuse.name} {excuse.claimed}{here}".strip()
 
 
 def _worst(finding: Finding) -> str:

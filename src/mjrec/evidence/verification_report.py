@@ -15,6 +15,7 @@ from typing import Any, Final
 
 from ..atomic_files import write_text
 from ..errors import MissingDependency
+from ..plain_text import spelled_out
 from . import summary
 from .findings import Finding, Outcome, Topic, Verdict, Verification
 
@@ -142,13 +143,4 @@ def _command(verification: Verification) -> str:
 
 
 def _shown(value: Any) -> Any:
-    """Return a text with what nobody sees spelled out, and cut where it is long."""
-    if not isinstance(value, str):
-        return value
-    if len(value) > _LONGEST_TEXT:
-        value = f"{value[:_LONGEST_TEXT]} ..."
-    if value.isprintable():
-        return value
-    return "".join(
-        c if c.isprintable() or c == "\n" else f"\\u{ord(c):04x}" for c in value
-    )
+    return spelled_out(value, _LONGEST_TEXT) if isinstance(value, str) else value

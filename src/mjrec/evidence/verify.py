@@ -9,6 +9,9 @@ import importlib.metadata
 import operator
 import os
 import secrets
+import shutil
+import stat
+import tempfile
 import time
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass
@@ -22,17 +25,22 @@ from ..errors import (
     UnknownName,
     UnreadableArchive,
 )
+from ..formats.locks import Lock, is_locked
 from ..machine import machine_fingerprint
 from ..sandbox import Sandbox
 from .excuses import with_allowed
 from .findings import Excuse, Finding, Level, Outcome, Topic, Verification
 from .stages import MODULE
-from .working_folder import working_folder
 
 _PACKAGES = ("mjrec", "mujoco", "numpy", "gymnasium", "dm-control", "imageio-ffmpeg")
 # Compiling a model may take 300 of them.
 _TIMEOUT_S = 900.0
 _SEEDS = 2**32
+_PREFIX = "mjrec-verify-"
+# Held by the process whose folder it is in.
+_LOCK = "lock"
+# A lock is a file for a moment before it is held.
+_A_MOMENT_S = 60.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -111,7 +119,7 @@ def verify(
     given = Path(path)
     if not given.exists():
         raise UnreadableArchive(given, "there is no such file or directory")
-    with working_folder() as folder:
+    with _working_folder() as folder:
         verifying = _Verifying(given.absolute(), folder, asked, on_progress)
         verifying.run(deepest)
         verification = Verification(
@@ -195,6 +203,8 @@ class _Verifying:
                     return True
                 failure = said.get("failure", failure)
             failure = failure or f"its process {sandbox.last_words()}"
+        # The reader knows nothing of the folder that they worked in.
+        failure = failure.replace(f"{self._folder}{os.sep}", "")
         self.findings.append(
             Finding(
                 topic=Topic.FILES,
@@ -288,3 +298,40 @@ def _versions() -> Iterator[tuple[str, str]]:
     for package in _PACKAGES:
         with contextlib.suppress(importlib.metadata.PackageNotFoundError):
             yield package, importlib.metadata.version(package)
+
+
+@contextlib.contextmanager
+def _working_folder() -> Iterator[Path]:
+    """Yield a new folder, and remove it at the end.
+
+    What verifications of the same user have left that were killed is removed first.
+    """
+    parent = Path(tempfile.gettempdir())
+    for folder in parent.glob(f"{_PREFIX}*"):
+        # One that goes away meanwhile, or that cannot be looked at, is no reason to
+        # stop.
+        with contextlib.suppress(OSError):
+            if _is_abandoned(folder):
+                shutil.rmtree(folder, ignore_errors=True)
+    with tempfile.TemporaryDirectory(
+        prefix=_PREFIX, ignore_cleanup_errors=True
+    ) as name:
+        folder = Path(name)
+        lock = None
+        # There are file systems without locks.
+        with contextlib.suppress(OSError):
+            lock = Lock(folder / _LOCK, "", mode=0o600)
+        try:
+            yield folder
+        finally:
+            if lock is not None:
+                lock.release()
+
+
+def _is_abandoned(folder: Path) -> bool:
+    facts = folder.lstat()
+    if not stat.S_ISDIR(facts.st_mode) or facts.st_uid != os.getuid():
+        return False
+    # Where there is none, nothing says that its process has ended.
+    age = time.time() - (folder / _LOCK).lstat().st_mtime
+    return age > _A_MOMENT_S and not is_locked(folder / _LOCK)

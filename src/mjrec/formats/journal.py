@@ -2,8 +2,8 @@
 """The journal: what happened in a run, one line of JSON for each event.
 
 `openaigym.episodes.<infix>.jsonl` grows while the monitor runs, so that a killed
-process loses nothing that was over. Statistics and manifest follow from it. A completed
-episode is a line::
+process loses nothing that was over. Statistics and manifest follow from it, and which
+rows of the logs are which recording (`spans`). A completed episode is a line::
 
     {"episode_id": 27, "length": 200, "reward": 12.5, "type": "t",
      "start_time": 1790000000.0, "end_time": 1790000004.0,
@@ -32,7 +32,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ..errors import ClosedError
+from ..errors import ClosedError, FileNotWritten
 from ..json_text import dumps
 from .appending import append_whole, open_for_appending
 from .json_fields import (
@@ -66,6 +66,11 @@ EVENTS = (
     *("run", "surroundings", "cut", "clip", "action", "dropped"),
     *("fault", "keep", "closed", "recovered", "begun", "failed"),
 )
+
+# Of recordings: what rows are, that one begins, more about it, that it ended, that its
+# rows were given up; and that a log gets no more rows.
+SPAN_EVENTS = ("rows", "begin", "note", "end", "drop", "full")
+_OF_SPANS = tuple(f'{{"{kind}": '.encode() for kind in SPAN_EVENTS)
 
 # The reason of an episode that ended with its process.
 KILLED = "killed"
@@ -123,14 +128,20 @@ class JournalWriter:
     Args:
         path: the file.
         run: what the first line of a new file says.
+
+    Attributes:
+        path: as given.
+        lost: how many files were removed: the next one says nothing of what was said
+            before.
     """
 
     def __init__(self, path: Path, *, run: Mapping[str, Any] | None = None) -> None:
-        self._path = path
+        self.path = path
+        self.lost = 0
         self._run = run
         self._descriptor: int | None = None
         self._unwritten = b""
-        self._closed = False
+        self._is_empty = self._closed = False
 
     def append(self, entry: JournalEntry) -> None:
         """Write down a completed episode.
@@ -140,8 +151,8 @@ class JournalWriter:
 
         Raises:
             ClosedError: after `close`.
-            OSError: it cannot be written now (a full disk); the journal is then as
-                it was before. Or it was removed.
+            FileNotWritten: it cannot be written now (a full disk); the journal is then
+                as it was before. Or it was removed.
         """
         # Not `asdict`, which would copy the options deeply; they may not allow it.
         optional_keys = ("chosen", "recording", "evaluation")
@@ -149,22 +160,29 @@ class JournalWriter:
         values = {k: v for k, v in vars(entry).items() if k not in left_out}
         line = dumps(values)
         if len(line) >= _LONGEST_LINE:
-            for key in ("seed", "options"):
-                values[key] = {"repr": repr(values[key])[:_LONGEST_REPR]}
-            line = dumps(values)
+            line = dumps(_shortened(values))
         self._append(f"{line}\n".encode())
 
-    def note(self, kind: str, facts: Any) -> None:
+    def note(self, kind: str, facts: Any, *, later: bool = True) -> None:
         """Write down another event.
 
         Args:
-            kind: one of `EVENTS`.
+            kind: one of `EVENTS`, or of `SPAN_EVENTS`.
             facts: what JSON can hold.
+            later: False forgets it where it cannot be written now.
 
         Raises:
-            ClosedError, OSError: as `append`.
+            ClosedError, FileNotWritten: as `append`.
         """
-        self._append(f"{dumps({kind: facts})}\n".encode())
+        line = dumps({kind: facts})
+        if len(line) >= _LONGEST_LINE and kind in ("rows", "begin"):
+            line = dumps({kind: {**facts, "facts": _shortened(facts["facts"])}})
+        self._append(f"{line}\n".encode(), later=later)
+
+    @property
+    def is_behind(self) -> bool:
+        """Whether something could not be written yet."""
+        return bool(self._unwritten)
 
     def close(self) -> None:
         """Close the file; further calls do nothing."""
@@ -173,23 +191,47 @@ class JournalWriter:
         if descriptor is not None:
             os.close(descriptor)
 
-    def _append(self, line: bytes) -> None:
+    def _append(self, line: bytes, *, later: bool = True) -> None:
         if self._closed:
-            raise ClosedError(f"The journal {self._path} is closed.")
-        self._unwritten += line
-        if self._descriptor is None:
-            self._descriptor = open_for_appending(self._path)
-        first = b""
-        if self._run is not None and not os.fstat(self._descriptor).st_size:
-            first = f"{dumps({'run': self._run})}\n".encode()
+            raise ClosedError(f"The journal {self.path} is closed.")
+        lines = self._unwritten + line
+        if later:
+            self._unwritten = lines
         try:
-            append_whole(self._descriptor, first + self._unwritten, torn=b"\n")
+            self._write(lines)
+        except OSError as error:
+            raise FileNotWritten(self.path, error.strerror or error) from error
+        self._unwritten = b""
+
+    def _write(self, lines: bytes) -> None:
+        if self._descriptor is None:
+            self._descriptor = open_for_appending(self.path)
+            self._is_empty = not os.fstat(self._descriptor).st_size
+        if self._run is not None and self._is_empty:
+            lines = f"{dumps({'run': self._run})}\n".encode() + lines
+        try:
+            append_whole(self._descriptor, lines, torn=b"\n")
+            self._is_empty = False
         except FileNotFoundError:
             # The next event begins another file.
             os.close(self._descriptor)
             self._descriptor = None
+            self.lost += 1
             raise
-        self._unwritten = b""
+
+
+def _shortened(values: Mapping[str, Any]) -> dict[str, Any]:
+    cut = {
+        key: {"repr": repr(values[key])[:_LONGEST_REPR]}
+        for key in ("seed", "options")
+        if key in values
+    }
+    return {**values, **cut}
+
+
+def is_of_spans(line: bytes) -> bool:
+    """Tell whether a line of a journal is about rows: `formats.spans` reads these."""
+    return line.startswith(_OF_SPANS)
 
 
 class JournalReader:
@@ -259,6 +301,8 @@ class JournalReader:
         )
 
     def _entry(self, index: int, line: bytes) -> JournalEntry | None:
+        if is_of_spans(line):
+            return None
         try:
             if len(line) >= _LONGEST_LINE:
                 self._gave_up = True

@@ -20,8 +20,7 @@
     ├── openaigym.video.<infix>.video000027.step000137.mp4 of a clip
     ├── rl-video-episode-27.mp4                         another name of the first ...
     ├── rl-video-episode-27.side.mp4                    ... and of a further one
-    ├── openaigym.states.<infix>.000000.spans           recordings in flight ...
-    ├── openaigym.states.<infix>.000000.log             ... their rows
+    ├── openaigym.states.<infix>.000000.log             rows of recordings in flight
     ├── openaigym.states.<infix>.000000.tail            ... the last of these
     ├── openaigym.states.<infix>.000000.looks           ... changes of the model
     ├── openaigym.trajectory.<infix>.episode000027.h5   a recorded episode, finished
@@ -38,7 +37,7 @@ What tells videos of one episode apart is a part of the name before its ending. 
 may be called anything, so its part is made of its name such that it is no other part
 and never leads out of the directory.
 
-A recording in flight is a span of rows, named in a `.spans` file (`spans`): an episode
+A recording in flight is a span of rows, which the journal names (`spans`): an episode
 as its trajectory will be, a clip's part, which is of one episode, as
 `openaigym.clip.<infix>.step000000137.part000000` after the number of steps that the
 monitor had recorded when the clip began. A clip's video is called as the episode's in
@@ -90,7 +89,7 @@ _VIDEO_FILE = re.compile(
     rf"{_VIDEO}(\.step(?P<step>[0-9]{{6,18}}))?(\.(?P<view>[^/\n\0]+?))??"
     r"\.(?P<ending>mp4|avi|json|framehash|meta\.json|failed\.json)"
 )
-_STATES = rf"openaigym\.states\.{_INFIX_PART}\.[0-9]{{6,9}}"
+_STATES = rf"openaigym\.states\.{_INFIX_PART}\.(?P<log>[0-9]{{6,9}})"
 
 _MANIFEST = re.compile(rf"openaigym\.manifest\.{_INFIX_PART}\.manifest\.json")
 # By what stands behind `openaigym.`: a directory may hold a million names, and each
@@ -104,7 +103,7 @@ _VISIBLE = {
     "video": re.compile(rf"{_VIDEO}\.[^/\n\0]*(mp4|avi|json|framehash)"),
     "clip": re.compile(rf"{_CLIP}\.failed\.json"),
     "trajectory": re.compile(rf"{_TRAJECTORY}\.h5"),
-    "states": re.compile(rf"{_STATES}\.(spans|log|tail|looks)"),
+    "states": re.compile(rf"{_STATES}\.(log|tail|looks)"),
     "model": re.compile(r"openaigym\.model\.[0-9a-f]{16}\.(zip|mjb\.gz)"),
     "results": re.compile(rf"openaigym\.results\.{_INFIX_PART}\.monitor\.csv"),
 }
@@ -257,7 +256,7 @@ def stats_prefix(infix: Infix) -> str:
     return f"{FILE_PREFIX}.episode_batch.{infix}"
 
 
-def journal_name(infix: Infix) -> str:
+def journal_name(infix: Infix | str) -> str:
     """Return the journal's name."""
     return f"{FILE_PREFIX}.episodes.{infix}.jsonl"
 
@@ -292,9 +291,9 @@ def clip_part_name(infix: Infix, first_step: int, number: int) -> str:
     return f"{clip_prefix(infix, first_step)}.part{number:06d}"
 
 
-def states_name(infix: Infix, number: int) -> str:
-    """Return the name of a list of spans; its rows' files have other suffixes."""
-    return f"{FILE_PREFIX}.states.{infix}.{number:06d}.spans"
+def log_name(infix: Infix | str, number: int) -> str:
+    """Return the name of a row log; the files beside it have other suffixes."""
+    return f"{FILE_PREFIX}.states.{infix}.{number:06d}.log"
 
 
 def clip_lock_name(infix: Infix, first_step: int) -> str:
@@ -348,6 +347,13 @@ def episode_of(name: str) -> int | None:
     """Return the episode's number in a file's name; None where there is none."""
     match = _match(name)
     number = None if match is None else match.groupdict().get("episode")
+    return None if number is None else int(number)
+
+
+def log_number(name: str) -> int | None:
+    """Return the number of the row log that a file is of; None for other files."""
+    match = _match(name)
+    number = None if match is None else match.groupdict().get("log")
     return None if number is None else int(number)
 
 

@@ -113,6 +113,11 @@ class RowLog:
         """Whether rows can be added."""
         return self._log >= 0
 
+    @property
+    def is_there(self) -> bool:
+        """Whether it is open, and was not removed."""
+        return self.is_open and os.fstat(self._log).st_nlink > 0
+
     def close(self) -> None:
         """Write the last rows and remove the tail. Idempotent.
 
@@ -178,6 +183,15 @@ class RowLog:
 def tail_path(log: Path) -> Path:
     """Return where the tail of a log is."""
     return log.with_suffix(_TAIL)
+
+
+def has_rows(log: Path) -> bool:
+    """Tell whether a log, or its tail, has rows."""
+    if log.stat().st_size:
+        return True
+    with contextlib.suppress(FileNotFoundError), open_regular(tail_path(log)) as tail:
+        return any(tail.read(8))
+    return False
 
 
 class RowLogReader:

@@ -2,9 +2,9 @@
 """Writing recordings into a monitor's row logs, one behind the other.
 
 A log goes on from recording to recording for as long as their rows look alike and it is
-not long. Each line of the list and each row is with the operating system when the call
-that wrote it returns, so that a killed process loses nothing and nothing needs to be
-flushed.
+not long. Each line of the journal and each row is with the operating system when the
+call that wrote it returns, so that a killed process loses nothing and nothing needs to
+be flushed.
 """
 
 from __future__ import annotations
@@ -15,24 +15,16 @@ import os
 import struct
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import DirectoryNotWritable, FileNotWritten
-from .monitor_directory import Infix, states_name
+from .journal import JournalWriter
+from .monitor_directory import Infix, log_name
 from .row_log import TAIL_BYTES, RowLog
-from .spans import (
-    FINISHED,
-    FORMAT,
-    LOG,
-    LOOKS,
-    append_line,
-    create_list,
-    remove_if_done,
-    remove_list,
-)
+from .spans import FINISHED, LOOKS, remove_if_done, remove_log
 from .trajectory import (
     FORMAT_VERSION,
     FRAME,
@@ -62,6 +54,7 @@ class SpanLogs:
     Args:
         directory: the monitor directory.
         infix: the monitor's.
+        journal: says which rows are which recording.
         numbers: gives each log its number; of one monitor all share it.
         tail_bytes: of each log.
     """
@@ -71,14 +64,17 @@ class SpanLogs:
         directory: Path,
         infix: Infix,
         *,
+        journal: JournalWriter,
         numbers: Iterator[int],
         tail_bytes: int = TAIL_BYTES,
     ) -> None:
         self.directory = directory
         self._infix = infix
+        self._journal = journal
         self._numbers = numbers
         self._tail_bytes = tail_bytes
         self._log: OpenLog | None = None
+        self._said: _Rows | None = None
 
     def path_of(self, name: str) -> Path:
         """Return the file that an episode's recording of this name becomes."""
@@ -106,10 +102,24 @@ class SpanLogs:
         if self._log is not None and (alone or not self._log.suits(dtype)):
             self.close()
         if self._log is None:
-            path = self.directory / states_name(self._infix, next(self._numbers))
+            number = next(self._numbers)
+            path = self.directory / log_name(self._infix, number)
             tail = self._tail_bytes // _TAILS_OF_ONE if alone else self._tail_bytes
-            self._log = OpenLog(path, facts, dtype, tail_bytes=tail)
-        return SpanWriter(self._log, name, facts, alone=alone)
+            self._log = OpenLog(path, number, dtype, self._journal, tail_bytes=tail)
+        log = self._log
+        try:
+            # The log is there before the journal has it: what has none is gone.
+            said = self._say_rows(log.number, dtype, facts)
+            line = _begin(log, name, facts, said)
+            self._journal.note("begin", line, later=False)
+        except FileNotWritten:
+            if not log.begun:
+                self._log = None
+                log.remove()
+            raise
+        log.is_alone = alone
+        log.begun += 1
+        return SpanWriter(log, name)
 
     def close(self) -> None:
         """Write what the log lacks, and close it. Idempotent.
@@ -127,13 +137,52 @@ class SpanLogs:
             self._log.release()
             self._log = None
 
+    def _say_rows(
+        self, number: int, dtype: np.dtype[Any], facts: Mapping[str, Any]
+    ) -> _Rows:
+        """Say what rows are, unless the journal has it."""
+        said, lost = self._said, self._journal.lost
+        if said is not None and said.lost == lost and said.dtype == dtype:
+            return said
+        line = {"number": number, "version": FORMAT_VERSION, "dtype": dtype.descr}
+        self._journal.note("rows", {**line, "facts": dict(facts)}, later=False)
+        self._said = _Rows(number, lost, dtype, facts)
+        return self._said
+
+
+class _Rows(NamedTuple):
+    """What the journal says of rows, and how many journals were lost before."""
+
+    number: int
+    lost: int
+    dtype: np.dtype[Any]
+    facts: Mapping[str, Any]
+
+
+def _begin(
+    log: OpenLog, name: str, facts: Mapping[str, Any], rows: _Rows
+) -> dict[str, Any]:
+    """Return what the journal says of a beginning: what it has not said of the rows."""
+    known = rows.facts
+    own = {
+        key: value
+        for key, value in facts.items()
+        # Most values are the very same objects in each recording.
+        if key not in known or (known[key] is not value and known[key] != value)
+    }
+    line = {"name": name, "log": log.number, "rows": rows.number}
+    line |= {"row": log.rows.count, "look": log.look_size, "facts": own}
+    without = [key for key in known if key not in facts]
+    return {**line, **({"without": without} if without else {})}
+
 
 class OpenLog:
-    """A row log that is written, with its list of spans.
+    """A row log that is written.
 
     Attributes:
-        path: of the list.
-        facts: of the first recording.
+        path: of the log.
+        number: its number.
+        journal: says what is in it.
         rows: the log itself.
         columns: what the slots of its tail hold: `state` as float64, `snapshot` in
             words, `action` and `observation`; what rows do not have is not there.
@@ -146,30 +195,18 @@ class OpenLog:
     def __init__(
         self,
         path: Path,
-        facts: Mapping[str, Any],
+        number: int,
         dtype: np.dtype[Any],
+        journal: JournalWriter,
         *,
         tail_bytes: int,
     ) -> None:
-        self.path = path
-        self.facts = facts
+        self.path, self.number, self.journal = path, number, journal
         self.is_alone = False
         self.look_size = self.begun = 0
         self._dtype = dtype
         self._looks: int | None = None
-        # What the disk was too full for, until it is said.
-        self._unsaid: list[Mapping[str, Any]] = []
-        line = {"format": FORMAT, "version": FORMAT_VERSION, "rows": dtype.descr}
-        # First of all, so that whatever a killed process leaves is found.
-        self._list: int | None = create_list(path, {**line, "facts": dict(facts)})
-        try:
-            self.rows = RowLog(
-                path.with_suffix(LOG), dtype.itemsize // 8, tail_bytes=tail_bytes
-            )
-        except BaseException:
-            os.close(self._list)
-            remove_list(path)
-            raise
+        self.rows = RowLog(path, dtype.itemsize // 8, tail_bytes=tail_bytes)
         slots = self.rows.slots
         self.bodies = [slots[k, HEAD_WORDS:] for k in range(self.rows.capacity)]
         self.columns: dict[str, NDArray[Any]] = {}
@@ -181,36 +218,8 @@ class OpenLog:
     def suits(self, dtype: np.dtype[Any]) -> bool:
         """Tell whether a recording with such rows can go on in this log."""
         is_short = self.rows.size + self.look_size < _LONG and self.begun < _MANY
-        is_free = self.rows.is_open and not self.is_alone
+        is_free = self.rows.is_there and not self.is_alone
         return is_short and is_free and (self._dtype is dtype or self._dtype == dtype)
-
-    def say(self, values: Mapping[str, Any]) -> None:
-        """Add a line to the list; one that finds no room comes before the next.
-
-        Raises:
-            FileNotWritten: the disk is full, or the list was removed.
-        """
-        self._unsaid.append(values)
-        self._say_all()
-
-    @property
-    def is_behind(self) -> bool:
-        """Whether the disk was too full for a line."""
-        return bool(self._unsaid)
-
-    def say_at_once(self, values: Mapping[str, Any]) -> None:
-        """Add a line to the list, or forget it.
-
-        Raises:
-            FileNotWritten: as `say`.
-        """
-        self._say_all()
-        append_line(self.path, values, descriptor=self._list)
-
-    def _say_all(self) -> None:
-        while self._unsaid:
-            append_line(self.path, self._unsaid[0], descriptor=self._list)
-            del self._unsaid[0]
 
     def add_change(self, change: ModelChange) -> None:
         """Add a change of the model that holds from the next row on.
@@ -241,7 +250,7 @@ class OpenLog:
             return
         try:
             self.rows.write()
-            self.say_at_once({"closed": True})
+            self.journal.note("full", self.number, later=False)
         except FileNotWritten:
             if not self.path.exists():
                 # The directory was removed; there is nothing to try again.
@@ -249,22 +258,24 @@ class OpenLog:
             raise
         self.rows.close()
         self.release()
-        self.remove_if_done()
+        if not self.is_alone:
+            # Else the finisher does it.
+            with contextlib.suppress(DirectoryNotWritable):
+                remove_if_done(self.path)
 
-    def remove_if_done(self) -> None:
-        """Remove the files if nothing is in flight; else the finisher does it."""
+    def remove(self) -> None:
+        """Let go of the files, and remove them."""
+        self.release()
         with contextlib.suppress(DirectoryNotWritable):
-            remove_if_done(self.path)
+            remove_log(self.path)
 
     def release(self) -> None:
         """Let go of the files as they are. Idempotent."""
         self.rows.release()
         self.bodies, self.columns = [], {}
-        for descriptor in (self._list, self._looks):
-            if descriptor is not None:
-                os.close(descriptor)
-        # Whatever is said of a recording after this goes by the path.
-        self._list = self._looks = None
+        if self._looks is not None:
+            os.close(self._looks)
+            self._looks = None
 
 
 class SpanWriter:
@@ -273,39 +284,19 @@ class SpanWriter:
     Args:
         log: where its rows go.
         name: of its file, without suffix.
-        facts: what is known of it.
-        alone: nothing else goes into the log.
 
     Attributes:
         log: as given.
         steps: the number of the last step; 0 before.
         frame_count: how many frames there are.
         last_frame: the step of the last one; -1 before.
-
-    Raises:
-        FileNotWritten: the disk is full.
     """
 
-    def __init__(
-        self, log: OpenLog, name: str, facts: Mapping[str, Any], *, alone: bool = False
-    ) -> None:
+    def __init__(self, log: OpenLog, name: str) -> None:
         self.log = log
         self.steps = self.frame_count = 0
         self.last_frame = -1
         self._name = name
-        known = log.facts
-        own = {
-            key: value
-            for key, value in facts.items()
-            # Most values are the very same objects in each recording.
-            if key not in known or (known[key] is not value and known[key] != value)
-        }
-        without = [key for key in known if key not in facts]
-        line = {"begin": name, "row": log.rows.count, "look": log.look_size}
-        line |= {"facts": own, **({"without": without} if without else {})}
-        log.say_at_once(line)
-        log.is_alone = alone
-        log.begun += 1
 
     def make_room(self) -> int:
         """Return the slot that the next row is to be filled in.
@@ -363,7 +354,7 @@ class SpanWriter:
         Raises:
             FileNotWritten: the disk is full; it is said before the next line.
         """
-        self.log.say({"note": self._name, "facts": dict(facts)})
+        self.log.journal.note("note", {"name": self._name, "facts": dict(facts)})
 
     def end(self, facts: Mapping[str, Any]) -> None:
         """Say how it ended. A log that is its own is closed.
@@ -371,8 +362,8 @@ class SpanWriter:
         Raises:
             FileNotWritten: the disk is full; it is said before the next line.
         """
-        row = self.log.rows.count
-        self.log.say({"end": self._name, "row": row, "facts": dict(facts)})
+        said = {"name": self._name, "row": self.log.rows.count, "facts": dict(facts)}
+        self.log.journal.note("end", said)
         if self.log.is_alone:
             self.log.close()
 
@@ -382,7 +373,7 @@ class SpanWriter:
         Raises:
             FileNotWritten: the disk is full; it is said before the next line.
         """
-        self.log.say({"drop": self._name})
         if self.log.is_alone:
-            self.log.close()
-            self.log.remove_if_done()
+            # First of all: the disk may be full.
+            self.log.remove()
+        self.log.journal.note("drop", self._name)

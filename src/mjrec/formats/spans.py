@@ -1,22 +1,23 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which rows of a monitor's logs are which recording.
+"""Which rows of a monitor's logs are which recording, as its journal tells it.
 
 A recording in flight is a span of rows: an episode, or a clip's part that is of one
-episode. `openaigym.states.<infix>.<number>.spans` lists those of one row log, a line of
-JSON each time something happens::
+episode. The journal has a line each time something happens::
 
-    {"format": "mjrec spans", "version": 1, "rows": [["row", "<i8"], ...], "facts": {}}
-    {"begin": "openaigym.trajectory.0.7.episode000027", "row": 54, "look": 0,
-     "facts": {...}, "without": [...]}
-    {"note": "openaigym.trajectory.0.7.episode000027", "facts": {...}}
-    {"end": "openaigym.trajectory.0.7.episode000027", "row": 77, "facts": {...}}
+    {"rows": {"number": 0, "version": 1, "dtype": [["row", "<i8"], ...], "facts": {}}}
+    {"begin": {"name": "openaigym.trajectory.0.7.episode000027", "log": 3, "rows": 0,
+               "row": 54, "look": 0, "facts": {...}, "without": [...]}}
+    {"note": {"name": "openaigym.trajectory.0.7.episode000027", "facts": {...}}}
+    {"end": {"name": "openaigym.trajectory.0.7.episode000027", "row": 77,
+             "facts": {...}}}
     {"drop": "openaigym.trajectory.0.7.episode000027"}
-    {"closed": true}
+    {"full": 3}
 
-The facts of the first line are those of every recording, as far as `begin` does not say
-otherwise. A span without an end goes on to the last row. The `.log` beside it has the
-rows, the `.looks` the changes of the model. When all recordings are dropped, or have
-become files of their own, all of these are removed.
+`rows` says what rows are, and the facts of every recording with such rows, as far as
+`begin` does not say otherwise. A span without an end goes on to the last row. Log 3 is
+`openaigym.states.<infix>.000003.log`, and the `.looks` beside it has the changes of the
+model. These are removed when all that is in them was dropped, or is there in its final
+form: an episode as a trajectory, what has a video only as that.
 
 A recording is called by the path of the file that it will become.
 """
@@ -26,16 +27,16 @@ from __future__ import annotations
 import contextlib
 import functools
 import os
+import threading
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 
-from ..errors import DirectoryNotWritable, FileNotWritten, UnreadableFile
-from ..json_text import dumps
-from .appending import append_whole, open_for_appending
+from ..errors import DirectoryNotWritable, UnreadableFile
+from .journal import is_of_spans
 from .json_fields import base_name, integer, json_object, mapping, unreadable
 from .locks import is_locked
 from .monitor_directory import (
@@ -43,177 +44,220 @@ from .monitor_directory import (
     Infix,
     episode_of,
     infix_of,
+    journal_name,
     lock_name,
+    log_name,
+    log_number,
     names_in,
 )
-from .regular_files import open_regular, regular_path
-from .row_log import tail_path
+from .regular_files import open_regular
+from .row_log import has_rows, tail_path
 from .trajectory import check_version, dtype_from_json
+from .video_metadata import is_done
 
-FORMAT = "mjrec spans"
-SPANS, LOG, LOOKS, FINISHED = ".spans", ".log", ".looks", ".h5"
+LOG, LOOKS, FINISHED = ".log", ".looks", ".h5"
+
+_LONGEST_LINE = 1 << 24
+# So much of what was read last must still be there for the next reading to go on.
+_SEAM = 128
 
 
 @dataclass
 class Recording:
-    """A recording in flight, as its list has it.
+    """A recording whose rows are in a log, as far as the journal was read.
 
     Attributes:
         name: of its file without suffix.
-        spans: the list that names it.
+        log: its row log.
+        rows: what the journal says of its rows.
         facts: all that is known of it.
         row: its first.
         look: where to look for its changes of the model.
         stop: the row behind its last; None where it has not ended.
+        following: the first row of the next recording; None where it is the last.
         is_dropped: its rows were given up.
     """
 
     name: str
-    spans: SpanList
+    log: Path
+    rows: Mapping[str, Any]
     facts: dict[str, Any]
     row: int
     look: int
     stop: int | None = None
+    following: int | None = None
     is_dropped: bool = False
 
     @property
     def path(self) -> Path:
         """What it is called: the file that an episode becomes."""
         is_episode = episode_of(f"{self.name}{FINISHED}") is not None
-        return self.spans.path.with_name(f"{self.name}{FINISHED * is_episode}")
+        return self.log.with_name(f"{self.name}{FINISHED * is_episode}")
+
+    @functools.cached_property
+    def dtype(self) -> np.dtype[Any]:
+        """Of its rows.
+
+        Raises:
+            UnreadableFile: the journal does not say it, or is of a newer version.
+        """
+        with unreadable(_journal_of(self.log)):
+            if not self.rows:
+                raise ValueError("it does not say what the rows of its logs are")
+            check_version(integer(self.rows.get("version")))
+            return dtype_from_json(self.rows.get("dtype"))
+
+    @property
+    def is_gone(self) -> bool:
+        """Whether its rows are of no use: dropped, or its video was all they were for.
+
+        Where its trajectory is kept, they are of use until that is there.
+        """
+        if self.is_dropped or self.facts.get("kept") is not False:
+            return self.is_dropped
+        video = self.facts.get("video")
+        name = video.get("name") if isinstance(video, dict) else None
+        with contextlib.suppress(ValueError):
+            return is_done(self.log.with_name(base_name(name)))
+        return False
 
     @property
     def is_in_flight(self) -> bool:
         """Whether only the log has it."""
-        return not self.is_dropped and not (
-            self.path.suffix == FINISHED and self.path.is_file()
-        )
-
-
-@dataclass
-class SpanList:
-    """A list of spans, as far as it was read.
-
-    Attributes:
-        path: of the list.
-        dtype: of its rows; None before its first line is there.
-        facts: of every recording.
-        recordings: by their names, in the order of their rows.
-        is_closed: no row is added any more.
-    """
-
-    path: Path
-    dtype: np.dtype[Any] | None = None
-    facts: Mapping[str, Any] = field(default_factory=dict)
-    recordings: dict[str, Recording] = field(default_factory=dict)
-    is_closed: bool = False
-
-    @property
-    def log(self) -> Path:
-        """Its row log."""
-        return self.path.with_suffix(LOG)
-
-    @property
-    def is_headless(self) -> bool:
-        """Whether rows are there, and nothing says what they are."""
-        rows = self.log.stat().st_size if self.log.exists() else 0
-        return self.dtype is None and rows > 0
+        path = self.path
+        return not (path.suffix == FINISHED and path.is_file()) and not self.is_gone
 
     @property
     def last_write(self) -> float:
-        """When its last row was written, in seconds since the epoch."""
+        """When the last row of its log was written, in seconds since the epoch."""
         files = (self.log, tail_path(self.log))
         return max((f.stat().st_mtime for f in files if f.exists()), default=0.0)
 
-    def in_flight(self) -> list[Recording]:
-        """Return the recordings that only the log has."""
-        return [each for each in self.recordings.values() if each.is_in_flight]
 
-    def _take(self, line: bytes) -> None:
-        if self.dtype is None:
-            values = json_object(line)
-            if values.get("format") != FORMAT:
-                raise ValueError("it is no list of spans")
-            check_version(integer(values.get("version")))
-            self.facts = mapping(values.get("facts"))
-            self.dtype = dtype_from_json(values.get("rows"))
-            return
-        # The end of a line whose writer was killed: nothing follows from it.
-        with contextlib.suppress(ValueError, LookupError, TypeError):
-            self._take_event(json_object(line))
+@dataclass
+class _Spans:
+    """What a journal says of rows, as far as it was read.
 
-    def _take_event(self, values: Mapping[str, Any]) -> None:
-        if values.get("closed") is True:
-            self.is_closed = True
-        elif "begin" in values:
-            name = base_name(values["begin"])
-            if infix_of_recording(name) != infix_of(self.path.name):
-                raise ValueError(f"{name!r:.100} is no recording of its monitor")
-            without = values.get("without", ())
-            common = {k: v for k, v in self.facts.items() if k not in without}
-            facts = {**common, **mapping(values["facts"])}
-            row, look = _count(values["row"]), _count(values["look"])
-            # In the order of their rows, also where one is begun anew.
-            self.recordings.pop(name, None)
-            self.recordings[name] = Recording(name, self, facts, row, look)
-        elif "drop" in values:
-            self.recordings[values["drop"]].is_dropped = True
-        elif "end" in values:
-            recording = self.recordings[values["end"]]
-            recording.stop = _count(values["row"])
-            recording.facts.update(mapping(values["facts"]))
-        elif "note" in values:
-            self.recordings[values["note"]].facts.update(mapping(values["facts"]))
+    Attributes:
+        journal: the file.
+        logs: the recordings of each log that is there, in the order of their rows.
+        recordings: all of these by their names, the newest of each.
+        full: the logs that get no more rows.
+    """
+
+    journal: Path
+    logs: dict[Path, list[Recording]] = field(default_factory=dict)
+    recordings: dict[str, Recording] = field(default_factory=dict)
+    full: set[Path] = field(default_factory=set)
+    _rows: dict[int, Mapping[str, Any]] = field(default_factory=dict)
+    _status: os.stat_result | None = None
+    _offset: int = 0
+    _seam: bytes = b""
+
+    def goes_on_in(self, file: BinaryIO) -> bool:
+        """Tell whether a file is the one that was read, and has only grown."""
+        before, now = self._status, os.fstat(file.fileno())
+        if before is None or (before.st_dev, before.st_ino) != (now.st_dev, now.st_ino):
+            return False
+        file.seek(self._offset - len(self._seam))
+        is_longer = now.st_size > before.st_size
+        is_same = (before.st_size, before.st_mtime_ns) == (now.st_size, now.st_mtime_ns)
+        return is_same or (is_longer and file.read(len(self._seam)) == self._seam)
+
+    def read_on(self, file: BinaryIO) -> None:
+        """Take in what a file has behind what was read."""
+        self._status = os.fstat(file.fileno())
+        file.seek(self._offset)
+        began = self._offset
+        # Without its end a line is being written, or its writer was killed.
+        while (line := file.readline(_LONGEST_LINE)).endswith(b"\n"):
+            self._offset += len(line)
+            self._seam = line[-_SEAM:]
+            if is_of_spans(line):
+                # Nothing follows from a line that makes no sense.
+                with contextlib.suppress(ValueError, LookupError, TypeError):
+                    self._take(json_object(line))
+        if self._offset > began:
+            self._forget_what_is_removed()
+
+    def _forget_what_is_removed(self) -> None:
+        self.logs = {log: each for log, each in self.logs.items() if log.exists()}
+        self.full &= self.logs.keys()
+        known = self.recordings.items()
+        self.recordings = {name: each for name, each in known if each.log in self.logs}
+
+    def _take(self, values: Mapping[str, Any]) -> None:
+        [(kind, said)] = values.items()
+        if kind == "rows":
+            self._rows[integer(said["number"])] = mapping(said)
+        elif kind == "begin":
+            self._begin(said)
+        elif kind == "full":
+            self.full.add(self._log(said))
+        elif kind == "drop":
+            self.recordings[said].is_dropped = True
+        elif kind == "note":
+            self.recordings[said["name"]].facts.update(mapping(said["facts"]))
+        elif kind == "end":
+            recording = self.recordings[said["name"]]
+            recording.stop = _count(said["row"])
+            recording.facts.update(mapping(said["facts"]))
+
+    def _begin(self, said: Mapping[str, Any]) -> None:
+        name, log = base_name(said["name"]), self._log(said["log"])
+        if infix_of_recording(name) != infix_of(self.journal.name):
+            raise ValueError(f"{name!r:.100} is no recording of its monitor")
+        rows, without = self._rows.get(said["rows"], {}), said.get("without", ())
+        common = mapping(rows.get("facts", {})).items()
+        facts = {k: v for k, v in common if k not in without}
+        facts.update(mapping(said["facts"]))
+        first, look = _count(said["row"]), _count(said["look"])
+        recording = Recording(name, log, rows, facts, row=first, look=look)
+        others = self.logs.setdefault(log, [])
+        if others:
+            others[-1].following = recording.row
+        others.append(recording)
+        if name in self.recordings:
+            # It is begun anew.
+            self.recordings[name].is_dropped = True
+        self.recordings[name] = recording
+
+    def _log(self, number: Any) -> Path:
+        infix = infix_of(self.journal.name)
+        return self.journal.with_name(log_name(infix or "", _count(number)))
 
 
-def create_list(path: Path, first_line: Mapping[str, Any]) -> int:
-    """Make a list, and return a descriptor for `append_line`.
+# A journal only grows, and each recording is looked for by itself.
+_known: dict[Path, _Spans] = {}
+_MOST_KNOWN = 64
+_lock = threading.Lock()
+
+
+def _read(journal: Path) -> _Spans:
+    """Return what a journal says of rows now; nothing where there is none.
 
     Raises:
-        FileNotWritten: the disk is full, or the directory is gone; nothing is left.
+        UnreadableFile: it cannot be read.
     """
-    try:
-        descriptor = open_for_appending(path, new=True)
-    except OSError as error:
-        raise FileNotWritten(path, error.strerror or error) from error
-    try:
-        append_line(path, first_line, descriptor=descriptor)
-    except BaseException:
-        os.close(descriptor)
-        with contextlib.suppress(OSError):
-            path.unlink()
-        raise
-    return descriptor
+    with _lock, contextlib.ExitStack() as opened:
+        spans = _known.pop(journal, None) or _Spans(journal)
+        with unreadable(journal):
+            try:
+                file = opened.enter_context(open_regular(journal))
+            except FileNotFoundError:
+                return _Spans(journal)
+            if not spans.goes_on_in(file):
+                spans = _Spans(journal)
+            spans.read_on(file)
+        while len(_known) >= _MOST_KNOWN:
+            del _known[next(iter(_known))]
+        _known[journal] = spans
+        return spans
 
 
-def append_line(
-    path: Path, values: Mapping[str, Any], *, descriptor: int | None = None
-) -> None:
-    """Add a line to a list, whole or not at all.
-
-    Args:
-        path: of the list.
-        values: of the line.
-        descriptor: of the list, where it is open.
-
-    Raises:
-        FileNotWritten: the disk is full, and the list says what it said before; or the
-            list was removed.
-    """
-    line = dumps(values).encode() + b"\n"
-    own = None
-    try:
-        if descriptor is None:
-            # It is there: its recordings are named in it.
-            path.lstat()
-            descriptor = own = open_for_appending(path)
-        # The torn end says nothing, also where nothing but its end is missing.
-        append_whole(descriptor, line, torn=b"?\n")
-    except OSError as error:
-        raise FileNotWritten(path, error.strerror or error) from error
-    finally:
-        if own is not None:
-            os.close(own)
+def _journal_of(path: Path) -> Path:
+    """Return the journal of the monitor that a file is of."""
+    return path.with_name(journal_name(infix_of(path.name) or ""))
 
 
 def infix_of_recording(name: str) -> str | None:
@@ -224,75 +268,50 @@ def infix_of_recording(name: str) -> str | None:
     return None if episode_of(path) is None else infix_of(path)
 
 
-def list_paths(directory: Path, infix: Infix | str | None = None) -> Iterator[Path]:
-    """Return the paths of the lists of a directory, or of one monitor in it."""
-    names = (name for name in names_in(directory) if name.endswith(SPANS))
-    for name in sorted(names):
-        own = infix_of(name)
-        if own is not None and (infix is None or own == str(infix)):
-            yield directory / name
+def log_paths(directory: Path, infix: Infix | str | None = None) -> Iterator[Path]:
+    """Return the paths of the logs of a directory, or of one monitor in it.
+
+    Also of one of which only the files beside it are left.
+    """
+    logs = {
+        directory / log_name(own, number)
+        for name in names_in(directory)
+        if (number := log_number(name)) is not None
+        and (own := infix_of(name)) is not None
+        and (infix is None or own == str(infix))
+    }
+    yield from sorted(logs)
 
 
-def read_list(path: Path) -> SpanList:
-    """Return a list as it is now.
+def recordings_in(log: Path) -> list[Recording]:
+    """Return the recordings of a log, in the order of their rows.
 
     Raises:
-        UnreadableFile: it is no such list, or of a newer format, or there is no such
-            file.
+        UnreadableFile: the journal cannot be read, or does not say what its rows are.
     """
-    with unreadable(path):
-        status = regular_path(path).stat()
-        version = status.st_ino, status.st_size, status.st_mtime_ns
-        return _read_version(path, version)
-
-
-# Each recording is looked for by itself, in all lists of its monitor.
-@functools.lru_cache(maxsize=64)
-def _read_version(path: Path, version: tuple[int, ...]) -> SpanList:
-    del version
-    spans = SpanList(path)
-    with open_regular(path) as file:
-        for line in file:
-            # Without its end it is being written, or its writer was killed.
-            if line.endswith(b"\n"):
-                spans._take(line)
-    return spans
+    found = _read(_journal_of(log)).logs.get(log, [])
+    with unreadable(log):
+        if not found and log.exists() and has_rows(log):
+            raise ValueError("no journal says what its rows are")
+    for recording in found:
+        # What is damaged has no dtype.
+        _ = recording.dtype
+    return [*found]
 
 
 def find_recording(path: Path) -> Recording | None:
-    """Return a recording that is not dropped, by the path of its file; None where none.
+    """Return a recording whose rows are of use, by the path of its file.
 
     Raises:
-        UnreadableFile: no list has it, and one of its monitor's cannot be read.
+        UnreadableFile: the journal of its monitor cannot be read.
     """
     name = path.name.removesuffix(FINISHED)
     infix = infix_of_recording(name)
-    if infix is None or not path.parent.is_dir():
+    if infix is None:
         return None
-    found, damage = None, None
-    for each in list_paths(path.parent, infix):
-        try:
-            recording = read_list(each).recordings.get(name)
-        except UnreadableFile as error:
-            # A list that was removed just now had nothing in flight.
-            damage = error if os.path.lexists(each) else damage
-            continue
-        if recording is not None and not recording.is_dropped:
-            found = recording
-    if found is None and damage is not None:
-        raise damage
-    return found
-
-
-def get_recording(path: Path) -> Recording:
-    """Return a recording that is not dropped, by the path of its file.
-
-    Raises:
-        UnreadableFile: there is none, or a list cannot be read.
-    """
-    recording = find_recording(path)
-    if recording is None:
-        raise UnreadableFile(path, "there is no such file, and no log of it")
+    recording = _read(path.with_name(journal_name(infix))).recordings.get(name)
+    if recording is None or recording.is_gone or not recording.log.exists():
+        return None
     return recording
 
 
@@ -312,65 +331,55 @@ def recordings_in_flight(
 ) -> list[Recording]:
     """Return the recordings that only logs have, of all monitors or one.
 
-    Lists that cannot be read are left out: `read_list` says why.
+    Where that cannot be read they are left out: `recordings_in` says why.
     """
     found: list[Recording] = []
-    for path in list_paths(directory, infix):
+    for log in log_paths(directory, infix):
         with contextlib.suppress(UnreadableFile):
-            found += read_list(path).in_flight()
+            found += [each for each in recordings_in(log) if each.is_in_flight]
     return found
 
 
-def drop_recording(path: Path) -> None:
-    """Give up the rows of a recording; it is no error where there are none.
+def remove_if_done(log: Path) -> None:
+    """Remove a log once it gets no more rows and nothing in it is in flight.
 
     Raises:
-        FileNotWritten: the disk is full.
-        DirectoryNotWritable: files cannot be removed.
-    """
-    recording = find_recording(path)
-    if recording is not None:
-        append_line(recording.spans.path, {"drop": recording.name})
-        remove_if_done(recording.spans.path)
-
-
-def remove_if_done(path: Path) -> None:
-    """Remove a list and its logs once the log is closed and nothing is in flight.
-
-    Raises:
-        DirectoryNotWritable: they cannot be removed.
+        DirectoryNotWritable: it cannot be removed.
     """
     # Asked first: a monitor that is closed begins nothing any more.
-    is_open = _is_open(path)
+    is_open = _is_open(log)
     try:
-        spans = read_list(path)
+        recordings = recordings_in(log)
+        is_over = not is_open or log in _read(_journal_of(log)).full
     except UnreadableFile:
         return
-    is_over = spans.is_closed or not is_open
-    if is_over and not spans.in_flight() and not spans.is_headless:
-        remove_list(path)
+    if is_over and not any(each.is_in_flight for each in recordings):
+        remove_log(log)
 
 
-def remove_list(path: Path) -> None:
-    """Remove a list and its logs.
+def files_beside(log: Path) -> tuple[Path, ...]:
+    """Return the files of a log, in the order of their removal."""
+    # The log first, so that no reader opens it without the rest.
+    return log, tail_path(log), log.with_suffix(LOOKS)
+
+
+def remove_log(log: Path) -> None:
+    """Remove a log, and the files beside it.
 
     Raises:
         DirectoryNotWritable: they cannot be removed.
     """
-    log = path.with_suffix(LOG)
     try:
-        # The log first, so that no reader opens it without the rest; the list last,
-        # because the others are found through it.
-        for each in (log, tail_path(log), path.with_suffix(LOOKS), path):
+        for each in files_beside(log):
             each.unlink(missing_ok=True)
     except OSError as error:
-        raise DirectoryNotWritable(path.parent, error) from error
+        raise DirectoryNotWritable(log.parent, error) from error
 
 
-def _is_open(path: Path) -> bool:
-    infix = Infix.parse(infix_of(path.name) or "")
+def _is_open(log: Path) -> bool:
+    infix = Infix.parse(infix_of(log.name) or "")
     try:
-        return infix is not None and is_locked(path.parent / lock_name(infix))
+        return infix is not None and is_locked(log.parent / lock_name(infix))
     except OSError:
         # Unknown: leave its files alone.
         return True

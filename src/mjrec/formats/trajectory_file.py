@@ -84,7 +84,7 @@ def finish_trajectory(path: Path) -> Path:
                 raise
             # Somebody else finished it just now.
     if recording is not None:
-        remove_if_done(recording.spans.path)
+        remove_if_done(recording.log)
     return path
 
 
@@ -114,7 +114,7 @@ def _end_time(facts: Mapping[str, Any], recording: Recording | None) -> float:
     """
     start, last = facts.get("start_time"), 0.0
     if recording is not None:
-        last = recording.spans.last_write
+        last = recording.last_write
     return max(start, last) if isinstance(start, float) else last
 
 

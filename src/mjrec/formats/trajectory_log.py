@@ -18,11 +18,11 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import InvalidArgument
+from ..errors import InvalidArgument, UnreadableFile
 from .json_fields import unreadable
 from .regular_files import open_regular
 from .row_log import RowLogReader
-from .spans import LOOKS, Recording, get_recording, read_list
+from .spans import LOOKS, Recording, find_recording
 from .trajectory import (
     FRAME,
     STEP,
@@ -56,17 +56,16 @@ def open_recording(path: Path) -> TrajectoryReader:
         UnreadableFile: there is no such recording, or its log is damaged, or of a newer
             version.
     """
-    recording = get_recording(path)
-    spans = recording.spans
-    assert spans.dtype is not None
-    with unreadable(spans.log), contextlib.ExitStack() as opened:
+    recording = find_recording(path)
+    if recording is None:
+        raise UnreadableFile(path, "there is no such file, and no log of it")
+    with unreadable(recording.log), contextlib.ExitStack() as opened:
         rows = opened.enter_context(
-            contextlib.closing(RowLogReader(spans.log, spans.dtype.itemsize))
+            contextlib.closing(RowLogReader(recording.log, recording.dtype.itemsize))
         )
         count = rows.count
         # Again: what was begun behind it is not its own.
-        spans = read_list(spans.path)
-        recording = spans.recordings.get(recording.name, recording)
+        recording = find_recording(path) or recording
         if recording.stop is not None:
             # All of its rows were counted when that was said.
             count = rows.count
@@ -80,8 +79,7 @@ def _reader_of(
     path: Path,
     opened: contextlib.ExitStack,
 ) -> TrajectoryReader:
-    log, dtype = recording.spans.log, recording.spans.dtype
-    assert dtype is not None
+    log, dtype = recording.log, recording.dtype
     first, stop = recording.row, _stop_of(recording, count)
     heads = _sound_heads(rows, dtype, first, stop)
     is_step, is_frame = heads["flags"] & STEP != 0, heads["flags"] & FRAME != 0
@@ -130,9 +128,7 @@ def _stop_of(recording: Recording, count: int) -> int:
     stop = recording.stop
     if stop is None:
         # One that was left without an end is followed by the next one, if there is any.
-        names = list(recording.spans.recordings)
-        following = names[names.index(recording.name) + 1 :][:1]
-        stop = recording.spans.recordings[following[0]].row if following else count
+        stop = count if recording.following is None else recording.following
     return max(recording.row, min(stop, count))
 
 
@@ -188,12 +184,11 @@ def _read_part(
 
 
 def _open_looks(recording: Recording, opened: contextlib.ExitStack) -> BinaryIO | None:
-    log = recording.spans.log
     try:
-        return opened.enter_context(open_regular(log.with_suffix(LOOKS)))
+        return opened.enter_context(open_regular(recording.log.with_suffix(LOOKS)))
     except FileNotFoundError:
         # All files of a log are removed, and that before this one.
-        log.lstat()
+        recording.log.lstat()
         return None
 
 

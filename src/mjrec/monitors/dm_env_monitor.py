@@ -19,6 +19,8 @@ from .cameras import camera_pictures, recorded_view
 
 logger = logging.getLogger(__name__)
 
+_MID = dm_env.StepType.MID
+
 _NO_PHYSICS = (
     "it has no physics that could be rendered, as dm_control's environments have. "
     "Record a dm_control environment"
@@ -110,12 +112,8 @@ class DmEnvMonitor(EnvironmentMonitor, dm_env.Environment):  # type: ignore[misc
         if fast is not recorder.fast:
             # Within the step this monitor was closed, or its process forked.
             fast = None
-        if (
-            fast is None
-            or timestep.first()
-            or timestep.last()
-            or not fast.step(timestep.reward)
-        ):
+        is_between = timestep.step_type is _MID
+        if fast is None or not is_between or not fast.step(timestep.reward):
             self._record(timestep)
         return timestep
 

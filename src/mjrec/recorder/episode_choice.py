@@ -3,7 +3,13 @@
 
 from __future__ import annotations
 
-from ..schedules import Schedule, disable_videos, schedule_name, to_schedule
+from ..schedules import (
+    Schedule,
+    capped_cubic_video_schedule,
+    disable_videos,
+    schedule_name,
+    to_schedule,
+)
 from .keep_rules import Selection, selection_from
 from .options import OFF, RecorderOptions
 
@@ -50,6 +56,14 @@ class EpisodeChoice:
     def is_scheduled(self) -> bool:
         """Whether the schedule chose the episode that `decide` was asked about last."""
         return self._decided[1]
+
+    def will_choose(self, episode_id: int) -> bool:
+        """Tell whether an episode will surely get a video: a user's schedule may wait.
+
+        It is asked when the episode begins.
+        """
+        is_ours = self._schedule is capped_cubic_video_schedule
+        return is_ours and self._schedule(episode_id)
 
     def decide(self, episode_id: int) -> bool:
         """Return whether an episode gets a video.

@@ -15,8 +15,12 @@ from ..formats.spans import is_in_flight
 class Finisher(Protocol):
     """Turns ended recordings into trajectories and videos, beside the simulation."""
 
-    def expect(self) -> None:
-        """Get ready: a recording will come that has a video. Never waits."""
+    def expect(self, recording: Path | None = None) -> None:
+        """Get ready: a recording will come that has a video. Never waits.
+
+        Args:
+            recording: which, once it begins; others will most likely be drawn alike.
+        """
 
     def submit(self, recording: Path) -> None:
         """Take over an ended trajectory, or a clip by its first part. Never waits."""
@@ -42,7 +46,7 @@ class LaterFinisher:
         self.failures: Mapping[str, str] = {}
         self._waiting: list[Path] = []
 
-    def expect(self) -> None:
+    def expect(self, recording: Path | None = None) -> None:
         """Do nothing."""
 
     def submit(self, recording: Path) -> None:

@@ -16,7 +16,7 @@ from ..atomic_files import file_sha256
 from ..errors import FileNotWritten
 from ..formats.journal import JournalEntry, JournalWriter
 from ..formats.monitor_directory import journal_name
-from ..formats.span_writer import OpenLog, SpanLogs
+from ..formats.span_writer import SpanLogs
 from ..machine import machine_fingerprint
 from ..provenance import look_around, versions
 from ..results.run import Run
@@ -106,8 +106,8 @@ class MonitoredRun:
         self.clock = options.clock
         self.finisher, self.selection = finisher, selection
         self.events = Run(place.run)
-        self._journal_path = self.directory / journal_name(self.infix)
-        self._journal = JournalWriter(self._journal_path, run=place.run)
+        path = self.directory / journal_name(self.infix)
+        self._journal = JournalWriter(path, run=place.run)
         self._faults: set[tuple[int | None, What, str]] = set()
         self._policy = _policy_facts(options)
         self._statements = options.statements
@@ -138,6 +138,7 @@ class MonitoredRun:
             SpanLogs(
                 self.directory,
                 self.infix,
+                journal=self._journal,
                 numbers=numbers,
                 tail_bytes=options.tail_bytes,
             )
@@ -145,7 +146,7 @@ class MonitoredRun:
         )
         self.layouts: dict[SpanLogs, RowLayout] = {}
         self.paces: dict[SpanLogs, Mapping[str, Any]] = {}
-        # Recordings whose ends are not in their lists yet: the disk was full.
+        # Recordings whose ends are not in the journal yet: the disk was full.
         self._late: list[Path] = []
         self.no_video = VideoRecorder(env.pictures, enabled=False)
         self._episode: BegunEpisode | None = None
@@ -225,9 +226,9 @@ class MonitoredRun:
         self.note("fault", facts)
         return True
 
-    def submit(self, recording: Path, log: OpenLog | None) -> None:
-        """Let a recording be finished, now or when its log says that it has ended."""
-        if log is not None and log.is_behind:
+    def submit(self, recording: Path) -> None:
+        """Let a recording be finished, now or when the journal says that it ended."""
+        if self._journal.is_behind:
             self._late.append(recording)
         else:
             self.finisher.submit(recording)
@@ -261,10 +262,9 @@ class MonitoredRun:
     def _write(self, write: Callable[[], None]) -> None:
         try:
             write()
-        except OSError as error:
-            named = FileNotWritten(self._journal_path, error.strerror or error)
-            if not self.tolerates("journal", named):
-                raise named from error
+        except FileNotWritten as error:
+            if not self.tolerates("journal", error):
+                raise
 
     # --- facts -----------------------------------------------------------------------
 

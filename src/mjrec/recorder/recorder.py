@@ -33,7 +33,7 @@ from .keep_rules import Standing
 from .kept_videos import KeptVideos
 from .monitored_run import BegunEpisode, MonitoredRun
 from .opening import open_directory
-from .options import LIVE, RecorderOptions, type_of_mode
+from .options import DEFERRED, LIVE, RecorderOptions, type_of_mode
 from .recorded_environment import RecordedEnvironment, check_pictures
 from .recording import EpisodeRecording
 from .states import DeferredVideo
@@ -142,6 +142,9 @@ class Recorder:
         )
         self._kept = None if selection is None else KeptVideos(selection)
         self._clips = Clips(self.run) if options.has_clips else None
+        draws_later = env.rendering.mode == DEFERRED and self._clips is None
+        if draws_later and self._choice.will_choose(self.episode_id):
+            self.run.finisher.expect()
 
     @property
     def done(self) -> bool | None:

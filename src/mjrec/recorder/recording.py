@@ -74,6 +74,11 @@ class EpisodeRecording:
         """
         run, capture = self._run, self._run.env.states
         deferred = wants_video and run.env.rendering.mode == DEFERRED
+        if deferred:
+            # What draws begins while the model is looked at.
+            run.finisher.expect(
+                run.logs.path_of(trajectory_prefix(run.infix, self.episode_id))
+            )
         start = None
         if capture is not None and (keeps or deferred):
             start = capture.begin_episode()
@@ -90,7 +95,6 @@ class EpisodeRecording:
             self.states = self._new_states(start, observation, name, is_kept=keeps)
         if deferred:
             assert self.states is not None
-            run.finisher.expect()
             self.video = DeferredVideo(run.directory, name, self.states)
         elif wants_video:
             live = live_videos(

@@ -282,8 +282,7 @@ class StateRecorder:
         """
         # Else the disk was too full for a single row: there is no video to come.
         if self._span is not None or recording is not None:
-            log = None if self._span is None else self._span.log
-            self._run.submit(recording or self.path, log)
+            self._run.submit(recording or self.path)
 
     def drop(self) -> None:
         """Give up its rows, also after its end.

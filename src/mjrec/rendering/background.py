@@ -6,7 +6,8 @@ thread, no simulator and no OpenGL comes into it. It starts the process that doe
 work, `python -m mjrec.rendering.background DIRECTORY --workers N|auto [--strict]`, and
 sends it::
 
-    {"expected": true}              a video will have to be rendered
+    {"expected": "<name>"|null}     a video will have to be rendered, that of a
+                                    recording which begins now, where it has one
     {"recording": "<name>"}         an ended trajectory, or the first part of a clip
     {"waited_for": true}            nothing more comes for now
 
@@ -92,7 +93,7 @@ class Background:
         self._arguments += ["--strict"] * strict
         self._process_id = os.getpid()
         self._child: Child | None = None
-        self._is_waited_for = False
+        self._is_waited_for = self._is_prepared = False
         self._progress = Progress()
         self._is_stopped = self._waits_later = False
         # How processes have died, the second of which was the last.
@@ -105,10 +106,16 @@ class Background:
         """Return what one of several monitors has of it."""
         return Share(self)
 
-    def expect(self) -> None:
-        """Start all processes: a video will have to be rendered. Idempotent."""
-        if self._child is None and not self._was_forked():
-            self._send(expected=True)
+    def expect(self, recording: Path | None = None) -> None:
+        """Start all processes: a video will have to be rendered. Idempotent.
+
+        Args:
+            recording: as of `recorder.finishers.Finisher`. Only the first is used.
+        """
+        is_news = self._child is None or (recording and not self._is_prepared)
+        if is_news and not self._was_forked():
+            self._is_prepared |= recording is not None
+            self._send(expected=None if recording is None else recording.name)
 
     def submit(self, recording: Path) -> None:
         """Take over an ended trajectory, or a clip. Never waits, raises no failure.
@@ -373,6 +380,8 @@ class _Work:
         self._is_waited_for = "waited_for" in message
         if "expected" in message:
             self._finisher.start_workers()
+            if (name := message["expected"]) is not None:
+                self._finisher.prepare(self._directory / name)
         elif "recording" in message:
             name = message["recording"]
             job = VideoJob(
@@ -397,7 +406,7 @@ def _environ() -> dict[str, str]:
     environ = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}
     # Beside a simulation a single worker, too, has one CPU to itself and no more: the
     # threads of Mesa's rasteriser would get in the way of the steps.
-    environ.setdefault("LP_NUM_THREADS", "1")
+    environ.setdefault("LP_NUM_THREADS", "0")
     return environ
 
 

@@ -10,7 +10,6 @@ rate, and the trajectory, where there is one, the episode.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -30,7 +29,6 @@ from ..formats.video_metadata import (
 )
 from ..formats.video_sink import VideoSink
 
-_MOMENT = 0.05
 # In the metadata of clips only.
 _FIRST_STEP = "first_step"
 _CUT = {"complete": False, "reason": KILLED}
@@ -40,9 +38,7 @@ _BROKEN = (
 _SAID_BY_TRAJECTORY = ("type", "env_id", "seed", "options", "versions")
 
 
-def finish_video(
-    path: Path, known: Mapping[str, Any], *, deadline: float
-) -> Iterator[tuple[str, str]]:
+def finish_video(path: Path, known: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
     """Give a live video its name and its metadata, as far as it goes.
 
     A file that cannot be decoded keeps its hidden name, and the metadata says that the
@@ -53,7 +49,6 @@ def finish_video(
             which its metadata names.
         known: what is known of the end of its episode, with `complete` where it ended,
             and of its `length` and `reward`.
-        deadline: until when to wait for its encoder, by `time.monotonic`.
 
     Yields:
         The name of the file and what was done; nothing where only the note was left.
@@ -67,7 +62,11 @@ def finish_video(
         # A note is written before there is a video.
         note_path(path).unlink(missing_ok=True)
         return
-    _wait_for_encoder(video, deadline)
+    if is_locked(video.temporary):
+        raise Error(
+            f"The encoder of {path.name} is still finishing its file. To wait longer: "
+            f"mjrec recover --timeout 60 {path.parent}"
+        )
     if not metadata_path(path).exists():
         if _FIRST_STEP in video.metadata:
             # A clip crosses episodes: what is known of one says nothing of its end.
@@ -95,16 +94,6 @@ def finish_video(
 def _counted(count: int, metadata: Mapping[str, Any]) -> str:
     ending = "" if metadata["complete"] else f", incomplete: {metadata['reason']}"
     return f"{count} {'frame' if count == 1 else 'frames'}{ending}"
-
-
-def _wait_for_encoder(video: UnfinishedVideo, deadline: float) -> None:
-    while is_locked(video.temporary):
-        if time.monotonic() >= deadline:
-            raise Error(
-                f"The encoder of {video.path.name} is still finishing its file. To "
-                f"wait longer: mjrec recover --timeout 60 {video.path.parent}"
-            )
-        time.sleep(_MOMENT)
 
 
 def _metadata(

@@ -11,13 +11,12 @@ from __future__ import annotations
 import contextlib
 import functools
 import logging
-import time
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from ..errors import Error, FileNotWritten, UnreadableFile
+from ..errors import Error, UnreadableFile
 from ..formats.journal import (
     KILLED,
     JournalEntry,
@@ -35,25 +34,27 @@ from ..formats.monitor_directory import (
     lock_name,
     manifest_name,
 )
-from ..formats.spans import drop_recording, read_list, remove_list
+from ..formats.spans import (
+    files_beside,
+    recordings_in,
+    recordings_in_flight,
+    remove_log,
+)
 from ..formats.trajectory_file import (
     find_trajectory,
     finish_trajectory,
     open_trajectory,
 )
-from ..formats.video_metadata import is_done
 from ..results.journal_or_stats import MonitorResults, locked_run
 from ..results.manifest_writing import manifest_lock, write_manifest_and_stats
 from ..results.monitor_files import MonitorFiles, files_of
 from .cut_videos import finish_text, finish_video
 from .jobs import key_of
-from .leftovers import Kind, lacks_results, leftovers
+from .leftovers import Kind, lacks_results, leftovers, logs_left
 from .recorded_facts import open_for_rendering, video_path
 from .recordings import claim, parts_of
 
 logger = logging.getLogger(__name__)
-
-_MOMENT = 0.05
 
 _Line = tuple[str, Mapping[str, Any]]
 
@@ -63,12 +64,10 @@ class Report:
     """What was done, and what failed.
 
     Attributes:
-        deadline: until when to wait for others, by `time.monotonic`.
         files: names, and what was done.
         failures: names, and why it could not be.
     """
 
-    deadline: float
     files: list[tuple[str, str]] = field(default_factory=list)
     failures: list[tuple[str, str]] = field(default_factory=list)
 
@@ -148,9 +147,9 @@ class _DeadMonitor:
             is_behind: its results may be older than the rest.
         """
         report = self._report
-        for spans in self._left("spans"):
-            with report.attempt(spans.name):
-                self._finish_spans(spans)
+        for log in logs_left(self._files()):
+            with report.attempt(log.name):
+                self._finish_log(log)
         # Of logs a manifest says nothing that is not so of trajectories.
         before = len(report.files)
         # The first video's metadata names those of further cameras.
@@ -158,7 +157,7 @@ class _DeadMonitor:
             path = note.with_name(final_name(note.name) or "")
             with report.attempt(path.name):
                 known = self._known(episode_of(path.name))
-                self._note_all(finish_video(path, known, deadline=report.deadline))
+                self._note_all(finish_video(path, known))
         for text in self._left("text"):
             path = text.with_name(final_name(text.name) or "")
             number = episode_of(path.name)
@@ -182,24 +181,22 @@ class _DeadMonitor:
         for name, what in done:
             self._report.note(name, what)
 
-    def _finish_spans(self, path: Path) -> None:
-        """Make trajectories of the episodes of a list; remove it where it is idle.
+    def _finish_log(self, log: Path) -> None:
+        """Make trajectories of the episodes of a log; remove it where it is idle.
 
         Raises:
-            UnreadableFile: it cannot be read; it stays with its rows.
+            UnreadableFile: the journal does not say what is in it; it stays.
         """
-        spans = read_list(path)
-        if spans.is_headless:
-            raise UnreadableFile(path, "it does not say what its rows are")
-        for recording in spans.in_flight():
-            log = recording.path
-            if log.suffix == ".h5":
-                with self._report.attempt(log.name), self._claimed(log) as is_ours:
-                    if is_ours and not log.exists():
-                        self._report.note(log.name, _finish_log(log))
-        if path.exists() and not read_list(path).in_flight():
-            remove_list(path)
-            self._report.note(path.name, "nothing in flight, removed")
+        for recording in recordings_in(log):
+            path = recording.path
+            if path.suffix == ".h5" and recording.is_in_flight:
+                with self._report.attempt(path.name), self._claimed(path) as is_ours:
+                    if is_ours and recording.is_in_flight:
+                        self._report.note(path.name, _finish_episode(path))
+        is_idle = not any(each.is_in_flight for each in recordings_in(log))
+        if is_idle and any(map(Path.exists, files_beside(log))):
+            remove_log(log)
+            self._report.note(log.name, "nothing in flight, removed")
 
     @contextlib.contextmanager
     def _claimed(self, path: Path) -> Iterator[bool]:
@@ -208,11 +205,7 @@ class _DeadMonitor:
         if key is None:
             yield True
             return
-        # A renderer that outlived its monitor is about to end.
-        while (lock := claim(self._directory, key)) is None:
-            if time.monotonic() >= self._report.deadline:
-                break
-            time.sleep(_MOMENT)
+        lock = claim(self._directory, key)
         with contextlib.nullcontext() if lock is None else lock:
             yield lock is not None
 
@@ -291,12 +284,8 @@ class _DeadMonitor:
 
         One that cannot be read is left out; rendering the directory reports it.
         """
-        spans = [path for path in now.paths if path.suffix == ".spans"]
-        keys = set()
-        for path in spans:
-            with contextlib.suppress(UnreadableFile):
-                keys |= {key_of(each.name) for each in read_list(path).in_flight()}
-        for key in keys:
+        in_flight = recordings_in_flight(self._directory, self._infix)
+        for key in {key_of(each.name) for each in in_flight}:
             if key is None or not key.is_clip:
                 continue
             with contextlib.suppress(UnreadableFile, IndexError):
@@ -323,17 +312,12 @@ class _DeadMonitor:
         lines = [*self._missing_episodes(now), *self._missing_clips(now)]
         path = self._directory / journal_name(self._infix)
         writer = JournalWriter(path, run=self._run_facts(now))
-        try:
-            with manifest_lock(self._directory, self._infix):
-                for kind, facts in (*lines, ("recovered", {})):
-                    if kind == "episode":
-                        writer.append(entry_of(facts))
-                    else:
-                        writer.note(kind, facts)
-        except OSError as error:
-            raise FileNotWritten(path, error.strerror or error) from error
-        finally:
-            writer.close()
+        with contextlib.closing(writer), manifest_lock(self._directory, self._infix):
+            for kind, facts in (*lines, ("recovered", {})):
+                if kind == "episode":
+                    writer.append(entry_of(facts))
+                else:
+                    writer.note(kind, facts)
         added = sum(kind == "episode" for kind, _ in lines)
         if added:
             self._report.note(path.name, f"{_counted(added, 'episode')} added")
@@ -365,14 +349,10 @@ class _DeadMonitor:
             note(manifest_name(self._infix), what)
 
 
-def _finish_log(path: Path) -> str:
+def _finish_episode(path: Path) -> str:
     """Give a recording in flight its final form; return what was done."""
     with open_trajectory(path) as reader:
         facts, steps = reader.facts, _counted(reader.step_count, "step")
-    if not facts.get("kept", True) and is_done(video_path(path, facts)):
-        # Its renderer died between the two.
-        drop_recording(path)
-        return "its video is there, removed"
     finish_trajectory(path)
     is_cut = "complete" not in facts and _facts_of(path).get("reason") == KILLED
     return f"{steps}, incomplete: killed" if is_cut else steps

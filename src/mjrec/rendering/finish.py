@@ -17,7 +17,7 @@ from pathlib import Path
 
 from ..errors import DirectoryNotWritable, FileNotWritten
 from ..formats.second_names import give_all_second_names
-from ..formats.spans import list_paths, remove_if_done
+from ..formats.spans import log_paths, remove_if_done
 from ..results.manifest_writing import update_manifests
 from .engine_jobs import do_on_engine
 from .finisher import do_jobs
@@ -83,8 +83,8 @@ def bring_up_to_date(directory: Path) -> None:
         UnreadableFile: a manifest is damaged.
     """
     give_all_second_names(directory)
-    for spans in list(list_paths(directory)):
+    for log in log_paths(directory):
         # Those of a process that died between finishing the last and removing them.
         with contextlib.suppress(DirectoryNotWritable):
-            remove_if_done(spans)
+            remove_if_done(log)
     update_manifests(directory)

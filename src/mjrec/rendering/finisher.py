@@ -19,7 +19,7 @@ from ..errors import (
     InvalidArgument,
 )
 from ..formats import video_metadata
-from ..formats.spans import drop_recording
+from ..formats.spans import remove_if_done
 from ..formats.trajectory_file import finish_trajectory
 from .jobs import Progress, RenderedVideos, VideoJob, key_of
 from .pool import WorkerPool
@@ -141,6 +141,13 @@ class Finisher:
         with contextlib.suppress(Error):
             self._pool.start()
 
+    def prepare(self, recording: Path) -> None:
+        """Let the workers load what a recording will be drawn with, once it is there.
+
+        It may be running still.
+        """
+        self._pool.prepare(recording)
+
     def rest(self) -> None:
         """Let others use the CPUs: there is nothing to do."""
         self._pool.rest()
@@ -182,7 +189,7 @@ class Finisher:
         return replace(nothing, failures={name: reason})
 
     def _finish(self, job: VideoJob, plan: Plan) -> RenderedVideos:
-        if plan.is_log and plan.is_kept:
+        if plan.logs and plan.is_kept:
             finish_trajectory(plan.parts[0])
         result = RenderedVideos(
             directory=job.directory, trajectories=(plan.parts[0].name,)
@@ -192,10 +199,10 @@ class Finisher:
                 remove_unfinished(video)
             result = self._render(job, plan)
         if not plan.is_kept:
-            # The first one last: it says which video they are of.
-            for part in reversed(plan.parts):
+            for part in plan.parts:
                 part.unlink(missing_ok=True)
-                drop_recording(part)
+            for log in plan.logs:
+                remove_if_done(log)
         return result
 
     def _render(self, job: VideoJob, plan: Plan) -> RenderedVideos:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a monitor that is not open has left to be put in order.
 
-Only names, locks, lists of spans and the journal are looked at: it is done at each
+Only names, locks and the journal are looked at: it is done at each
 `resume`, in the process of the simulation.
 """
 
@@ -14,37 +14,48 @@ from typing import Literal
 from ..errors import UnreadableFile
 from ..formats.locks import is_locked
 from ..formats.monitor_directory import (
+    Infix,
     VideoName,
     final_name,
     is_note,
     iter_monitor_files,
     unfinished_files,
 )
-from ..formats.spans import SPANS, read_list
+from ..formats.spans import recordings_in
 from ..formats.unfinished_video import note_path
 from ..formats.video_metadata import is_broken, metadata_path
 from ..results.journal_or_stats import MonitorResults
-from ..results.monitor_files import MonitorFiles, monitors_of
+from ..results.monitor_files import MonitorFiles, files_of, monitors_of
 
 _SHARED_LOCK = re.compile(r"\.openaigym\.(recover|render\.\d+)\.lock")
 
-# A list of spans with ended episodes, or without any use; the note of a live video; the
-# frames of a text recording; an unfinished file that no process will finish, or a dead
-# one's lock. What is left is done in this order.
-Kind = Literal["spans", "video", "text", "stale"]
+# The note of a live video; the frames of a text recording; an unfinished file that no
+# process will finish, or a dead one's lock. What is left is done in this order, after
+# the logs.
+Kind = Literal["video", "text", "stale"]
+
+
+def logs_left(files: MonitorFiles) -> list[Path]:
+    """Return the row logs of a monitor that hold episodes, or are of no use."""
+    return [log for log in sorted(files.logs) if _has_work(log)]
 
 
 def leftovers(files: MonitorFiles, kind: Kind) -> list[Path]:
     """Return the files of one kind that are left of a monitor."""
-    # Lists of spans are read for their own kind only.
-    are_spans = kind == "spans"
-    paths = [path for path in files.paths if (path.suffix == SPANS) == are_spans]
-    return [path for path in paths if _kind_of(path, files) == kind]
+    return [path for path in files.paths if _kind_of(path, files) == kind]
 
 
 def has_leftovers(files: MonitorFiles) -> bool:
     """Tell whether anything is left to do of a monitor."""
-    return any(_kind_of(path, files) for path in files.paths) or lacks_results(files)
+    is_left = bool(logs_left(files)) or any(_kind_of(p, files) for p in files.paths)
+    return is_left or lacks_results(files)
+
+
+def is_at_work(directory: Path, infix: Infix) -> bool:
+    """Tell whether an encoder or a renderer is at a file of a monitor that is gone."""
+    files = files_of(directory, infix)
+    hidden = [path for path in files.paths if path.name.startswith(".")]
+    return any(is_locked(path) for path in hidden if path != files.lock)
 
 
 def stale_shared_files(directory: Path) -> list[Path]:
@@ -61,25 +72,17 @@ def stale_shared_files(directory: Path) -> list[Path]:
     return models + [path for path in locks if not is_locked(path)]
 
 
-def _kind_of(path: Path, files: MonitorFiles) -> Kind | None:
-    """Return what is to be done about a file; None where nothing is."""
-    if path.suffix == SPANS:
-        return "spans" if _has_work(path) else None
-    return _kind_of_part(path, files)
-
-
-def _has_work(path: Path) -> bool:
-    """Tell whether a list of spans is to be finished or removed."""
+def _has_work(log: Path) -> bool:
+    """Tell whether a log is to be finished or removed."""
     try:
-        spans = read_list(path)
+        in_flight = [each for each in recordings_in(log) if each.is_in_flight]
     except UnreadableFile:
         return True
-    in_flight = spans.in_flight()
-    is_idle = not in_flight
-    return is_idle or any(each.path.suffix == ".h5" for each in in_flight)
+    # Clips wait for their video.
+    return not in_flight or any(each.path.suffix == ".h5" for each in in_flight)
 
 
-def _kind_of_part(path: Path, files: MonitorFiles) -> Kind | None:
+def _kind_of(path: Path, files: MonitorFiles) -> Kind | None:
     """Return what is to be done about a hidden file; None where nothing is."""
     if path.suffix == ".lock" and path != files.lock:
         return None if is_locked(path) else "stale"

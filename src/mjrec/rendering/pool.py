@@ -136,6 +136,18 @@ class WorkerPool:
             self._start(worker)
         self.rest()
 
+    def prepare(self, trajectory: Path) -> None:
+        """Let the workers load what a trajectory is drawn with; it may come later.
+
+        Those that are started and have nothing to draw. What fails, fails when frames
+        are asked for.
+        """
+        if self._job is None:
+            drawing = {"trajectory": str(trajectory), "view": View().as_json()}
+            for worker in self._workers:
+                if worker.child is not None:
+                    worker.child.send(prepares=drawing)
+
     def rest(self) -> None:
         """Give the CPUs back: there is nothing to draw. The workers stay."""
         while self._held:
@@ -481,6 +493,7 @@ def _environment(environ: Mapping[str, str], *, alone: bool) -> dict[str, str]:
         )
         del changed["LP_NATIVE_VECTOR_WIDTH"]
     if not alone:
-        # Mesa's rasteriser would start as many threads as there are CPUs, in each.
-        changed.setdefault("LP_NUM_THREADS", "1")
+        # Mesa's rasteriser would start as many threads as there are CPUs, in each. One
+        # of its own would only be waited for.
+        changed.setdefault("LP_NUM_THREADS", "0")
     return changed

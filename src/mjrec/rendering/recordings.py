@@ -9,7 +9,7 @@ its video is there.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
@@ -27,7 +27,7 @@ from ..formats.monitor_directory import (
     lock_name,
     unfinished_files,
 )
-from ..formats.spans import FINISHED, recordings_in_flight
+from ..formats.spans import FINISHED, find_recording, recordings_in_flight
 from ..formats.trajectory import added_up
 from ..formats.trajectory_file import find_trajectory
 from ..formats.video_metadata import is_done, metadata_path
@@ -52,7 +52,7 @@ class Plan:
         parts: its rows, by the names of their files, in order.
         videos: those that are to be rendered, the first camera's first.
         frame_count: how many frames are to be rendered, of all of these.
-        is_log: its rows are in a log still.
+        logs: where its rows are, if they are in logs still.
         is_kept: the trajectory stays once the video is there.
         model_file: what has to be there for rendering, if it is known.
     """
@@ -60,7 +60,7 @@ class Plan:
     parts: tuple[Path, ...]
     videos: tuple[Path, ...]
     frame_count: int
-    is_log: bool = False
+    logs: frozenset[Path] = frozenset()
     is_kept: bool = True
     model_file: Path | None = None
 
@@ -223,10 +223,15 @@ def look_at(directory: Path, key: RecordingKey) -> Plan | None:
         parts=tuple(parts),
         videos=tuple(videos),
         frame_count=frames * len(videos),
-        is_log=is_log,
+        logs=_logs_of(parts) if is_log else frozenset(),
         is_kept=not key.is_clip and facts.get("kept", True),
         model_file=model_file(directory, last) if videos else None,
     )
+
+
+def _logs_of(parts: Iterable[Path]) -> frozenset[Path]:
+    found = map(find_recording, parts)
+    return frozenset(each.log for each in found if each is not None)
 
 
 def claim(directory: Path, key: RecordingKey) -> Lock | None:

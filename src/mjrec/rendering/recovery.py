@@ -15,11 +15,12 @@ from ..formats.locks import is_locked, wait_for_lock
 from ..formats.monitor_directory import Infix
 from ..formats.second_names import give_all_second_names
 from ..results.monitor_files import monitors_of
-from .leftovers import has_leftovers, stale_shared_files
+from .leftovers import has_leftovers, is_at_work, stale_shared_files
 
 # One recovery of a directory at a time.
 _LOCK = ".openaigym.recover.lock"
 _SECONDS = 5.0
+_MOMENT = 0.05
 
 
 @dataclass(frozen=True)
@@ -118,9 +119,12 @@ def recover(
     # monitor left off has no use for.
     from .dead_monitor import Report, finish_dead_monitor
 
-    report = Report(deadline=deadline)
+    report = Report()
     if not os.access(path, os.W_OK | os.X_OK):
         raise DirectoryNotWritable(path, "permission denied")
+    # Nothing is locked meanwhile.
+    while time.monotonic() < deadline and any(is_at_work(path, each) for each in dead):
+        time.sleep(_MOMENT)
     with wait_for_lock(path / _LOCK):
         # Once more, because another process may have done it meanwhile.
         dead, open_monitors = _dead_and_open(path)

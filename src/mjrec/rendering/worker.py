@@ -5,10 +5,11 @@ Its parent sends::
 
     {"tries": true}                         it makes its context and, if true, looks at
                                             a frame of its own
+    {"prepares": {...}}                     it loads what that will be drawn with
     {"drawing": {...}, "indices": [1, 3, 5]}
 
-`drawing` is what `open_drawing` takes; `indices` are the frames. It sends the bytes of
-frames, `(height, width, 3) uint8`, and::
+`drawing` and `prepares` are what `open_drawing` takes; `indices` are the frames. It
+sends the bytes of frames, `(height, width, 3) uint8`, and::
 
     {"size": [48, 64], "gl": {...}}         before the frames of a job
     {"error": {...}}                        instead of a frame and all that would follow
@@ -23,6 +24,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -39,6 +41,8 @@ from .recorded_facts import check_has_frames, open_for_rendering
 from .views import PlainCamera, View
 
 _NICE = 10
+_LOOKS_FOR_RECORDING = 100
+_SECONDS_BETWEEN_LOOKS = 0.02
 
 
 class Drawing:
@@ -61,6 +65,10 @@ class Drawing:
         # The frame whose cameras the renderers have in mind.
         self._last: int | None = None
         self._canvas_is_old = False
+        # Whether a frame depends on the one before, at any time.
+        self._looks_back = not scene.is_constant or any(
+            camera.shows_frame_before for camera in cameras
+        )
 
     @property
     def size(self) -> tuple[int, int]:
@@ -88,7 +96,7 @@ class Drawing:
                 "from 0."
             )
         last, self._last = self._last, None
-        if last is None or index != last + 1:
+        if self._looks_back and (last is None or index != last + 1):
             self._prepare(index, last)
         self._bring_to(index)
         if self._canvas_is_old:
@@ -200,10 +208,12 @@ def main() -> None:
     parent.send_warnings()
     parent.listen()
     os.setpriority(os.PRIO_PROCESS, 0, max(_NICE, os.getpriority(os.PRIO_PROCESS, 0)))
-    canvas = Canvas()
+    canvas = Canvas(is_alone=True)
     while True:
         order = parent.receive()
-        if "tries" not in order:
+        if "prepares" in order:
+            _prepare(order["prepares"], canvas, parent)
+        elif "drawing" in order:
             try:
                 _draw(order, canvas, parent)
             except Exception as error:
@@ -219,6 +229,19 @@ def main() -> None:
             # What is in the way is said when there is something to draw.
             with contextlib.suppress(Error):
                 canvas.open()
+
+
+def _prepare(drawing: Mapping[str, Any], canvas: Canvas, parent: Parent) -> None:
+    """Load the model into the canvas, where it is there before there is more to do."""
+    for _ in range(_LOOKS_FOR_RECORDING):
+        if parent.has_said_something:
+            return
+        # A recording is there from its first step on, its model a moment later. What
+        # else is in the way is said when there is something to draw.
+        with contextlib.suppress(Exception):
+            open_drawing(drawing, canvas).close()
+            return
+        time.sleep(_SECONDS_BETWEEN_LOOKS)
 
 
 def _draw(order: Mapping[str, Any], canvas: Canvas, parent: Parent) -> None:

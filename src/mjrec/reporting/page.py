@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 from ..errors import MissingDependency
 from ..evaluation.statistics import PERCENTILE_BOOTSTRAP, Bootstrap, Interval
 from ..evaluation.summaries import TaskSummary
+from ..plain_text import spelled_out
 from .contents import FAILED, ReportContents, ReportTask, ReportVideo
 from .curves import SERIES, evaluation_curve, learning_curve, profile_curve
 from .page_text import (
@@ -36,7 +37,6 @@ from .page_text import (
     interval_text,
     number,
     page_json,
-    spelled_out,
 )
 from .provenance import SELECTION
 

@@ -1,9 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Numbers, names and addresses as they stand on a page.
-
-Texts may be of strangers: they are cut where they are long, and what nobody sees
-(control characters, marks that turn the direction of writing) is spelled out.
-"""
+"""Numbers, names and addresses as they stand on a page."""
 
 from __future__ import annotations
 
@@ -19,8 +15,6 @@ from ..evaluation.statistics import Interval
 # What stands where there is no number.
 NOTHING: Final = "\N{EN DASH}"
 
-# Spaces between figures, which are no stranger's trick, and the ends of lines.
-_SEEN: Final = "\n\N{NO-BREAK SPACE}\N{NARROW NO-BREAK SPACE}"
 _DATA: Final = re.compile(r"data:(video|image)/[a-z0-9.+-]+;base64,[A-Za-z0-9+/=]*")
 _SPECIAL: Final = {ord(c): f"\\u{ord(c):04x}" for c in "<>&\u2028\u2029"}
 
@@ -59,17 +53,6 @@ def interval_text(interval: Interval | None, decimals: int) -> str:
 def counted(count: int, noun: str) -> str:
     """Return `1 task`, `2 tasks`."""
     return f"{number(count, 0)} {noun}{'' if count == 1 else 's'}"
-
-
-def spelled_out(text: str, longest: int = 1000) -> str:
-    """Return a text with what nobody sees spelled out, and cut where it is long."""
-    if len(text) > longest:
-        text = text[:longest] + "…"
-    if text.isprintable():
-        return text
-    return "".join(
-        c if c.isprintable() or c in _SEEN else f"\\u{ord(c):04x}" for c in text
-    )
 
 
 def address(path: str) -> str:

@@ -18,10 +18,11 @@ from ..formats.monitor_directory import (
     infix_of,
     is_manifest,
     iter_monitor_files,
+    log_number,
     names_in,
 )
 from ..formats.second_names import is_called_like_second
-from ..formats.spans import recordings_in_flight
+from ..formats.spans import LOG, recordings_in_flight
 
 logger = logging.getLogger(__name__)
 
@@ -44,6 +45,7 @@ class MonitorFiles:
         videos: its videos, by the numbers of their episodes.
         metadata: their metadata, likewise.
         trajectories: the recorded states, likewise; also what is in flight.
+        logs: its row logs; also one of which only a file beside it is left.
         last_episode_id: the highest number of an episode in a name, also of a file
             that was never finished; -1 where there is none.
     """
@@ -60,6 +62,7 @@ class MonitorFiles:
         self.videos: dict[int, Path] = {}
         self.metadata: dict[int, Path] = {}
         self.trajectories: dict[int, Path] = {}
+        self.logs: set[Path] = set()
         self.last_episode_id = -1
         for path in (*self.paths, *in_flight):
             self._sort_in(path)
@@ -96,6 +99,8 @@ class MonitorFiles:
                 self.videos[video.episode_id] = path
             elif video.ending == "meta.json":
                 self.metadata[video.episode_id] = path
+        elif log_number(path.name) is not None:
+            self.logs.add(path.with_suffix(LOG))
         elif path.suffix == ".h5" and number is not None:
             self.trajectories[number] = path
 

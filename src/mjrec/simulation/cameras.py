@@ -22,6 +22,7 @@ FREE_CAMERA = -1
 # Plain integers, because since mujoco 3.12 a member of a MuJoCo enumeration is not
 # equal to the NumPy integer of its value.
 _TRACK = int(mujoco.mjtCamLight.mjCAMLIGHT_TRACK)
+_PLANE = int(mujoco.mjtGeom.mjGEOM_PLANE)
 _TRACKCOM = int(mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM)
 _TRAVELLING_JOINTS = (
     int(mujoco.mjtJoint.mjJNT_FREE),
@@ -190,6 +191,12 @@ def camera_label(model: mujoco.MjModel, camera: Any) -> str | int | dict[str, An
 def _name_of(model: mujoco.MjModel, number: int) -> str | int:
     """Return a camera's name, or its number where it has none."""
     return number if number < 0 else model.camera(number).name or number
+
+
+def has_infinite_plane(model: mujoco.MjModel) -> bool:
+    """Tell whether a plane has no end: it is drawn around the cameras."""
+    planes = model.geom_size[model.geom_type == _PLANE]
+    return bool((planes[:, :2] <= 0).any())
 
 
 def _travels(model: mujoco.MjModel, body: int) -> bool:

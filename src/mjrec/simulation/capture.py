@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import ClosedError, PicturesDiffer
-from .cameras import is_tracking, raw_data, raw_model
+from .cameras import has_infinite_plane, is_tracking, raw_data, raw_model
 from .captured_arrays import needs_constraints, snapshot_dtype
 from .fields import VIEW_PREFIXES, is_settable
 from .looks import Looks
@@ -29,7 +29,6 @@ from .view import SceneView
 
 T = TypeVar("T")
 
-_PLANE = int(mujoco.mjtGeom.mjGEOM_PLANE)
 
 # Fields of a model that `snapshot_dtype` looks at, which environments leave alone.
 _SETTLING_THE_KIND = (
@@ -366,7 +365,7 @@ class _Frames:
         self._facts = view.facts()
         self._follow_camera()
         self.scene: mujoco.MjvScene | None = None
-        if is_tracking(view.camera) or (not view.fresh and _has_infinite_plane(model)):
+        if is_tracking(view.camera) or (not view.fresh and has_infinite_plane(model)):
             self.scene = stored.scene or mujoco.MjvScene(model, maxgeom=1)
 
     def facts(self) -> dict[str, Any]:
@@ -436,11 +435,6 @@ class _Frames:
         # Moved as frames move it; the environment's own stays where it is.
         self._camera = copy.copy(self.view.camera)
         self._lookat = self._camera.lookat.tolist()
-
-
-def _has_infinite_plane(model: mujoco.MjModel) -> bool:
-    planes = model.geom_size[model.geom_type == _PLANE]
-    return bool((planes[:, :2] <= 0).any())
 
 
 def _never() -> bool:

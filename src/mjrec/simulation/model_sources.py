@@ -166,14 +166,17 @@ def _compile(authored: AuthoredModel) -> mujoco.MjModel:
         raise ValueError(f"{authored.main} is not MJCF")
     # All files that may be read as MJCF are looked at, whatever they are called, and
     # wherever they are: MuJoCo's rules for that have changed.
-    waiting = [authored.main]
+    waiting, goes_up = [authored.main], False
     while waiting:
         name = waiting.pop()
-        for reference in _References(name, authored.files[name]).xml:
+        references = _References(name, authored.files[name])
+        goes_up |= references.go_up
+        for reference in references.xml:
             # Taken out, so that nothing is looked at twice, however often it is named.
             waiting += by_base_name.pop(PurePosixPath(reference).name, [])
     with tempfile.TemporaryDirectory(prefix="mjrec-model-") as directory:
-        root = Path(directory) / _EMPTY
+        # Making so many folders takes longer than compiling most models.
+        root = Path(directory) / _EMPTY if goes_up else Path(directory)
         for name, content in authored.files.items():
             (root / name).parent.mkdir(parents=True, exist_ok=True)
             (root / name).write_bytes(content)
@@ -184,6 +187,12 @@ def _compile(authored: AuthoredModel) -> mujoco.MjModel:
 class _References:
     """What one MJCF file refers to, as it is written there.
 
+    Attributes:
+        xml: other MJCF.
+        assets: all other files.
+        directories: in which they are looked for.
+        go_up: whether a path leaves a folder by `..`.
+
     Raises:
         ValueError: it is no plain MJCF, or refers to what is elsewhere.
     """
@@ -192,6 +201,7 @@ class _References:
         self.xml: set[str] = set()
         self.assets: set[str] = set()
         self.directories = {""}
+        self.go_up = False
         for element in _parsed(name, content).iter():
             for attribute, value in element.attrib.items():
                 if attribute in _DIRECTORIES:
@@ -201,6 +211,7 @@ class _References:
                 else:
                     continue
                 _check_reference(value)
+                self.go_up |= ".." in value
                 kind.add(value)
 
 

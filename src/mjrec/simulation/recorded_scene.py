@@ -46,6 +46,7 @@ class RecordedScene:
         previous_cameras: where the two cameras of the environment's scene stood before
             the first frame, `(2, 3)`.
         count: how many frames there are.
+        is_constant: model and view are the same in all of them.
     """
 
     def __init__(self, reader: TrajectoryReader) -> None:
@@ -62,6 +63,7 @@ class RecordedScene:
         self.model = load_model(reader.path.parent, facts["model"])
         self.data = mujoco.MjData(self.model)
         self.count = reader.frame_count
+        self.is_constant = not reader.change_count
         self._rows = reader.snapshots(0, 0)
         try:
             check_layout(self.model, self.data, self._rows.dtype)
@@ -190,6 +192,8 @@ class GivenStates:
         data: its data, in the state last brought to.
         count: how many rows there are.
     """
+
+    is_constant = True
 
     def __init__(self, directory: Path, spec: int) -> None:
         self.model = mujoco.MjModel.from_binary_path(str(directory / _MODEL))

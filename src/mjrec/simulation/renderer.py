@@ -16,7 +16,13 @@ from numpy.typing import ArrayLike
 
 from ..errors import ClosedError, InvalidArgument
 from ..frames import Frame, check_quality, check_size
-from .cameras import FREE_CAMERA, Camera, is_tracking, resolve_camera
+from .cameras import (
+    FREE_CAMERA,
+    Camera,
+    has_infinite_plane,
+    is_tracking,
+    resolve_camera,
+)
 from .fields import holder_of
 from .gl_context import (
     context_kept,
@@ -65,11 +71,16 @@ class Canvas:
     It stays as it is from one `prepare` to the next where those three do, and nothing
     has changed that the context keeps of the model.
 
+    Args:
+        is_alone: nothing else draws in this process, so that its context can stay
+            current on its thread.
+
     Attributes:
         gl_facts: what metadata says of who draws, as `current_gl_facts`.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, *, is_alone: bool = False) -> None:
+        self._is_alone = is_alone
         self.gl_facts: dict[str, Any] = {}
         self._context: Any = None
         self._drawing: mujoco.MjrContext | None = None
@@ -155,6 +166,9 @@ class Canvas:
     def _current(self) -> Iterator[None]:
         if self._closed:
             raise ClosedError("The renderer is closed.")
+        if self._is_alone and self._context is not None:
+            yield
+            return
         refuse_fork_of_gl()
         with context_kept():
             if self._context is None:
@@ -283,6 +297,13 @@ class SceneRenderer:
     def gl_facts(self) -> dict[str, Any]:
         """What metadata says of who draws, as `gl_context.current_gl_facts`."""
         return self._canvas.gl_facts
+
+    @property
+    def shows_frame_before(self) -> bool:
+        """Whether a frame depends on where the cameras stood in the one before."""
+        return self.is_following or (
+            not self._fresh and has_infinite_plane(self._model)
+        )
 
     def begin(self) -> None:
         """Go to before the first frame."""

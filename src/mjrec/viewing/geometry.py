@@ -1,0 +1,307 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a shape looks like: a MuJoCo geom or site as a mesh with a colour or a texture.
+
+mjviser makes the meshes of primitives, height fields and sites. The rest is done here:
+normals and texture coordinates of meshes, cube textures, planes as the model has them,
+colours as MuJoCo's visualiser mixes them.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import MissingDependency
+from .motion import Shape
+
+try:
+    import trimesh
+    from mjviser.conversions import create_primitive_mesh, create_site_mesh
+    from PIL import Image
+    from trimesh.visual import TextureVisuals
+    from trimesh.visual.material import PBRMaterial
+except ModuleNotFoundError as error:
+    raise MissingDependency(
+        error.name or "viser",
+        purpose="A 3D replay",
+        install='pip install "mjrec[replay]"',
+    ) from error
+
+_GEOM, _SITE = int(mujoco.mjtObj.mjOBJ_GEOM), int(mujoco.mjtObj.mjOBJ_SITE)
+_PLANE, _MESH = int(mujoco.mjtGeom.mjGEOM_PLANE), int(mujoco.mjtGeom.mjGEOM_MESH)
+_FIELD, _FLEX = int(mujoco.mjtGeom.mjGEOM_HFIELD), int(mujoco.mjtGeom.mjGEOM_FLEX)
+_TEXTURE_2D = int(mujoco.mjtTexture.mjTEXTURE_2D)
+_COLOUR_ROLES = (
+    mujoco.mjtTextureRole.mjTEXROLE_RGB,
+    mujoco.mjtTextureRole.mjTEXROLE_RGBA,
+)
+# How far an infinite plane goes, in sizes of the model.
+_HORIZON = 30.0
+_SHARP = 0.6  # radians between faces that make an edge
+_GAMMA = 2.2
+
+# For each side of a cube texture, in OpenGL's order: the axis that looks at it, and the
+# axes that give s and t, with signs.
+_SIDES = (
+    ((0, 1), (2, -1), (1, -1)),
+    ((0, -1), (2, 1), (1, -1)),
+    ((1, 1), (0, 1), (2, 1)),
+    ((1, -1), (0, 1), (2, -1)),
+    ((2, 1), (0, 1), (1, -1)),
+    ((2, -1), (0, -1), (1, -1)),
+)
+
+
+def mesh_of(model: mujoco.MjModel, shape: Shape) -> trimesh.Trimesh:
+    """Return a shape in its own frame, with its colour or texture.
+
+    Args:
+        model: of the shape.
+        shape: a geom or a site; anything else is a cylinder of radius 1 and half
+            length 1, or an ellipsoid, which its scale brings to size.
+    """
+    if shape.object_type == _SITE:
+        return _coloured(_smoothed(create_site_mesh(model, shape.object_id)), shape)
+    if shape.object_type != _GEOM:
+        return _coloured(_unit_mesh(shape.geom_type), shape)
+    geom, texture = shape.object_id, _texture_of(model, shape.object_id)
+    if shape.geom_type == _PLANE:
+        return _plane(model, shape, texture)
+    if shape.geom_type == _MESH:
+        mesh, uv = _asset_mesh(model, int(model.geom_dataid[geom]))
+    else:
+        mesh, uv = create_primitive_mesh(model, geom), None
+        if shape.geom_type == _FIELD:
+            uv = _unit_square(mesh.vertices)
+        else:
+            mesh = _smoothed(mesh)
+    if texture is None:
+        return _coloured(mesh, shape)
+    image = _image(model, texture)
+    if int(model.tex_type[texture]) != _TEXTURE_2D:
+        mesh, uv = _on_cube(mesh)
+    if uv is None:
+        return _coloured(mesh, shape, np.asarray(image).reshape(-1, 3).mean(axis=0))
+    return _textured(mesh, uv, image, shape)
+
+
+def soft_mesh(model: mujoco.MjModel, shape: Shape) -> trimesh.Trimesh:
+    """Return a skin in its resting pose, or a flex; a state moves its vertices."""
+    index = shape.object_id
+    if shape.geom_type == _FLEX:
+        return _coloured(_flex_mesh(model, index), shape)
+    vertices = _part(model.skin_vert, model.skin_vertadr, model.skin_vertnum, index)
+    faces = _part(model.skin_face, model.skin_faceadr, model.skin_facenum, index)
+    mesh = trimesh.Trimesh(vertices, faces, process=False)
+    material, first = int(model.skin_matid[index]), int(model.skin_texcoordadr[index])
+    texture = None if material < 0 else _texture_of_material(model, material)
+    if texture is None or first < 0:
+        return _coloured(mesh, shape)
+    uv = model.skin_texcoord[first : first + len(vertices)]
+    return _textured(mesh, uv, _image(model, texture), shape)
+
+
+def skin_weights(model: mujoco.MjModel, skin: int) -> dict[str, NDArray[Any]]:
+    """Return how bones move a skin's vertices.
+
+    Returns:
+        `bind`, `(bones, 7)`, each bone's resting pose; `counts`, how many vertices it
+        moves; `ids` and `weights` of these vertices, bone after bone.
+    """
+    bones = slice(
+        model.skin_boneadr[skin], model.skin_boneadr[skin] + model.skin_bonenum[skin]
+    )
+    first = model.skin_bonevertadr[bones.start]
+    counts = model.skin_bonevertnum[bones]
+    moved = slice(first, first + counts.sum())
+    bind = (model.skin_bonebindpos[bones], model.skin_bonebindquat[bones])
+    return {
+        "bind": np.hstack(bind),
+        "counts": counts,
+        "ids": model.skin_bonevertid[moved],
+        "weights": model.skin_bonevertweight[moved],
+    }
+
+
+def linear(rgba: Any) -> list[float]:
+    """Return a colour as the page takes it: its lighting is linear, unlike MuJoCo's."""
+    red, green, blue, alpha = (float(channel) for channel in rgba)
+    return [*(max(0.0, c) ** _GAMMA for c in (red, green, blue)), alpha]
+
+
+def sky(model: mujoco.MjModel) -> NDArray[np.uint8] | None:
+    """Return the model's sky as a narrow picture, from top to bottom, if it has one."""
+    kinds = model.tex_type.tolist()
+    if int(mujoco.mjtTexture.mjTEXTURE_SKYBOX) not in kinds:
+        return None
+    texture = kinds.index(int(mujoco.mjtTexture.mjTEXTURE_SKYBOX))
+    pixels = np.asarray(_image(model, texture))
+    width = pixels.shape[1]
+    # The third side from the end is one that stands upright.
+    side = pixels[-2 * width : -width] if len(pixels) == 6 * width else pixels
+    column = side.mean(axis=1, keepdims=True).astype(np.uint8)
+    return np.repeat(column, 2, axis=1)
+
+
+def _coloured(
+    mesh: trimesh.Trimesh, shape: Shape, tint: NDArray[Any] | None = None
+) -> trimesh.Trimesh:
+    rgba = np.array(shape.rgba)
+    if tint is not None:
+        rgba[:3] *= tint / 255
+    mesh.visual = TextureVisuals(material=_material(rgba))
+    return mesh
+
+
+def _textured(
+    mesh: trimesh.Trimesh, uv: NDArray[Any], image: Image.Image, shape: Shape
+) -> trimesh.Trimesh:
+    # glTF counts from the top of a picture, trimesh from its bottom.
+    flipped = image.transpose(Image.Transpose.FLIP_TOP_BOTTOM)
+    mesh.visual = TextureVisuals(
+        uv=uv, material=_material(np.array(shape.rgba), baseColorTexture=flipped)
+    )
+    return mesh
+
+
+def _material(rgba: NDArray[Any], **options: Any) -> PBRMaterial:
+    return PBRMaterial(
+        baseColorFactor=linear(rgba),
+        metallicFactor=0.0,
+        roughnessFactor=1.0,
+        alphaMode="BLEND" if rgba[3] < 1 else "OPAQUE",
+        **options,
+    )
+
+
+def _texture_of(model: mujoco.MjModel, geom: int) -> int | None:
+    material = int(model.geom_matid[geom])
+    return None if material < 0 else _texture_of_material(model, material)
+
+
+def _texture_of_material(model: mujoco.MjModel, material: int) -> int | None:
+    ids = (int(model.mat_texid[material, int(role)]) for role in _COLOUR_ROLES)
+    return next((texture for texture in ids if texture >= 0), None)
+
+
+def _image(model: mujoco.MjModel, texture: int) -> Image.Image:
+    height, width = int(model.tex_height[texture]), int(model.tex_width[texture])
+    channels, first = int(model.tex_nchannel[texture]), int(model.tex_adr[texture])
+    data = model.tex_data[first : first + height * width * channels]
+    pixels = data.reshape(height, width, channels)
+    return Image.fromarray(np.ascontiguousarray(pixels.squeeze())).convert("RGB")
+
+
+def _part(
+    array: NDArray[Any], first: NDArray[Any], count: NDArray[Any], index: int
+) -> NDArray[Any]:
+    return array[first[index] : first[index] + count[index]]
+
+
+def _asset_mesh(
+    model: mujoco.MjModel, mesh: int
+) -> tuple[trimesh.Trimesh, NDArray[Any] | None]:
+    """Return a mesh, and its texture coordinates if it has any.
+
+    A vertex with two normals or texture coordinates becomes two: the page computes its
+    own normals, and edges stay sharp.
+    """
+    vertices = _part(model.mesh_vert, model.mesh_vertadr, model.mesh_vertnum, mesh)
+    parts = [model.mesh_face, model.mesh_facenormal]
+    has_uv = model.mesh_texcoordnum[mesh] > 0
+    if has_uv:
+        parts.append(model.mesh_facetexcoord)
+    faces = [_part(p, model.mesh_faceadr, model.mesh_facenum, mesh) for p in parts]
+    corners = np.stack(faces, axis=-1).reshape(-1, len(parts))
+    unique, inverse = np.unique(corners, axis=0, return_inverse=True)
+    made = trimesh.Trimesh(
+        vertices[unique[:, 0]], inverse.reshape(-1, 3), process=False
+    )
+    if not has_uv:
+        return made, None
+    args = (model.mesh_texcoord, model.mesh_texcoordadr, model.mesh_texcoordnum, mesh)
+    return made, _part(*args)[unique[:, 2]]
+
+
+def _flex_mesh(model: mujoco.MjModel, flex: int) -> trimesh.Trimesh:
+    """Return the triangles of a surface, or of a volume's outside."""
+    first, count = model.flex_vertadr[flex], model.flex_vertnum[flex]
+    if model.flex_dim[flex] == 2:
+        begin, size = model.flex_elemdataadr[flex], 3 * model.flex_elemnum[flex]
+        faces = model.flex_elem[begin : begin + size].reshape(-1, 3)
+    else:
+        begin, size = model.flex_shelldataadr[flex], 3 * model.flex_shellnum[flex]
+        faces = model.flex_shell[begin : begin + size].reshape(-1, 3)
+    # From both sides, as a cloth is seen.
+    faces = np.vstack([faces, faces[:, ::-1]]) if model.flex_dim[flex] == 2 else faces
+    vertices = model.flex_vert[first : first + count]
+    return trimesh.Trimesh(vertices, faces, process=False)
+
+
+def _plane(model: mujoco.MjModel, shape: Shape, texture: int | None) -> trimesh.Trimesh:
+    """Return a plane of the size that it has; an infinite one up to the horizon."""
+    size = model.geom_size[shape.object_id][:2]
+    is_infinite = size <= 0
+    half = np.where(is_infinite, _HORIZON * max(1.0, model.stat.extent), size)
+    corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
+    vertices = np.column_stack([corners * half, np.zeros(4)])
+    mesh = trimesh.Trimesh(vertices, [[0, 1, 2], [0, 2, 3]], process=False)
+    if texture is None or int(model.tex_type[texture]) != _TEXTURE_2D:
+        return _coloured(mesh, shape)
+    material = int(model.geom_matid[shape.object_id])
+    repeat = model.mat_texrepeat[material].astype(float)
+    # Its texture repeats so often over the plane, or over each unit of length.
+    per_length = is_infinite | bool(model.mat_texuniform[material])
+    scale = np.where(per_length, half, 1.0) * repeat
+    uv = 0.5 * corners * scale - 0.5
+    return _textured(mesh, uv, _image(model, texture), shape)
+
+
+def _smoothed(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
+    """Return a mesh whose edges stay sharp, and whose round parts look round."""
+    smoothed: trimesh.Trimesh = trimesh.graph.smooth_shade(mesh, angle=_SHARP)
+    return smoothed
+
+
+def _unit_square(vertices: NDArray[Any]) -> NDArray[np.float64]:
+    flat = np.asarray(vertices[:, :2], float)
+    low, size = flat.min(axis=0), np.ptp(flat, axis=0)
+    uv: NDArray[np.float64] = (flat - low) / np.maximum(size, 1e-9)
+    return uv
+
+
+def _on_cube(mesh: trimesh.Trimesh) -> tuple[trimesh.Trimesh, NDArray[np.float64]]:
+    """Return a mesh that a cube texture is laid around, and texture coordinates.
+
+    The six sides of the texture stand one below the other in one picture.
+    """
+    extents = np.maximum(mesh.extents / 2, 1e-9)
+    directions = mesh.vertices / extents
+    middles = directions[mesh.faces].mean(axis=1)
+    axis = np.abs(middles).argmax(axis=1)
+    side = 2 * axis + (middles[np.arange(len(axis)), axis] < 0)
+    corners = np.column_stack([mesh.faces.ravel(), np.repeat(side, 3)])
+    unique, inverse = np.unique(corners, axis=0, return_inverse=True)
+    uv = np.empty((len(unique), 2))
+    for number, ((major, _), *across) in enumerate(_SIDES):
+        here = unique[:, 1] == number
+        at = directions[unique[here, 0]]
+        depth = np.maximum(np.abs(at[:, major]), 1e-9)
+        s, t = (np.clip((at[:, i] * sign / depth + 1) / 2, 0, 1) for i, sign in across)
+        uv[here] = np.column_stack([s, (number + t) / 6])
+    made = trimesh.Trimesh(
+        mesh.vertices[unique[:, 0]], inverse.reshape(-1, 3), process=False
+    )
+    return made, uv
+
+
+def _unit_mesh(geom_type: int) -> trimesh.Trimesh:
+    round_types = (mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_ELLIPSOID)
+    if geom_type in [int(kind) for kind in round_types]:
+        return trimesh.creation.icosphere(subdivisions=2)
+    if geom_type == int(mujoco.mjtGeom.mjGEOM_BOX):
+        return _smoothed(trimesh.creation.box((2, 2, 2)))
+    return _smoothed(trimesh.creation.cylinder(radius=1, height=2, sections=12))

@@ -1,0 +1,259 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A look at a run while it goes on: a read-only server of pages, for this machine.
+
+It reads journal and row logs as any other reader does, and at a low priority. The
+monitor does not know of it. A page asks for what is new, and waits several times as
+long as the answer took.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import secrets
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+from http import HTTPStatus
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import Any
+from urllib.parse import parse_qs, urlsplit
+
+import numpy as np
+
+from ..errors import Error, InvalidArgument
+from ..formats.monitor_directory import episode_of
+from ..results import iter_episodes
+from ..simulation.trajectories import Trajectory, load_trajectory
+from .episodes import recorded_episodes
+from .geometry import linear
+from .motion import Stage
+from .replay import ending_of, motion_chunk, replay_page
+
+_ADDRESS = "127.0.0.1"
+_NICENESS = 10
+# What one answer holds; a page asks again for the rest.
+_MOST_STATES = 500
+_MOST_EPISODES = 200
+_MOST_POINTS = 1000
+
+
+class LiveView:
+    """Serves a directory's episodes to browsers of this machine.
+
+    ::
+
+        with LiveView("recordings/run1") as view:
+            print(view.url)
+            view.serve()  # until Ctrl-C, or `close` in another thread
+
+    Args:
+        directory: of one or more monitors.
+        port: to listen at; any that is free, if 0.
+        trust_models: as of `load_trajectory`.
+
+    Attributes:
+        url: of the page, with the token without which nothing is answered.
+
+    Raises:
+        InvalidArgument: there is no such directory, or the port is taken.
+    """
+
+    def __init__(
+        self,
+        directory: str | os.PathLike[str],
+        *,
+        port: int = 0,
+        trust_models: bool = False,
+    ) -> None:
+        path = Path(directory)
+        if not path.is_dir():
+            raise InvalidArgument(f"There is no directory {path}.")
+        self._token = secrets.token_urlsafe(24)
+        self._answers = _Answers(path, trust_models=trust_models)
+        try:
+            self._server = ThreadingHTTPServer((_ADDRESS, port), self._handler())
+        except OSError as error:
+            raise InvalidArgument(
+                f"Port {port} cannot be used ({error.strerror}): leave it out, and a "
+                "free one is taken."
+            ) from error
+        self._server.daemon_threads = True
+        at = f"http://{_ADDRESS}:{self._server.server_port}"
+        self.url = f"{at}/?token={self._token}"
+
+    def serve(self) -> None:
+        """Answer until `close` is called, or Ctrl-C comes."""
+        self._server.serve_forever(poll_interval=0.1)
+
+    def close(self) -> None:
+        """Stop answering. Idempotent."""
+        self._server.shutdown()
+        self._server.server_close()
+
+    def __enter__(self) -> LiveView:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._server.server_close()
+
+    def _handler(self) -> type[BaseHTTPRequestHandler]:
+        token, answers = self._token, self._answers
+
+        class Handler(BaseHTTPRequestHandler):
+            def do_GET(self) -> None:
+                address = urlsplit(self.path)
+                asked = {k: v[-1] for k, v in parse_qs(address.query).items()}
+                if not secrets.compare_digest(
+                    asked.get("token", "").encode(), token.encode()
+                ):
+                    self.send_error(HTTPStatus.FORBIDDEN)
+                    return
+                try:
+                    kind, body = answers.to(address.path, asked)
+                except (KeyError, ValueError):
+                    self.send_error(HTTPStatus.NOT_FOUND)
+                    return
+                except (Error, OSError) as error:
+                    # A file may go while it is read: the page asks again.
+                    kind, body = "application/json", json.dumps({"error": str(error)})
+                self._send(kind, body.encode())
+
+            def _send(self, kind: str, body: bytes) -> None:
+                self.send_response(HTTPStatus.OK)
+                self.send_header("Content-Type", f"{kind}; charset=utf-8")
+                self.send_header("Content-Length", str(len(body)))
+                self.send_header("Cache-Control", "no-store")
+                self.send_header("Referrer-Policy", "no-referrer")
+                self.end_headers()
+                self.wfile.write(body)
+
+            def log_message(self, format: str, *args: Any) -> None:
+                # Addresses hold the token.
+                pass
+
+        return Handler
+
+
+def be_nice() -> None:
+    """Let everything else of this machine go first."""
+    os.nice(_NICENESS)
+
+
+@dataclass
+class _Shown:
+    """The episode that was asked for last."""
+
+    path: Path
+    stage: Stage
+    next: int = 0
+
+
+class _Answers:
+    """What pages are answered. MuJoCo's objects are used by one thread at a time."""
+
+    def __init__(self, directory: Path, *, trust_models: bool) -> None:
+        self._directory = directory
+        self._trust_models = trust_models
+        self._shown: _Shown | None = None
+        self._lock = threading.Lock()
+        self._pages: dict[str, Callable[[dict[str, str]], tuple[str, str]]] = {
+            "/": self._page,
+            "/episodes": self._episodes,
+            "/motion": self._motion,
+        }
+
+    def to(self, path: str, asked: dict[str, str]) -> tuple[str, str]:
+        """Return the media type and the text of an answer.
+
+        Raises:
+            KeyError: there is no such page or episode.
+        """
+        answer = self._pages[path]
+        with self._lock:
+            return answer(asked)
+
+    def _page(self, asked: dict[str, str]) -> tuple[str, str]:
+        paths = recorded_episodes(self._directory)
+        if not paths:
+            return "text/html", _WAITING
+        path = self._path(asked["episode"]) if "episode" in asked else paths[-1]
+        trajectory, stage = self._load(path)
+        motion = stage.motion(trajectory, np.arange(1))
+        live = {
+            "live": True,
+            "episode": path.name,
+            "scene": _scene_id(trajectory, stage),
+        }
+        return "text/html", replay_page(trajectory, stage, motion, additions=live)
+
+    def _episodes(self, asked: dict[str, str]) -> tuple[str, str]:
+        ended = {}
+        returns = []
+        for episode in iter_episodes(self._directory):
+            returns.append(episode.reward)
+            if episode.trajectory is not None:
+                ended[episode.trajectory.name] = episode
+        listed = []
+        for path in recorded_episodes(self._directory)[-_MOST_EPISODES:]:
+            entry: dict[str, Any] = {"name": path.name, "id": episode_of(path.name)}
+            if (over := ended.get(path.name)) is not None:
+                entry |= {"length": over.length, "return": _number(over.reward)}
+            listed.append(entry)
+        stride = max(1, -(-len(returns) // _MOST_POINTS))
+        curve = [_number(each) for each in returns[::stride]]
+        told = {"episodes": listed, "count": len(returns), "returns": curve}
+        return "application/json", json.dumps(told)
+
+    def _motion(self, asked: dict[str, str]) -> tuple[str, str]:
+        path, first = self._path(asked["episode"]), int(asked.get("from", "0"))
+        trajectory, stage = self._load(path, first)
+        last = min(len(trajectory.states), first + _MOST_STATES)
+        told: dict[str, Any] = {
+            "scene": _scene_id(trajectory, stage),
+            "steps": len(trajectory),
+            "hasMore": last < len(trajectory.states),
+            "ending": ending_of(trajectory) if trajectory.complete else "",
+            "rgba": {s.name: linear(s.rgba) for s in stage.shapes},
+        }
+        if first < last and self._shown is not None:
+            self._shown.next = last
+            motion = stage.motion(trajectory, np.arange(first, last))
+            told["start"] = motion.target[0].tolist()
+            told["chunk"] = motion_chunk(motion, keep_all=True)
+        return "application/json", json.dumps(told)
+
+    def _path(self, name: str) -> Path:
+        known = {path.name: path for path in recorded_episodes(self._directory)}
+        return known[name]
+
+    def _load(self, path: Path, first: int = 0) -> tuple[Trajectory, Stage]:
+        """Return a trajectory, and a stage for its states from `first` on."""
+        trajectory, shown = load_trajectory(path, trust_models=self._trust_models), None
+        if self._shown is not None and self._shown.path == path:
+            # A stage goes through the states in their order.
+            shown = self._shown if 0 < self._shown.next <= first else None
+        self._shown = shown or _Shown(path, Stage(trajectory))
+        self._shown.next = first + 1
+        return trajectory, self._shown.stage
+
+
+def _scene_id(trajectory: Trajectory, stage: Stage) -> str:
+    """Return what two episodes have in common if one page can show both."""
+    shapes = [(s.name, s.geom_type) for s in (*stage.shapes, *stage.soft)]
+    parts = json.dumps([trajectory.facts.get("model"), shapes], sort_keys=True)
+    return hashlib.sha256(parts.encode()).hexdigest()[:16]
+
+
+def _number(value: float) -> float | None:
+    return value if np.isfinite(value) else None
+
+
+_WAITING = (
+    '<!doctype html><html lang="en"><head><meta charset="utf-8">'
+    '<meta http-equiv="refresh" content="2"><title>mjrec view</title></head><body>'
+    "<p>No episode is recorded yet. This page looks again every two seconds.</p>"
+    "</body></html>"
+)

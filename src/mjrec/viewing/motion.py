@@ -1,0 +1,370 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How everything that is drawn moves: places and colours in each recorded state.
+
+MuJoCo's own visualiser chooses what is drawn, with the options of the recorded
+environment. So hidden groups, tendons and sites are those of its videos.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Any
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import InvalidArgument, UnreadableFile
+from ..formats.trajectory import TrajectoryReader
+from ..simulation.cameras import check_camera, default_camera, resolve_camera
+from ..simulation.fields import apply_fields
+from ..simulation.foreign_files import open_vetted_trajectory
+from ..simulation.trajectories import Trajectory
+from ..simulation.view import view_from_facts
+
+_MOST_GEOMS = 20_000
+_EVERYTHING = int(mujoco.mjtCatBit.mjCAT_ALL)
+_DECOR = int(mujoco.mjtCatBit.mjCAT_DECOR)
+_GEOM, _SITE = int(mujoco.mjtObj.mjOBJ_GEOM), int(mujoco.mjtObj.mjOBJ_SITE)
+_TENDON = int(mujoco.mjtObj.mjOBJ_TENDON)
+_SKIN, _FLEX = int(mujoco.mjtGeom.mjGEOM_SKIN), int(mujoco.mjtGeom.mjGEOM_FLEX)
+
+
+@dataclass(frozen=True)
+class Shape:
+    """Something that is drawn.
+
+    Attributes:
+        name: of its node in the page's scene: `/geom/3`.
+        object_type: `mjtObj`: a geom, a site, a tendon.
+        object_id: of the object in the model.
+        geom_type: `mjtGeom`.
+        rgba: as MuJoCo's visualiser gives it, materials included.
+    """
+
+    name: str
+    object_type: int
+    object_id: int
+    geom_type: int
+    rgba: tuple[float, float, float, float]
+
+    @property
+    def is_skin(self) -> bool:
+        """Whether bones move its vertices."""
+        return self.geom_type == _SKIN
+
+
+@dataclass(frozen=True, kw_only=True)
+class Motion:
+    """N states of a recorded episode, as a page shows them.
+
+    Attributes:
+        steps: `(N,)`, after how many steps each state was reached.
+        time: `(N,)`, in seconds of simulated time.
+        rewards: `(N,)`, of the step that led to the state; 0 for the reset.
+        returns: `(N,)`, the sum of rewards up to the state.
+        vertices: `(N, vertices, 3)` of flexible bodies, by name.
+        poses: `(N, 7)` by the name of a shape or bone: position and quaternion (wxyz).
+        scales: `(N, 3)` for shapes that change size; zero where one is not there.
+        cameras: `(N, cameras, 7)`, the model's cameras, looking along their -z.
+        target: `(N, 3)`, what the tracking camera follows.
+        colours: changes: the index of a state, the name of a shape, RGBA from then on.
+    """
+
+    steps: NDArray[np.int64]
+    time: NDArray[np.float64]
+    rewards: NDArray[np.float64]
+    returns: NDArray[np.float64]
+    vertices: dict[str, NDArray[np.float64]]
+    poses: dict[str, NDArray[np.float64]]
+    scales: dict[str, NDArray[np.float64]]
+    cameras: NDArray[np.float64]
+    target: NDArray[np.float64]
+    colours: list[tuple[int, str, list[float]]]
+
+
+@dataclass
+class _Frames:
+    geoms: list[NDArray[np.float64]] = field(default_factory=list)
+    others: list[dict[str, NDArray[np.float64]]] = field(default_factory=list)
+    cameras: list[NDArray[np.float64]] = field(default_factory=list)
+    target: list[NDArray[np.float64]] = field(default_factory=list)
+    vertices: dict[str, list[NDArray[np.float64]]] = field(default_factory=dict)
+    colours: list[tuple[int, str, list[float]]] = field(default_factory=list)
+
+
+class Stage:
+    """A model in one recorded state after the other, and what is drawn of it.
+
+    Used on one thread. States are asked for in their order.
+
+    Args:
+        trajectory: of the model and of the options to draw it with.
+
+    Attributes:
+        model: as it was in the state that was last asked for.
+        data: its data, likewise.
+        shapes: what is drawn in all states, in MuJoCo's order.
+        passing: what was drawn in some states, with a size of its own in each: tendons.
+        soft: skins and flexible bodies.
+        notes: what cannot be shown.
+        view: where the recorded camera is at first, what it looks at, and its `fovy`.
+
+    Raises:
+        UnreadableFile, UntrustedModel: as of `Trajectory.model`.
+    """
+
+    def __init__(self, trajectory: Trajectory) -> None:
+        self.model = trajectory.model()
+        self.data = mujoco.MjData(self.model)
+        self.passing: dict[str, Shape] = {}
+        self.notes: list[str] = []
+        self._camera, self._option = _recorded_view(trajectory, self.model)
+        self._scene = mujoco.MjvScene(self.model, maxgeom=_MOST_GEOMS)
+        self._changes_seen = 0
+        with open_vetted_trajectory(trajectory.path) as reader:
+            # Of the camera and the options; the model has them already.
+            self._change_model(reader, 0)
+        self._enter(trajectory, 0)
+        drawn = list(self._drawn())
+        self.view = self._view()
+        self.soft = [_shape(geom) for geom in drawn if geom.type in (_SKIN, _FLEX)]
+        self.shapes = [_shape(geom) for geom in drawn if _is_fixed_size(geom)]
+        self._rgba = {shape.name: shape.rgba for shape in self.shapes}
+        self._has_passing = self.model.ntendon > 0 or any(
+            not _is_fixed_size(geom) and geom.type not in (_SKIN, _FLEX)
+            for geom in drawn
+        )
+        lines = [s for s in self.soft if s.geom_type == _FLEX and self._is_line(s)]
+        if lines:
+            self.soft = [shape for shape in self.soft if shape not in lines]
+            self.notes.append("Flexible bodies of one dimension are not shown.")
+        if self._scene.ngeom > len(drawn):
+            self.notes.append("Labels, contacts and other marks are not shown.")
+        self._tracked = _tracked_body(self.model)
+
+    @property
+    def camera_number(self) -> int | None:
+        """The model's camera that the recorded videos are seen from; None if none."""
+        is_fixed = self._camera.type == int(mujoco.mjtCamera.mjCAMERA_FIXED)
+        return int(self._camera.fixedcamid) if is_fixed else None
+
+    def _view(self) -> tuple[list[float], list[float], float]:
+        cameras = self._scene.camera
+        position = np.mean([camera.pos for camera in cameras], axis=0)
+        distance = self.model.stat.extent
+        if self.camera_number is None:
+            distance, fovy = self._camera.distance, self.model.vis.global_.fovy
+        else:
+            fovy = self.model.cam_fovy[self.camera_number]
+        target = position + distance * np.array(cameras[0].forward)
+        return position.tolist(), target.tolist(), float(fovy)
+
+    @property
+    def everything(self) -> list[Shape]:
+        """All that is ever drawn."""
+        return [*self.shapes, *self.passing.values(), *self.soft]
+
+    def bones_of(self, skin: int) -> list[int]:
+        """Return the bodies that are the bones of a skin, in its order."""
+        first, count = self.model.skin_boneadr[skin], self.model.skin_bonenum[skin]
+        bodies: list[int] = self.model.skin_bonebodyid[first : first + count].tolist()
+        return bodies
+
+    def motion(self, trajectory: Trajectory, steps: NDArray[np.int64]) -> Motion:
+        """Return how everything moves in some states of the same episode.
+
+        Args:
+            trajectory: with these states; it may have grown since.
+            steps: `(N,)`, their numbers, ascending, none before one that was asked for.
+
+        Raises:
+            UnreadableFile: the file is gone or damaged.
+        """
+        frames, model, data = _Frames(), self.model, self.data
+        geoms = [s.object_id for s in self.shapes if s.object_type == _GEOM]
+        sites = [s.object_id for s in self.shapes if s.object_type == _SITE]
+        skins = [s.object_id for s in self.soft if s.geom_type == _SKIN]
+        flexes = [s for s in self.soft if s.geom_type == _FLEX]
+        bones = sorted({body for skin in skins for body in self.bones_of(skin)})
+        with open_vetted_trajectory(trajectory.path) as reader:
+            for index, step in enumerate(steps):
+                if self._change_model(reader, int(step)):
+                    frames.colours += self._new_colours(trajectory, int(step), index)
+                self._enter(trajectory, int(step))
+                frames.geoms.append(
+                    np.vstack(
+                        [
+                            _places(data.geom_xpos, data.geom_xmat, geoms),
+                            _places(data.site_xpos, data.site_xmat, sites),
+                            _places(data.xpos, data.xmat, bones),
+                        ]
+                    )
+                )
+                cameras = list(range(model.ncam))
+                frames.cameras.append(_places(data.cam_xpos, data.cam_xmat, cameras))
+                for flex in flexes:
+                    first = self.model.flex_vertadr[flex.object_id]
+                    count = self.model.flex_vertnum[flex.object_id]
+                    places = data.flexvert_xpos[first : first + count].copy()
+                    frames.vertices.setdefault(flex.name, []).append(places)
+                frames.target.append(data.subtree_com[self._tracked].copy())
+                frames.others.append(self._passing_now() if self._has_passing else {})
+        names = [s.name for s in self.shapes if s.object_type == _GEOM]
+        names += [s.name for s in self.shapes if s.object_type == _SITE]
+        names += [f"bone/{body}" for body in bones]
+        return self._motion(trajectory, steps, frames, names)
+
+    def _motion(
+        self,
+        trajectory: Trajectory,
+        steps: NDArray[np.int64],
+        frames: _Frames,
+        names: list[str],
+    ) -> Motion:
+        count = len(steps)
+        placed = np.reshape(frames.geoms, (count, len(names), 12))
+        poses = dict(zip(names, np.moveaxis(_quaternions(placed), 1, 0), strict=True))
+        scales = {}
+        nowhere = np.concatenate([np.zeros(3), np.eye(3).ravel(), np.zeros(3)])
+        for name in self.passing:
+            rows = np.array([each.get(name, nowhere) for each in frames.others])
+            poses[name] = _quaternions(rows[:, :12])
+            scales[name] = rows[:, 12:]
+        rewards = np.concatenate([[0.0], trajectory.rewards])
+        time = trajectory.time
+        return Motion(
+            steps=steps,
+            time=steps.astype(float) if time is None else time[steps],
+            rewards=rewards[steps],
+            returns=np.cumsum(rewards)[steps],
+            vertices={name: np.array(each) for name, each in frames.vertices.items()},
+            poses=poses,
+            scales=scales,
+            cameras=_quaternions(
+                np.reshape(frames.cameras, (count, self.model.ncam, 12))
+            ),
+            target=np.reshape(frames.target, (count, 3)),
+            colours=frames.colours,
+        )
+
+    def _enter(self, trajectory: Trajectory, step: int) -> None:
+        try:
+            trajectory.set_state(self.data, step)
+        except InvalidArgument as error:
+            raise UnreadableFile(trajectory.path, error) from error
+        # What follows from positions, without contacts.
+        mujoco.mj_kinematics(self.model, self.data)
+        mujoco.mj_comPos(self.model, self.data)
+        mujoco.mj_camlight(self.model, self.data)
+        mujoco.mj_flex(self.model, self.data)
+        mujoco.mj_tendon(self.model, self.data)
+
+    def _change_model(self, reader: TrajectoryReader, step: int) -> bool:
+        """Make the model what it was after `step`; tell whether anything changed."""
+        before = self._changes_seen
+        while self._changes_seen < reader.change_count:
+            change = reader.read_change(self._changes_seen)
+            if change.step > step:
+                break
+            try:
+                view = {"camera": self._camera, "option": self._option}
+                apply_fields(self.model, change.fields, **view)
+            except InvalidArgument as error:
+                raise UnreadableFile(reader.path, error) from error
+            self._changes_seen += 1
+        return self._changes_seen > before
+
+    def _new_colours(
+        self, trajectory: Trajectory, step: int, index: int
+    ) -> Iterator[tuple[int, str, list[float]]]:
+        self._enter(trajectory, step)
+        for geom in self._drawn():
+            name = _name(geom)
+            if name in self._rgba and self._rgba[name] != (rgba := _rgba(geom)):
+                self._rgba[name] = rgba
+                yield index, name, list(rgba)
+
+    def _is_line(self, flex: Shape) -> bool:
+        return bool(self.model.flex_dim[flex.object_id] == 1)
+
+    def _drawn(self) -> Iterator[Any]:
+        mujoco.mjv_updateScene(
+            *(self.model, self.data, self._option, None, self._camera),
+            *(_EVERYTHING, self._scene),
+        )
+        for geom in self._scene.geoms[: self._scene.ngeom]:
+            if geom.objtype == _TENDON or geom.category != _DECOR:
+                yield geom
+
+    def _passing_now(self) -> dict[str, NDArray[np.float64]]:
+        found: dict[str, NDArray[np.float64]] = {}
+        for geom in self._drawn():
+            if _is_fixed_size(geom) or geom.type in (_SKIN, _FLEX):
+                continue
+            stem, count = _name(geom), 0
+            while (name := f"{stem}-{count}") in found:
+                count += 1
+            found[name] = np.concatenate([geom.pos, geom.mat.ravel(), geom.size])
+            self.passing.setdefault(name, _shape(geom, name))
+        return found
+
+
+def _recorded_view(
+    trajectory: Trajectory, model: mujoco.MjModel
+) -> tuple[mujoco.MjvCamera, mujoco.MjvOption]:
+    scene = trajectory.facts.get("scene")
+    if not scene:
+        return resolve_camera(model, default_camera(model)), mujoco.MjvOption()
+    try:
+        view = view_from_facts(scene)
+        check_camera(model, view.camera)
+    # Not all that NumPy and the bindings refuse is looked for.
+    except (AttributeError, TypeError, ValueError, OverflowError) as error:
+        raise UnreadableFile(trajectory.path, f"of its scene: {error}") from error
+    return view.camera, view.option
+
+
+def _is_fixed_size(geom: Any) -> bool:
+    return geom.objtype in (_GEOM, _SITE)
+
+
+def _name(geom: Any) -> str:
+    kind = mujoco.mjtObj(geom.objtype).name.removeprefix("mjOBJ_").lower()
+    return f"/{kind}/{geom.objid}"
+
+
+def _rgba(geom: Any) -> tuple[float, float, float, float]:
+    red, green, blue, alpha = geom.rgba.tolist()
+    return red, green, blue, alpha
+
+
+def _shape(geom: Any, name: str | None = None) -> Shape:
+    return Shape(
+        name or _name(geom), geom.objtype, geom.objid, int(geom.type), _rgba(geom)
+    )
+
+
+def _places(
+    positions: NDArray[Any], matrices: NDArray[Any], wanted: list[int]
+) -> NDArray[np.float64]:
+    """Return `(wanted, 12)`: positions and rotation matrices."""
+    return np.hstack([positions[wanted], matrices[wanted].reshape(-1, 9)])
+
+
+def _quaternions(placed: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return `(..., 7)`, position and quaternion, of `(..., 12)`."""
+    poses = np.empty((*placed.shape[:-1], 7))
+    poses[..., :3] = placed[..., :3]
+    for matrix, out in zip(
+        placed[..., 3:].reshape(-1, 9), poses.reshape(-1, 7), strict=True
+    ):
+        mujoco.mju_mat2Quat(out[3:], matrix)
+    return poses
+
+
+def _tracked_body(model: mujoco.MjModel) -> int:
+    """Return the first body that moves, with all that hangs on it; else the world."""
+    moving = np.flatnonzero(model.body_weldid != 0)
+    return int(model.body_rootid[moving[0]]) if len(moving) else 0

@@ -1,0 +1,255 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A replay: one HTML file that shows a recorded episode from every side, offline.
+
+viser draws the scene. This page adds the recorded states and its own controls, because
+viser's player knows no rewards, cameras, steps or places in the URL.
+"""
+
+from __future__ import annotations
+
+import base64
+import html
+import json
+import logging
+import os
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..atomic_files import write_text
+from ..rates import rate_from_timestep, stride_for
+from ..simulation.trajectories import Trajectory
+from .geometry import linear, skin_weights
+from .motion import Motion, Shape, Stage
+from .scene import scene_page
+
+_LOG = logging.getLogger(__name__)
+_COMPRESSION = 6
+# Nothing is loaded from anywhere: scripts and pictures are in the page.
+_POLICY = (
+    "default-src 'none'; script-src 'unsafe-inline' 'unsafe-eval' blob: data:; "
+    "style-src 'unsafe-inline'; img-src data: blob:; font-src data:; "
+    "worker-src blob: data:; connect-src {connect} data: blob:; base-uri 'none'; "
+    "form-action 'none'"
+)
+
+
+@dataclass(frozen=True)
+class Replay:
+    """What was written.
+
+    Attributes:
+        path: of the page.
+        states: how many it shows.
+        size: in bytes.
+        notes: what it does not show.
+    """
+
+    path: Path
+    states: int
+    size: int
+    notes: Sequence[str]
+
+
+def write_replay(
+    trajectory: Trajectory,
+    path: str | os.PathLike[str],
+    *,
+    max_fps: float | None = None,
+) -> Replay:
+    """Write a page that shows a recorded episode in three dimensions.
+
+    It is one file, which needs no network. It shows the geometry that the videos show,
+    in all recorded states, from any side and from the model's cameras, with rewards. It
+    is a view of the recorded states, and no evidence of its own.
+
+    Args:
+        trajectory: as `load_trajectory` returns it.
+        path: of the page; a file that is there is replaced.
+        max_fps: the most states per second of simulated time; all, if None.
+
+    Raises:
+        InvalidArgument: `max_fps` is no rate.
+        MissingDependency: viser or mjviser is not installed.
+        UnreadableFile: the file is damaged, or was recorded without a simulation.
+        UntrustedModel: as of `Trajectory.model`.
+        FileNotWritten: the disk is full.
+    """
+    stage = Stage(trajectory)
+    motion = stage.motion(trajectory, shown_steps(trajectory, max_fps))
+    for note in stage.notes:
+        _LOG.warning("%s: %s", trajectory.path.name, note)
+    page = replay_page(trajectory, stage, motion)
+    write_text(Path(path), page)
+    return Replay(
+        path=Path(path),
+        states=len(motion.steps),
+        size=len(page.encode()),
+        notes=tuple(stage.notes),
+    )
+
+
+def shown_steps(trajectory: Trajectory, max_fps: float | None) -> NDArray[np.int64]:
+    """Return which states are shown: each n-th, and the last."""
+    count, time = len(trajectory.states), trajectory.time
+    stride = 1
+    if max_fps is not None and time is not None and count > 1:
+        timestep = float(np.median(np.diff(time)))
+        if timestep > 0:
+            stride = stride_for(rate_from_timestep(timestep), max_fps)
+    steps = np.arange(0, count, stride)
+    is_last_shown = len(steps) and steps[-1] == count - 1
+    return steps if is_last_shown else np.append(steps, count - 1)
+
+
+def replay_page(
+    trajectory: Trajectory,
+    stage: Stage,
+    motion: Motion,
+    *,
+    additions: dict[str, Any] | None = None,
+) -> str:
+    """Return a page that shows a motion.
+
+    Args:
+        trajectory: whose states these are.
+        stage: of its model.
+        motion: some states of it.
+        additions: to what the page's script is given.
+    """
+    about = {**_about(trajectory, stage, motion), **(additions or {})}
+    connect = "'self'" if additions else ""
+    head = (
+        '<meta http-equiv="Content-Security-Policy" '
+        f'content="{_POLICY.format(connect=connect)}">'
+        f"<title>{html.escape(about['title'])}</title>"
+        f"<style>{_file('replay.css')}</style>"
+    )
+    notes = "".join(f"<p>{html.escape(note)}</p>" for note in about["notes"])
+    options = "".join(
+        f'<option value="{number}" data-name="{html.escape(camera["name"])}">'
+        f"{html.escape(camera['name'])}</option>"
+        for number, camera in enumerate(about["cameras"])
+    )
+    controls = _file("replay.html").format(
+        cameras=options, notes=notes, title=html.escape(about["title"])
+    )
+    # A script ends at the first `</`, wherever it stands.
+    data = json.dumps(about, allow_nan=False).replace("<", "\\u003c")
+    body = (
+        f'{controls}<script type="application/json" id="replay-data">{data}</script>'
+        f"<script>{_file('replay.js')}</script>"
+    )
+    if additions:
+        body += f"<script>{_file('live.js')}</script>"
+    scene = scene_page(stage, motion)
+    # Our title and policy come first, ours being the ones that count.
+    begin, _, rest = scene.partition("<head>")
+    before_end, end, after = rest.rpartition("</body>")
+    return f"{begin}<head>{head}{before_end}{body}{end}{after}"
+
+
+def motion_chunk(motion: Motion, *, keep_all: bool = False) -> dict[str, Any]:
+    """Return a motion as the page's script reads it.
+
+    A row is a state, in float32: step, time, reward and return; the tracking camera's
+    target; cameras; poses; scales; vertices.
+
+    Args:
+        motion: the states.
+        keep_all: also what does not move in any of them, which is left out otherwise.
+    """
+    still = {
+        name
+        for name, poses in motion.poses.items()
+        if not keep_all and name not in motion.scales and (poses == poses[:1]).all()
+    }
+    names = [name for name in motion.poses if name not in still]
+    count = len(motion.steps)
+    numbers = (motion.steps, motion.time, motion.rewards, motion.returns)
+    columns = [
+        np.column_stack(numbers),
+        motion.target,
+        motion.cameras.reshape(count, -1),
+        *(motion.poses[name] for name in names),
+        *motion.scales.values(),
+        *(vertices.reshape(count, -1) for vertices in motion.vertices.values()),
+    ]
+    return {
+        "count": count,
+        "names": names,
+        "scaled": list(motion.scales),
+        "vertices": {n: v.shape[1] for n, v in motion.vertices.items()},
+        "colours": [[at, name, linear(rgba)] for at, name, rgba in motion.colours],
+        "data": _packed(np.hstack(columns)),
+    }
+
+
+def _packed(array: NDArray[Any], kind: str = "<f4") -> str:
+    raw = np.ascontiguousarray(array, kind).tobytes()
+    return base64.b64encode(zlib.compress(raw, _COMPRESSION)).decode()
+
+
+def _skin(stage: Stage, shape: Shape) -> dict[str, Any]:
+    weights = skin_weights(stage.model, shape.object_id)
+    return {
+        "bones": [f"bone/{body}" for body in stage.bones_of(shape.object_id)],
+        "counts": weights["counts"].tolist(),
+        "bind": _packed(weights["bind"]),
+        "ids": _packed(weights["ids"], "<i4"),
+        "weights": _packed(weights["weights"]),
+    }
+
+
+def _about(trajectory: Trajectory, stage: Stage, motion: Motion) -> dict[str, Any]:
+    model, episode = stage.model, trajectory.episode_id
+    position, target, fovy = stage.view
+    cameras = [
+        {"name": model.camera(i).name or str(i), "fovy": float(model.cam_fovy[i])}
+        for i in range(model.ncam)
+    ]
+    number = stage.camera_number
+    return {
+        "title": f"{trajectory.env_id or 'Recording'}, episode {episode}",
+        "steps": len(trajectory),
+        "ending": ending_of(trajectory),
+        "hasRewards": bool(len(trajectory.rewards)),
+        "cameras": cameras,
+        "camera": "track" if number is None else cameras[number]["name"],
+        "extent": float(model.stat.extent),
+        "view": {"position": position, "target": target, "fovy": fovy},
+        "start": motion.target[0].tolist(),
+        "nodes": [
+            s.name for s in (*stage.shapes, *stage.passing.values(), *stage.soft)
+        ],
+        "rgba": {s.name: linear(s.rgba) for s in stage.shapes},
+        "skins": {s.name: _skin(stage, s) for s in stage.soft if s.is_skin},
+        "still": {
+            name: poses[0].tolist()
+            for name, poses in motion.poses.items()
+            if name.startswith("bone/")
+        },
+        "notes": ["A view of the recorded states, not evidence.", *stage.notes],
+        "chunk": motion_chunk(motion),
+    }
+
+
+def ending_of(trajectory: Trajectory) -> str:
+    """Return how an episode ended, in a word or two."""
+    for flags, word in (
+        (trajectory.terminated, "terminated"),
+        (trajectory.truncated, "truncated"),
+    ):
+        if len(flags) and flags[-1]:
+            return f"Episode {word}"
+    return "End of the recording"
+
+
+def _file(name: str) -> str:
+    return (resources.files(__package__) / "page" / name).read_text(encoding="utf-8")

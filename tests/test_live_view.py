@@ -1,0 +1,91 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The live view: a read-only server of pages about a run that goes on."""
+
+from __future__ import annotations
+
+import base64
+import json
+import threading
+import urllib.error
+import urllib.request
+import zlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+from urllib.parse import parse_qs, urlsplit
+
+import gymnasium
+import numpy as np
+import pytest
+
+import mjrec
+
+pytest.importorskip("viser")
+from mjrec.viewing.live import LiveView
+
+_STEPS = 6
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Iterator[Any]:
+    """Yield a monitor that has ended an episode and is in its second."""
+    env = gymnasium.make("Hopper-v5", max_episode_steps=_STEPS)
+    with mjrec.Monitor(env, tmp_path, workers=0, video_callable=lambda _: True) as env:
+        env.reset(seed=0)
+        env.action_space.seed(0)
+        for _ in range(_STEPS):
+            env.step(env.action_space.sample())
+        env.reset(seed=1)
+        env.step(env.action_space.sample())
+        yield env
+
+
+@pytest.fixture
+def view(run: Any, tmp_path: Path) -> Iterator[LiveView]:
+    """Yield a view of the run, answered by a thread."""
+    del run
+    with LiveView(tmp_path) as opened:
+        thread = threading.Thread(target=opened.serve)
+        thread.start()
+        yield opened
+        opened.close()
+        thread.join()
+
+
+def ask(view: LiveView, page: str, **options: Any) -> Any:
+    """Return what the view says, in JSON."""
+    address = urlsplit(view.url)
+    token = parse_qs(address.query)["token"][0]
+    query = "&".join(f"{k}={v}" for k, v in {"token": token, **options}.items())
+    with urllib.request.urlopen(f"http://{address.netloc}{page}?{query}") as answer:
+        return json.loads(answer.read())
+
+
+def test_new_states_of_a_running_episode_are_served(run: Any, view: LiveView) -> None:
+    """A page gets the states that came since it last asked, and their rewards."""
+    episodes = ask(view, "/episodes")
+    assert [each["id"] for each in episodes["episodes"]] == [0, 1]
+    assert episodes["episodes"][0]["length"] == _STEPS
+    assert "length" not in episodes["episodes"][1]
+    assert len(episodes["returns"]) == episodes["count"] == 1
+    name = episodes["episodes"][1]["name"]
+    first = ask(view, "/motion", episode=name)
+    assert (first["steps"], first["chunk"]["count"], first["ending"]) == (1, 2, "")
+    _, reward, *_ = run.step(run.action_space.sample())
+    then = ask(view, "/motion", **{"episode": name, "from": 2})
+    assert (then["steps"], then["chunk"]["count"]) == (2, 1)
+    data = zlib.decompress(base64.b64decode(then["chunk"]["data"]))
+    assert np.frombuffer(data, "<f4")[2] == pytest.approx(reward, rel=1e-6)
+
+
+def test_nothing_is_served_without_the_token(view: LiveView) -> None:
+    """A page without the token, or of another name, is refused; nothing can be sent."""
+    address = f"http://{urlsplit(view.url).netloc}"
+    assert address.startswith("http://127.0.0.1:")
+    for page in ("/", "/episodes", "/motion?token=guess"):
+        with pytest.raises(urllib.error.HTTPError, match="403"):
+            urllib.request.urlopen(address + page)
+    with pytest.raises(urllib.error.HTTPError, match="404"):
+        ask(view, "/motion", episode="../secret.h5")
+    with pytest.raises(urllib.error.HTTPError, match="501"):
+        urllib.request.urlopen(view.url, data=b"{}")

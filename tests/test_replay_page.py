@@ -1,0 +1,281 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Replays: files that show recorded episodes in 3D, opened in headless Chromium."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import mujoco
+import numpy as np
+import pytest
+from playwright.sync_api import Page, sync_playwright
+
+import mjrec
+from mjrec.commands import main
+
+pytest.importorskip("viser")
+pytest.importorskip("mjviser")
+
+_STEPS = 12
+_SIZE = {"width": 240, "height": 240}
+_READY = "html[data-replay=ready]"
+# No sandbox, which root and most containers cannot have: it opens our own pages only.
+_OPTIONS = ("--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage")
+
+# All shapes that are not geoms of one size: tendons around a cylinder, a cloth.
+_SOFT = """
+<mujoco>
+  <worldbody>
+    <geom type="plane" size="2 2 .1"/>
+    <site name="above" pos="0 0 1"/>
+    <geom name="pulley" type="cylinder" size=".1 .1" pos=".15 0 .7" euler="90 0 0"/>
+    <body pos=".3 0 .4">
+      <freejoint/> <geom size=".05"/> <site name="below"/>
+    </body>
+    <flexcomp name="cloth" type="grid" dim="2" count="4 4 1" spacing=".1 .1 .1"
+      pos="1 0 .5" radius=".01" mass=".1"/>
+  </worldbody>
+  <tendon>
+    <spatial width=".01">
+      <site site="above"/> <geom geom="pulley"/> <site site="below"/>
+    </spatial>
+  </tendon>
+</mujoco>
+"""
+
+# Where nodes of the scene are, in the frame of the model.
+_POSES = """() => {
+  const nodes = window.__viserMutable.nodeRefFromName;
+  const shown = Object.entries(nodes).filter(([name]) => name.startsWith("/"));
+  return Object.fromEntries(
+    shown.map(([name, node]) => [name, [...node.position.toArray(),
+      node.quaternion.w, node.quaternion.x, node.quaternion.y, node.quaternion.z]]));
+}"""
+_VERTICES = """(name) => {
+  let found = null;
+  window.__viserMutable.nodeRefFromName[name].traverse((part) => {
+    if (part.isMesh) found ??= [...part.geometry.attributes.position.array];
+  });
+  return found;
+}"""
+
+
+def record(env: gymnasium.Env[Any, Any], directory: Path, steps: int = _STEPS) -> Path:
+    """Record an episode without drawing it, and return its trajectory."""
+    with mjrec.Monitor(env, directory, workers=0, video_callable=lambda _: True) as env:
+        env.reset(seed=0)
+        env.action_space.seed(0)
+        for _ in range(steps):
+            env.step(env.action_space.sample())
+    [path] = directory.glob("*.h5")
+    return path
+
+
+@pytest.fixture(scope="module")
+def cheetah(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Record a short episode that is cut by its time limit."""
+    env = gymnasium.make("HalfCheetah-v5", max_episode_steps=_STEPS)
+    return record(env, tmp_path_factory.mktemp("cheetah"))
+
+
+@pytest.fixture(scope="module")
+def pages() -> Iterator[Any]:
+    """Yield what opens a page that must not fail, nor ask for anything but itself."""
+    complaints: list[str] = []
+    with sync_playwright() as playwright:
+        found = shutil.which("chromium") or playwright.chromium.executable_path
+        browser = playwright.chromium.launch(executable_path=found, args=_OPTIONS)
+
+        def opened(address: str) -> Page:
+            page = browser.new_page(viewport=_SIZE)
+            page.set_default_timeout(120_000)
+            page.on("pageerror", lambda error: complaints.append(str(error)))
+            page.on("request", lambda asked: complaints.append(asked.url))
+            page.goto(address)
+            page.wait_for_selector(_READY, state="attached")
+            return page
+
+        yield opened
+        browser.close()
+    known = ("file:", "data:", "blob:", "http://127.0.0.1:")
+    assert [each for each in complaints if not each.startswith(known)] == []
+
+
+@pytest.fixture(scope="module")
+def page(cheetah: Path, pages: Any, tmp_path_factory: pytest.TempPathFactory) -> Page:
+    """Open a replay of the cheetah at its seventh step."""
+    file = tmp_path_factory.mktemp("page") / "replay.html"
+    mjrec.write_replay(mjrec.load_trajectory(cheetah), file)
+    opened: Page = pages(f"{file.as_uri()}#step=7&camera=track&speed=2")
+    return opened
+
+
+def data_at(trajectory: mjrec.Trajectory, step: int) -> mujoco.MjData:
+    """Return what MuJoCo computes from a recorded state."""
+    data = mujoco.MjData(trajectory.model())
+    trajectory.set_state(data, step)
+    mujoco.mj_forward(data.model, data)
+    return data
+
+
+def check_geoms(page: Page, data: mujoco.MjData, count: int) -> None:
+    """Check that the page's geoms are where MuJoCo's are."""
+    page.wait_for_timeout(500)
+    poses = {k: v for k, v in page.evaluate(_POSES).items() if k.startswith("/geom/")}
+    assert len(poses) == count
+    for name, (*position, w, x, y, z) in poses.items():
+        geom = int(name.rpartition("/")[2])
+        matrix = np.empty(9)
+        mujoco.mju_quat2Mat(matrix, np.array([w, x, y, z]))
+        assert position == pytest.approx(data.geom_xpos[geom], abs=1e-5)
+        assert matrix == pytest.approx(data.geom_xmat[geom], abs=1e-5)
+
+
+# --- The page -----------------------------------------------------------------------
+
+
+@pytest.mark.browser
+def test_geoms_stand_where_mujoco_has_them(page: Page, cheetah: Path) -> None:
+    """A replay begins at the state that its address names, and shows it exactly."""
+    check_geoms(page, data_at(mjrec.load_trajectory(cheetah), 7), 9)
+
+
+@pytest.mark.browser
+def test_keys_go_through_the_states(page: Page, cheetah: Path) -> None:
+    """Steps, their rewards and the end are shown; the address keeps the place."""
+    trajectory = mjrec.load_trajectory(cheetah)
+    page.keyboard.press("Home")
+    assert "step 0 of 12" in page.inner_text("#replay-where")
+    assert page.inner_text("#replay-ending") == ""
+    page.keyboard.press(".")
+    page.keyboard.press(".")
+    where = page.inner_text("#replay-where")
+    assert "step 2 of 12, 0.10 s" in where
+    assert float(where.split("reward ")[1].split(",")[0]) == pytest.approx(
+        trajectory.rewards[1], rel=1e-3
+    )
+    assert float(where.split("return ")[1]) == pytest.approx(
+        trajectory.rewards[:2].sum(), rel=1e-3
+    )
+    page.keyboard.press("End")
+    assert page.inner_text("#replay-ending") == "Episode truncated"
+    assert page.evaluate("location.hash") == "#step=12&camera=track&speed=2"
+    check_geoms(page, data_at(trajectory, _STEPS), 9)
+
+
+@pytest.mark.browser
+def test_it_plays_and_pauses(page: Page) -> None:
+    """Space plays from the reset and pauses; playing stops at the last state."""
+    page.keyboard.press("End")
+    page.evaluate("document.getElementById('replay-speed').value = '0.1'")
+    page.keyboard.press(" ")
+    assert page.inner_text("#replay-play") == "Pause"
+    assert "step 12" not in page.inner_text("#replay-where")
+    page.keyboard.press(" ")
+    assert page.inner_text("#replay-play") == "Play"
+    page.evaluate("document.getElementById('replay-speed').value = '4'")
+    page.click("#replay-play")
+    page.wait_for_function("() => document.getElementById('replay-ending').textContent")
+    assert page.inner_text("#replay-play") == "Play"
+
+
+@pytest.mark.browser
+def test_a_named_camera_is_where_the_model_has_it(page: Page, cheetah: Path) -> None:
+    """The model's cameras can be chosen, and move as they do in the videos."""
+    page.select_option("#replay-camera", label="track")
+    page.keyboard.press("End")
+    data = data_at(mjrec.load_trajectory(cheetah), _STEPS)
+    shown = page.evaluate(
+        """() => { const viewer = window.__viserMutable;
+          const inverse = viewer.nodeRefFromName[""].quaternion.clone().invert();
+          return [viewer.camera.position.clone().applyQuaternion(inverse).toArray(),
+            viewer.camera.fov]; }"""
+    )
+    assert shown[0] == pytest.approx(data.cam_xpos[0], abs=1e-4)
+    assert shown[1] == pytest.approx(data.model.cam_fovy[0])
+
+
+@pytest.mark.browser
+@pytest.mark.thorough
+def test_tendons_and_cloth_move(pages: Any, tmp_path: Path) -> None:
+    """What changes its shape has the vertices and the segments that MuJoCo computes."""
+    model = tmp_path / "soft.xml"
+    model.write_text(_SOFT)
+    out = tmp_path / "run"
+    arguments = ["--out", str(out), "--max-steps", "8", "--workers", "0"]
+    assert main(["record", str(model), "--policy", "zero", *arguments]) == 0
+    [path] = out.glob("*.h5")
+    trajectory = mjrec.load_trajectory(path)
+    file = tmp_path / "replay.html"
+    made = mjrec.write_replay(trajectory, file)
+    assert made.notes == ()
+    page = pages(f"{file.as_uri()}#step=8")
+    page.wait_for_timeout(1000)
+    data = data_at(trajectory, 8)
+    shown = np.reshape(page.evaluate(_VERTICES, "/flex/0"), (-1, 3))
+    assert shown == pytest.approx(data.flexvert_xpos, abs=1e-5)
+    segments = [n for n in page.evaluate(_POSES) if n.startswith("/tendon/")]
+    assert len(segments) >= 2
+
+
+# --- The file -----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("framework", ["gymnasium", "dm_control"])
+def test_every_framework_has_replays(framework: str, tmp_path: Path) -> None:
+    """A replay has all recorded states, in a file of a megabyte or two."""
+    if framework == "gymnasium":
+        path = record(gymnasium.make("Hopper-v5"), tmp_path / "run")
+    else:
+        suite = pytest.importorskip("dm_control.suite")
+        path = record_suite(suite.load("cartpole", "balance"), tmp_path / "run")
+    made = mjrec.write_replay(mjrec.load_trajectory(path), tmp_path / "page.html")
+    assert made.states == _STEPS + 1
+    assert 500_000 < made.size == made.path.stat().st_size < 2_000_000
+
+
+def record_suite(env: Any, directory: Path) -> Path:
+    """Record some steps of a dm_control environment, without drawing them."""
+    with mjrec.Monitor(
+        env, directory, workers=0, video_callable=lambda _: True, env_id="suite"
+    ) as env:
+        env.reset()
+        for _ in range(_STEPS):
+            env.step(env.action_spec().generate_value())
+    [path] = directory.glob("*.h5")
+    return path
+
+
+def test_the_command_writes_an_episode_of_a_directory(
+    cheetah: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """`mjrec replay DIR --episode N` takes an episode by its number, at a rate."""
+    page = tmp_path / "page.html"
+    options = ["--episode", "0", "--max-fps", "5", "--out", str(page)]
+    assert main(["replay", str(cheetah.parent), *options]) == 0
+    # Every fourth of 13 states, at twenty a second.
+    assert capsys.readouterr().out.startswith(f"{page}: 4 states, ")
+    assert main(["replay", str(cheetah.parent), "--episode", "3"]) == 1
+    assert "Recorded: 0." in capsys.readouterr().err
+
+
+def test_the_page_holds_no_code_of_a_name(cheetah: Path, tmp_path: Path) -> None:
+    """What a file calls its environment is text, whatever it is."""
+    trajectory = mjrec.load_trajectory(cheetah)
+    trajectory.facts = {**trajectory.facts, "env_id": "</script><script>alert(1)"}
+    mjrec.write_replay(trajectory, tmp_path / "page.html")
+    assert "<script>alert" not in (tmp_path / "page.html").read_text()
+
+
+@pytest.mark.thorough
+def test_a_thousand_states_of_a_humanoid_are_small(tmp_path: Path) -> None:
+    """1,000 states of Humanoid take at most 5 MB."""
+    env = gymnasium.make("Humanoid-v5", terminate_when_unhealthy=False)
+    path = record(env, tmp_path / "run", steps=999)
+    made = mjrec.write_replay(mjrec.load_trajectory(path), tmp_path / "page.html")
+    assert made.states == 1000
+    assert made.size < 5_000_000
