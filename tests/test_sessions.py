@@ -125,7 +125,7 @@ def test_what_cannot_be_drawn_is_recorded_without_videos(options, tmp_path, capl
         list(record_session(live))
 
 
-def test_record_chooses_a_backend_before_mujoco_is_loaded(tmp_path: Path) -> None:
+def test_record_chooses_a_backend_before_mujoco_is_loaded(tmp_path):
     """Where `MUJOCO_GL` says nothing, MuJoCo would take one that needs a screen."""
     environ = {k: v for k, v in os.environ.items() if k not in ("MUJOCO_GL", "DISPLAY")}
     subprocess.run(
