@@ -12,6 +12,7 @@ import inspect
 import io
 import os
 import re
+import textwrap
 from pathlib import Path
 
 from mkdocs.config.defaults import MkDocsConfig
@@ -41,6 +42,7 @@ GROUPS = {
 }
 # What is public in modules of its own.
 MODULES = {
+    "All monitors": ("mjrec.monitors.base", "EnvironmentMonitor"),
     "Trackers": (
         "mjrec.trackers",
         "Tracker TensorBoardTracker WandbTracker MonitorCsvTracker Run FinishedEpisode "
@@ -135,7 +137,12 @@ def _help(*command: str) -> str:
         os.environ.pop("COLUMNS")
         if earlier is not None:
             os.environ["COLUMNS"] = earlier
-    return re.sub(r"\x1b\[[0-9;]*m", "", out.getvalue()).strip()
+    plain = re.sub(r"\x1b\[[0-9;]*m", "", out.getvalue()).strip()
+    # tyro leaves paragraphs to the terminal.
+    return "\n".join(
+        textwrap.fill(line, 80) if len(line) > 80 else line
+        for line in plain.splitlines()
+    )
 
 
 def api_page() -> str:
@@ -175,13 +182,18 @@ def gl_page() -> str:
         "`mjrec doctor` explains these, and so does `mjrec.gl.diagnose(text)`.",
         "",
     ]
+    # Messages with one cause and one fix stand together.
+    answers: dict[tuple[str, str], list[str]] = {}
     for backend, message in GL_MESSAGES:
         environ = next(
             (e for part, e in _GL_ENVIRONMENTS.items() if part in message), {}
         )
         found = diagnose(message, backend=backend or None, environ=environ)
         assert found is not None, message
-        lines += [f"**`{message}`**", "", found.cause, "", *_fix(found.fix), ""]
+        answers.setdefault((found.cause, found.fix), []).append(message)
+    for (cause, fix), messages in answers.items():
+        lines += [f"**`{message}`**  " for message in messages]
+        lines += ["", cause, "", *_fix(fix), ""]
     lines += [
         "**It hangs**",
         "",

@@ -1,17 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """A dm_control task whose model is another one in each episode."""
 
-from __future__ import annotations
 
-from typing import Any
-
-
-def growing() -> Any:
+def growing():
     """Return a composer task that compiles another model at each reset."""
     from dm_control import composer
 
-    class Growing(composer.Task):  # type: ignore[misc]  # no stubs
-        def __init__(self) -> None:
+    class Growing(composer.Task):
+        def __init__(self):
             self.root_entity = composer.Arena()
             world = self.root_entity.mjcf_model.worldbody
             world.add("light", pos=(0, 0, 3))
@@ -26,10 +22,10 @@ def growing() -> Any:
 
         root_entity = None
 
-        def initialize_episode_mjcf(self, random_state: Any) -> None:
+        def initialize_episode_mjcf(self, random_state):
             self.box.size = random_state.uniform(0.1, 0.5, 3)
 
-        def get_reward(self, physics: Any) -> float:
+        def get_reward(self, physics):
             return 1.0
 
     return composer.Environment(Growing(), time_limit=0.08, random_state=3)

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the tests share: OpenGL's backend, small environments, small helpers."""
 
-from __future__ import annotations
-
 import gc
 import importlib.util
 import os
@@ -12,7 +10,6 @@ import time
 # Before anything imports mujoco, which reads it once.
 os.environ.setdefault("MUJOCO_GL", "egl")
 
-from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -29,15 +26,13 @@ from mjrec.rendering import engine_jobs, finisher
 _HAS_DM_CONTROL = importlib.util.find_spec("dm_control") is not None
 
 # It is in an environment of its own.
-collect_ignore = (
-    []
-    if importlib.util.find_spec("stable_baselines3")
-    else ["test_stable_baselines3.py"]
-)
+collect_ignore = ["test_stable_baselines3.py"]
+if importlib.util.find_spec("stable_baselines3"):
+    collect_ignore.clear()
 
 
 @pytest.fixture(scope="session", autouse=True)
-def own_state_home(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+def own_state_home(tmp_path_factory):
     """Keep the list of the tests' models out of the home directory."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_STATE_HOME", str(tmp_path_factory.mktemp("state")))
@@ -46,7 +41,7 @@ def own_state_home(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 
 
 @pytest.fixture
-def default_signals() -> Iterator[None]:
+def default_signals():
     """Have child processes start with SIGINT and SIGHUP as in a terminal.
 
     Under `nohup` and in a background job they are ignored, in every child too. So a
@@ -62,12 +57,12 @@ def default_signals() -> Iterator[None]:
         signal.signal(signum, handler)
 
 
-def pytest_report_header() -> list[str]:
+def pytest_report_header():
     """Say what the pictures come from."""
     return [f"MUJOCO_GL={os.environ['MUJOCO_GL']}", f"dm_control: {_HAS_DM_CONTROL}"]
 
 
-class Corridor(gymnasium.Env[Any, Any]):
+class Corridor(gymnasium.Env):
     """Walks `length` steps and ends; draws its position. Needs no simulator."""
 
     metadata: dict[str, Any] = {  # noqa: RUF012  Gymnasium's own way
@@ -77,12 +72,7 @@ class Corridor(gymnasium.Env[Any, Any]):
     observation_space = gymnasium.spaces.Box(0, 1000, (1,), np.float64)
     action_space = gymnasium.spaces.Discrete(2)
 
-    def __init__(
-        self,
-        length: int = 3,
-        render_mode: str | None = "rgb_array",
-        size: tuple[int, int] = (32, 48),
-    ) -> None:
+    def __init__(self, length=3, render_mode="rgb_array", size=(32, 48)):
         self.length = length
         self.render_mode = render_mode
         self.size = size
@@ -90,18 +80,16 @@ class Corridor(gymnasium.Env[Any, Any]):
         self.closed = 0
         self.rendered = 0
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Any, dict[str, Any]]:
+    def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
         self.position = 0
         return self._observation(), {}
 
-    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+    def step(self, action):
         self.position += 1
         return self._observation(), 0.5, self.position >= self.length, False, {}
 
-    def render(self) -> Any:
+    def render(self):
         self.rendered += 1
         if self.render_mode == "ansi":
             return "." * self.position + "o\n"
@@ -109,15 +97,15 @@ class Corridor(gymnasium.Env[Any, Any]):
         frame[:, : 4 * self.position + 4] = (200, 40, 10)
         return [frame] if self.render_mode == "rgb_array_list" else frame
 
-    def close(self) -> None:
+    def close(self):
         self.closed += 1
 
-    def _observation(self) -> Any:
+    def _observation(self):
         return np.array([self.position], np.float64)
 
 
 @pytest.fixture(autouse=True)
-def free_dm_control_contexts(request: pytest.FixtureRequest) -> Iterator[None]:
+def free_dm_control_contexts(request):
     """Free the OpenGL contexts of dm_control on the thread that made them.
 
     Its environments are garbage in cycles. Where a later test's other thread happens
@@ -130,11 +118,11 @@ def free_dm_control_contexts(request: pytest.FixtureRequest) -> Iterator[None]:
 
 
 @pytest.fixture(scope="session")
-def pendulums(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Path]:
+def pendulums(tmp_path_factory):
     """Return what records once in a session, for tests that change nothing."""
-    made: dict[str, Path] = {}
+    made = {}
 
-    def recorded(episodes: int, **options: Any) -> Path:
+    def recorded(episodes, **options):
         key = f"{episodes} {sorted(options.items())}"
         if key not in made:
             directory = tmp_path_factory.mktemp("pendulum") / "recorded"
@@ -146,18 +134,18 @@ def pendulums(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Path]:
 
 
 @pytest.fixture
-def corridor() -> Corridor:
+def corridor():
     """An environment of three steps that draws 48x32 pictures."""
     return Corridor()
 
 
 @pytest.fixture
-def make_corridor() -> type[Corridor]:
+def make_corridor():
     """The class of `corridor`, for other arguments."""
     return Corridor
 
 
-def run_episodes(env: Any, count: int, *, seed: int | None = None) -> None:
+def run_episodes(env, count, *, seed=None):
     """Run whole episodes of a Gymnasium environment."""
     for _ in range(count):
         env.reset(seed=seed)
@@ -168,18 +156,18 @@ def run_episodes(env: Any, count: int, *, seed: int | None = None) -> None:
 
 
 @pytest.fixture
-def play() -> Callable[..., None]:
+def play():
     """Return `run_episodes`."""
     return run_episodes
 
 
-def kill_children(name: str) -> int:
+def kill_children(name):
     """Kill this process's children of that name, and return how many there were.
 
     One that was started just now has its parent's name for a moment.
     """
     deadline = time.monotonic() + 10
-    named: list[int] = []
+    named = []
     while not named and time.monotonic() < deadline:
         named = [p for p in children() if name in Path(f"/proc/{p}/comm").read_text()]
     for pid in named:
@@ -188,7 +176,7 @@ def kill_children(name: str) -> int:
 
 
 @pytest.fixture
-def no_process_is_left() -> Iterator[None]:
+def no_process_is_left():
     """See that a test leaves no process that was not there before, zombies included."""
     before = children()
     yield
@@ -196,15 +184,13 @@ def no_process_is_left() -> Iterator[None]:
 
 
 @pytest.fixture
-def kill_ffmpeg() -> Callable[[], int]:
+def kill_ffmpeg():
     """Return a function that kills this process's encoders."""
     return lambda: kill_children("ffmpeg")
 
 
 @pytest.fixture
-def stuck_encoder(
-    tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
-) -> Path:
+def stuck_encoder(tmp_path_factory, monkeypatch):
     """Let every encoder begin and never go on; the returned file says that one has."""
     begun = tmp_path_factory.mktemp("encoder") / "begun"
     program = begun.with_name("ffmpeg")
@@ -218,7 +204,7 @@ def stuck_encoder(
 
 
 @pytest.fixture
-def painter(monkeypatch: pytest.MonkeyPatch) -> Painter:
+def painter(monkeypatch):
     """Draw without processes and without OpenGL; the encoder is the real one."""
     painter = Painter()
     for module in (finisher, engine_jobs):
@@ -227,13 +213,13 @@ def painter(monkeypatch: pytest.MonkeyPatch) -> Painter:
 
 
 @pytest.fixture
-def names() -> Callable[[Path], list[str]]:
+def names():
     """Return the sorted names in a directory, hidden ones too."""
     return lambda directory: sorted(p.name for p in Path(directory).iterdir())
 
 
 @pytest.fixture
-def halfcheetah() -> Iterator[Any]:
+def halfcheetah():
     """A small HalfCheetah-v5 that can be drawn."""
     env = gymnasium.make("HalfCheetah-v5", render_mode="rgb_array", width=64, height=48)
     yield env

@@ -4,10 +4,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
 
 import mjrec
 from mjrec.trackers import FinishedEpisode, FinishedVideo, Run
@@ -21,7 +18,7 @@ class Finished:
     video: FinishedVideo
 
 
-def episode(number: int = 0, **facts: Any) -> FinishedEpisode:
+def episode(number=0, **facts):
     """Return an episode of ten steps; the run had no others."""
     now = time.time()
     usual = {
@@ -41,7 +38,7 @@ def episode(number: int = 0, **facts: Any) -> FinishedEpisode:
     return FinishedEpisode(**{**usual, **facts})
 
 
-def record(directory: Path, env: Any, play: Callable[..., None]) -> Finished:
+def record(directory, env, play):
     """Record an episode, and return it with its video."""
     with mjrec.Monitor(
         env, directory, video_callable=lambda n: n == 0, env_id="Corridor-v0"

@@ -1,15 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Ctrl-C, at a moment that a test chooses."""
 
-from __future__ import annotations
-
 import contextlib
 import signal
-from collections.abc import Iterator
 
 
 @contextlib.contextmanager
-def ctrl_c_soon() -> Iterator[None]:
+def ctrl_c_soon():
     """Raise KeyboardInterrupt from a signal's handler, a hundredth of a second on."""
     earlier = signal.signal(signal.SIGALRM, signal.default_int_handler)
     try:

@@ -1,23 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Matrices of which the default run tries a few cases, and `scripts/test --all` all."""
 
-from __future__ import annotations
-
-from collections.abc import Container, Iterable
-from typing import Any
-
 import pytest
 from _pytest.mark import ParameterSet
 
 
-def parametrize(
-    names: str | tuple[str, ...],
-    cases: Iterable[Any],
-    *,
-    default: int | Container[Any] = 1,
-    part: pytest.MarkDecorator = pytest.mark.thorough,
-    **options: Any,
-) -> pytest.MarkDecorator:
+def parametrize(names, cases, *, default=1, part=pytest.mark.thorough, **options):
     """Do what `pytest.mark.parametrize` does, and mark what only `--all` runs.
 
     Args:

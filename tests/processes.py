@@ -1,17 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """The processes that a process, mostly the tests' own, has started."""
 
-from __future__ import annotations
-
 import functools
 import os
 import signal
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 
-def children(of: int | str = "self") -> set[int]:
+def children(of="self"):
     """Return those that are still there, be it as zombies.
 
     Without the one in which multiprocessing tracks what processes share: it starts
@@ -30,7 +26,7 @@ def children(of: int | str = "self") -> set[int]:
             continue
 
 
-def forked(child: Callable[[Callable[[], object]], None]) -> tuple[int, int]:
+def forked(child):
     """Run a function in a forked process, and wait for its end.
 
     Args:
@@ -55,6 +51,6 @@ def forked(child: Callable[[Callable[[], object]], None]) -> tuple[int, int]:
     return far, status
 
 
-def kill_self(*_: object) -> Any:
+def kill_self(*_):
     """End this process as the kernel does where memory is short."""
     os.kill(os.getpid(), signal.SIGKILL)

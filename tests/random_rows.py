@@ -1,16 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Recordings of random bytes, with NaNs of every kind, to be compared bit for bit."""
 
-from __future__ import annotations
-
-from typing import Any
-
 import numpy as np
 from trajectories_by_hand import add_row
-from trajectory_contents import TrajectoryContent
 
 from mjrec.formats.monitor_directory import Infix, trajectory_prefix
-from mjrec.formats.span_writer import SpanLogs, SpanWriter
 from mjrec.formats.trajectory import packed, row_dtype
 
 INFIX = Infix(0, "1")
@@ -31,23 +25,15 @@ DTYPE = row_dtype(
 )
 
 
-def rows(count: int, dtype: np.dtype[Any] = DTYPE) -> Any:
+def rows(count, dtype=DTYPE):
     """Return rows of random bytes; of more rows the first are the same."""
     data = np.random.default_rng(1).bytes(count * dtype.itemsize)
     return np.frombuffer(data, dtype)
 
 
 def write(
-    logs: SpanLogs,
-    steps: int,
-    *,
-    episode: int = 27,
-    every: int = 1,
-    facts: dict[str, Any] = FACTS,
-    dtype: np.dtype[Any] = DTYPE,
-    first: int = 0,
-    span: SpanWriter | None = None,
-) -> SpanWriter:
+    logs, steps, *, episode=27, every=1, facts=FACTS, dtype=DTYPE, first=0, span=None
+):
     """Record an episode, or go on with one from step `first` on, without an end."""
     span = span or logs.begin(trajectory_prefix(INFIX, episode), facts, dtype)
     for step, row in enumerate(rows(steps + 1, dtype)):
@@ -62,13 +48,7 @@ def write(
     return span
 
 
-def check(
-    content: TrajectoryContent,
-    steps: int,
-    *,
-    every: int = 1,
-    dtype: np.dtype[Any] = DTYPE,
-) -> None:
+def check(content, steps, *, every=1, dtype=DTYPE):
     """Check that a recording has exactly what `write` wrote."""
     expected = rows(steps + 1, dtype)
     assert content.dtype == dtype

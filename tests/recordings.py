@@ -69,6 +69,12 @@ def frames_of(path: str | Path | None) -> list[Any]:
         return [f.to_ndarray(format="rgb24") for f in container.decode(video=0)]
 
 
+def hashes_at(path):
+    """Return the SHA-256 of each frame, as a framehash file says them."""
+    lines = [line for line in path.read_text().splitlines() if line[:1] != "#"]
+    return [line.rpartition(",")[2].strip() for line in lines]
+
+
 def videos_in(directory: Path) -> list[int]:
     """Return the numbers of the episodes that have a video."""
     names = (path.name for path in directory.glob("openaigym.*.mp4"))

@@ -1,18 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """What monitors leave of their episodes, written by hand."""
 
-from __future__ import annotations
-
-from pathlib import Path
-from typing import Any
-
 from mjrec.formats.journal import JournalEntry, JournalWriter
 from mjrec.formats.manifest import Manifest, StatsFile, write_manifest, write_stats_file
 
 ENV_INFO = {"gym_version": "mjrec-1", "env_id": "(unknown:Corridor)"}
 
 
-def entry(episode_id: int, **facts: Any) -> JournalEntry:
+def entry(episode_id, **facts):
     """Return an episode that tells its number in all that is known of it."""
     usual = {
         "length": 10 + episode_id,
@@ -28,9 +23,7 @@ def entry(episode_id: int, **facts: Any) -> JournalEntry:
     return JournalEntry(episode_id, **{**usual, **facts})
 
 
-def write_journal(
-    directory: Path, infix: str, *episodes: int | JournalEntry, **options: Any
-) -> Path:
+def write_journal(directory, infix, *episodes, **options):
     """Write the journal of episodes, or of those of these numbers."""
     path = directory / f"openaigym.episodes.{infix}.jsonl"
     writer = JournalWriter(path, **options)
@@ -40,9 +33,7 @@ def write_journal(
     return path
 
 
-def stats_of(
-    *episodes: int, start: float | None = 98.0, types: str | None = ""
-) -> StatsFile:
+def stats_of(*episodes, start=98.0, types=""):
     """Return the statistics of the episodes of these numbers, all of type "t"."""
     entries = [entry(number) for number in episodes]
     return StatsFile(
@@ -55,15 +46,15 @@ def stats_of(
 
 
 def write_saved(
-    directory: Path,
-    infix: str,
-    *episodes: int,
-    stats: StatsFile | None = None,
-    env_info: Any = ENV_INFO,
-    videos: Any = (),
-    details: Any = None,
-    **options: Any,
-) -> Path:
+    directory,
+    infix,
+    *episodes,
+    stats=None,
+    env_info=ENV_INFO,
+    videos=(),
+    details=None,
+    **options,
+):
     """Write statistics, and the manifest that names them; return the latter."""
     name = f"openaigym.episode_batch.{infix}.stats.json"
     write_stats_file(directory / name, stats or stats_of(*episodes, **options))

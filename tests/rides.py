@@ -7,7 +7,6 @@ before; on the way the terrain, a texture and a colour change.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,7 +16,7 @@ from trajectories_by_hand import add_row, new_logs
 
 from mjrec.formats.monitor_directory import Infix
 from mjrec.formats.trajectory import ModelChange, row_dtype
-from mjrec.simulation.cameras import Camera, resolve_camera
+from mjrec.simulation.cameras import resolve_camera
 from mjrec.simulation.captured_arrays import snapshot_dtype
 from mjrec.simulation.fields import read_fields
 from mjrec.simulation.model_store import ModelStore
@@ -57,19 +56,19 @@ class Ride(NamedTuple):
     frames: list[Any]
 
 
-def start(xml: str = PLAIN) -> tuple[mujoco.MjModel, mujoco.MjData]:
+def start(xml=PLAIN):
     """Return the model at its start."""
     model = mujoco.MjModel.from_xml_string(xml)
     return model, mujoco.MjData(model)
 
 
-def move(model: mujoco.MjModel, data: mujoco.MjData, number: int) -> None:
+def move(model, data, number):
     """Go on to a picture's place, unevenly."""
     data.qpos[0] = 3.1 * number + 2 * (number % 3)
     mujoco.mj_forward(model, data)
 
 
-def change(model: mujoco.MjModel, number: int) -> list[str]:
+def change(model, number):
     """Change the model before a picture; return the names of what has changed."""
     if number == 3:
         model.hfield_data[20:40] = 1
@@ -83,13 +82,7 @@ def change(model: mujoco.MjModel, number: int) -> list[str]:
     return []
 
 
-def record(
-    directory: Path,
-    *,
-    camera: Camera = "rider",
-    fresh: bool = False,
-    facts: Mapping[str, Any] | None = None,
-) -> Ride:
+def record(directory, *, camera="rider", fresh=False, facts=None):
     """Record a ride as a log, with the pictures that a viewer had shown."""
     model, data = start()
     option = mujoco.MjvOption()

@@ -1,13 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Gymnasium-Robotics' environments, as far as they run with the mujoco installed."""
 
-from __future__ import annotations
-
 import contextlib
 import importlib.util
 import types
 import warnings
-from collections.abc import Iterator
 from unittest import mock
 
 import gymnasium
@@ -16,7 +13,7 @@ import mujoco
 has_robotics = importlib.util.find_spec("gymnasium_robotics") is not None
 
 
-def robotics_ids() -> list[str]:
+def robotics_ids():
     """Return the ids of all that need no mujoco_py; none without the package."""
     if not has_robotics:
         return []
@@ -33,7 +30,7 @@ def robotics_ids() -> list[str]:
 
 
 @contextlib.contextmanager
-def robots_that_reset() -> Iterator[None]:
+def robots_that_reset():
     """Let Gymnasium-Robotics compare MuJoCo's enumerations with NumPy's integers.
 
     From mujoco 3.12 on `mjtJoint.mjJNT_FREE == np.int32(0)` is False, and resets of
@@ -58,7 +55,7 @@ def robots_that_reset() -> Iterator[None]:
         yield
 
 
-def _register() -> None:
+def _register():
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         import gymnasium_robotics

@@ -1,12 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Frames say which moment of which episode they show."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -16,13 +13,13 @@ from mjrec.annotation import Caption, annotated
 CAPTION = Caption(episode_id=27, step=120, time=2.4, reward=-35.25)
 
 
-def plain(height: int, width: int, brightness: int = 128) -> Any:
+def plain(height, width, brightness=128):
     return np.full((height, width, 3), brightness, np.uint8)
 
 
 @pytest.mark.parametrize("size", [(64, 64), (480, 480)])
 @pytest.mark.parametrize("brightness", [0, 128, 255])
-def test_letters_stand_out(size: tuple[int, int], brightness: int) -> None:
+def test_letters_stand_out(size, brightness):
     """On light and on dark; most of the frame stays as it was."""
     frame = plain(*size, brightness)
     result = annotated(frame, CAPTION)
@@ -36,14 +33,14 @@ def test_letters_stand_out(size: tuple[int, int], brightness: int) -> None:
     "other",
     [{"episode_id": 28}, {"step": 121}, {"time": 2.45}, {"time": None}, {"reward": 1}],
 )
-def test_everything_is_said(other: dict[str, Any]) -> None:
+def test_everything_is_said(other):
     """Whatever of a caption is other, the picture is another one."""
     frame = plain(240, 320)
     before = annotated(frame, CAPTION)
     assert (annotated(frame, replace(CAPTION, **other)) != before).any()
 
 
-def test_the_same_caption_gives_the_same_picture() -> None:
+def test_the_same_caption_gives_the_same_picture():
     """Also in another process."""
     program = (
         "import sys, numpy\n"
@@ -56,7 +53,7 @@ def test_the_same_caption_gives_the_same_picture() -> None:
     assert other.stdout == annotated(plain(120, 160), CAPTION).tobytes()
 
 
-def test_any_size_will_do() -> None:
+def test_any_size_will_do():
     """Down to one pixel, which has no room for letters."""
     long = Caption(episode_id=10**9, step=10**9, time=1e9, reward=float("nan"))
     for height in (1, 2, 7, 16, 33, 64):

@@ -1,11 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-from __future__ import annotations
-
 import json
 import subprocess
 import sys
 from fractions import Fraction
-from pathlib import Path
 
 import pytest
 from full_disk import file_size_limit
@@ -14,7 +11,7 @@ from mjrec import FileNotWritten
 from mjrec.formats.asciicast import AsciicastWriter
 
 
-def test_frames_last_one_over_the_rate_and_clear_the_screen(tmp_path: Path) -> None:
+def test_frames_last_one_over_the_rate_and_clear_the_screen(tmp_path):
     """An accent is one column wide and a colour none; the real player plays it."""
     path = tmp_path / "a.json"
     writer = AsciicastWriter(path, rate=Fraction(4))
@@ -41,7 +38,7 @@ def test_frames_last_one_over_the_rate_and_clear_the_screen(tmp_path: Path) -> N
     assert "world" in done.stdout
 
 
-def test_without_frames_or_given_up_there_is_no_file(tmp_path: Path) -> None:
+def test_without_frames_or_given_up_there_is_no_file(tmp_path):
     """A full disk is an error that names the file."""
     AsciicastWriter(tmp_path / "a.json", rate=Fraction(1)).close()
     writer = AsciicastWriter(tmp_path / "a.json", rate=Fraction(1))

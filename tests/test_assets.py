@@ -1,6 +1,4 @@
 # SPDX-License-Identifier: Apache-2.0
-from __future__ import annotations
-
 import importlib.util
 from pathlib import Path
 
@@ -12,21 +10,17 @@ ASSETS = Path(__file__).parents[1] / "assets"
 MODELS = ["showcase", "walker_on_plane", "pendulum"]
 
 
-def load(name: str) -> mujoco.MjModel:
+def load(name):
     return mujoco.MjModel.from_xml_path(str(ASSETS / f"{name}.xml"))
 
 
-def values(array: np.ndarray) -> set[int]:
-    return set(np.ravel(array).tolist())
-
-
 @pytest.fixture(scope="module")
-def showcase() -> mujoco.MjModel:
+def showcase():
     return load("showcase")
 
 
 @pytest.mark.parametrize("name", MODELS)
-def test_each_model_steps_without_a_warning(name: str) -> None:
+def test_each_model_steps_without_a_warning(name):
     """Two hundred steps leave finite numbers and no warning of MuJoCo's."""
     model = load(name)
     data = mujoco.MjData(model)
@@ -42,14 +36,14 @@ def test_each_model_steps_without_a_warning(name: str) -> None:
     assert moved > 0.1
 
 
-def test_each_model_is_read_here() -> None:
+def test_each_model_is_read_here():
     """A model that is added gets these tests too."""
     models = {path.stem for path in ASSETS.glob("*.xml")} - {"finger_skin"}
 
     assert models == set(MODELS)
 
 
-def test_parts_are_what_the_script_writes() -> None:
+def test_parts_are_what_the_script_writes():
     """Pictures, mesh and skin can be made again from the committed script."""
     spec = importlib.util.spec_from_file_location(
         "make_parts", ASSETS / "make_parts.py"

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Recordings are finished beside a simulation, by a process of its own."""
 
-from __future__ import annotations
-
 import functools
 import os
 import shutil
@@ -10,9 +8,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
 
 import gymnasium
 import pytest
@@ -22,12 +18,11 @@ from recordings import frames_of, in_flight
 from trajectories_by_hand import write_log
 from waiting import wait_until
 
-from mjrec import Error, Monitor
+from mjrec import Monitor
 from mjrec.formats.monitor_directory import Infix
 from mjrec.formats.spans import find_recording, is_in_flight
 from mjrec.formats.trajectory_file import open_trajectory
 from mjrec.rendering.background import Background
-from mjrec.rendering.jobs import Progress
 
 # A program around it, with the directory at argv[1].
 PROGRAM = """
@@ -40,11 +35,9 @@ for recording in recordings_in_flight(directory):
     background.submit(recording.path)
 """
 
-Start = Callable[..., Background]
-
 
 @pytest.fixture(scope="module")
-def _recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def _recorded(tmp_path_factory):
     """Two short episodes of a simulation, as yet without videos."""
     directory = tmp_path_factory.mktemp("recorded")
     env = gymnasium.make(
@@ -60,17 +53,17 @@ def _recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def recorded(_recorded: Path, tmp_path: Path) -> Path:
+def recorded(_recorded, tmp_path):
     """A copy of it."""
     return Path(shutil.copytree(_recorded, tmp_path / "recorded"))
 
 
 @pytest.fixture
-def start(tmp_path: Path) -> Iterator[Start]:
+def start(tmp_path):
     """Make backgrounds that are given recordings, and are stopped at the end."""
     made = []
 
-    def make(directory: Path = tmp_path, *logs: Path, workers: Any = 1) -> Background:
+    def make(directory=tmp_path, *logs, workers=1):
         made.append(Background(directory, workers=workers))
         for log in logs:
             made[-1].submit(log)
@@ -82,12 +75,12 @@ def start(tmp_path: Path) -> Iterator[Start]:
 
 
 @pytest.fixture
-def others() -> set[int]:
+def others():
     """The processes that were there before."""
     return children()
 
 
-def patched(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: str) -> None:
+def patched(tmp_path, monkeypatch, code):
     """Let the process run other code first."""
     lines = "".join(f"    {line}\n" for line in code.splitlines())
     guarded = f"import sys\nif sys.argv[0] == '-m':\n{lines}"
@@ -95,12 +88,12 @@ def patched(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: str) -> None:
     monkeypatch.syspath_prepend(tmp_path)
 
 
-def is_finished(log: Path) -> bool:
+def is_finished(log):
     """Tell whether it is there, and its rows are not."""
     return log.exists() and find_recording(log) is None
 
 
-def has_ended(pid: int) -> bool:
+def has_ended(pid):
     try:
         stat = Path(f"/proc/{pid}/stat").read_text()
     except (FileNotFoundError, ProcessLookupError):
@@ -111,9 +104,7 @@ def has_ended(pid: int) -> bool:
 # What it does
 
 
-def test_one_process_does_all(
-    tmp_path: Path, others: set[int], start: Start, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_one_process_does_all(tmp_path, others, start, monkeypatch):
     """Also what comes after a wait; without anything to do there is none."""
     background = start()
     background.wait()
@@ -133,22 +124,7 @@ def test_one_process_does_all(
     assert children() == others
 
 
-def test_videos_are_rendered(recorded: Path, start: Start) -> None:
-    """By workers of their own, and every frame is shown to be drawn."""
-    logs = in_flight(recorded)
-    background = start(recorded, *logs, workers=None)
-    seen: list[Progress] = []
-    background.wait(seen.append)
-    assert background.failures == {}
-    videos = sorted(recorded.glob("*.mp4"))
-    assert [len(frames_of(video)) for video in videos] == [4, 4]
-    assert all(map(is_finished, logs))
-    assert seen[-1] == Progress(videos_done=2, videos=2, frames_done=8, frames=8)
-    background.stop()
-    assert not list(recorded.glob(".*"))
-
-
-def test_submitting_never_waits(others: set[int], tmp_path: Path, start: Start) -> None:
+def test_submitting_never_waits(others, tmp_path, start):
     """Not even while nobody reads, with more names than a pipe holds."""
     log = write_log(tmp_path, video=None)
     background = start(tmp_path, log)
@@ -162,29 +138,12 @@ def test_submitting_never_waits(others: set[int], tmp_path: Path, start: Start) 
     assert is_finished(log)
 
 
-def make_unreadable(log: Path) -> None:
+def make_unreadable(log):
     log.unlink()
     log.mkdir()
 
 
-def test_what_fails_is_told_and_stops_nothing_else(
-    tmp_path: Path, start: Start
-) -> None:
-    """By the name of the video, also where nobody waits; the trajectory stays."""
-    bad, good = write_log(tmp_path, 0), write_log(tmp_path, 1, video=None)
-    make_unreadable(min(tmp_path.glob("*.log")))
-    background = start(tmp_path, bad, good)
-    wait_until(lambda: is_finished(good))
-    background.stop()
-    [(name, reason)] = background.failures.items()
-    assert name == "openaigym.video.0.7.video000000.mp4"
-    assert "Cannot read" in reason
-    assert in_flight(tmp_path) == [bad]
-
-
-def test_a_model_that_is_still_being_written_is_waited_for(
-    recorded: Path, start: Start
-) -> None:
+def test_a_model_that_is_still_being_written_is_waited_for(recorded, start):
     """It is compressed beside the simulation; once nobody writes, it is an error."""
     [model] = recorded.glob("*.mjb.gz")
     hidden = model.rename(model.with_name("hidden"))
@@ -203,7 +162,7 @@ def test_a_model_that_is_still_being_written_is_waited_for(
     assert len(list(recorded.glob("*.mp4"))) == 1
 
 
-def test_several_monitors_share_one(tmp_path: Path, start: Start) -> None:
+def test_several_monitors_share_one(tmp_path, start):
     """Each knows its own failures, ends nothing, and all are waited for at once."""
     background = start()
     shares = {}
@@ -227,9 +186,7 @@ def test_several_monitors_share_one(tmp_path: Path, start: Start) -> None:
 # How it ends
 
 
-def test_stopping_leaves_what_is_not_done(
-    recorded: Path, others: set[int], start: Start, stuck_encoder: Path
-) -> None:
+def test_stopping_leaves_what_is_not_done(recorded, others, start, stuck_encoder):
     """At once, in the midst of a video; no process and no temporary file stays."""
     logs = in_flight(recorded)
     background = start(recorded, *logs)
@@ -249,31 +206,10 @@ def test_stopping_leaves_what_is_not_done(
     assert all(log.exists() or is_in_flight(log) for log in logs)
 
 
-def test_a_wait_can_be_interrupted(recorded: Path, start: Start) -> None:
-    """Ctrl-C while it waits; another wait goes on, with what came in between."""
-    background = start(recorded, in_flight(recorded)[0])
-
-    def interrupt(progress: Progress) -> None:
-        raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        background.wait(interrupt)
-    late = write_log(recorded, video=None)
-    background.submit(late)
-    background.wait()
-    assert background.failures == {}
-    assert len(list(recorded.glob("*.mp4"))) == 1
-    assert is_finished(late)
-
-
 @parametrize("signum", [signal.SIGKILL, signal.SIGSEGV])
 def test_another_process_goes_on_for_a_dead_one(
-    others: set[int],
-    signum: signal.Signals,
-    recorded: Path,
-    start: Start,
-    caplog: pytest.LogCaptureFixture,
-) -> None:
+    others, signum, recorded, start, caplog
+):
     """Nothing is missing, nothing is left of the first one, and it is told how it died.
 
     It dies once in the midst of a video, and once before anything has begun.
@@ -292,9 +228,7 @@ def test_another_process_goes_on_for_a_dead_one(
     assert children() == others
 
 
-def test_the_second_death_is_one_clear_failure(
-    others: set[int], tmp_path: Path, start: Start, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_the_second_death_is_one_clear_failure(others, tmp_path, start, caplog):
     """It is told how they died; nothing waits for ever, and all stays pending."""
     logs = [write_log(tmp_path, k, model={"mjb": "none"}) for k in range(3)]
     background = start(tmp_path, *logs[:2])
@@ -336,14 +270,7 @@ f.finish_trajectory = slowly
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("hangs", [True, False])
-def test_one_that_hangs_is_ended(
-    hangs: bool,
-    others: set[int],
-    tmp_path: Path,
-    start: Start,
-    caplog: pytest.LogCaptureFixture,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_one_that_hangs_is_ended(hangs, others, tmp_path, start, caplog, monkeypatch):
     """With its children; the log has its threads' stacks, and another one tries.
 
     One that is at work does not hang, however long it takes for one thing.
@@ -370,8 +297,8 @@ def test_one_that_hangs_is_ended(
 
 
 def test_workers_are_forks_and_one_that_dies_is_replaced(
-    recorded: Path, others: set[int], start: Start, caplog: pytest.LogCaptureFixture
-) -> None:
+    recorded, others, start, caplog
+):
     """What they import is imported once; they end with the process, however it ends."""
     background = start(recorded, workers=2)
     for victim in ("a worker", "the process"):
@@ -398,11 +325,8 @@ def test_workers_are_forks_and_one_that_dies_is_replaced(
 
 
 def test_a_worker_beside_a_simulation_draws_with_one_thread(
-    recorded: Path,
-    others: set[int],
-    start: Start,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+    recorded, others, start, monkeypatch
+):
     """Mesa's rasteriser would start as many as there are CPUs, also in the only one."""
     monkeypatch.delenv("LP_NUM_THREADS", raising=False)
     background = start(recorded, in_flight(recorded)[0], workers=1)
@@ -418,27 +342,7 @@ def test_a_worker_beside_a_simulation_draws_with_one_thread(
 # What it leaves alone
 
 
-def test_a_forked_child_leaves_it_alone(tmp_path: Path, start: Start) -> None:
-    """It cannot use it, and its end is not that of the process."""
-    log = write_log(tmp_path, video=None)
-    background = start(tmp_path, log)
-    child = os.fork()
-    if child == 0:
-        status = 1
-        try:
-            background.submit(log)
-        except Error:
-            background.wait()
-            background.stop()
-            status = 0
-        os._exit(status)
-    assert os.waitpid(child, 0)[1] == 0
-    background.wait()
-    assert background.failures == {}
-    assert is_finished(log)
-
-
-def test_it_ends_with_its_parent(tmp_path: Path) -> None:
+def test_it_ends_with_its_parent(tmp_path):
     """However that ends, and though it has forked a child that lives on.
 
     The parent has no thread for it, and no library that draws or writes HDF5.

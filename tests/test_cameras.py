@@ -1,7 +1,4 @@
 # SPDX-License-Identifier: Apache-2.0
-from __future__ import annotations
-
-from typing import Any
 
 import mujoco
 import numpy as np
@@ -21,11 +18,11 @@ from mjrec.simulation.cameras import (
 class Wrapper:
     """Like dm_control's wrappers of models and data."""
 
-    def __init__(self, ptr: object) -> None:
+    def __init__(self, ptr):
         self.ptr = ptr
 
 
-def model_with(cameras: str = "", inside: str = "") -> mujoco.MjModel:
+def model_with(cameras="", inside=""):
     return mujoco.MjModel.from_xml_string(
         f"""
         <mujoco>
@@ -44,16 +41,11 @@ FRONT_AND_SIDE = '<camera name="front"/><camera/><camera name="side"/>'
 
 @pytest.mark.parametrize(
     ("camera", "number", "label"),
-    [
-        ("side", 2, "side"),
-        (0, 0, "front"),
-        (np.int64(1), 1, 1),
-        (Wrapper, 2, "side"),
-    ],
+    [("side", 2, "side"), (0, 0, "front"), (np.int64(1), 1, 1), (Wrapper, 2, "side")],
 )
-def test_a_camera_by_name_or_number(camera: Any, number: int, label: Any) -> None:
+def test_a_camera_by_name_or_number(camera, number, label):
     """Of MuJoCo's model or a wrapper; it is called by its name, else its number."""
-    model: Any = model_with(FRONT_AND_SIDE)
+    model = model_with(FRONT_AND_SIDE)
     assert camera_names(model) == ["front", "side"]
     if camera is Wrapper:
         camera = label
@@ -64,7 +56,7 @@ def test_a_camera_by_name_or_number(camera: Any, number: int, label: Any) -> Non
     assert camera_label(model, camera) == camera_label(model, resolved) == label
 
 
-def test_a_free_camera() -> None:
+def test_a_free_camera():
     """-1 is where the model puts it; an `MjvCamera` is its owner's to move."""
     model = model_with()
     expected = mujoco.MjvCamera()
@@ -75,7 +67,7 @@ def test_a_free_camera() -> None:
     assert camera.distance == expected.distance
     assert resolve_camera(model, camera) is camera
     assert camera_label(model, -1) == -1
-    label: Any = camera_label(model, camera)
+    label = camera_label(model, camera)
     members = {k: v for k, v in label.items() if k not in ("type", "trackbodyid")}
     assert camera_label(model, resolve_camera(model, members)) == label
     with pytest.raises(InvalidArgument, match="zoom"):
@@ -95,7 +87,7 @@ def test_a_free_camera() -> None:
         *((other, "A camera is a name, a number or") for other in (True, 0.0, None)),
     ],
 )
-def test_an_unknown_camera_names_those_there_are(camera: Any, said: str) -> None:
+def test_an_unknown_camera_names_those_there_are(camera, said):
     """One clear error each."""
     with pytest.raises(InvalidArgument, match=said) as caught:
         resolve_camera(model_with(FRONT_AND_SIDE), camera)
@@ -103,7 +95,7 @@ def test_an_unknown_camera_names_those_there_are(camera: Any, said: str) -> None
         assert caught.value.available == ["front", "side"]
 
 
-def test_wrappers_are_opened() -> None:
+def test_wrappers_are_opened():
     """dm_control's objects hold MuJoCo's as `.ptr`; what is no model is named."""
     model = model_with()
     data = mujoco.MjData(model)
@@ -141,8 +133,6 @@ ARM = """
         (FRONT_AND_SIDE, '<camera mode="trackcom"/>', 3),
     ],
 )
-def test_the_camera_that_follows_the_robot(
-    cameras: str, inside: str, found: str | int | None
-) -> None:
+def test_the_camera_that_follows_the_robot(cameras, inside, found):
     """By name, or by number where it has none."""
     assert tracking_camera(model_with(cameras, inside)) == found

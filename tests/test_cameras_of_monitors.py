@@ -1,18 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Several cameras, captions and second names, through `mjrec.Monitor`."""
 
-from __future__ import annotations
-
 import json
-import subprocess
-import sys
-from pathlib import Path
-from typing import Any
 
 import gymnasium
 import numpy as np
 import pytest
-from recordings import frames_of, manifest_of
+from other_python import run_python
+from recordings import frames_of, hashes_at, manifest_of
 
 import mjrec
 
@@ -23,11 +18,8 @@ WAYS = ["deferred", pytest.param("live", marks=pytest.mark.dm_control)]
 CAMERAS = {"deferred": ["track", -1], "live": ["side", "back"]}
 
 
-def record(
-    directory: Path, steps: int = 3, render: str = "deferred", **options: Any
-) -> dict[str, str]:
+def record(directory, steps=3, render="deferred", **options):
     """Record an episode; return the frame hashes of each video, by its name's end."""
-    made: Any
     if render == "live":
         from dm_control import suite
 
@@ -40,22 +32,17 @@ def record(
         for _ in range(steps):
             env.step(np.full(6, 0.5, np.float32))
     return {
-        path.name.split(".video000000")[-1].removesuffix(".framehash"): _hashes(path)
+        path.name.split(".video000000")[-1].removesuffix(".framehash"): hashes_at(path)
         for path in directory.glob("*.framehash")
     }
 
 
-def _hashes(path: Path) -> str:
-    lines = path.read_text().splitlines()
-    return "\n".join(line for line in lines if not line.startswith("#"))
-
-
 # Takes more than five seconds: several monitors with workers of their own.
 @pytest.mark.parametrize("render", WAYS)
-def test_several_cameras(tmp_path: Path, render: str) -> None:
+def test_several_cameras(tmp_path, render):
     """Each has the video that it would have alone; side by side they are one."""
     first, second = CAMERAS[render]
-    several: dict[str, Any] = {"camera": [first, second], "render": render}
+    several = {"camera": [first, second], "render": render}
     both = record(tmp_path / "both", **several)
     assert both.keys() == {"", f".{second}"}
     assert both[""] != both[f".{second}"]
@@ -79,28 +66,6 @@ def test_several_cameras(tmp_path: Path, render: str) -> None:
         assert difference.mean() < 4
 
 
-@pytest.mark.thorough
-def test_live_and_deferred_captions_are_the_same(tmp_path: Path) -> None:
-    """They say the same of each frame, in the same letters."""
-
-    def hashes(name: str, **options: Any) -> str:
-        made = gymnasium.make(
-            "HalfCheetah-v5", max_episode_steps=3, render_mode="rgb_array", **SIZE
-        )
-        with mjrec.Monitor(made, tmp_path / name, **options) as env:
-            env.reset(seed=0)
-            for _ in range(3):
-                env.step(np.full(6, 0.5, np.float32))
-        [path] = (tmp_path / name).glob("*.framehash")
-        return _hashes(path)
-
-    live = hashes("live", annotate=True, render="live")
-    later = hashes("later", annotate=True, render="deferred")
-    plain = hashes("plain", render="deferred")
-    assert live == later
-    assert live != plain
-
-
 WITHOUT_PILLOW = """
 import sys
 
@@ -114,15 +79,8 @@ except mjrec.MissingDependency as error:
 """
 
 
-def test_captions_without_pillow_are_an_error_of_the_constructor(
-    tmp_path: Path,
-) -> None:
+def test_captions_without_pillow_are_an_error_of_the_constructor(tmp_path):
     """It says how to install it, and nothing is left."""
-    done = subprocess.run(
-        [sys.executable, "-c", WITHOUT_PILLOW, str(tmp_path / "run")],
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    assert "pip install 'mjrec[annotate]'" in done.stdout
+    said = run_python(WITHOUT_PILLOW, tmp_path / "run").stdout
+    assert "pip install 'mjrec[annotate]'" in said
     assert not (tmp_path / "run").exists()

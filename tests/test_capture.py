@@ -1,26 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """The states of a simulation, as a recorder asks for them."""
 
-from __future__ import annotations
-
-import copy
-import dataclasses
-from collections.abc import Callable, Iterator
-from pathlib import Path
-from typing import Any
-
 import mujoco
 import numpy as np
 import pytest
 
 from mjrec.errors import PicturesDiffer
-from mjrec.simulation.capture import Capture, EpisodeStart
+from mjrec.simulation.capture import Capture
 from mjrec.simulation.fields import apply_fields
-from mjrec.simulation.model_store import load_model, saved_model
-from mjrec.simulation.raw_memory import WORDS
+from mjrec.simulation.model_store import load_model
 from mjrec.simulation.self_check import differences
 from mjrec.simulation.snapshot import restore_snapshot
-from mjrec.simulation.states import read_state
 from mjrec.simulation.view import SceneView, view_from_facts
 
 BALL = """
@@ -42,7 +32,7 @@ BALL = """
 class Simulation:
     """What an environment has, and what takes its states down."""
 
-    def __init__(self, directory: Path, xml: str = BALL, **options: Any) -> None:
+    def __init__(self, directory, xml=BALL, **options):
         self.camera, self.option = mujoco.MjvCamera(), mujoco.MjvOption()
         self.directory = directory
         self.fresh = options.pop("fresh", False)
@@ -54,12 +44,12 @@ class Simulation:
         )
         self.states.open(directory)
 
-    def compile(self, xml: str, plane: str = "2 2 .1") -> None:
+    def compile(self, xml, plane="2 2 .1"):
         self.model = mujoco.MjModel.from_xml_string(xml.format(plane=plane))
         self.data = mujoco.MjData(self.model)
         self.step()
 
-    def view(self) -> SceneView:
+    def view(self):
         return SceneView(
             camera=self.camera,
             option=self.option,
@@ -70,30 +60,30 @@ class Simulation:
             label=-1,
         )
 
-    def step(self, count: int = 1) -> None:
+    def step(self, count=1):
         self.data.ctrl[:] = 5
         mujoco.mj_step(self.model, self.data, nstep=count)
 
-    def begin(self) -> EpisodeStart:
+    def begin(self):
         self.start = self.states.begin_episode()
         kind = self.start.snapshot
         self.words = np.zeros(0 if kind is None else kind.itemsize // 8, np.uint64)
         return self.start
 
     @property
-    def row(self) -> Any:
+    def row(self):
         return self.words.view(self.start.snapshot)[0]
 
-    def begin_scene(self) -> Any:
+    def begin_scene(self):
         return self.begin().scene
 
-    def capture(self) -> Any:
+    def capture(self):
         return self.states.capture_snapshot(self.words)
 
-    def captured(self, name: str) -> Any:
+    def captured(self, name):
         return self.row[name]
 
-    def shown(self, flag: str) -> int:
+    def shown(self, flag):
         """Show what a flag is for; return its number."""
         index = int(mujoco.mjtVisFlag.__members__[f"mjVIS_{flag}"])
         self.option.flags[index] = True
@@ -101,10 +91,10 @@ class Simulation:
 
 
 @pytest.fixture
-def new(tmp_path: Path) -> Iterator[Callable[..., Simulation]]:
-    made: list[Simulation] = []
+def new(tmp_path):
+    made = []
 
-    def make(*args: Any, **options: Any) -> Simulation:
+    def make(*args, **options):
         made.append(Simulation(tmp_path, *args, **options))
         return made[-1]
 
@@ -115,36 +105,11 @@ def new(tmp_path: Path) -> Iterator[Callable[..., Simulation]]:
 
 
 @pytest.fixture
-def simulation(new: Callable[..., Simulation]) -> Simulation:
+def simulation(new):
     return new()
 
 
-def test_rows_can_be_gathered_while_only_the_state_changes(
-    new: Callable[..., Simulation],
-) -> None:
-    """State and snapshot; not once model, view or what `model_changed` says moved."""
-    still = new(is_unmoved=lambda: still.is_unmoved)
-    start = still.begin()
-    assert start.words is not None
-    for _ in range(3):
-        still.step()
-        assert start.is_current()
-        assert still.capture() is None
-        state = read_state(still.model, still.data).tobytes()
-        assert WORDS.take(start.words).tobytes() == state + still.words.tobytes()
-    still.model.geom_rgba[0] = (1, 0, 0, 1)
-    assert not start.is_current()
-    assert list(still.capture()) == ["geom_rgba"]
-    assert start.is_current()
-    still.is_unmoved = False
-    assert not start.is_current()
-    still.is_unmoved = True
-    still.states.model_changed()
-    assert not start.is_current()
-    assert still.begin().words is not None
-
-
-def test_changes_of_model_and_view_are_told_once(simulation: Simulation) -> None:
+def test_changes_of_model_and_view_are_told_once(simulation):
     """And the stored model, facts, a row and these changes give the scene."""
     simulation.shown("INERTIA")
     simulation.model.geom_rgba[0] = (1, 0, 0, 1)
@@ -178,44 +143,11 @@ def test_changes_of_model_and_view_are_told_once(simulation: Simulation) -> None
     assert list(differences(live, again, view.option)) == []
 
 
-def update(scene: Any, model: Any, data: Any, view: SceneView) -> None:
+def update(scene, model, data, view):
     mujoco.mjv_updateScene(model, data, view.option, None, view.camera, 7, scene)
 
 
-def test_long_arrays_are_looked_at_when_somebody_says_so(
-    simulation: Simulation,
-) -> None:
-    """Textures, for example; and at the next reset, without a word."""
-    simulation.begin()
-    simulation.model.tex_data[5] ^= 1
-    assert simulation.capture() is None
-    simulation.states.model_changed()
-    assert simulation.capture().keys() == {"tex_data"}
-    assert simulation.capture() is None
-    assert simulation.begin().model_fields.keys() == {"tex_data"}
-    assert simulation.capture() is None
-    simulation.model.tex_data[5] ^= 1
-    assert simulation.begin().model_fields == {}
-
-
-def test_the_model_is_stored_once_and_differences_are_told(
-    simulation: Simulation,
-) -> None:
-    """Every episode says in what its model is other than the stored one."""
-    first = simulation.begin()
-    assert first.model_fields == {}
-    simulation.model.body_pos[1] = (1, 2, 3)
-    second = simulation.begin()
-    assert second.model == first.model
-    assert second.model_fields["body_pos"][1].tolist() == [1, 2, 3]
-    assert simulation.capture() is None
-    simulation.states.finish()
-    assert len(list(simulation.directory.iterdir())) == 1
-
-
-def test_a_model_that_consists_of_other_things_is_stored_anew(
-    simulation: Simulation,
-) -> None:
+def test_a_model_that_consists_of_other_things_is_stored_anew(simulation):
     """In mid-episode that is an error, where it is drawn, because it cannot be set."""
     first = simulation.begin()
     simulation.model.geom_type[1] = int(mujoco.mjtGeom.mjGEOM_BOX)
@@ -229,7 +161,7 @@ def test_a_model_that_consists_of_other_things_is_stored_anew(
         simulation.capture()
 
 
-def test_a_recompiled_model_is_another_one(simulation: Simulation) -> None:
+def test_a_recompiled_model_is_another_one(simulation):
     """As in composer environments, at every reset; in mid-episode it is an error."""
     first = simulation.begin()
     simulation.compile(BALL.replace('size=".1"', 'size=".2"'))
@@ -249,9 +181,7 @@ def test_a_recompiled_model_is_another_one(simulation: Simulation) -> None:
 @pytest.mark.parametrize(
     "flag", ["CONTACTPOINT", "CONTACTFORCE", "CONTACTSPLIT", "ISLAND"]
 )
-def test_what_only_constraints_tell_is_refused(
-    simulation: Simulation, flag: str
-) -> None:
+def test_what_only_constraints_tell_is_refused(simulation, flag):
     """States are still recorded, and what changes in the model still told."""
     if flag == "ISLAND" and hasattr(mujoco.mjtEnableBit, "mjENBL_ISLAND"):
         simulation.model.opt.enableflags |= int(mujoco.mjtEnableBit.mjENBL_ISLAND)
@@ -269,9 +199,7 @@ def test_what_only_constraints_tell_is_refused(
     assert simulation.begin().refusal is None
 
 
-def test_an_option_that_snapshots_cannot_follow_is_an_error(
-    simulation: Simulation,
-) -> None:
+def test_an_option_that_snapshots_cannot_follow_is_an_error(simulation):
     """Turned on in mid-episode it is too late for another row."""
     simulation.begin()
     simulation.shown("INERTIA")
@@ -284,110 +212,7 @@ def test_an_option_that_snapshots_cannot_follow_is_an_error(
         simulation.capture()
 
 
-def test_an_obstacle_is_a_refusal_and_in_mid_episode_an_error(
-    new: Callable[..., Simulation],
-) -> None:
-    """Markers in a viewer, for example."""
-    obstacles: list[str] = ["there is a marker"]
-    simulation = new(obstacle=lambda: obstacles[0] if obstacles else None)
-    assert simulation.begin().refusal == "there is a marker"
-    obstacles.clear()
-    assert simulation.begin().refusal is None
-    assert simulation.capture() is None
-    obstacles.append("there is an arrow")
-    with pytest.raises(PicturesDiffer, match=r'there is an arrow.*render="live"'):
-        simulation.capture()
-
-
-def test_a_field_that_is_forgotten_is_refused(
-    simulation: Simulation, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_field_that_is_forgotten_is_refused(simulation, monkeypatch):
     """The first frame is compared, whatever the reason for a difference is."""
     monkeypatch.setattr("mjrec.simulation.captured_arrays.ALWAYS", ("geom_xmat",))
     assert "the scene is another one" in (simulation.begin().refusal or "")
-
-
-def test_a_frame_is_taken_when_the_environment_would_draw(
-    new: Callable[..., Simulation],
-) -> None:
-    """What a render callback moves is in the frame, and put back afterwards."""
-    calls = []
-
-    def at_picture(capture: Callable[[], None]) -> None:
-        kept = simulation.data.geom_xpos.copy()
-        simulation.data.geom_xpos[1] = (7, 8, 9)
-        capture()
-        calls.append(1)
-        simulation.data.geom_xpos[:] = kept
-
-    simulation = new(at_picture=at_picture)
-    simulation.begin()
-    assert len(calls) == 1, "the check is of such a frame too"
-    assert simulation.capture() is None
-    assert simulation.captured("geom_xpos")[1].tolist() == [7, 8, 9]
-    assert simulation.data.geom_xpos[1].tolist() != [7, 8, 9]
-
-
-def check_scenes_that_stay(simulation: Simulation, frames: int) -> None:
-    """Compare scenes that stay, frame by frame: a live and a recorded one."""
-    view = view_from_facts(simulation.begin_scene())
-    own = simulation.view()
-    camera, option = copy.copy(own.camera), copy.copy(own.option)
-    live_view = dataclasses.replace(own, camera=camera, option=option)
-    live = mujoco.MjvScene(simulation.model, maxgeom=100)
-    model = copy.copy(simulation.model)
-    data = mujoco.MjData(model)
-    again = mujoco.MjvScene(model, maxgeom=100)
-    for _ in range(frames):
-        simulation.step(30)
-        changed = simulation.capture() or {}
-        update(live, simulation.model, simulation.data, live_view)
-        apply_fields(model, changed, camera=view.camera, option=view.option)
-        restore_snapshot(simulation.row, model, data)
-        update(again, model, data, view)
-        assert list(differences(live, again, view.option)) == []
-    left = [camera.pos.tolist() for camera in live.camera]
-    assert simulation.begin_scene()["previous_cameras"] == left
-
-
-def test_an_infinite_plane_remembers_the_camera_before(simulation: Simulation) -> None:
-    """An episode says what the last frame before has left, until it is forgotten."""
-    simulation.compile(BALL, plane="0 0 1")
-    simulation.camera.type = int(mujoco.mjtCamera.mjCAMERA_FIXED)
-    simulation.camera.fixedcamid = 0
-    assert simulation.begin_scene()["previous_cameras"] is None
-    check_scenes_that_stay(simulation, 3)
-    simulation.states.forget_pictures()
-    assert simulation.begin_scene()["previous_cameras"] is None
-
-
-def track(simulation: Simulation) -> None:
-    simulation.camera.type = int(mujoco.mjtCamera.mjCAMERA_TRACKING)
-    simulation.camera.trackbodyid = 1
-
-
-def test_a_camera_that_tracks_moves_from_frame_to_frame(simulation: Simulation) -> None:
-    """Each frame moves it a fifth of the way; where to is part of the recording."""
-    track(simulation)
-    before = simulation.camera.lookat.copy()
-    check_scenes_that_stay(simulation, 4)
-    assert np.array_equal(simulation.camera.lookat, before), "the user's own stays"
-    assert simulation.begin_scene()["camera"]["lookat"] != before.tolist()
-
-
-def test_nothing_is_written_to_the_simulation(simulation: Simulation) -> None:
-    """Model and data are the same bytes before and after."""
-    track(simulation)
-    # Once: some arrays that are not there are other memory whenever they are asked for.
-    data = simulation.data
-    values = [getattr(data, name) for name in dir(data) if not name.startswith("_")]
-    arrays = [value for value in values if isinstance(value, np.ndarray)]
-
-    def everything() -> list[bytes]:
-        saved = saved_model(simulation.model)
-        return [array.tobytes() for array in (saved, *arrays)]
-
-    before = everything()
-    simulation.begin()
-    simulation.capture()
-    assert everything() == before

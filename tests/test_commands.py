@@ -433,7 +433,7 @@ def test_help_flows(mjrec, capsys, command):
     out = capsys.readouterr().out
     assert f"usage: mjrec {command}" in out
     words = " ".join(out.replace("│", " ").split())
-    assert command != "record" or "1000 where the environment itself has no" in words
+    assert command != "record" or "By default the environment's limit, or 1000" in words
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,6 @@ import subprocess
 import sys
 import time
 from dataclasses import dataclass
-from pathlib import Path
 
 import pytest
 from parts import parametrize
@@ -91,7 +90,7 @@ class Crash:
     reason: str
 
 
-def crash(directory: Path, render: str, way: str, delay: float) -> Crash:
+def crash(directory, render, way, delay):
     """Record until the process ends in that way."""
     with subprocess.Popen(
         [sys.executable, "-c", PROGRAM, str(directory), render, way, str(delay)],
@@ -112,7 +111,7 @@ def crash(directory: Path, render: str, way: str, delay: float) -> Crash:
     return Crash(dict(map(json.loads, output.splitlines())), reason)
 
 
-def check_statistics(directory: Path, crashed: Crash) -> None:
+def check_statistics(directory, crashed):
     """Every episode that was over is counted; at most one more, just not said."""
     results = mjrec.load_results(directory)
     lengths = [] if results is None else results["episode_lengths"]
@@ -122,7 +121,7 @@ def check_statistics(directory: Path, crashed: Crash) -> None:
         assert results["episode_rewards"][episode] == pytest.approx(sum(rewards))
 
 
-def check_episodes(directory: Path, crashed: Crash) -> None:
+def check_episodes(directory, crashed):
     """Trajectories bit for bit; of scheduled ones a video with every frame."""
     for episode, rewards in crashed.rewards.items():
         [path] = directory.glob(f"*.episode{episode:06d}.h5")
@@ -142,7 +141,7 @@ def check_episodes(directory: Path, crashed: Crash) -> None:
         assert each["complete"] or each["reason"] == crashed.reason
 
 
-def check_nothing_is_half(directory: Path) -> None:
+def check_nothing_is_half(directory):
     """No hidden file is left, no log, and whatever is there can be read."""
     hidden = [p.name for p in directory.glob(".*") if not p.name.endswith(".lock")]
     assert hidden == []
@@ -151,7 +150,7 @@ def check_nothing_is_half(directory: Path) -> None:
         json.loads(path.read_text())
 
 
-def render_all(directory: Path) -> bool:
+def render_all(directory):
     """Render what is pending; False while the dead process's renderer holds some.
 
     It ends when it notices that its parent is gone, and until then is left alone.
@@ -173,9 +172,7 @@ def render_all(directory: Path) -> bool:
     ],
     part=pytest.mark.crashes,
 )
-def test_what_was_complete_is_there(
-    way: str, render: str, moment: int, tmp_path: Path
-) -> None:
+def test_what_was_complete_is_there(way, render, moment, tmp_path):
     """Loaded, recovered, rendered and compared."""
     delay = random.Random(f"{way} {render} {moment}").uniform(0, LONGEST)
     crashed = crash(tmp_path, render, way, delay)

@@ -1,24 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
 """Videos counted in steps that are rendered later, from recorded states."""
 
-from __future__ import annotations
-
 import copy
 import json
 import signal
-import subprocess
-import sys
 from pathlib import Path
-from typing import Any
 
 import gymnasium
 import numpy as np
 import pytest
 from compiled_tasks import growing
 from full_disk import file_size_limit
+from other_python import run_python
 from parts import parametrize
-from recorded_states import assert_same, trajectories
-from recordings import add_facts, in_flight, manifest_of
+from recordings import add_facts, hashes_at, in_flight, manifest_of
 
 import mjrec
 from mjrec.commands import main
@@ -27,23 +22,23 @@ from mjrec.rendering.jobs import key_of
 from mjrec.rendering.recordings import recordings
 
 
-class Blinking(gymnasium.Wrapper[Any, Any, Any, Any]):
+class Blinking(gymnasium.Wrapper):
     """Shows another colour after every step and every reset."""
 
-    def reset(self, **options: Any) -> Any:
+    def reset(self, **options):
         self._blink(0.5)
         return self.env.reset(**options)
 
-    def step(self, action: Any) -> Any:
+    def step(self, action):
         self._blink(0.1)
         return self.env.step(action)
 
-    def _blink(self, more: float) -> None:
-        colour: Any = self.env.unwrapped.model.geom_rgba  # type: ignore[attr-defined]  # MuJoCo's
+    def _blink(self, more):
+        colour = self.env.unwrapped.model.geom_rgba
         colour[:, 0] = (colour[:, 0] + more) % 1
 
 
-def hopper(length: int = 5, **made: Any) -> gymnasium.Env[Any, Any]:
+def hopper(length=5, **made):
     """Return a hopper whose episodes are short, and small pictures of it."""
     # So wide that a caption has room.
     size = {"width": 256, "height": 48}
@@ -52,14 +47,14 @@ def hopper(length: int = 5, **made: Any) -> gymnasium.Env[Any, Any]:
     )
 
 
-def reacher() -> Any:
+def reacher():
     """Return a task whose resets put another target into the model."""
     from dm_control import suite
 
     return suite.load("reacher", "easy", {"random": 3, "time_limit": 0.08})
 
 
-def hop(env: Any, steps: int) -> None:
+def hop(env, steps):
     """Take so many steps, with resets where they are needed."""
     done = True
     for number in range(steps):
@@ -69,7 +64,7 @@ def hop(env: Any, steps: int) -> None:
         done = terminated or truncated
 
 
-def reach(env: Any, steps: int) -> None:
+def reach(env, steps):
     """Take so many steps; a step after the last one of an episode is a reset."""
     timestep = env.reset()
     for number in range(steps):
@@ -78,48 +73,44 @@ def reach(env: Any, steps: int) -> None:
         timestep = env.step(np.full(2, 0.1 * (number % 7)))
 
 
-def record(directory: Path, env: Any, steps: int, **options: Any) -> None:
+def record(directory, env, steps, **options):
     """Record so many steps of an environment, and all videos of them."""
     ride = hop if isinstance(env, gymnasium.Env) else reach
     with mjrec.Monitor(env, directory, **{"workers": 1, **options}) as monitor:
         ride(monitor, steps)
 
 
-def finish(directory: Path) -> list[Any]:
+def finish(directory):
     """Render what is pending."""
     return list(module.finish(directory, workers=1))
 
 
-def parts(directory: Path) -> list[str]:
+def parts(directory):
     """Return the names of all logs of clips, without their beginnings."""
     return [path.name.partition(".step")[2] for path in in_flight(directory)]
 
 
-def hashes(directory: Path) -> dict[str, list[str]]:
+def hashes(directory):
     """Return the hashes of the pictures of each video, by the end of its name."""
     return {
-        path.name.partition(".video")[2].split(".video")[-1]: [
-            line.split(",")[-1].strip()
-            for line in path.read_text().splitlines()
-            if not line.startswith("#")
-        ]
+        path.name.partition(".video")[2].split(".video")[-1]: hashes_at(path)
         for path in sorted(directory.glob("*.framehash"))
     }
 
 
-def metadata_in(directory: Path) -> list[dict[str, Any]]:
+def metadata_in(directory):
     """Return the metadata of each video."""
     paths = sorted(directory.glob("openaigym.*.meta.json"))
     return [json.loads(path.read_text()) for path in paths]
 
 
-def metadata_of(directory: Path, video: str) -> dict[str, Any]:
+def metadata_of(directory, video):
     content = (directory / video).with_suffix(".meta.json").read_text()
     return dict(json.loads(content))
 
 
 # One that begins with the second step.
-CLIP: dict[str, Any] = {"step_trigger": lambda step: step == 1, "workers": 0}
+CLIP = {"step_trigger": lambda step: step == 1, "workers": 0}
 SAME = (
     *("episode_id", "first_step", "last_episode_id", "length", "reward", "complete"),
     *("fps", "timestep", "stride", "frame_count", "frame_steps", "seed", "type"),
@@ -127,7 +118,7 @@ SAME = (
 )
 
 
-def check_same(live: Path, deferred: Path) -> None:
+def check_same(live, deferred):
     """Check that both show the same, and say the same of it."""
     assert hashes(live)
     assert hashes(live) == hashes(deferred)
@@ -140,14 +131,9 @@ def check_same(live: Path, deferred: Path) -> None:
 
 # Takes more than five seconds: the same run live and deferred.
 @parametrize("options", [{"annotate": True, "max_fps": 50}, {}])
-def test_pictures_are_those_that_were_drawn_live(
-    options: dict[str, Any], tmp_path: Path
-) -> None:
+def test_pictures_are_those_that_were_drawn_live(options, tmp_path):
     """Byte for byte, across resets and from the midst of an episode."""
-    clips: dict[str, Any] = {
-        "step_trigger": lambda step: step in (2, 20),
-        "video_length": 13,
-    }
+    clips = {"step_trigger": lambda step: step in (2, 20), "video_length": 13}
     for render in ("live", "deferred"):
         env = hopper(render_mode="rgb_array")
         record(tmp_path / render, env, 36, render=render, **clips, **options)
@@ -161,11 +147,9 @@ def test_pictures_are_those_that_were_drawn_live(
     ("make", "annotate"),
     [(reacher, False), (growing, False), (reacher, True), (growing, True)],
 )
-def test_resets_that_change_or_compile_the_model_are_seen(
-    make: Any, annotate: bool, tmp_path: Path
-) -> None:
+def test_resets_that_change_or_compile_the_model_are_seen(make, annotate, tmp_path):
     """A target lies elsewhere in each episode, or the model is another one."""
-    options: dict[str, Any] = {
+    options = {
         **CLIP,
         "workers": 1,
         "video_length": 9,
@@ -179,25 +163,6 @@ def test_resets_that_change_or_compile_the_model_are_seen(
     check_same(tmp_path / "live", tmp_path / "deferred")
 
 
-@pytest.mark.thorough
-def test_trajectories_and_clips_run_beside_each_other(tmp_path: Path) -> None:
-    """Each sees all that changes in the model, whoever looks first."""
-    clips: dict[str, Any] = {
-        "step_trigger": lambda step: step in (2, 9),
-        "video_length": 6,
-    }
-    live = hopper(render_mode="rgb_array")
-    evaluation: dict[str, Any] = {"mode": "evaluation"}
-    record(tmp_path / "live", live, 14, render="live", **clips, **evaluation)
-    record(tmp_path / "both", hopper(), 14, **clips, **evaluation)
-    record(tmp_path / "plain", hopper(), 14, video_callable=False, **evaluation)
-    check_same(tmp_path / "live", tmp_path / "both")
-    recorded, plain = trajectories(tmp_path / "both"), trajectories(tmp_path / "plain")
-    assert len(recorded) == 3
-    for one, other in zip(recorded, plain, strict=True):
-        assert_same(one, other)
-
-
 @parametrize(
     ("options", "part", "frames"),
     [
@@ -207,11 +172,9 @@ def test_trajectories_and_clips_run_beside_each_other(tmp_path: Path) -> None:
         ({"step_trigger": None, "video_callable": lambda e: e == 1}, "episode", 7),
     ],
 )
-def test_clips_wait_to_be_rendered(
-    options: dict[str, Any], part: str, frames: int, tmp_path: Path
-) -> None:
+def test_clips_wait_to_be_rendered(options, part, frames, tmp_path):
     """Pending, with a log for each episode; afterwards there is the video alone."""
-    steps: dict[str, Any] = {**CLIP, "video_length": 6, "name_prefix": "rl-video"}
+    steps = {**CLIP, "video_length": 6, "name_prefix": "rl-video"}
     record(tmp_path, hopper(3), 8, **{**steps, **options})
     [entry] = manifest_of(tmp_path)["mjrec"]["pending"]
     assert [name[-6:] for name in parts(tmp_path)] == [
@@ -231,7 +194,7 @@ def test_clips_wait_to_be_rendered(
 
 
 # Takes more than five seconds: a process is killed, and its clips are drawn.
-def test_a_killed_process_leaves_a_clip_that_can_be_rendered(tmp_path: Path) -> None:
+def test_a_killed_process_leaves_a_clip_that_can_be_rendered(tmp_path):
     """With all that was there; and it is in the manifest then."""
     script = (
         "import os, sys\n"
@@ -243,10 +206,7 @@ def test_a_killed_process_leaves_a_clip_that_can_be_rendered(tmp_path: Path) -> 
         "hop(env, 13)\n"
         "os.kill(os.getpid(), 9)\n"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", script], check=False, capture_output=True, text=True
-    )
-    assert done.returncode == -signal.SIGKILL, done.stderr
+    run_python(script, status=-signal.SIGKILL)
     assert mjrec.recover(tmp_path)
     details = manifest_of(tmp_path)["mjrec"]
     [entry] = details["pending"]
@@ -264,16 +224,14 @@ def test_a_killed_process_leaves_a_clip_that_can_be_rendered(tmp_path: Path) -> 
 
 
 @pytest.mark.thorough
-def test_a_clip_ends_where_its_frames_would_lie(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_clip_ends_where_its_frames_would_lie(tmp_path, caplog):
     """What was taken before stays, and the next clip is another one."""
     env = hopper()
     with mjrec.Monitor(
         env, tmp_path, **{**CLIP, "workers": 1}, video_length=4, mode="evaluation"
     ) as monitor:
         hop(monitor, 3)
-        simulated: Any = env.unwrapped
+        simulated = env.unwrapped
         simulated.model = copy.copy(simulated.model)
         monitor.step(np.zeros(3))
         monitor.step(np.zeros(3))
@@ -287,9 +245,9 @@ def test_a_clip_ends_where_its_frames_would_lie(
     assert not manifest["mjrec"]["pending"]
 
 
-def test_a_full_disk_ends_a_clip_and_not_the_simulation(tmp_path: Path) -> None:
+def test_a_full_disk_ends_a_clip_and_not_the_simulation(tmp_path):
     """With `on_error="warn"`: what had room is rendered, and the manifest tells."""
-    begins: dict[str, Any] = {**CLIP, "step_trigger": lambda step: step == 2}
+    begins = {**CLIP, "step_trigger": lambda step: step == 2}
     monitor = mjrec.Monitor(
         hopper(), tmp_path, **begins, video_length=9, on_error="warn"
     )
@@ -316,7 +274,7 @@ def test_a_full_disk_ends_a_clip_and_not_the_simulation(tmp_path: Path) -> None:
         "",
     ],
 )
-def test_no_other_video_is_written_over(name: str, tmp_path: Path) -> None:
+def test_no_other_video_is_written_over(name, tmp_path):
     """Logs may be anybody's: the name of a video has to be that of its own clip."""
     record(tmp_path, hopper(), 3, **CLIP)
     [key] = recordings(tmp_path)
@@ -330,7 +288,7 @@ def test_no_other_video_is_written_over(name: str, tmp_path: Path) -> None:
     assert new.match("openaigym.clip.*.failed.json")
 
 
-def test_a_clip_is_written_at_the_rate_that_was_asked_for(tmp_path: Path) -> None:
+def test_a_clip_is_written_at_the_rate_that_was_asked_for(tmp_path):
     """`fps` is that of the file, whichever frames `max_fps` leaves."""
     record(tmp_path, hopper(), 9, **CLIP, video_length=6, fps=12, max_fps=62.5)
     assert not finish(tmp_path)[0].failures

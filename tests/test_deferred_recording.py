@@ -10,17 +10,16 @@ import hashlib
 import itertools
 import logging
 import os
-import shutil
 import signal
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any, ClassVar
 
 import gymnasium
 import numpy as np
 import pytest
+from other_python import run_python
 from parts import parametrize
 from processes import children
 from recordings import frames_in, in_flight, manifest_of, metadata_of, videos_in
@@ -29,15 +28,15 @@ from touch_grid import TOUCH_GRID
 import mjrec
 from mjrec.environments.mjcf_environments import MjcfEnvironment
 
-SIZE: dict[str, Any] = {"height": 48, "width": 64}
+SIZE = {"height": 48, "width": 64}
 
 
-def make(env_id: str = "InvertedPendulum-v5", **arguments: Any) -> Any:
+def make(env_id="InvertedPendulum-v5", **arguments):
     """Return a small environment, without a render mode unless one is given."""
     return gymnasium.make(env_id, **SIZE, **arguments)
 
 
-def steps(env: Any, count: int, *, seed: int = 0) -> None:
+def steps(env, count, *, seed=0):
     """Reset and take N steps, or fewer if the episode ends."""
     env.reset(seed=seed)
     env.action_space.seed(seed)
@@ -46,13 +45,13 @@ def steps(env: Any, count: int, *, seed: int = 0) -> None:
             break
 
 
-def monitored(env: Any, directory: Path, *positional: Any, **options: Any) -> Any:
+def monitored(env, directory, *positional, **options):
     """Return a monitor that takes a reset for the end of an episode."""
     options = {"workers": 1, **options}
     return mjrec.Monitor(env, directory, *positional, allow_early_reset=True, **options)
 
 
-def render(directory: Path, **environment: str) -> None:
+def render(directory, **environment):
     """Render what is pending, as a user does."""
     command = [sys.executable, "-m", "mjrec", "render", str(directory)]
     done = subprocess.run(
@@ -61,12 +60,12 @@ def render(directory: Path, **environment: str) -> None:
     assert done.returncode == 0, done.stdout + done.stderr
 
 
-def pending_in(directory: Path) -> list[int]:
+def pending_in(directory):
     entries = manifest_of(directory)["mjrec"]["pending"]
     return [entry["episode_id"] for entry in entries]
 
 
-def trajectory_in(directory: Path) -> mjrec.Trajectory:
+def trajectory_in(directory):
     """Return the only one."""
     [path] = directory.glob("*.h5")
     return mjrec.load_trajectory(path)
@@ -75,7 +74,7 @@ def trajectory_in(directory: Path) -> mjrec.Trajectory:
 # --- what is written -----------------------------------------------------------------
 
 
-def test_close_leaves_a_rendered_directory(tmp_path: Path) -> None:
+def test_close_leaves_a_rendered_directory(tmp_path):
     """Video, hashes, metadata, trajectory, model; no log, and nothing pending."""
     with monitored(make(), tmp_path, lambda e: True) as env:
         steps(env, 3)
@@ -101,7 +100,7 @@ def test_close_leaves_a_rendered_directory(tmp_path: Path) -> None:
     assert [each.complete for each in recorded] == [False, False]
 
 
-def test_a_deferred_video_is_the_live_one(tmp_path: Path) -> None:
+def test_a_deferred_video_is_the_live_one(tmp_path):
     """The same bytes, and all that the live one's metadata says."""
     found = {}
     for how in ("live", "deferred"):
@@ -124,7 +123,7 @@ def test_a_deferred_video_is_the_live_one(tmp_path: Path) -> None:
     assert len(frames_in(directory, 0)) == 3
 
 
-def test_a_trajectory_holds_what_happened(tmp_path: Path) -> None:
+def test_a_trajectory_holds_what_happened(tmp_path):
     """Also seed and environment; observations where asked for; a replaced reset not."""
     with monitored(make(), tmp_path, workers=0, observations=True) as env:
         env.reset(seed=3)
@@ -156,11 +155,9 @@ def test_a_trajectory_holds_what_happened(tmp_path: Path) -> None:
     ],
     default=4,
 )
-def test_trajectories_are_kept_as_asked(
-    options: dict[str, Any], kept: list[int], filmed: list[int], tmp_path: Path
-) -> None:
+def test_trajectories_are_kept_as_asked(options, kept, filmed, tmp_path):
     """The videos' own are removed once the videos are there, if they are not wanted."""
-    asked: list[int] = []
+    asked = []
     if callable(choose := options.get("trajectory_callable")):
         options = {"trajectory_callable": lambda k: asked.append(k) or choose(k)}
     with monitored(make(), tmp_path, **options) as env:
@@ -177,9 +174,7 @@ def test_trajectories_are_kept_as_asked(
 # --- pending -------------------------------------------------------------------------
 
 
-def test_without_workers_videos_are_pending(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_without_workers_videos_are_pending(tmp_path, caplog):
     """The manifest lists them, one line says how to make them, and that makes them."""
     with monitored(make(), tmp_path, lambda e: e < 2, workers=0) as env:
         for seed in range(3):
@@ -193,27 +188,25 @@ def test_without_workers_videos_are_pending(
     assert len(manifest_of(tmp_path)["videos"]) == 2
 
 
-def leave_by_exception(env: Any) -> None:
+def leave_by_exception(env):
     with contextlib.suppress(ZeroDivisionError), env:
         steps(env, 2)
         _ = 1 // 0
 
 
-def leave_without_waiting(env: Any) -> None:
+def leave_without_waiting(env):
     steps(env, 2)
     env.close(wait=False)
 
 
-def leave_to_the_collector(env: Any) -> None:
+def leave_to_the_collector(env):
     steps(env, 2)
 
 
 @pytest.mark.parametrize(
     "leave", [leave_by_exception, leave_without_waiting, leave_to_the_collector]
 )
-def test_leaving_otherwise_renders_nothing(
-    leave: Callable[[Any], None], tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_leaving_otherwise_renders_nothing(leave, tmp_path, caplog):
     """What is pending is said, and no child is left."""
     before = children()
     env = mjrec.Monitor(make(), tmp_path, workers=1)
@@ -237,42 +230,8 @@ env.step(env.action_space.sample())
 """
 
 
-def run_script(
-    code: str, *arguments: object, **environment: str
-) -> subprocess.CompletedProcess[str]:
-    """Run code as `python -`, which has no file to come from."""
-    return subprocess.run(
-        [sys.executable, "-", *map(str, arguments)],
-        input=code,
-        capture_output=True,
-        text=True,
-        env={**os.environ, **environment},
-        timeout=120,
-        check=False,
-    )
-
-
-def test_what_a_kill_leaves_is_rendered_on_another_machine(tmp_path: Path) -> None:
-    """In a log's tail; its model is compiled there."""
-    code = (
-        "while not list(pathlib.Path(sys.argv[1]).glob('*.zip')): time.sleep(0.01)\n"
-        "os.kill(os.getpid(), 9)\n"
-    )
-    done = run_script(SCRIPT.replace("workers=1", "workers=0") + code, tmp_path / "run")
-    assert done.returncode == -signal.SIGKILL, done.stderr
-    assert list((tmp_path / "run").glob("*.tail"))
-    shutil.copytree(tmp_path / "run", tmp_path / "copy")
-    shutil.rmtree(tmp_path / "run")
-    # Where this user has stored no model.
-    render(tmp_path / "copy", XDG_STATE_HOME=str(tmp_path / "state"))
-    assert len(frames_in(tmp_path / "copy", 0)) == 2
-    assert metadata_of(tmp_path / "copy", 0)["reason"] == "killed"
-
-
 @pytest.mark.usefixtures("default_signals")
-def test_ctrl_c_while_waiting_leaves_the_rest_pending(
-    tmp_path: Path, stuck_encoder: Path
-) -> None:
+def test_ctrl_c_while_waiting_leaves_the_rest_pending(tmp_path, stuck_encoder):
     """The manifest is written, the line is said, and the process ends at once."""
     code = SCRIPT + (
         "import signal, threading\n"
@@ -282,8 +241,7 @@ def test_ctrl_c_while_waiting_leaves_the_rest_pending(
         "threading.Thread(target=interrupt).start()\n"
         "env.close()\n"
     )
-    done = run_script(code, tmp_path, stuck_encoder)
-    assert done.returncode == -signal.SIGINT, done.stderr
+    done = run_python(code, tmp_path, stuck_encoder, status=-signal.SIGINT)
     assert "1 video pending: mjrec render" in done.stderr
     assert pending_in(tmp_path) == [0]
 
@@ -291,18 +249,16 @@ def test_ctrl_c_while_waiting_leaves_the_rest_pending(
 # --- which way -----------------------------------------------------------------------
 
 
-class Overlay(gymnasium.Wrapper[Any, Any, Any, Any]):
+class Overlay(gymnasium.Wrapper):
     """Draws something on top."""
 
-    def render(self) -> Any:
+    def render(self):
         frame = np.array(self.env.render())
         frame[:4] = 255
         return frame
 
 
-def test_an_overlay_is_recorded_live_and_says_why(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_an_overlay_is_recorded_live_and_says_why(tmp_path, caplog):
     """Its frames do not follow from the state; to render it again says so, too."""
     caplog.set_level(logging.INFO)
     with mjrec.Monitor(Overlay(make(render_mode="rgb_array")), tmp_path) as env:
@@ -328,13 +284,8 @@ def test_an_overlay_is_recorded_live_and_says_why(
     ],
 )
 def test_a_plugin_that_draws_is_recorded_live_or_refused(
-    *,
-    how: Any,
-    mode: Any,
-    error: str | None,
-    tmp_path: Path,
-    caplog: pytest.LogCaptureFixture,
-) -> None:
+    *, how, mode, error, tmp_path, caplog
+):
     """Its frames do not follow from what can be put back, and one message says so."""
     path = tmp_path / "grid.xml"
     path.write_text(TOUCH_GRID)
@@ -362,7 +313,7 @@ def test_a_plugin_that_draws_is_recorded_live_or_refused(
 
 
 # Takes more than five seconds: the same video by several numbers of workers.
-def test_a_video_is_the_same_bytes_whoever_draws_it(tmp_path: Path) -> None:
+def test_a_video_is_the_same_bytes_whoever_draws_it(tmp_path):
     """One worker or three."""
     hashes = set()
     for workers in (1, 3):
@@ -375,7 +326,7 @@ def test_a_video_is_the_same_bytes_whoever_draws_it(tmp_path: Path) -> None:
     assert len(hashes) == 1
 
 
-def test_what_changes_in_the_model_shows(tmp_path: Path) -> None:
+def test_what_changes_in_the_model_shows(tmp_path):
     """Colours by themselves, textures after `model_changed`: from the next frame on."""
     env = make("Ant-v5")
     with mjrec.Monitor(env, tmp_path, workers=1) as monitor:
@@ -406,20 +357,19 @@ def opengl():
 """
 
 
-def test_no_opengl_in_the_simulation(tmp_path: Path) -> None:
+def test_no_opengl_in_the_simulation(tmp_path):
     """A process in which MuJoCo has none records all the same, and loads none."""
     bare, recorded = SCRIPT.split("env = mjrec")
     code = (
         f"{bare}{OPENGL}before = opengl()\nenv = mjrec{recorded}env.close()\n"
         "print(sorted(opengl() - before))"
     )
-    done = run_script(code, tmp_path, MUJOCO_GL="disable")
-    assert done.returncode == 0, done.stderr
+    done = run_python(code, tmp_path, env={**os.environ, "MUJOCO_GL": "disable"})
     assert done.stdout == "[]\n"
     assert len(frames_in(tmp_path, 0)) == 2
 
 
-def test_model_and_data_may_be_replaced_and_deleted(tmp_path: Path) -> None:
+def test_model_and_data_may_be_replaced_and_deleted(tmp_path):
     """Rows follow the data that there is; none are read from freed memory."""
     env = make("HalfCheetah-v5")
     shown = []
@@ -441,7 +391,7 @@ def test_model_and_data_may_be_replaced_and_deleted(tmp_path: Path) -> None:
 
 
 @pytest.mark.thorough
-def test_the_global_random_state_is_left_alone(tmp_path: Path) -> None:
+def test_the_global_random_state_is_left_alone(tmp_path):
     """Python's and NumPy's, also where a library is loaded for the first time."""
     bare, recorded = SCRIPT.split("env = mjrec")
     code = (
@@ -450,23 +400,23 @@ def test_the_global_random_state_is_left_alone(tmp_path: Path) -> None:
         f"before = state()\nenv = mjrec{recorded}env.close()\n"
         "assert state() == before\n"
     )
-    done = run_script(code.replace("env.action_space.sample()", "[0.0]"), tmp_path)
-    assert done.returncode == 0, done.stderr
+    run_python(code.replace("env.action_space.sample()", "[0.0]"), tmp_path)
 
 
 # --- where monitors live -------------------------------------------------------------
 
 
-def test_works_in_a_script_without_a_main_guard(tmp_path: Path) -> None:
-    """Workers never import the user's main module."""
+def test_works_in_a_script_without_a_main_guard(tmp_path):
+    """Workers never import the user's main module, nor what lies beside it."""
     script = tmp_path / "script.py"
+    (tmp_path / "h5py.py").write_text("raise RuntimeError('not this one')")
     script.write_text(SCRIPT + "print('once')\nenv.close()\n")
     command = [sys.executable, str(script), str(tmp_path / "out")]
     assert subprocess.check_output(command, text=True) == "once\n"
     assert len(list((tmp_path / "out").glob("*.mp4"))) == 1
 
 
-class Dictionaries(gymnasium.Env[Any, Any]):
+class Dictionaries(gymnasium.Env):
     """Nobody sees its state; observations and actions are dictionaries."""
 
     metadata: ClassVar[dict[str, Any]] = {"render_fps": 20}
@@ -475,17 +425,17 @@ class Dictionaries(gymnasium.Env[Any, Any]):
     )
     observation_space = action_space
 
-    def reset(self, *, seed: Any = None, options: Any = None) -> Any:
+    def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
         return self.action_space.sample(), {}
 
-    def step(self, action: Any) -> Any:
+    def step(self, action):
         return action, 1.5, False, False, {}
 
 
-def test_without_a_simulation_there_are_actions_and_rewards(tmp_path: Path) -> None:
+def test_without_a_simulation_there_are_actions_and_rewards(tmp_path):
     """Dictionaries are one vector, and it is said what that was made from."""
-    options: dict[str, Any] = {"trajectory_callable": True, "observations": True}
+    options = {"trajectory_callable": True, "observations": True}
     with mjrec.Monitor(
         Dictionaries(), tmp_path, False, env_id="Dict-v0", **options
     ) as env:
@@ -502,7 +452,7 @@ def test_without_a_simulation_there_are_actions_and_rewards(tmp_path: Path) -> N
     assert recorded.facts["rate"] == "20"
 
 
-def test_it_is_known_in_which_dtype_actions_were_given(tmp_path: Path) -> None:
+def test_it_is_known_in_which_dtype_actions_were_given(tmp_path):
     """An environment that gets another one gives other rewards."""
     env = gymnasium.make("InvertedPendulum-v5", max_episode_steps=4)
     kinds = ["float32", "float32", "float64", "float64"] + 4 * ["float64"]

@@ -1,10 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-from __future__ import annotations
-
 import tempfile
-from collections.abc import Iterator
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -26,20 +21,20 @@ from mjrec import (  # noqa: E402  after importorskip
 pytestmark = pytest.mark.dm_control
 
 
-class Countdown(dm_env.Environment):  # type: ignore[misc]  # dm_env is untyped
+class Countdown(dm_env.Environment):
     """Counts `length` steps down; a discount of 0 ends the task."""
 
-    def __init__(self, length: int = 3, discount: float = 0.0) -> None:
+    def __init__(self, length=3, discount=0.0):
         self.length = length
         self.discount = discount
-        self.left: int | None = None
+        self.left = None
         self.closed = 0
 
-    def reset(self) -> dm_env.TimeStep:
+    def reset(self):
         self.left = self.length
         return dm_env.restart(self._observation())
 
-    def step(self, action: Any) -> dm_env.TimeStep:
+    def step(self, action):
         if not self.left:
             return self.reset()
         self.left -= 1
@@ -47,21 +42,21 @@ class Countdown(dm_env.Environment):  # type: ignore[misc]  # dm_env is untyped
             return dm_env.transition(0.5, self._observation())
         return dm_env.truncation(0.5, self._observation(), self.discount)
 
-    def observation_spec(self) -> Any:
+    def observation_spec(self):
         return specs.Array((1,), np.float64)
 
-    def action_spec(self) -> Any:
+    def action_spec(self):
         return specs.BoundedArray((1,), np.float64, -1, 1)
 
-    def close(self) -> None:
+    def close(self):
         self.closed += 1
 
-    def _observation(self) -> Any:
+    def _observation(self):
         return np.array([self.left], np.float64)
 
 
 @pytest.fixture
-def cheetah() -> Iterator[Any]:
+def cheetah():
     """dm_control's cheetah-run, four steps long."""
     suite = pytest.importorskip("dm_control.suite", reason="dm_control not installed")
     env = suite.load("cheetah", "run", task_kwargs={"random": 0, "time_limit": 0.04})
@@ -69,20 +64,20 @@ def cheetah() -> Iterator[Any]:
     env.close()
 
 
-def zeros(env: Any) -> Any:
+def zeros(env):
     return np.zeros(env.action_spec().shape)
 
 
 class ContractTest(dm_env_test_utils.EnvironmentTestMixin, absltest.TestCase):
     """dm_env's own conformance test of the monitor."""
 
-    def make_object_under_test(self) -> Any:
+    def make_object_under_test(self):
         directory = tempfile.TemporaryDirectory()
         self.addCleanup(directory.cleanup)
         return mjrec.Monitor(Countdown(), directory.name, video_callable=False)
 
 
-def test_steps_that_are_resets(tmp_path: Path) -> None:
+def test_steps_that_are_resets(tmp_path):
     """Before the first reset and after the last step; whatever was before."""
     inner = Countdown()
     inner.reset()
@@ -101,7 +96,7 @@ def test_steps_that_are_resets(tmp_path: Path) -> None:
     assert env.episode_id == 2
 
 
-def test_reset_is_allowed_at_any_time(tmp_path: Path) -> None:
+def test_reset_is_allowed_at_any_time(tmp_path):
     """The unfinished episode has a number and no statistics; it can be forbidden."""
     with mjrec.Monitor(Countdown(), tmp_path, video_callable=False) as env:
         env.reset()
@@ -121,9 +116,7 @@ def test_reset_is_allowed_at_any_time(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("discount", "terminated"), [(0.0, True), (1.0, False)])
-def test_discount_tells_termination_from_truncation(
-    tmp_path: Path, discount: float, terminated: bool
-) -> None:
+def test_discount_tells_termination_from_truncation(tmp_path, discount, terminated):
     """A last step with discount 0 ends the task; another is a limit."""
     with mjrec.Monitor(
         Countdown(discount=discount), tmp_path, video_callable=False
@@ -134,7 +127,7 @@ def test_discount_tells_termination_from_truncation(
     assert (line["terminated"], line["truncated"]) == (terminated, not terminated)
 
 
-def test_environment_that_cannot_be_drawn_is_an_error(tmp_path: Path) -> None:
+def test_environment_that_cannot_be_drawn_is_an_error(tmp_path):
     """It names the way out, and nothing is left."""
     inner = Countdown()
     with pytest.raises(NoPictures, match="video_callable=False"):
@@ -145,7 +138,7 @@ def test_environment_that_cannot_be_drawn_is_an_error(tmp_path: Path) -> None:
     assert inner.closed == 0
 
 
-def test_records_dm_control(cheetah: Any, tmp_path: Path) -> None:
+def test_records_dm_control(cheetah, tmp_path):
     """Five frames of four steps; the environment's own attributes are there."""
     with mjrec.Monitor(
         cheetah, tmp_path, width=64, height=48, env_id="dm_control/cheetah-run"

@@ -1,11 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """`episode_info=True`, and what is known of success."""
 
-from __future__ import annotations
-
-from pathlib import Path
-from typing import Any
-
 import gymnasium
 import numpy as np
 import pytest
@@ -15,7 +10,7 @@ import mjrec
 from mjrec.monitors.gymnasium_monitor import success_in
 
 
-def last_info(env: Any) -> list[dict[str, Any]]:
+def last_info(env):
     """Run CartPole to its end; return the info of every step."""
     env.reset(seed=3)
     infos, done = [], False
@@ -26,12 +21,12 @@ def last_info(env: Any) -> list[dict[str, Any]]:
     return infos
 
 
-def monitor(directory: Path, env: Any = None, **options: Any) -> Any:
+def monitor(directory, env=None, **options):
     made = gymnasium.make("CartPole-v1") if env is None else env
     return mjrec.Monitor(made, directory, video_callable=False, **options)
 
 
-def test_last_step_has_what_gymnasium_gives(tmp_path: Path) -> None:
+def test_last_step_has_what_gymnasium_gives(tmp_path):
     """Keys, types and values are those of RecordEpisodeStatistics."""
     theirs = RecordEpisodeStatistics(gymnasium.make("CartPole-v1"))
     expected = last_info(theirs)[-1]["episode"]
@@ -46,7 +41,7 @@ def test_last_step_has_what_gymnasium_gives(tmp_path: Path) -> None:
     assert 0 < last["episode"]["t"] < 60
 
 
-def test_key_that_is_there_stays(tmp_path: Path) -> None:
+def test_key_that_is_there_stays(tmp_path):
     """The environment below, or a wrapper of it, has said it already."""
     inner = RecordEpisodeStatistics(gymnasium.make("CartPole-v1"))
     with monitor(tmp_path, inner, episode_info=True) as env:
@@ -54,7 +49,7 @@ def test_key_that_is_there_stays(tmp_path: Path) -> None:
     assert episode["t"] == inner.time_queue[-1]
 
 
-def test_gymnasiums_own_goes_around_a_monitor(tmp_path: Path) -> None:
+def test_gymnasiums_own_goes_around_a_monitor(tmp_path):
     """It asserts that the key is absent, which is why it is off by default."""
     with monitor(tmp_path) as env:
         assert last_info(RecordEpisodeStatistics(env))[-1]["episode"]["l"] > 0
@@ -66,7 +61,7 @@ def test_gymnasiums_own_goes_around_a_monitor(tmp_path: Path) -> None:
 
 
 @pytest.mark.dm_control
-def test_time_steps_have_no_info_to_add_to(tmp_path: Path) -> None:
+def test_time_steps_have_no_info_to_add_to(tmp_path):
     """An option that would do nothing is an error."""
     from dm_control import suite
 
@@ -88,6 +83,6 @@ def test_time_steps_have_no_info_to_add_to(tmp_path: Path) -> None:
         ({"success": np.zeros(2)}, None),
     ],
 )
-def test_success_is_what_the_info_says(info: dict[str, Any], expected: Any) -> None:
+def test_success_is_what_the_info_says(info, expected):
     """Under either name; what is no truth value says nothing."""
     assert success_in(info) is expected

@@ -1,21 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """Steps of which nothing but the state is new are recorded as all others are."""
 
-from __future__ import annotations
-
 import itertools
 import signal
-import subprocess
 import sys
-from collections.abc import Callable, Iterator
-from pathlib import Path
-from typing import Any
 
 import gymnasium
 import mujoco
 import numpy as np
 import pytest
-from recorded_states import assert_same, changes_in, is_fast, trajectories
+from other_python import run_python
+from recorded_states import assert_same, is_fast, trajectories
 from recordings import stats_of
 
 import mjrec
@@ -24,27 +19,25 @@ from mjrec import Monitor
 CHEETAH, HOPPER = "HalfCheetah-v5", "Hopper-v5"
 INTEGRATION = mujoco.mjtState.mjSTATE_INTEGRATION
 
-Before = Callable[[int, Any], None]
 
-
-class Rewarding(gymnasium.Wrapper[Any, Any, Any, Any]):
+class Rewarding(gymnasium.Wrapper):
     """Gives the rewards of the steps another type."""
 
-    def __init__(self, env: Any, reward: Callable[[float], Any]) -> None:
+    def __init__(self, env, reward):
         super().__init__(env)
         self.reward = reward
 
-    def step(self, action: Any) -> Any:
+    def step(self, action):
         observation, reward, *rest = self.env.step(action)
         return (observation, self.reward(float(reward)), *rest)
 
 
-def make(env_id: str = CHEETAH, steps: int = 8) -> Any:
+def make(env_id=CHEETAH, steps=8):
     """Return an environment nearly all of whose steps are usual."""
     return gymnasium.make(env_id, width=48, height=32, max_episode_steps=steps)
 
 
-def dm_control_task(domain: str, task: str) -> Any:
+def dm_control_task(domain, task):
     """Return a dm_control task with Gymnasium's actions; its episodes have 8 steps."""
     suite = pytest.importorskip("dm_control.suite", reason="dm_control not installed")
     timestep = 0.02 if domain in ("reacher", "hopper") else 0.01
@@ -52,7 +45,7 @@ def dm_control_task(domain: str, task: str) -> Any:
     return suite.load(domain, task, task_kwargs=task_kwargs)
 
 
-def monitored(env: Any, directory: Path, schedule: Any = None, **options: Any) -> Any:
+def monitored(env, directory, schedule=None, **options):
     """Return a monitor of the environment that draws nothing yet."""
     if not isinstance(env, gymnasium.Env):
         options |= {"env_id": "dm_control/some-task", "height": 32, "width": 48}
@@ -60,7 +53,7 @@ def monitored(env: Any, directory: Path, schedule: Any = None, **options: Any) -
     return Monitor(env, directory, schedule, workers=0, **options)
 
 
-def begin(monitor: Any) -> None:
+def begin(monitor):
     if isinstance(monitor, gymnasium.Env):
         monitor.reset(seed=0)
         monitor.action_space.seed(0)
@@ -68,9 +61,7 @@ def begin(monitor: Any) -> None:
         monitor.reset()
 
 
-def go(
-    monitor: Any, count: int, *, usual: bool = True, before: Before | None = None
-) -> list[Any]:
+def go(monitor, count, *, usual=True, before=None):
     """Take so many steps, and return what they returned."""
     results = []
     for number in range(1, count + 1):
@@ -88,9 +79,7 @@ def go(
     return results
 
 
-def recorded(
-    env: Any, directory: Path, *, camera: Any = None, max_fps: Any = None, **steps: Any
-) -> mjrec.Trajectory:
+def recorded(env, directory, *, camera=None, max_fps=None, **steps):
     """Record an episode of eight steps and return its trajectory."""
     with monitored(env, directory, camera=camera, max_fps=max_fps) as monitor:
         begin(monitor)
@@ -99,7 +88,7 @@ def recorded(
     return trajectory
 
 
-def state_of(env: Any) -> Any:
+def state_of(env):
     model, data = env.unwrapped.model, env.unwrapped.data
     state = np.empty(mujoco.mj_stateSize(model, INTEGRATION))
     mujoco.mj_getState(model, data, state, INTEGRATION)
@@ -107,7 +96,7 @@ def state_of(env: Any) -> Any:
 
 
 @pytest.fixture
-def cheetah() -> Iterator[Any]:
+def cheetah():
     """An environment nearly all of whose steps are usual."""
     env = make()
     yield env
@@ -117,7 +106,7 @@ def cheetah() -> Iterator[Any]:
 # --- what is recorded ----------------------------------------------------------------
 
 
-def _dm_control(domain: str, task: str, camera: Any, *marks: Any) -> Any:
+def _dm_control(domain, task, camera, *marks):
     return pytest.param(
         *(lambda: dm_control_task(domain, task), camera, None, [*range(9)]),
         id=f"{domain} {camera!s:.4}",
@@ -139,9 +128,7 @@ def _dm_control(domain: str, task: str, camera: Any, *marks: Any) -> Any:
         _dm_control("hopper", "stand", None, pytest.mark.thorough),
     ],
 )
-def test_usual_steps_are_recorded_as_others_are(
-    new: Any, camera: Any, max_fps: Any, frames: list[int], tmp_path: Path
-) -> None:
+def test_usual_steps_are_recorded_as_others_are(new, camera, max_fps, frames, tmp_path):
     """States, actions, rewards, ends and frames are the same, bit for bit."""
     usual, other = (
         recorded(
@@ -157,25 +144,12 @@ def test_usual_steps_are_recorded_as_others_are(
     assert_same(usual, other)
 
 
-def test_states_are_those_of_the_environment(cheetah: Any, tmp_path: Path) -> None:
-    """Of every step, as MuJoCo itself gives them after it."""
-    states = []
-    with monitored(cheetah, tmp_path) as monitor:
-        begin(monitor)
-        states.append(state_of(cheetah))
-        for _ in range(8):
-            go(monitor, 1)
-            states.append(state_of(cheetah))
-    [trajectory] = trajectories(tmp_path)
-    np.testing.assert_array_equal(trajectory.states, states)
-
-
 @pytest.mark.parametrize(
     ("max_fps", "schedule", "slow"), [(None, None, 1), (8, None, 1), (None, False, 0)]
 )
 def test_all_steps_but_the_first_of_the_run_are_usual(
-    max_fps: Any, schedule: Any, slow: int, cheetah: Any, tmp_path: Path
-) -> None:
+    max_fps, schedule, slow, cheetah, tmp_path
+):
     """Recorded or counted; the first tells what actions are, and how long it is."""
     with monitored(cheetah, tmp_path, schedule, max_fps=max_fps) as monitor:
         seen = []
@@ -188,30 +162,16 @@ def test_all_steps_but_the_first_of_the_run_are_usual(
     assert seen == [*slow * [False], *(16 - slow) * [True]]
 
 
-def test_a_reset_that_another_one_replaces_leaves_nothing(
-    cheetah: Any, tmp_path: Path
-) -> None:
-    """Its row was written at once; so was that of one that no step followed."""
-    with monitored(cheetah, tmp_path) as monitor:
-        begin(monitor)
-        go(monitor, 8)
-        for seed in (3, 4, 5):
-            monitor.reset(seed=seed)
-    first, second = trajectories(tmp_path)
-    assert (len(first), len(second)) == (8, 0)
-    assert (second.seed, second.complete) == (5, False)
-
-
-def test_the_first_step_of_another_episode_may_be_unlike(tmp_path: Path) -> None:
+def test_the_first_step_of_another_episode_may_be_unlike(tmp_path):
     """Another action and another pace: the reset is written anew, or they are noted."""
 
-    class Other(gymnasium.Wrapper[Any, Any, Any, Any]):
-        def reset(self, **options: Any) -> Any:
+    class Other(gymnasium.Wrapper):
+        def reset(self, **options):
             result = self.env.reset(**options)
-            self.unwrapped.model.opt.timestep = 0.01 / (monitor.episode_id + 1)  # type: ignore[attr-defined]
+            self.unwrapped.model.opt.timestep = 0.01 / (monitor.episode_id + 1)
             return result
 
-        def step(self, action: Any) -> Any:
+        def step(self, action):
             return self.env.step(np.resize(action, 6))
 
     with monitored(Other(make(steps=2)), tmp_path) as monitor:
@@ -249,9 +209,7 @@ def test_the_first_step_of_another_episode_may_be_unlike(tmp_path: Path) -> None
     ],
     ids=["int", "float64", "float32", "0-d", "1-d", "bool", "mixed"],
 )
-def test_rewards_of_any_type_are_numbers(
-    kind: Callable[[float], Any], tmp_path: Path
-) -> None:
+def test_rewards_of_any_type_are_numbers(kind, tmp_path):
     """In the trajectory and, added up in their order, in the statistics."""
     with monitored(Rewarding(make(), kind), tmp_path) as monitor:
         begin(monitor)
@@ -269,24 +227,7 @@ def test_rewards_of_any_type_are_numbers(
     assert stats_of(tmp_path)["episode_rewards"] == [total]
 
 
-def test_episodes_that_are_only_counted(tmp_path: Path) -> None:
-    """Lengths, sums and ends are those of episodes whose states are recorded."""
-    found = []
-    for name, schedule in (("counted", False), ("recorded", None)):
-        with monitored(make(HOPPER, 30), tmp_path / name, schedule) as monitor:
-            begin(monitor)
-            for steps in range(1, 101):
-                [(_, _, terminated, truncated, _)] = go(monitor, 1)
-                assert monitor.get_total_steps() == steps
-                if terminated or truncated:
-                    monitor.reset()
-        stats = stats_of(tmp_path / name)
-        found.append((stats["episode_lengths"], stats["episode_rewards"]))
-    assert found[0] == found[1]
-    assert not list((tmp_path / "counted").glob("*trajectory*"))
-
-
-def test_a_reward_that_is_no_number_is_told(tmp_path: Path) -> None:
+def test_a_reward_that_is_no_number_is_told(tmp_path):
     """The step is not recorded, and the next one is."""
     rewards = iter([1.0, 1.0, "much", 1.0, 1.0])
     env = Rewarding(make(), lambda _: next(rewards))
@@ -300,48 +241,6 @@ def test_a_reward_that_is_no_number_is_told(tmp_path: Path) -> None:
     [trajectory] = trajectories(tmp_path)
     np.testing.assert_array_equal(trajectory.states[-1], state_of(env))
     assert trajectory.rewards.tolist() == [1.0] * 4
-
-
-# --- what is noticed -----------------------------------------------------------------
-
-
-def test_a_changed_model_is_noticed_at_the_very_step(
-    cheetah: Any, tmp_path: Path
-) -> None:
-    """A colour set before step 4 is that of frame 4, and another one's that of 7."""
-    model = cheetah.unwrapped.model
-
-    def paint(number: int, monitor: Any) -> None:
-        if number in (4, 7):
-            assert is_fast(monitor)
-            model.geom_rgba[1] = (0, 0, 1, number / 10)
-
-    trajectory = recorded(cheetah, tmp_path, before=paint)
-    alphas = [trajectory.model(step).geom_rgba[1, 3] for step in (3, 4, 6, 7, 8)]
-    assert alphas == pytest.approx([1, 0.4, 0.4, 0.7, 0.7])
-    assert trajectory.frame_steps.tolist() == list(range(9))
-
-
-@pytest.mark.parametrize(
-    "kind", ["own", "free", pytest.param("dm", marks=pytest.mark.dm_control)]
-)
-def test_a_camera_may_move(kind: str, tmp_path: Path) -> None:
-    """One's own at any step; a free one with the model, for every frame anew."""
-    camera: Any = {"own": mujoco.MjvCamera(), "free": -1, "dm": None}[kind]
-    env = dm_control_task("cheetah", "run") if kind == "dm" else make()
-    model = env.physics.model if kind == "dm" else env.unwrapped.model
-
-    def turn(number: int, monitor: Any) -> None:
-        if number in (3, 4, 7):
-            assert is_fast(monitor)
-            if kind == "own":
-                camera.azimuth += 10
-            else:
-                model.vis.global_.azimuth += 30
-
-    recorded(env, tmp_path, camera=camera, before=turn)
-    moved = {"camera.azimuth"} | (set() if kind == "own" else {"vis.global_.azimuth"})
-    assert changes_in(tmp_path) == dict.fromkeys((3, 4, 7), moved)
 
 
 # --- actions -------------------------------------------------------------------------
@@ -360,8 +259,8 @@ def test_a_camera_may_move(kind: str, tmp_path: Path) -> None:
     ids=lambda value: value if isinstance(value, str) else "",
 )
 def test_actions_of_another_kind_are_recorded_as_they_are(
-    kind: str, value: Any, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+    kind, value, tmp_path, caplog
+):
     """In mid-episode, with no word about it; and those after them too."""
     env = make()
     actions = [env.action_space.sample() for _ in range(8)]
@@ -375,11 +274,11 @@ def test_actions_of_another_kind_are_recorded_as_they_are(
     assert "not like those before" not in caplog.text
 
 
-def test_an_action_that_the_environment_overwrites(tmp_path: Path) -> None:
+def test_an_action_that_the_environment_overwrites(tmp_path):
     """Is recorded as it was given."""
 
-    class Overwriting(gymnasium.Wrapper[Any, Any, Any, Any]):
-        def step(self, action: Any) -> Any:
+    class Overwriting(gymnasium.Wrapper):
+        def step(self, action):
             result = self.env.step(action)
             action[:] = 7
             return result
@@ -396,7 +295,7 @@ def test_an_action_that_the_environment_overwrites(tmp_path: Path) -> None:
 # --- errors, and the end -------------------------------------------------------------
 
 
-def interrupt_in(monitor: Any, event_number: int) -> bool:
+def interrupt_in(monitor, event_number):
     """Take a step, and raise behind one of the calls in it, as a signal's handler does.
 
     Returns:
@@ -404,7 +303,7 @@ def interrupt_in(monitor: Any, event_number: int) -> bool:
     """
     left = event_number
 
-    def profile(frame: Any, event: str, _: object) -> None:
+    def profile(frame, event, _):
         nonlocal left
         if event in ("return", "c_return") and "mjrec" in frame.f_code.co_filename:
             left -= 1
@@ -427,9 +326,7 @@ def interrupt_in(monitor: Any, event_number: int) -> bool:
     [(None, None), (8, None), (None, False)],
     ids=["frames", "few frames", "counted"],
 )
-def test_an_interrupted_step_is_recorded_or_is_not(
-    max_fps: Any, schedule: Any, tmp_path: Path
-) -> None:
+def test_an_interrupted_step_is_recorded_or_is_not(max_fps, schedule, tmp_path):
     """Wherever it is interrupted, who goes on has statistics and rows of all others."""
     numbers = itertools.count(1)
     for number in numbers:
@@ -455,42 +352,6 @@ def test_an_interrupted_step_is_recorded_or_is_not(
         if not was_interrupted:
             break
     assert number > 4
-
-
-def test_steps_after_the_close_go_to_the_environment(
-    cheetah: Any, tmp_path: Path
-) -> None:
-    """Nothing more is recorded of them."""
-    monitor = monitored(cheetah, tmp_path)
-    begin(monitor)
-    go(monitor, 4)
-    monitor.close()
-    time = float(cheetah.unwrapped.data.time)
-    observation, reward, *_ = monitor.step(np.zeros(6))
-    assert observation.shape == (17,)
-    assert isinstance(reward, float)
-    assert cheetah.unwrapped.data.time > time
-    assert monitor.get_total_steps() == 4
-    [trajectory] = trajectories(tmp_path)
-    assert len(trajectory) == 4
-
-
-def test_a_monitor_may_be_closed_within_a_step(tmp_path: Path) -> None:
-    """As by a signal's handler that only closes it: the step returns as ever."""
-
-    def close_at(reward: float) -> float:
-        if monitor.get_total_steps() == 3:
-            monitor.close()
-        return reward
-
-    monitor = monitored(Rewarding(make(), close_at), tmp_path)
-    begin(monitor)
-    go(monitor, 3)
-    assert is_fast(monitor)
-    [(observation, *_)] = go(monitor, 1)
-    assert observation.shape == (17,)
-    [trajectory] = trajectories(tmp_path)
-    assert len(trajectory) == 3
 
 
 KILLED = """
@@ -527,10 +388,9 @@ while True:
 
 
 @pytest.mark.parametrize("moment", ["being filled", "filled"])
-def test_a_kill_at_a_row_loses_that_row(moment: str, tmp_path: Path) -> None:
+def test_a_kill_at_a_row_loses_that_row(moment, tmp_path):
     """Between filling it and counting it, too: all rows before it are there."""
-    done = subprocess.run([sys.executable, "-c", KILLED, str(tmp_path), moment])
-    assert done.returncode == -signal.SIGKILL
+    run_python(KILLED, tmp_path, moment, status=-signal.SIGKILL)
     mjrec.recover(tmp_path)
     # The first step of all did not go the fast way.
     assert [len(each) for each in trajectories(tmp_path)] == [3, 3, 1]

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Finding and running ffmpeg."""
 
-from __future__ import annotations
-
 import hashlib
 import os
 import time
@@ -24,13 +22,13 @@ from mjrec.formats.ffmpeg import (
 )
 
 
-def script(path: Path, text: str) -> Path:
+def script(path, text):
     path.write_text(f"#!/bin/sh\n{text}\n")
     path.chmod(0o755)
     return path
 
 
-def test_the_binary_is_named_and_hashed() -> None:
+def test_the_binary_is_named_and_hashed():
     """Version line and sha256 are those of the program that is run."""
     path = ffmpeg_executable()
     assert os.access(path, os.X_OK)
@@ -40,15 +38,11 @@ def test_the_binary_is_named_and_hashed() -> None:
 
 
 @pytest.mark.parametrize(
-    ("libavutil", "option"),
-    [
-        ("56. 70.100", "-vsync"),
-        ("61.  1.102", "-fps_mode"),
-    ],
+    ("libavutil", "option"), [("56. 70.100", "-vsync"), ("61.  1.102", "-fps_mode")]
 )
 def test_an_old_ffmpeg_is_asked_in_its_own_words(
-    libavutil: str, option: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    libavutil, option, tmp_path, monkeypatch
+):
     """5.1 renamed the option that lets each frame pass, and 9 took the old one away."""
     text = f"printf 'ffmpeg version x\\nlibavutil      {libavutil} / {libavutil}\\n'"
     monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", str(script(tmp_path / "other", text)))
@@ -57,12 +51,12 @@ def test_an_old_ffmpeg_is_asked_in_its_own_words(
 
 @pytest.mark.parametrize("is_named", [True, False])
 def test_a_program_that_cannot_be_started_is_told_from_one_that_failed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, is_named: bool
-) -> None:
+    tmp_path, monkeypatch, is_named
+):
     """A file that is executable and no program: the reason, and how to get another."""
     broken = script(tmp_path / "broken", "")
     broken.write_bytes(b"\0\0\0\0")
-    error: type[Exception] = MissingDependency
+    error = MissingDependency
     reason = r"broken \(Exec format error\)"
     if is_named:
         monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", str(broken))
@@ -76,12 +70,12 @@ def test_a_program_that_cannot_be_started_is_told_from_one_that_failed(
 
 
 @pytest.fixture
-def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
+def impatient(monkeypatch):
     """Let what makes no progress hang after a moment."""
     monkeypatch.setenv("MJREC_PATIENCE", "0.3")
 
 
-def hang_at(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, text: str) -> None:
+def hang_at(tmp_path, monkeypatch, text):
     # Not replaced by what it starts: a wrapper script, that has to go with it.
     program = script(tmp_path / "wrapper", f"echo begun >&2; {text}; exit 0")
     monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", str(program))
@@ -89,9 +83,7 @@ def hang_at(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, text: str) -> None:
 
 @pytest.mark.usefixtures("impatient")
 @pytest.mark.parametrize("way", ["write", "read", "wait"])
-def test_a_process_that_hangs_is_ended(
-    way: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_process_that_hangs_is_ended(way, tmp_path, monkeypatch):
     """Whether it takes nothing, gives nothing or does not end."""
     hang_at(tmp_path, monkeypatch, "sleep 33.75")
     process = FfmpegProcess(["-"], what="No.", reads=way == "write", writes=True)
@@ -109,9 +101,7 @@ def test_a_process_that_hangs_is_ended(
 
 
 @pytest.mark.usefixtures("impatient")
-def test_a_slow_process_does_not_hang(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_slow_process_does_not_hang(tmp_path, monkeypatch):
     """As long as something moves: what it takes, gives, or writes into its file."""
     out = tmp_path / "out"
     hang_at(
@@ -127,7 +117,7 @@ def test_a_slow_process_does_not_hang(
     process.release()
 
 
-def still_runs(*command: str) -> bool:
+def still_runs(*command):
     """Tell whether it does so for another ten seconds, on a busy machine."""
     wanted = "\0".join([*command, ""]).encode()
     end = time.monotonic() + 10
@@ -139,7 +129,7 @@ def still_runs(*command: str) -> bool:
     return True
 
 
-def read_or_nothing(path: Path) -> bytes:
+def read_or_nothing(path):
     try:
         return path.read_bytes()
     except OSError:
@@ -150,27 +140,27 @@ def read_or_nothing(path: Path) -> bytes:
 
 
 @pytest.fixture
-def program(tmp_path: Path) -> Path:
+def program(tmp_path):
     path = tmp_path / "program"
     path.write_text("one")
     return path
 
 
 @pytest.fixture
-def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def cache(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     return tmp_path / "cache" / "mjrec" / "programs.json"
 
 
-def ask(program: Path, asked: list[str], answer: str = "yes") -> str:
+def ask(program, asked, answer="yes"):
     """Ask as a new process does, and note where the program had to be asked."""
     ffmpeg._answers.clear()
     return remembered(str(program), "does it work?", lambda: asked.append("") or answer)
 
 
-def test_a_program_is_asked_once(program: Path, cache: Path) -> None:
+def test_a_program_is_asked_once(program, cache):
     """Another process need not ask, until the file is another one."""
-    asked: list[str] = []
+    asked = []
     assert [ask(program, asked), ask(program, asked)] == ["yes", "yes"]
     assert len(asked) == 1
     # Of the same size and time of change.
@@ -182,11 +172,9 @@ def test_a_program_is_asked_once(program: Path, cache: Path) -> None:
 
 
 @pytest.mark.parametrize("what", ["garbage", "no place"])
-def test_what_cannot_be_read_is_asked_anew(
-    what: str, program: Path, cache: Path
-) -> None:
+def test_what_cannot_be_read_is_asked_anew(what, program, cache):
     """Whatever stands in its place."""
-    asked: list[str] = []
+    asked = []
     if what == "no place":
         cache.parents[1].write_text("a file")
     else:

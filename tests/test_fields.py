@@ -1,23 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """Fields of a model and of a view, read and set by their names."""
 
-from __future__ import annotations
-
 import copy
 import json
-from typing import Any
 
 import mujoco
 import numpy as np
 import pytest
 
 from mjrec.errors import InvalidArgument
-from mjrec.simulation.fields import (
-    apply_fields,
-    array_names,
-    read_fields,
-    struct_names,
-)
+from mjrec.simulation.fields import apply_fields, array_names, read_fields, struct_names
 from mjrec.simulation.view import SceneView, view_from_facts
 
 XML = """
@@ -32,11 +24,11 @@ XML = """
 
 
 @pytest.fixture
-def model() -> mujoco.MjModel:
+def model():
     return mujoco.MjModel.from_xml_string(XML)
 
 
-def test_what_was_read_can_be_set_in_another_model(model: mujoco.MjModel) -> None:
+def test_what_was_read_can_be_set_in_another_model(model):
     """Arrays and members of structs; a single number is an array of no dimension."""
     assert len(read_fields(model, [*array_names(), *struct_names()])) > 450
     other = copy.copy(model)
@@ -77,16 +69,14 @@ def test_what_was_read_can_be_set_in_another_model(model: mujoco.MjModel) -> Non
         ("option.label", np.array(1 << 30), "has to be from 0 to"),
     ],
 )
-def test_what_cannot_be_set_is_refused(
-    model: mujoco.MjModel, name: str, value: Any, words: str
-) -> None:
+def test_what_cannot_be_set_is_refused(model, name, value, words):
     """A file may name anything: MuJoCo would read foreign memory at a wrong index."""
     with pytest.raises(InvalidArgument, match=words):
         apply_fields(model, {name: value}, option=mujoco.MjvOption())
 
 
 @pytest.fixture
-def view() -> SceneView:
+def view():
     camera, option = mujoco.MjvCamera(), mujoco.MjvOption()
     camera.lookat[:] = (0.1, 1 / 3, -7)
     camera.fixedcamid = 4
@@ -96,7 +86,7 @@ def view() -> SceneView:
     return SceneView(camera=camera, option=option, label="side", **more)
 
 
-def test_facts_are_json_and_come_back_as_the_same_view(view: SceneView) -> None:
+def test_facts_are_json_and_come_back_as_the_same_view(view):
     """To the last bit, and with every member there is."""
     facts = json.loads(json.dumps(view.facts()))
     again = view_from_facts(facts)
@@ -123,9 +113,7 @@ def test_facts_are_json_and_come_back_as_the_same_view(view: SceneView) -> None:
         ("option.frame", 1 << 30),
     ],
 )
-def test_facts_that_cannot_be_are_refused_by_name(
-    view: SceneView, name: str, value: Any
-) -> None:
+def test_facts_that_cannot_be_are_refused_by_name(view, name, value):
     """They may come from a file."""
     facts = view.facts()
     struct, _, member = name.partition(".")

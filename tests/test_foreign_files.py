@@ -1,11 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """What strangers have recorded is read in a sandbox first, and once."""
 
-from __future__ import annotations
-
 import os
 import shutil
-from pathlib import Path
 
 import gymnasium
 import pytest
@@ -19,20 +16,20 @@ from mjrec.simulation.model_trust import directory_digest, note_models
 
 
 @pytest.fixture
-def started(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+def started(monkeypatch):
     """The modules that were started in a sandbox."""
-    modules: list[str] = []
+    modules = []
 
     class Counted(foreign_files.Sandbox):
-        def __init__(self, module: str, *arguments: object, **options: object) -> None:
+        def __init__(self, module, *arguments, **options):
             modules.append(module)
-            super().__init__(module, *arguments, **options)  # type: ignore[arg-type]
+            super().__init__(module, *arguments, **options)
 
     monkeypatch.setattr(foreign_files, "Sandbox", Counted)
     return modules
 
 
-def test_a_strangers_file_is_vetted_once(tmp_path: Path, started: list[str]) -> None:
+def test_a_strangers_file_is_vetted_once(tmp_path, started):
     """Until it is another one."""
     path = finished(tmp_path)
     assert mjrec.load_trajectory(path).snapshots
@@ -43,9 +40,7 @@ def test_a_strangers_file_is_vetted_once(tmp_path: Path, started: list[str]) -> 
     assert len(started) == 2
 
 
-def test_ones_own_files_cost_no_process(
-    tmp_path: Path, started: list[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_ones_own_files_cost_no_process(tmp_path, started, monkeypatch):
     """Those of a directory that this user has recorded into, wherever they moved."""
     own = tmp_path / "own"
     with mjrec.Monitor(gymnasium.make("InvertedPendulum-v5"), own, workers=0) as env:
@@ -66,7 +61,7 @@ def test_ones_own_files_cost_no_process(
     assert len(started) == 2
 
 
-def test_what_is_in_flight_is_read_directly(tmp_path: Path, started: list[str]) -> None:
+def test_what_is_in_flight_is_read_directly(tmp_path, started):
     """Nothing in a log is packed."""
     mjrec.load_trajectory(write_log(tmp_path))
     assert started == []

@@ -1,46 +1,29 @@
 # SPDX-License-Identifier: Apache-2.0
 """`use_gl`, in processes of their own: it is about what a process has done so far."""
 
-from __future__ import annotations
-
-import os
-import subprocess
-import sys
-from pathlib import Path
-
 import pytest
+from other_python import run_python, without_gl
 from parts import parametrize
 
 from mjrec.gl import probe
 
-_CHOOSING = ("MUJOCO_GL", "PYOPENGL_PLATFORM", "MUJOCO_EGL_DEVICE_ID")
-_SCREEN = ("DISPLAY", "WAYLAND_DISPLAY", "XDG_SESSION_TYPE")
 _SHOW = (
     "\nprint(answer, os.environ.get('MUJOCO_GL'), os.environ.get('PYOPENGL_PLATFORM'))"
 )
 _HEAD = "import logging, os, sys; import mjrec; logging.basicConfig(level='INFO')\n"
 
 
-def run(code: str, **variables: str) -> subprocess.CompletedProcess[str]:
+def run(code, **variables):
     """Run `code` in a Python whose environment chooses no OpenGL but these."""
-    environ = {k: v for k, v in os.environ.items() if k not in _CHOOSING + _SCREEN}
-    return subprocess.run(
-        [sys.executable, "-P", "-c", _HEAD + code],
-        env={**environ, **variables},
-        capture_output=True,
-        check=False,
-        text=True,
-    )
+    return run_python(_HEAD + code, env=without_gl(**variables))
 
 
-def answer_of(code: str, **variables: str) -> str:
+def answer_of(code, **variables):
     """Return what `code`, which sets `answer`, and the variables afterwards say."""
-    done = run(code + _SHOW, **variables)
-    assert done.returncode == 0, done.stderr
-    return done.stdout.strip()
+    return run(code + _SHOW, **variables).stdout.strip()
 
 
-def error_of(code: str, **variables: str) -> str:
+def error_of(code, **variables):
     """Return how `code` failed, and that no variable has changed."""
     body = "\n  ".join(code.splitlines())
     wrapped = (
@@ -50,9 +33,7 @@ def error_of(code: str, **variables: str) -> str:
         "  assert dict(os.environ) == before\n"
         "else:\n  sys.exit('no error')"
     )
-    done = run(wrapped, **variables)
-    assert done.returncode == 0, done.stderr
-    return done.stdout
+    return run(wrapped, **variables).stdout
 
 
 @parametrize(
@@ -69,12 +50,12 @@ def error_of(code: str, **variables: str) -> str:
         ("import mujoco; answer = mjrec.use_gl('egl')", {"MUJOCO_GL": "egl"}),
     ],
 )
-def test_a_backend_is_taken(code: str, variables: dict[str, str]) -> None:
+def test_a_backend_is_taken(code, variables):
     """The argument, else the variable, else the first that renders; both variables."""
     assert answer_of(code, **variables) == "egl egl egl"
 
 
-def test_mujoco_then_takes_the_choice() -> None:
+def test_mujoco_then_takes_the_choice():
     """What is imported afterwards draws by it; importing mjrec.gl imports none."""
     code = (
         "import mjrec.gl\n"
@@ -106,15 +87,13 @@ def test_mujoco_then_takes_the_choice() -> None:
         ),
     ],
 )
-def test_what_cannot_be_taken(
-    code: str, variables: dict[str, str], said: list[str]
-) -> None:
+def test_what_cannot_be_taken(code, variables, said):
     """The error has the cause and what to do, and no variable changes."""
     error = error_of(code, **variables)
     assert all(each in error for each in said), error
 
 
-def test_the_next_one_where_the_first_crashes(tmp_path: Path) -> None:
+def test_the_next_one_where_the_first_crashes(tmp_path):
     """A crash of EGL's driver leads to OSMesa, and the reason is logged."""
     osmesa = probe("osmesa")
     if not osmesa.renders:
@@ -129,7 +108,7 @@ def test_the_next_one_where_the_first_crashes(tmp_path: Path) -> None:
     assert "egl cannot be used: The driver crashed (SIGSEGV)" in done.stderr
 
 
-def test_nothing_renders(tmp_path: Path) -> None:
+def test_nothing_renders(tmp_path):
     """Every backend is listed with its own cause and fix."""
     for name in ("libEGL.so", "libOSMesa.so"):
         for number in ["", *(f".{n}" for n in range(10))]:
@@ -179,9 +158,7 @@ def test_nothing_renders(tmp_path: Path) -> None:
     ],
     ids=["other", "off", "any", "PyOpenGL", "dm_control"],
 )
-def test_what_was_imported_before(
-    code: str, variables: dict[str, str], said: list[str]
-) -> None:
+def test_what_was_imported_before(code, variables, said):
     """A backend is taken once; the one that was is named, and the way out."""
     error = error_of(code, **variables)
     assert all(each in error for each in said), error

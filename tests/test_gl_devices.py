@@ -1,16 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Rendering on a given GPU: found among EGL's devices, and said where there is none."""
 
-from __future__ import annotations
-
-import os
-import subprocess
-import sys
-from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
+from other_python import run_python, without_gl
 
 from mjrec.errors import InvalidArgument
 from mjrec.gl import EglDevice, probe, render_on_given_gpu, visible_gpus
@@ -33,32 +27,24 @@ LLVMPIPE = EglDevice(index=0, device_file="", cuda_id=None, software=True, in_us
 OTHER = replace(
     HIDDEN, index=1, in_use=False, uuid="GPU-0f3e5d1c-2b4a-4968-8877-665544332211"
 )
-CHOOSING = ("MUJOCO_GL", "PYOPENGL_PLATFORM", "MUJOCO_EGL_DEVICE_ID")
 
 
 @pytest.fixture(autouse=True)
-def nothing_chosen(monkeypatch: pytest.MonkeyPatch) -> None:
+def nothing_chosen(monkeypatch):
     """No test begins with a GPU, and none leaves a choice behind."""
     monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
 
 
-def run(code: str, **variables: str) -> subprocess.CompletedProcess[str]:
+def run(code, **variables):
     """Run `code` in a Python whose environment chooses no OpenGL but these."""
     head = (
         "import logging, os, sys; logging.basicConfig(level='INFO')\n"
         "from mjrec.gl import render_on_given_gpu\n"
     )
-    environ = {k: v for k, v in os.environ.items() if k not in CHOOSING}
-    return subprocess.run(
-        [sys.executable, "-P", "-c", head + code],
-        env={**environ, **variables},
-        capture_output=True,
-        check=False,
-        text=True,
-    )
+    return run_python(head + code, env=without_gl(**variables), status=None)
 
 
-def has_gpu() -> bool:
+def has_gpu():
     return any(not device.software for device in probe("egl").devices)
 
 
@@ -91,9 +77,7 @@ SHOWN = replace(H100, index=2, cuda_id=3)
         ([H100, replace(H100, index=1)], "0", None),
     ],
 )
-def test_egls_device_of_a_gpu(
-    devices: list[EglDevice], gpu: str, expected: EglDevice | None
-) -> None:
+def test_egls_device_of_a_gpu(devices, gpu, expected):
     """It is found by CUDA's number or the UUID, and never guessed."""
     assert device_of_gpu(devices, gpu) is expected
 
@@ -108,12 +92,12 @@ def test_egls_device_of_a_gpu(
         ("0,-1,2", ["0"]),
     ],
 )
-def test_visible_gpus_are_the_variables_entries(text: str, expected: list[str]) -> None:
+def test_visible_gpus_are_the_variables_entries(text, expected):
     """As CUDA reads it, up to the first that it does not understand."""
     assert visible_gpus({"CUDA_VISIBLE_DEVICES": text}) == expected
 
 
-def test_visible_gpus_without_the_variable(tmp_path: Path) -> None:
+def test_visible_gpus_without_the_variable(tmp_path):
     """CUDA counts those that may be opened, whatever their files are called."""
     for name in ("nvidia2", "nvidia5", "nvidiactl", "nvidia-uvm", "null"):
         (tmp_path / name).touch()
@@ -124,7 +108,7 @@ def test_visible_gpus_without_the_variable(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("gpu", ["", "cuda:0", "0,1", "GPU-1,GPU-2", "-1"])
-def test_what_is_no_entry_is_refused(gpu: str) -> None:
+def test_what_is_no_entry_is_refused(gpu):
     """Before anything is tried."""
     with pytest.raises(InvalidArgument, match="CUDA_VISIBLE_DEVICES"):
         render_on_given_gpu(gpu)
@@ -136,11 +120,7 @@ def test_what_is_no_entry_is_refused(gpu: str) -> None:
         ("None", {"CUDA_VISIBLE_DEVICES": ""}, "This process was given no GPU"),
         ("None", {"CUDA_VISIBLE_DEVICES": "-1"}, "This process was given no GPU"),
         # `MUJOCO_GL` stands, and what that means is said.
-        (
-            "'0'",
-            {"MUJOCO_GL": "osmesa"},
-            "GPU 0 was given for rendering, and MUJOCO",
-        ),
+        ("'0'", {"MUJOCO_GL": "osmesa"}, "GPU 0 was given for rendering, and MUJOCO"),
         pytest.param(
             *("'3'", {}, "GPU 3 was given for rendering, and EGL has only"),
             marks=needs_no_gpu,
@@ -151,9 +131,7 @@ def test_what_is_no_entry_is_refused(gpu: str) -> None:
         ),
     ],
 )
-def test_where_it_cannot_be_there_is_one_warning(
-    gpu: str, variables: dict[str, str], said: str
-) -> None:
+def test_where_it_cannot_be_there_is_one_warning(gpu, variables, said):
     """No variable changes; it is an error where the GPU is required."""
     done = run(
         f"before = dict(os.environ)\nassert render_on_given_gpu({gpu}) is None\n"
@@ -166,32 +144,11 @@ def test_where_it_cannot_be_there_is_one_warning(
     assert f"GLError: {said}" in done.stderr
 
 
-@pytest.mark.parametrize(
-    ("first", "variables", "expected"),
-    [
-        ("import mujoco", {"MUJOCO_GL": "off"}, ""),
-        ("import mujoco", {"MUJOCO_GL": ""}, "cannot change to egl any more"),
-        (
-            "import mujoco; context = mujoco.GLContext(16, 16)",
-            {"MUJOCO_GL": "egl"},
-            "has begun to draw by EGL",
-        ),
-    ],
-)
-def test_too_late_in_a_process(
-    first: str, variables: dict[str, str], expected: str
-) -> None:
-    """An error where what was imported cannot change any more."""
-    done = run(f"{first}\nrender_on_given_gpu('0')", DISPLAY="", **variables)
-    assert expected in done.stderr
-    assert (done.returncode == 0) is (not expected)
-
-
 @needs_gpu
 @pytest.mark.parametrize(
     "name", [lambda d: "0", lambda d: d.uuid, lambda d: d.uuid[:9]]
 )
-def test_the_given_gpu_draws(name: Callable[[EglDevice], str]) -> None:
+def test_the_given_gpu_draws(name):
     """By its number and by its UUID; mujoco then draws on that device."""
     gpu = name(next(d for d in probe("egl").devices if d.cuda_id == 0))
     done = run(

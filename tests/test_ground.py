@@ -1,14 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """The small modules at the bottom: JSON, files that appear whole, frames, errors."""
 
-from __future__ import annotations
-
 import json
 import math
 import pickle
 import re
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -20,7 +17,7 @@ from mjrec.formats.monitor_directory import infix_of
 from mjrec.frames import check_frame, check_size, grid_frame, grid_shape
 from mjrec.json_text import dumps, float_from_json, loads
 
-LOOP: list[Any] = []
+LOOP = []
 LOOP.append(LOOP)
 
 
@@ -42,19 +39,19 @@ LOOP.append(LOOP)
         (LOOP, '[{"repr": "[[...]]"}]'),
     ],
 )
-def test_json_is_what_every_reader_accepts(value: Any, text: str) -> None:
+def test_json_is_what_every_reader_accepts(value, text):
     """NumPy's numbers, NaN and infinity, and what JSON does not know."""
     assert dumps(value) == text
     json.loads(text, parse_constant=pytest.fail)
 
 
-def test_nan_comes_back() -> None:
+def test_nan_comes_back():
     """Also from gym's own token."""
     assert math.isnan(float_from_json(None))
     assert repr(loads("[NaN, -Infinity, 1e999]")) == "[nan, -inf, inf]"
 
 
-def test_a_file_appears_whole_or_not_at_all(tmp_path: Path) -> None:
+def test_a_file_appears_whole_or_not_at_all(tmp_path):
     """A failure leaves the old one, and no temporary one."""
     path = tmp_path / "a.txt"
     with replacing(path) as temporary:
@@ -64,7 +61,7 @@ def test_a_file_appears_whole_or_not_at_all(tmp_path: Path) -> None:
         assert temporary.parent == tmp_path
     write_text(path, "old")
 
-    def fail() -> None:
+    def fail():
         with replacing(path) as temporary:
             temporary.write_text("new")
             raise RuntimeError
@@ -75,7 +72,7 @@ def test_a_file_appears_whole_or_not_at_all(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_unfinished_file_of_a_hidden_one_is_known_as_a_monitors(tmp_path: Path) -> None:
+def test_unfinished_file_of_a_hidden_one_is_known_as_a_monitors(tmp_path):
     """Or nobody would remove what a killed process has left of it."""
     note = tmp_path / ".openaigym.video.0.7.video000015.mp4.note.part"
     with replacing(note) as temporary:
@@ -91,24 +88,24 @@ def test_unfinished_file_of_a_hidden_one_is_known_as_a_monitors(tmp_path: Path) 
         *(np.zeros((2, 2, 4), np.uint8), np.zeros((0, 2, 3), np.uint8)),
     ],
 )
-def test_what_is_no_frame_is_said(bad: Any) -> None:
+def test_what_is_no_frame_is_said(bad):
     """The error says what it is and what it should be."""
     with pytest.raises(InvalidFrame, match="must"):
         check_frame(bad)
 
 
 @pytest.mark.parametrize("size", [(0, 1), (1, -1), (1.5, 2), (True, 2), (99999, 1)])
-def test_impossible_sizes_are_an_error(size: tuple[Any, Any]) -> None:
+def test_impossible_sizes_are_an_error(size):
     """It names the side."""
     with pytest.raises(InvalidArgument, match=r"height|width"):
         check_size(*size)
 
 
-def plain(value: int, *, height: int = 2, width: int = 3) -> Any:
+def plain(value, *, height=2, width=3):
     return np.full((height, width, 3), value, np.uint8)
 
 
-def test_a_grid_is_as_square_as_can_be() -> None:
+def test_a_grid_is_as_square_as_can_be():
     """Every frame is in its place, row by row; nothing is scaled to fit."""
     for count in range(1, 40):
         rows, columns = grid_shape(count)
@@ -122,7 +119,7 @@ def test_a_grid_is_as_square_as_can_be() -> None:
         grid_frame([plain(1), plain(2, height=5, width=4)])
 
 
-def test_unknown_name_lists_what_there_is() -> None:
+def test_unknown_name_lists_what_there_is():
     """A few names are all listed; of many, those that look alike."""
     assert "There are: side, top." in str(UnknownName("camera", "sid", ["side", "top"]))
     many = [f"Env-v{n}" for n in range(50)]
@@ -148,7 +145,7 @@ ERRORS = [
 
 
 @pytest.mark.parametrize("error", ERRORS, ids=lambda error: type(error).__name__)
-def test_errors_come_home_from_other_processes(error: mjrec.Error) -> None:
+def test_errors_come_home_from_other_processes(error):
     """They survive pickling, message and facts."""
     again = pickle.loads(pickle.dumps(error))
     assert type(again) is type(error)

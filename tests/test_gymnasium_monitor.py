@@ -1,17 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-from __future__ import annotations
-
-import subprocess
-import sys
 import threading
 import warnings
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
 
 import gymnasium
 import pytest
 from gymnasium.utils.env_checker import check_env
+from other_python import run_python
 from parts import parametrize
 from recordings import (
     frames_in,
@@ -26,7 +20,7 @@ import mjrec
 from mjrec import ResetNeeded, ResetNotAllowed
 
 
-def finish_episode(env: Any) -> None:
+def finish_episode(env):
     while not env.stats_recorder.done:
         env.step(0)
 
@@ -34,19 +28,13 @@ def finish_episode(env: Any) -> None:
 BAR = [4, 8, 12, 16]
 
 
-def shown(directory: Path, episode: int) -> list[int]:
+def shown(directory, episode):
     """Return how long the corridor's bar is in each frame of a video."""
     frames = frames_in(directory, episode)
     return [int((frame[0, :, 0] > 128).sum()) for frame in frames]
 
 
-def test_records_the_scheduled_episodes(
-    corridor: Any,
-    tmp_path: Path,
-    play: Any,
-    names: Any,
-    caplog: pytest.LogCaptureFixture,
-) -> None:
+def test_records_the_scheduled_episodes(corridor, tmp_path, play, names, caplog):
     """Of ten episodes 0, 1 and 8 have a video; statistics and manifest are gym's."""
     with mjrec.Monitor(corridor, tmp_path) as env:
         play(env, 10)
@@ -67,7 +55,7 @@ def test_records_the_scheduled_episodes(
     assert [name for name in names(tmp_path) if name.startswith(".")] == []
 
 
-def test_video_and_its_metadata(corridor: Any, tmp_path: Path, play: Any) -> None:
+def test_video_and_its_metadata(corridor, tmp_path, play):
     """N + 1 frames of n steps, each with its hash; keys of gym and the episode's."""
     with mjrec.Monitor(corridor, tmp_path, fps=50) as env:
         play(env, 1, seed=7)
@@ -95,8 +83,8 @@ def test_video_and_its_metadata(corridor: Any, tmp_path: Path, play: Any) -> Non
 
 @pytest.mark.parametrize("pop_frames", [True, False])
 def test_frame_collections_lose_and_double_nothing(
-    tmp_path: Path, make_corridor: Any, play: Any, pop_frames: bool
-) -> None:
+    tmp_path, make_corridor, play, pop_frames
+):
     """Whether or not RenderCollection forgets the frames it has given."""
     env = gymnasium.wrappers.RenderCollection(make_corridor(), pop_frames=pop_frames)
     with mjrec.Monitor(env, tmp_path) as env:
@@ -105,9 +93,7 @@ def test_frame_collections_lose_and_double_nothing(
         assert shown(tmp_path, episode) == BAR
 
 
-def test_write_upon_reset_writes_at_each_reset(
-    make_corridor: Any, tmp_path: Path, play: Any
-) -> None:
+def test_write_upon_reset_writes_at_each_reset(make_corridor, tmp_path, play):
     """Before the monitor closes; without videos no render mode is needed."""
     corridor = make_corridor(render_mode=None)
     with mjrec.Monitor(corridor, tmp_path, False, write_upon_reset=True) as env:
@@ -117,7 +103,7 @@ def test_write_upon_reset_writes_at_each_reset(
         assert manifest_of(tmp_path)["stats"]
 
 
-def test_wrong_use_is_refused(corridor: Any, tmp_path: Path, play: Any) -> None:
+def test_wrong_use_is_refused(corridor, tmp_path, play):
     """The environment is neither stepped nor reset, and the episode can go on."""
     with mjrec.Monitor(corridor, tmp_path) as env:
         with pytest.raises(ResetNeeded, match="before the first reset"):
@@ -136,9 +122,7 @@ def test_wrong_use_is_refused(corridor: Any, tmp_path: Path, play: Any) -> None:
     assert shown(tmp_path, 0) == BAR
 
 
-def test_gyms_questions_have_gyms_answers(
-    corridor: Any, tmp_path: Path, play: Any
-) -> None:
+def test_gyms_questions_have_gyms_answers(corridor, tmp_path, play):
     """Total steps cover the unfinished episode; after close nothing counts."""
     env = mjrec.Monitor(corridor, tmp_path)
     assert env.episode_id == 0
@@ -155,13 +139,11 @@ def test_gyms_questions_have_gyms_answers(
     assert env.get_episode_rewards() == [1.5, 1.5]
 
 
-def test_the_schedule_is_asked_once_for_each_number(
-    corridor: Any, tmp_path: Path, play: Any
-) -> None:
+def test_the_schedule_is_asked_once_for_each_number(corridor, tmp_path, play):
     """A reset before any step keeps it and replaces the picture; truth counts."""
-    asked: list[int] = []
+    asked = []
 
-    def even(episode_id: int) -> Any:
+    def even(episode_id):
         asked.append(episode_id)
         return (episode_id + 1) % 2
 
@@ -178,7 +160,7 @@ def test_the_schedule_is_asked_once_for_each_number(
     assert schedule["recorded"] == [0, 2]
 
 
-def test_check_env_passes(tmp_path: Path) -> None:
+def test_check_env_passes(tmp_path):
     """Gymnasium's own checker accepts the monitor where early resets are allowed."""
     env = gymnasium.make("HalfCheetah-v5", render_mode="rgb_array")
     monitor = mjrec.Monitor(env, tmp_path, video_callable=False, allow_early_reset=True)
@@ -188,9 +170,7 @@ def test_check_env_passes(tmp_path: Path) -> None:
         check_env(monitor, skip_render_check=True)
 
 
-def test_environments_that_reset_themselves_begin_episodes(
-    make_corridor: Any, tmp_path: Path
-) -> None:
+def test_environments_that_reset_themselves_begin_episodes(make_corridor, tmp_path):
     """In the step after the end; in that of the end, as gym's own, a frame is lost."""
     env = gymnasium.wrappers.Autoreset(make_corridor())
     with mjrec.Monitor(env, tmp_path / "next", lambda _: True) as env:
@@ -200,10 +180,10 @@ def test_environments_that_reset_themselves_begin_episodes(
     assert stats_of(tmp_path / "next")["episode_lengths"] == [3, 3]
     assert shown(tmp_path / "next", 0) == shown(tmp_path / "next", 1) == BAR
 
-    class Looping(make_corridor):  # type: ignore[misc,valid-type]  # a fixture's class
+    class Looping(make_corridor):
         metadata = make_corridor.metadata | {"semantics.autoreset": True}
 
-        def step(self, action: Any) -> Any:
+        def step(self, action):
             result = super().step(action)
             if result[2]:
                 self.reset()
@@ -218,14 +198,12 @@ def test_environments_that_reset_themselves_begin_episodes(
     assert metadata_of(tmp_path / "same", 0)["final_frame"] == "missing"
 
 
-def test_close_in_mid_episode_keeps_the_video(
-    make_corridor: Any, tmp_path: Path
-) -> None:
+def test_close_in_mid_episode_keeps_the_video(make_corridor, tmp_path):
     """Marked incomplete, and listed before the environment is closed, once."""
-    seen: list[bool] = []
+    seen = []
 
-    class Watching(make_corridor):  # type: ignore[misc,valid-type]  # a fixture's class
-        def close(self) -> None:
+    class Watching(make_corridor):
+        def close(self):
             seen.append(any(tmp_path.glob("openaigym.manifest.*")))
 
     with mjrec.Monitor(Watching(), tmp_path) as env:
@@ -241,9 +219,7 @@ def test_close_in_mid_episode_keeps_the_video(
 
 
 @pytest.mark.parametrize("thread", ["main", "mjrec-encoder"])
-def test_garbage_collection_closes(
-    corridor: Any, tmp_path: Path, play: Any, thread: str
-) -> None:
+def test_garbage_collection_closes(corridor, tmp_path, play, thread):
     """A forgotten monitor writes its results; never on a thread that it waits for."""
     holder = [mjrec.Monitor(corridor, tmp_path)]
     play(holder[0], 1)
@@ -259,14 +235,12 @@ def test_garbage_collection_closes(
 
 LEAVING = """
 import sys
-sys.path.insert(0, {tests!r})
-import conftest, gymnasium, mjrec
+import gymnasium, mjrec
 env = gymnasium.make("HalfCheetah-v5", render_mode="rgb_array", width=32, height=32)
-env = mjrec.Monitor(env, {directory!r}, render="live")
+env = mjrec.Monitor(env, sys.argv[1], render="live")
 env.reset(seed=0)
 for _ in range(3):
     env.step(env.action_space.sample())
-{how}
 """
 
 
@@ -275,25 +249,19 @@ for _ in range(3):
     [("", 0), ("sys.exit(3)", 3), ("raise RuntimeError('on purpose')", 1)],
     ids=["end", "exit", "exception"],
 )
-def test_leaving_the_interpreter_closes(tmp_path: Path, how: str, status: int) -> None:
+def test_leaving_the_interpreter_closes(tmp_path, how, status):
     """Without close(): a live video, statistics and manifest, without noise."""
-    script = LEAVING.format(
-        tests=str(Path(__file__).parent), directory=str(tmp_path), how=how
-    )
-    done = subprocess.run(
-        [sys.executable, "-c", script], capture_output=True, text=True, check=False
-    )
-    assert done.returncode == status
+    done = run_python(LEAVING + how, tmp_path, status=status)
     assert len(frames_in(tmp_path, 0)) == 4
     assert manifest_of(tmp_path)["videos"]
     assert "Exception ignored" not in done.stderr
 
 
-def test_a_frame_that_fails_is_left_out(make_corridor: Any, tmp_path: Path) -> None:
+def test_a_frame_that_fails_is_left_out(make_corridor, tmp_path):
     """The error goes through; the episode goes on, or is complete."""
 
-    class Blinking(make_corridor):  # type: ignore[misc,valid-type]  # a fixture's class
-        def render(self) -> Any:
+    class Blinking(make_corridor):
+        def render(self):
             if self.position in (2, 5):
                 raise RuntimeError("on purpose")
             return super().render()
@@ -311,47 +279,12 @@ def test_a_frame_that_fails_is_left_out(make_corridor: Any, tmp_path: Path) -> N
     assert journal_of(tmp_path)[0]["length"] == 5
 
 
-def test_forked_child_leaves_the_files_alone(
-    corridor: Any, tmp_path: Path, play: Any
-) -> None:
-    """A child may exit, but not record or close; the files stay the parent's."""
-    script = LEAVING.replace("HalfCheetah-v5", "CartPole-v1").format(
-        tests=str(Path(__file__).parent),
-        directory=str(tmp_path),
-        how="""
-import os
-if os.fork() == 0:
-    for call in (env.reset, lambda: env.step(0), env.close):
-        try:
-            call()
-        except mjrec.Error as error:
-            print(error)
-    sys.exit(0)
-os.wait()
-print(sorted(os.listdir(env.directory)))
-""",
-    )
-    script = script.replace(
-        'gymnasium.make("CartPole-v1", render_mode="rgb_array", width=32, height=32)',
-        "conftest.Corridor(length=9)",
-    ).replace("env.action_space.sample()", "0")
-    done = subprocess.run(
-        [sys.executable, "-W", "ignore", "-c", script],
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    assert done.stdout.count("forked from it") == 3
-    assert "manifest" not in done.stdout.splitlines()[-1]
-    assert len(manifest_of(tmp_path)["videos"]) == 1
-
-
 def test_users_exception_is_not_hidden_by_a_failing_close(
-    make_corridor: Any, tmp_path: Path, kill_ffmpeg: Callable[[], int]
-) -> None:
+    make_corridor, tmp_path, kill_ffmpeg
+):
     """The encoder's failure is a note on it."""
 
-    def fail() -> None:
+    def fail():
         with mjrec.Monitor(make_corridor(length=9), tmp_path) as env:
             env.reset()
             env.step(0)

@@ -1,15 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """A `close()` that Ctrl-C interrupts leaves what SIGKILL leaves: nothing is lost."""
 
-from __future__ import annotations
-
 import contextlib
 import gc
 import math
 import sys
 from pathlib import Path
-from types import FrameType
-from typing import Any
 
 import gymnasium
 import pytest
@@ -31,7 +27,7 @@ MOMENTS = 20
 _ENTRANCE = ("close", "close_here", "call_all", "_leaving_if_interrupted")
 
 
-def record(directory: Path, render: str) -> Any:
+def record(directory, render):
     """Record two episodes, and the first steps of a third."""
     env = gymnasium.make(
         "InvertedPendulum-v5",
@@ -51,11 +47,11 @@ def record(directory: Path, render: str) -> Any:
 class Interrupting:
     """Counts what functions of mjrec do, and presses Ctrl-C behind so many events."""
 
-    def __init__(self, last: float = math.inf) -> None:
+    def __init__(self, last=math.inf):
         self.count = 0
         self.last = last
 
-    def __call__(self, frame: FrameType, event: str, _: object) -> None:
+    def __call__(self, frame, event, _):
         path = Path(frame.f_code.co_filename)
         # While HDF5 writes, signals wait.
         is_ours = "mjrec" in path.parts and path.stem != "trajectory_hdf5"
@@ -66,7 +62,7 @@ class Interrupting:
                 raise KeyboardInterrupt
 
 
-def close(monitor: Any, interrupting: Interrupting) -> None:
+def close(monitor, interrupting):
     """Close it, and be interrupted."""
     sys.setprofile(interrupting)
     try:
@@ -86,9 +82,7 @@ def close(monitor: Any, interrupting: Interrupting) -> None:
     default=[("deferred", 7), ("deferred", 15), ("live", 5), ("live", 15)],
     part=pytest.mark.crashes,
 )
-def test_finish_completes_what_ctrl_c_has_cut_short(
-    render: str, moment: int, tmp_path: Path
-) -> None:
+def test_finish_completes_what_ctrl_c_has_cut_short(render, moment, tmp_path):
     """All episodes are there; the monitor is closed and lets go of its files."""
     whole = Interrupting()
     close(record(tmp_path / "whole", render), whole)

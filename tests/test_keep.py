@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import logging
 import signal
 import subprocess
@@ -267,25 +266,6 @@ def test_incomplete_episodes_are_never_chosen(tmp_path: Path, way: Any) -> None:
 # --- ends ----------------------------------------------------------------------------
 
 
-@parametrize("way", ["close", "exception"])
-def test_leaving_early_leaves_the_chosen_pending(tmp_path: Path, way: str) -> None:
-    """What fell out is gone then too, and so is a running episode."""
-    env = mjrec.Monitor(pendulum(), tmp_path, keep="worst:2", workers=1)
-    run(env, 7)
-    with contextlib.suppress(ZeroDivisionError), env:
-        if way == "exception":
-            env.reset()
-            raise ZeroDivisionError
-        run(env, 1)
-        env.close(wait=False)
-    assert logs_of(tmp_path) == pending_in(tmp_path) == [1, 3]
-    render(tmp_path)
-    assert videos_in(tmp_path) == [1, 3]
-    finished = 8 - (way == "exception")
-    assert metadata_of(tmp_path, 1)["selection"]["finished"] == finished
-    assert pending_in(tmp_path) == []
-
-
 def confused(episodes: Sequence[Any]) -> list[int]:
     """Return a number that is none of an episode."""
     return [len(episodes)]
@@ -318,21 +298,6 @@ def test_a_function_that_cannot_choose_loses_nothing(
     assert len(manifest_of(tmp_path)["videos"]) == 3
     selection = {"rule": "confused", "decided": False}
     assert metadata_of(tmp_path, 0)["selection"] == selection
-
-
-def test_an_interrupted_choice_leaves_all_candidates(tmp_path: Path) -> None:
-    """Ctrl-C while the function runs: nothing is decided, and nothing is lost."""
-
-    def choose(episodes: Sequence[Any]) -> list[int]:
-        raise KeyboardInterrupt
-
-    env = mjrec.Monitor(pendulum(), tmp_path, keep=choose, workers=0)
-    run(env, 3)
-    with pytest.raises(KeyboardInterrupt):
-        env.close()
-    assert mjrec.recover(tmp_path)
-    assert pending_in(tmp_path) == [0, 1, 2]
-    assert manifest_of(tmp_path)["mjrec"]["keep"]["decided"] is False
 
 
 @parametrize("on_error", ["warn", "raise"])

@@ -1,11 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The rules by which episodes are chosen after they ended, against naive ones."""
 
-from __future__ import annotations
-
 import math
-from collections.abc import Callable, Sequence
-from typing import Any
 
 import numpy as np
 import pytest
@@ -13,21 +9,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mjrec.errors import InvalidArgument
-from mjrec.recorder.keep_rules import (
-    Selection,
-    Standing,
-    selection_from,
-)
+from mjrec.recorder.keep_rules import Standing, selection_from
 from mjrec.recorder.tracking import FinishedEpisode
 
 
-def episode(
-    number: int,
-    reward: float = 0.0,
-    *,
-    terminated: bool = True,
-    success: bool | None = None,
-) -> FinishedEpisode:
+def episode(number, reward=0.0, *, terminated=True, success=None):
     """Return an episode that has ended."""
     return FinishedEpisode(
         episode_id=number,
@@ -45,7 +31,7 @@ def episode(
     )
 
 
-def told(keep: Any, episodes: Sequence[FinishedEpisode]) -> Selection:
+def told(keep, episodes):
     """Return a selection that has been told of the episodes."""
     selection = selection_from(keep)
     for each in episodes:
@@ -53,7 +39,7 @@ def told(keep: Any, episodes: Sequence[FinishedEpisode]) -> Selection:
     return selection
 
 
-def chosen(keep: Any, episodes: Sequence[FinishedEpisode]) -> list[int]:
+def chosen(keep, episodes):
     """Return what is chosen in the end."""
     selection = told(keep, episodes)
     selection.close()
@@ -68,13 +54,13 @@ some_rewards = st.lists(
 )
 
 
-def with_rewards(rewards: Sequence[float]) -> list[FinishedEpisode]:
+def with_rewards(rewards):
     """Return episodes with these returns; not every number is that of one."""
     return [episode(3 + 2 * k, reward) for k, reward in enumerate(rewards)]
 
 
 @given(some_rewards, st.integers(1, 5))
-def test_returns_are_ranked(rewards: list[float], count: int) -> None:
+def test_returns_are_ranked(rewards, count):
     """NaN is the worst; of equal ones the earlier counts; the median is the lower."""
     episodes = with_rewards(rewards)
     # Python's sort is stable, and so is it in reverse.
@@ -94,9 +80,7 @@ def test_returns_are_ranked(rewards: list[float], count: int) -> None:
     st.lists(st.tuples(st.booleans(), st.sampled_from([True, False, None]))),
     st.integers(1, 4),
 )
-def test_failures_are_what_the_environment_calls_so(
-    flags: list[tuple[bool, bool | None]], most: int
-) -> None:
+def test_failures_are_what_the_environment_calls_so(flags, most):
     """Where it says nothing of success, what was terminated; the first, if limited."""
     episodes = [
         episode(k, terminated=terminated, success=success)
@@ -115,11 +99,11 @@ def test_failures_are_what_the_environment_calls_so(
     assert selection(99) == (len(failed) < most)
 
 
-def test_a_function_gets_the_finished_episodes() -> None:
+def test_a_function_gets_the_finished_episodes():
     """All of them, in their order, once; NumPy's numbers will do."""
     calls = []
 
-    def longest(episodes: Sequence[FinishedEpisode]) -> Any:
+    def longest(episodes):
         calls.append([each.episode_id for each in episodes])
         return np.array([4, 0])
 
@@ -133,7 +117,7 @@ def test_a_function_gets_the_finished_episodes() -> None:
     assert selection.standing(1) is Standing.DROPPED
 
 
-def no_function(episodes: Sequence[FinishedEpisode]) -> Any:
+def no_function(episodes):
     raise ZeroDivisionError("of the user")
 
 
@@ -149,9 +133,7 @@ def no_function(episodes: Sequence[FinishedEpisode]) -> Any:
         (lambda episodes: episodes[:1], "TypeError"),
     ],
 )
-def test_a_function_that_cannot_choose_is_named(
-    keep: Callable[..., Any], what: str
-) -> None:
+def test_a_function_that_cannot_choose_is_named(keep, what):
     """And nothing is decided, so that nothing needs to be deleted."""
     selection = told(keep, [episode(k) for k in range(3)])
     with pytest.raises(InvalidArgument, match=what):

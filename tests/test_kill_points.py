@@ -1,19 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """SIGKILL between any two things that a recorder or a finisher does to its files."""
 
-from __future__ import annotations
-
 import json
 import signal
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
+from other_python import run_python
 from parts import parametrize
 from recordings import frames_in, manifest_of, metadata_of, stats_of
 from result_files import entry, write_journal
-from trajectories_by_hand import INFIX, Painter, write_log
+from trajectories_by_hand import INFIX, write_log
 from waiting import wait_until
 
 import mjrec
@@ -32,14 +29,9 @@ def die(*_, **__):
 """
 
 
-def run(program: str, directory: Path, place: object) -> bool:
+def run(program, directory, place):
     """Run a program; tell whether it was killed, and not over before that."""
-    done = subprocess.run(
-        [sys.executable, "-c", START + program, directory, str(place)],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    done = run_python(START + program, directory, place, status=None)
     assert done.returncode in (0, -signal.SIGKILL), done.stderr
     # An encoder outlives it for a moment.
     wait_until(lambda: not any(map(is_locked, directory.glob(".*.part"))))
@@ -80,8 +72,8 @@ for result in finish(Path(directory), workers=1):
     part=pytest.mark.crashes,
 )
 def test_a_finisher_killed_at_any_change_of_a_file_is_taken_up_again(
-    moments: range, tmp_path: Path, painter: Painter
-) -> None:
+    moments, tmp_path, painter
+):
     """Of a dead monitor; with a trajectory that stays, and one that does not."""
     for moment in moments:
         directory = tmp_path / str(moment)
@@ -184,9 +176,7 @@ LIVE = (
 
 
 @parametrize("place", [*DEFERRED, *LIVE], default=8)
-def test_a_recorder_killed_between_two_things_loses_no_episode(
-    place: str, tmp_path: Path
-) -> None:
+def test_a_recorder_killed_between_two_things_loses_no_episode(place, tmp_path):
     """Rows, journal, encoder and names: whichever of them was first."""
     assert run(f"LIVE = {LIVE!r}\n{RECORD}", tmp_path, place)
     assert not mjrec.recover(tmp_path).failures

@@ -7,10 +7,8 @@ import gc
 import os
 import re
 import threading
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import gymnasium
 from parts import parametrize
@@ -43,7 +41,7 @@ class Held:
     children: set[int]
 
 
-def held() -> Held:
+def held():
     gc.collect()
     pages = int(Path("/proc/self/statm").read_text().split()[1])
     return Held(
@@ -54,7 +52,7 @@ def held() -> Held:
     )
 
 
-def _file(descriptor: Path) -> str:
+def _file(descriptor):
     try:
         # Pipes and sockets have numbers of their own, and so has each log.
         name = str(descriptor.readlink()).split(":")[0]
@@ -63,7 +61,7 @@ def _file(descriptor: Path) -> str:
         return ""
 
 
-def run(monitor: Any, episodes: int) -> None:
+def run(monitor, episodes):
     for seed in range(episodes):
         monitor.reset(seed=seed)
         for _ in range(3):
@@ -72,7 +70,7 @@ def run(monitor: Any, episodes: int) -> None:
 
 # Takes more than five seconds: a thousand episodes, so that what grows is seen.
 @parametrize("workers", [1, 0])
-def test_recorded_episodes_leave_nothing(workers: int, tmp_path: Path) -> None:
+def test_recorded_episodes_leave_nothing(workers, tmp_path):
     """Memory, files, threads and processes; each episode with its trajectory."""
     env = gymnasium.make(
         "InvertedPendulum-v5", width=32, height=32, max_episode_steps=3
@@ -109,9 +107,7 @@ def test_recorded_episodes_leave_nothing(workers: int, tmp_path: Path) -> None:
 
 # Takes more than five seconds: an encoder for each episode.
 @parametrize("count", [60, EPISODES])
-def test_live_episodes_leave_nothing(
-    count: int, tmp_path: Path, make_corridor: Callable[..., Any]
-) -> None:
+def test_live_episodes_leave_nothing(count, tmp_path, make_corridor):
     """Each has an encoder of its own."""
     before = held()
     monitor = Monitor(make_corridor(3, size=(16, 16)), tmp_path, lambda _: True)

@@ -1,15 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """A lock is held exactly as long as its process lives or until it is released."""
 
-from __future__ import annotations
-
-import fcntl
 import os
 import subprocess
 import sys
-import threading
-from collections.abc import Callable, Iterator
-from pathlib import Path
 
 import pytest
 
@@ -38,16 +32,16 @@ for _ in range(300):
 
 
 @pytest.fixture
-def path(tmp_path: Path) -> Path:
+def path(tmp_path):
     return tmp_path / ".openaigym.0.1.lock"
 
 
 @pytest.fixture
-def start(path: Path) -> Iterator[Callable[[str], subprocess.Popen[str]]]:
+def start(path):
     """Run code in a process that has the lock's `path`."""
-    started: list[subprocess.Popen[str]] = []
+    started = []
 
-    def run(code: str) -> subprocess.Popen[str]:
+    def run(code):
         command = [sys.executable, "-c", HOLD + code, str(path)]
         pipe = subprocess.PIPE
         process = subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True)
@@ -60,7 +54,7 @@ def start(path: Path) -> Iterator[Callable[[str], subprocess.Popen[str]]]:
         process.communicate()
 
 
-def test_a_lock_is_held_until_it_is_released(path: Path) -> None:
+def test_a_lock_is_held_until_it_is_released(path):
     """Release removes the file, and leaves one that another has put there."""
     first = Lock(path, "who holds it")
     assert is_locked(path)
@@ -77,9 +71,7 @@ def test_a_lock_is_held_until_it_is_released(path: Path) -> None:
 
 @pytest.mark.parametrize("way", ["Lock", "try_lock"])
 @pytest.mark.parametrize("left", ["exec", "fork"])
-def test_a_killed_process_holds_no_lock(
-    path: Path, left: str, way: str, start: Callable[[str], subprocess.Popen[str]]
-) -> None:
+def test_a_killed_process_holds_no_lock(path, left, way, start):
     """Whatever it leaves behind; the file is taken over, with what it says."""
     call = 'Lock(path, "content")' if way == "Lock" else "try_lock(path)"
     holder = start(f"lock = {call}\n{LEFT[left]}{WAIT}")
@@ -99,20 +91,7 @@ def test_a_killed_process_holds_no_lock(
     assert not path.exists()
 
 
-def test_a_lock_that_is_looked_at_can_be_got(path: Path) -> None:
-    """`is_locked` holds the file for a moment."""
-    path.write_text("left behind")
-    looking = path.open()
-    fcntl.flock(looking, fcntl.LOCK_SH)
-    threading.Timer(0.003, looking.close).start()
-    lock = try_lock(path)
-    assert lock is not None
-    lock.release()
-
-
-def test_one_process_at_a_time_has_a_lock(
-    path: Path, start: Callable[[str], subprocess.Popen[str]]
-) -> None:
+def test_one_process_at_a_time_has_a_lock(path, start):
     """Though each removes the file that the others wait for."""
     number = path.with_name("number")
     number.write_text("0")
@@ -122,11 +101,7 @@ def test_one_process_at_a_time_has_a_lock(
 
 @pytest.mark.parametrize("get", [try_lock, wait_for_lock])
 @pytest.mark.parametrize("put", [os.symlink, os.link, lambda _, path: os.mkfifo(path)])
-def test_no_other_file_is_taken_for_a_lock(
-    put: Callable[[Path, Path], None],
-    get: Callable[[Path], Lock | None],
-    path: Path,
-) -> None:
+def test_no_other_file_is_taken_for_a_lock(put, get, path):
     """Neither through a link nor by its second name; a pipe is not waited for."""
     victim = path.with_name("victim")
     victim.write_text("valuable")

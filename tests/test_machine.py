@@ -1,10 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the kernel says a process may use, read from small file trees."""
 
-from __future__ import annotations
-
 import os
-from pathlib import Path
 
 import pytest
 
@@ -30,9 +27,7 @@ _DEEP = {
         ("", {}, None),
     ],
 )
-def test_cpus_that_the_cgroup_grants(
-    own: str, files: dict[str, str], expected: float | None, tmp_path: Path
-) -> None:
+def test_cpus_that_the_cgroup_grants(own, files, expected, tmp_path):
     """None where nothing limits them."""
     root = tmp_path / "cgroup"
     for name, content in files.items():
@@ -42,7 +37,7 @@ def test_cpus_that_the_cgroup_grants(
     assert cgroup_cpu_quota(root=root, own=tmp_path / "own") == expected
 
 
-def test_usable_cpus_follow_the_affinity() -> None:
+def test_usable_cpus_follow_the_affinity():
     """A process that is bound to one CPU has one."""
     before = os.sched_getaffinity(0)
     assert 1 <= usable_cpus() <= len(before)
@@ -53,7 +48,7 @@ def test_usable_cpus_follow_the_affinity() -> None:
         os.sched_setaffinity(0, before)
 
 
-def test_gpus(tmp_path: Path) -> None:
+def test_gpus(tmp_path):
     """NVIDIA's devices and everybody's render nodes; nothing else."""
     (tmp_path / "dri").mkdir()
     for name in ("nvidia0", "nvidiactl", "dri/renderD128", "dri/card0", "null"):

@@ -1,13 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Statistics and manifest follow from the journal, whoever computes them."""
 
-from __future__ import annotations
-
-import json
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
-
 import gymnasium
 import pytest
 from recordings import events_of, manifest_of, stats_of
@@ -16,7 +9,7 @@ import mjrec
 from mjrec.formats.monitor_directory import Infix
 from mjrec.results.manifest_writing import write_manifest_and_stats
 
-OPTIONS: dict[str, dict[str, Any]] = {
+OPTIONS = {
     "deferred": {"video_callable": lambda episode: episode % 2 == 0},
     "not waited for": {"video_callable": lambda episode: True, "workers": 0},
     "live": {"video_callable": lambda episode: episode < 2, "render": "live"},
@@ -26,7 +19,7 @@ OPTIONS: dict[str, dict[str, Any]] = {
 }
 
 
-def record(directory: Path, options: dict[str, Any]) -> None:
+def record(directory, options):
     """Record three episodes, of which the last is closed early."""
     env = gymnasium.make(
         "InvertedPendulum-v5", render_mode="rgb_array", width=32, height=32
@@ -44,9 +37,7 @@ def record(directory: Path, options: dict[str, Any]) -> None:
 
 
 @pytest.mark.parametrize("options", OPTIONS.values(), ids=OPTIONS)
-def test_another_process_computes_the_same(
-    options: dict[str, Any], tmp_path: Path
-) -> None:
+def test_another_process_computes_the_same(options, tmp_path):
     """Nothing is new for it; and made from nothing, both files are the same again."""
     record(tmp_path, options)
     manifest, stats = manifest_of(tmp_path), stats_of(tmp_path)
@@ -67,9 +58,7 @@ def test_another_process_computes_the_same(
     assert anew == stats
 
 
-def test_an_episode_that_was_cut_is_in_the_journal(
-    tmp_path: Path, make_corridor: Callable[..., Any]
-) -> None:
+def test_an_episode_that_was_cut_is_in_the_journal(tmp_path, make_corridor):
     """With its reason, and whether it was chosen; it is no part of the statistics."""
     env = mjrec.Monitor(make_corridor(), tmp_path, allow_early_reset=True)
     env.reset()
@@ -91,20 +80,3 @@ def test_an_episode_that_was_cut_is_in_the_journal(
     assert (second["episode_id"], second["reason"]) == (1, "close")
     assert manifest_of(tmp_path)["mjrec"]["schedule"]["recorded"] == [0, 1]
     assert stats_of(tmp_path)["timestamps"] == []
-
-
-def test_a_reason_goes_with_the_video_that_comes(tmp_path: Path) -> None:
-    """It stands in the manifest as long as the video is pending, and no longer."""
-    record(tmp_path, OPTIONS["not waited for"])
-    [video, *_] = [e["video"] for e in manifest_of(tmp_path)["mjrec"]["pending"]]
-    said = tmp_path / video.replace(".mp4", ".failed.json")
-    said.write_text(json.dumps({"reason": "no paint"}))
-    [path] = tmp_path.glob("*.manifest.json")
-    infix = Infix.parse(path.name.split(".manifest.")[1])
-    assert infix is not None
-    write_manifest_and_stats(tmp_path, infix)
-    [entry] = [e for e in manifest_of(tmp_path)["mjrec"]["pending"] if "reason" in e]
-    assert (entry["video"], entry["reason"]) == (video, "no paint")
-    assert not mjrec.render_videos(tmp_path).failures
-    assert not said.exists()
-    assert manifest_of(tmp_path)["mjrec"]["pending"] == []

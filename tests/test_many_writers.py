@@ -1,16 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Many monitors record into one directory at once."""
 
-from __future__ import annotations
-
 import copy
 import pickle
 import subprocess
 import sys
 import threading
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
 
 import gymnasium
 import pytest
@@ -39,7 +34,7 @@ with mjrec.Monitor(env, sys.argv[1], lambda _: True, resume=True, uid="7",
 """
 
 
-def check(directory: Path) -> None:
+def check(directory):
     """Check that there is everything of everyone, and nothing twice."""
     infixes = {path.name.split(".")[2] for path in directory.glob("*.jsonl")}
     assert len(infixes) == WRITERS
@@ -51,7 +46,7 @@ def check(directory: Path) -> None:
 
 
 @pytest.mark.thorough
-def test_eight_processes_with_the_same_number(tmp_path: Path) -> None:
+def test_eight_processes_with_the_same_number(tmp_path):
     """As in eight containers: no file is overwritten, and all results are merged."""
     command = [sys.executable, "-c", PROGRAM, str(tmp_path)]
     processes = [
@@ -77,12 +72,12 @@ def test_eight_processes_with_the_same_number(tmp_path: Path) -> None:
     assert len(list(tmp_path.glob("*.mjb.gz"))) == 1
 
 
-def test_eight_threads(tmp_path: Path, make_corridor: Callable[..., Any]) -> None:
+def test_eight_threads(tmp_path, make_corridor):
     """Each with a monitor of its own, and an encoder at work in each."""
-    errors: list[BaseException] = []
+    errors = []
     barrier = threading.Barrier(WRITERS)
 
-    def record() -> None:
+    def record():
         try:
             env = make_corridor(STEPS, size=(16, 16))
             barrier.wait(30)
@@ -108,9 +103,7 @@ def test_eight_threads(tmp_path: Path, make_corridor: Callable[..., Any]) -> Non
 
 
 @pytest.mark.parametrize("send", [pickle.dumps, copy.copy, copy.deepcopy])
-def test_a_monitor_is_not_sent_to_another_process(
-    send: Callable[[Any], Any], tmp_path: Path
-) -> None:
+def test_a_monitor_is_not_sent_to_another_process(send, tmp_path):
     """The error says where to make it instead."""
     with Monitor(
         gymnasium.make("InvertedPendulum-v5"), tmp_path, video_callable=False

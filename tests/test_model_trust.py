@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A compiled model is loaded if this user has stored it, or says so."""
 
-from __future__ import annotations
-
 import gzip
 import hashlib
 import os
@@ -11,14 +9,13 @@ import subprocess
 import sys
 import tempfile
 from pathlib import Path
-from typing import Any
 
 import gymnasium
 import mujoco
 import numpy as np
 import pytest
 from full_disk import file_size_limit
-from rides import Ride, record
+from rides import record
 from sound_files import stored
 
 import mjrec
@@ -43,7 +40,7 @@ BY_ROOT = pytest.mark.skipif(os.geteuid() != 0, reason="only root gives files aw
 
 
 @pytest.fixture(autouse=True)
-def state_home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def state_home(tmp_path, monkeypatch):
     """A user with a home, and a temporary directory that nobody else uses."""
     temporary = tmp_path / "tmp"
     temporary.mkdir(mode=0o1777)
@@ -55,38 +52,36 @@ def state_home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 @pytest.fixture
-def directory(tmp_path: Path) -> Path:
+def directory(tmp_path):
     path = tmp_path / "recordings"
     path.mkdir()
     return path
 
 
-def become_another_user(patch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def become_another_user(patch, tmp_path):
     patch.setenv("XDG_STATE_HOME", str(tmp_path / "elsewhere"))
 
 
-def list_in(state_home: Path) -> Path:
+def list_in(state_home):
     return state_home / "mjrec/models"
 
 
-def fallback_in(tmp_path: Path) -> Path:
+def fallback_in(tmp_path):
     return tmp_path / f"tmp/mjrec-{os.geteuid()}/models"
 
 
-def mode_of(path: Path) -> int:
+def mode_of(path):
     return stat.S_IMODE(path.lstat().st_mode)
 
 
-def digest_of(content: object) -> str:
+def digest_of(content):
     return hashlib.sha256(str(content).encode()).hexdigest()
 
 
 # --- the list ------------------------------------------------------------------------
 
 
-def test_the_list_is_the_users_alone(
-    state_home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_list_is_the_users_alone(state_home, tmp_path, monkeypatch):
     """Made with the first model, not by looking; each model is in it once, in order."""
     assert not is_stored(DIGEST)
     note_models([])
@@ -103,7 +98,7 @@ def test_the_list_is_the_users_alone(
     assert not is_stored(DIGEST)
 
 
-def test_many_processes_lose_nothing(state_home: Path) -> None:
+def test_many_processes_lose_nothing(state_home):
     """Of each other's lines, and none is torn, also after one that was cut off."""
     note_models([DIGEST])
     with list_in(state_home).open("a") as file:
@@ -125,9 +120,7 @@ def test_many_processes_lose_nothing(state_home: Path) -> None:
     assert not is_stored(OTHER)
 
 
-def test_the_list_does_not_grow_for_ever(
-    state_home: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_list_does_not_grow_for_ever(state_home, monkeypatch):
     """A task may compile a model for each episode; then the oldest are forgotten."""
     monkeypatch.setattr(model_trust, "_MOST_BYTES", 10 * 66)
     models = list(map(digest_of, range(35)))
@@ -140,11 +133,8 @@ def test_the_list_does_not_grow_for_ever(
 
 
 def test_where_the_home_cannot_be_written_the_other_place_has_a_list(
-    tmp_path: Path,
-    state_home: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    caplog: pytest.LogCaptureFixture,
-) -> None:
+    tmp_path, state_home, monkeypatch, caplog
+):
     """Nothing is said; and it is still good when there is room at home later."""
     note_models([DIGEST])
     with file_size_limit(70):
@@ -166,12 +156,12 @@ def test_where_the_home_cannot_be_written_the_other_place_has_a_list(
     assert not caplog.records
 
 
-def a_pipe(path: Path) -> None:
+def a_pipe(path):
     path.unlink()
     os.mkfifo(path, 0o600)
 
 
-def a_link(path: Path) -> None:
+def a_link(path):
     path.symlink_to(path.rename(path.parent.parent / "elsewhere"))
 
 
@@ -183,12 +173,8 @@ def a_link(path: Path) -> None:
     ],
 )
 def test_a_list_that_others_may_have_written_is_not_used(
-    state_home: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    caplog: pytest.LogCaptureFixture,
-    spoil: Any,
-) -> None:
+    state_home, tmp_path, monkeypatch, caplog, spoil
+):
     """It stays for its owner to decide; a warning says what to do."""
     note_models([DIGEST])
     path = list_in(state_home)
@@ -212,8 +198,8 @@ def test_a_list_that_others_may_have_written_is_not_used(
 
 
 def test_a_worker_elsewhere_loads_what_its_user_has_stored(
-    directory: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    directory, tmp_path, monkeypatch
+):
     """Of the models in the directory, which its worker has reported."""
     with noting_models() as noted:
         facts = {**stored(directory), "xml": None}
@@ -233,11 +219,11 @@ def test_a_worker_elsewhere_loads_what_its_user_has_stored(
 # --- models --------------------------------------------------------------------------
 
 
-def forbid_compiled_models(patch: pytest.MonkeyPatch, directory: Path) -> None:
+def forbid_compiled_models(patch, directory):
     """Fail where MuJoCo is given a compiled model of the directory, or its bytes."""
     load = mujoco.MjModel.from_binary_path
 
-    def loaded(path: str, *assets: Any) -> Any:
+    def loaded(path, *assets):
         # The process that compiles sources gives its model in a file elsewhere.
         assert not assets
         assert not Path(path).is_relative_to(directory)
@@ -247,9 +233,7 @@ def forbid_compiled_models(patch: pytest.MonkeyPatch, directory: Path) -> None:
 
 
 @pytest.mark.parametrize("said", [{}, {"sha256": None}, {"sha256": {"a": 1}}])
-def test_mujoco_never_sees_what_nobody_vouches_for(
-    directory: Path, monkeypatch: pytest.MonkeyPatch, said: dict[str, Any]
-) -> None:
+def test_mujoco_never_sees_what_nobody_vouches_for(directory, monkeypatch, said):
     """The error names the file and the ways out; the hash of another is no help."""
     facts = {**stored(directory), "xml": None}
     content = bytearray(gzip.decompress((directory / facts["mjb"]).read_bytes()))
@@ -269,8 +253,8 @@ def test_mujoco_never_sees_what_nobody_vouches_for(
 
 
 def test_where_a_strangers_sources_fail_the_ways_out_are_told(
-    directory: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    directory, tmp_path, monkeypatch
+):
     """What they are compiled to is tried with recordings, below."""
     facts = stored(directory)
     become_another_user(monkeypatch, tmp_path)
@@ -279,9 +263,7 @@ def test_where_a_strangers_sources_fail_the_ways_out_are_told(
         load_model(directory, facts)
 
 
-def test_trust_is_said_by_an_argument_or_a_variable(
-    directory: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_trust_is_said_by_an_argument_or_a_variable(directory, tmp_path, monkeypatch):
     """The hash is looked at all the same; one's own needs no word."""
     facts = {**stored(directory), "xml": None}
     assert load_model(directory, facts).ngeom == 1
@@ -302,14 +284,14 @@ def test_trust_is_said_by_an_argument_or_a_variable(
 
 
 @pytest.fixture
-def theirs(directory: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Ride:
+def theirs(directory, tmp_path, monkeypatch):
     """A stranger's recording, of which the compiled model is all there is."""
     ride = record(directory)
     become_another_user(monkeypatch, tmp_path)
     return ride
 
 
-def test_frames_of_a_strangers_recording_need_a_word(theirs: Ride) -> None:
+def test_frames_of_a_strangers_recording_need_a_word(theirs):
     """Of the trajectory, which goes to the workers too."""
     trajectory = load_trajectory(theirs.path)
     with pytest.raises(UntrustedModel, match="not written by this user"):
@@ -322,9 +304,7 @@ def test_frames_of_a_strangers_recording_need_a_word(theirs: Ride) -> None:
 
 
 @pytest.mark.thorough
-def test_the_command_takes_the_word(
-    theirs: Ride, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_command_takes_the_word(theirs, tmp_path, capsys):
     """Without it, the reason says which; afterwards all is as before."""
     again = ["render", str(theirs.path), "--out", str(tmp_path / "again.mp4")]
     assert main(again) == 1
@@ -334,9 +314,9 @@ def test_the_command_takes_the_word(
     assert TRUST_VARIABLE not in os.environ
 
 
-def cheetah() -> tuple[Any, Any, Any]:
+def cheetah():
     env = gymnasium.make("HalfCheetah-v5", render_mode="rgb_array", width=64, height=48)
-    model = env.unwrapped.model  # type: ignore[attr-defined]  # it has one
+    model = env.unwrapped.model
     # Set by hand before the recording.
     model.vis.quality.shadowsize = 256
     model.geom_rgba[2] = (0, 1, 0, 1)
@@ -344,7 +324,7 @@ def cheetah() -> tuple[Any, Any, Any]:
     return env, env.render, {}
 
 
-def reach() -> tuple[Any, Any, Any]:
+def reach():
     manipulation = pytest.importorskip("dm_control.manipulation")
     env = manipulation.load("reach_site_features", seed=2)
     size = {"height": 48, "width": 64}
@@ -360,8 +340,8 @@ def reach() -> tuple[Any, Any, Any]:
     ],
 )
 def test_sources_show_what_the_environment_showed(
-    directory: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, make: Any
-) -> None:
+    directory, tmp_path, monkeypatch, make
+):
     """With what was set by hand, and what composer has put together."""
     env, picture, options = make()
     with mjrec.Monitor(env, directory, lambda _: True, workers=0, **options) as monitor:

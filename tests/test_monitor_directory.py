@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Which names in a directory are monitors' files, and what they say."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 
@@ -63,12 +61,12 @@ NAMES = {**VISIBLE, **HIDDEN, **NO_FILE, **FOREIGN}
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_name_says_monitor_and_episode(name: str) -> None:
+def test_a_name_says_monitor_and_episode(name):
     """As far as it has them; others' names say nothing."""
     assert (infix_of(name), episode_of(name)) == NAMES[name]
 
 
-def test_monitor_files_are_listed_by_name(tmp_path: Path) -> None:
+def test_monitor_files_are_listed_by_name(tmp_path):
     """Hidden ones if asked for; no other files, no directories."""
     for name in NAMES:
         (tmp_path / name).touch()
@@ -86,7 +84,7 @@ def test_monitor_files_are_listed_by_name(tmp_path: Path) -> None:
     assert list(iter_monitor_files(tmp_path / "missing")) == []
 
 
-def test_a_wrong_directory_names_the_folders_with_recordings(tmp_path: Path) -> None:
+def test_a_wrong_directory_names_the_folders_with_recordings(tmp_path):
     """An evaluation has one for each task; some are named."""
     assert "mjrec record ENV --out" in where_recordings_are(tmp_path)
     for number in range(7):
@@ -110,7 +108,7 @@ CAMERAS = (
 
 
 @pytest.mark.parametrize("name", CAMERAS)
-def test_a_name_stays_in_its_directory_and_is_short(name: str) -> None:
+def test_a_name_stays_in_its_directory_and_is_short(name):
     """However the model calls its camera; it is no first video's."""
     file = with_part(FIRST, camera_part(name))
     assert (infix_of(file), episode_of(file)) == ("0.7", 27)
@@ -120,7 +118,7 @@ def test_a_name_stays_in_its_directory_and_is_short(name: str) -> None:
     assert len(hidden) < 255
 
 
-def test_each_name_gives_another_part() -> None:
+def test_each_name_gives_another_part():
     """None is taken for another one, or for another part of a name."""
     assert camera_part("a b/ü.~") == "a%20b%2F%C3%BC%2E%7E"
     assert tiled_name(FIRST) == "openaigym.video.0.7.video000027.tiled.mp4"
@@ -130,7 +128,7 @@ def test_each_name_gives_another_part() -> None:
     assert not taken & set(parts)
 
 
-def test_further_cameras_never_share_a_name() -> None:
+def test_further_cameras_never_share_a_name():
     """Numbers are their digits, nameless ones are called by their place."""
     cameras = ["a", "side", {"distance": 1}, 1, "1", "side", "1-2", "camera3", "a"]
     assert further_parts(cameras) == [
@@ -138,7 +136,7 @@ def test_further_cameras_never_share_a_name() -> None:
     ]
 
 
-def test_gymnasiums_names_are_second_names() -> None:
+def test_gymnasiums_names_are_second_names():
     """With any prefix that is portable; others may come from a file of anybody's."""
     for name in ("rl-video-episode-27.mp4", "a-step-0.mp4", "_.x-1-episode-3.mp4"):
         assert is_second_name(name)

@@ -1,11 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Options of `mjrec.Monitor` that cannot be are refused before anything is made."""
 
-from __future__ import annotations
-
 import gc
-from pathlib import Path
-from typing import Any
 
 import gymnasium
 import numpy as np
@@ -16,16 +12,16 @@ from conftest import Corridor
 from mjrec.recorder.tracking import Tracker
 
 
-class Overlay(gymnasium.Wrapper[Any, Any, Any, Any]):
+class Overlay(gymnasium.Wrapper):
     """Draws something on top."""
 
-    def render(self) -> Any:
+    def render(self):
         frame = np.array(self.env.render())
         frame[:4] = 255
         return frame
 
 
-def cheetah() -> Any:
+def cheetah():
     return gymnasium.make("HalfCheetah-v5", render_mode="rgb_array")
 
 
@@ -35,7 +31,7 @@ ENVIRONMENTS = {
     "cheetah": cheetah,
     "overlay": lambda: Overlay(cheetah()),
 }
-IMPOSSIBLE: dict[str, list[tuple[dict[str, Any], str, str]]] = {
+IMPOSSIBLE = {
     "corridor": [
         ({"video_callable": True}, "InvalidArgument", "video_callable"),
         ({"mode": "testing"}, "InvalidArgument", "training"),
@@ -103,11 +99,9 @@ IMPOSSIBLE: dict[str, list[tuple[dict[str, Any], str, str]]] = {
     ("made", "options", "error", "words"),
     [(made, *case) for made, cases in IMPOSSIBLE.items() for case in cases],
 )
-def test_impossible_options_leave_nothing(
-    made: str, options: dict[str, Any], error: str, words: str, tmp_path: Path
-) -> None:
+def test_impossible_options_leave_nothing(made, options, error, words, tmp_path):
     """One error with the way out; no file, and the user's environment still works."""
-    env: Any = ENVIRONMENTS[made]()
+    env = ENVIRONMENTS[made]()
     with pytest.raises(getattr(mjrec, error), match=words):
         mjrec.Monitor(env, tmp_path / "new", **options)
     gc.collect()
@@ -117,7 +111,7 @@ def test_impossible_options_leave_nothing(
     env.close()
 
 
-def test_what_is_no_environment_is_named(tmp_path: Path) -> None:
+def test_what_is_no_environment_is_named(tmp_path):
     """With its type."""
     with pytest.raises(mjrec.InvalidArgument, match=r"builtins\.dict"):
-        mjrec.Monitor({}, tmp_path)  # type: ignore[call-overload]  # that is the test
+        mjrec.Monitor({}, tmp_path)

@@ -1,10 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Where a monitor may record, and with which number it begins."""
 
-from __future__ import annotations
-
 from pathlib import Path
-from typing import Any
 
 import pytest
 from full_disk import file_size_limit
@@ -21,18 +18,16 @@ from mjrec import (
     InvalidArgument,
     UnreadableFile,
 )
-from mjrec.formats.monitor_directory import (
-    Infix,
-)
+from mjrec.formats.monitor_directory import Infix
 
 ANOTHER = "Ant-v5"
 
 
-def monitor(directory: Path, **options: Any) -> Any:
+def monitor(directory, **options):
     return mjrec.Monitor(Corridor(), directory, video_callable=False, **options)
 
 
-def first_number(directory: Path, **options: Any) -> int:
+def first_number(directory, **options):
     """Return the number that a monitor begins with, and forget the monitor."""
     opened = monitor(directory, **{"resume": True, **options})
     opened.close()
@@ -41,16 +36,16 @@ def first_number(directory: Path, **options: Any) -> int:
     return int(opened.episode_id)
 
 
-def record(directory: Path, episodes: int = 2, **options: Any) -> None:
+def record(directory, episodes=2, **options):
     with monitor(directory, **options) as env:
         run_episodes(env, episodes)
 
 
-def write_video(directory: Path, infix: str, episode: int) -> None:
+def write_video(directory, infix, episode):
     (directory / f"openaigym.video.{infix}.video{episode:06d}.mp4").touch()
 
 
-def test_existing_recordings_need_force_or_resume(tmp_path: Path) -> None:
+def test_existing_recordings_need_force_or_resume(tmp_path):
     """The error lists files and the ways out; a crashed run's videos count too."""
     write_video(tmp_path, "0.1", 0)
     with pytest.raises(ExistingRecordings):
@@ -60,7 +55,7 @@ def test_existing_recordings_need_force_or_resume(tmp_path: Path) -> None:
         monitor(tmp_path)
 
 
-def test_force_deletes_monitor_files_only(tmp_path: Path, names: Any) -> None:
+def test_force_deletes_monitor_files_only(tmp_path, names):
     """Others' files are no recordings, and stay, whatever their names begin with."""
     others = ["notes.txt", "openaigym.manifest.1.1.manifest.json", "openaigym.txt"]
     (tmp_path / others[1]).mkdir()
@@ -73,7 +68,7 @@ def test_force_deletes_monitor_files_only(tmp_path: Path, names: Any) -> None:
             monitor(tmp_path, force=True)
 
 
-def test_resume_goes_on_after_the_highest_number(tmp_path: Path) -> None:
+def test_resume_goes_on_after_the_highest_number(tmp_path):
     """By what a closed run counted, and by a dead one's videos."""
     record(tmp_path)
     assert first_number(tmp_path) == 2
@@ -84,7 +79,7 @@ def test_resume_goes_on_after_the_highest_number(tmp_path: Path) -> None:
     assert first_number(tmp_path) == 8
 
 
-def test_resume_counts_the_same_uid_only(tmp_path: Path) -> None:
+def test_resume_counts_the_same_uid_only(tmp_path):
     """With a uid each run has numbers of its own; without, the directory's."""
     write_video(tmp_path, "0.alice", 7)
     write_video(tmp_path, "0.bob", 3)
@@ -92,7 +87,7 @@ def test_resume_counts_the_same_uid_only(tmp_path: Path) -> None:
         assert first_number(tmp_path, uid=uid) == expected
 
 
-def test_resume_never_takes_a_used_name(tmp_path: Path) -> None:
+def test_resume_never_takes_a_used_name(tmp_path):
     """A uid that was used before gets another monitor id."""
     used = {f"{number}.same" for number in range(50)}
     for infix in used:
@@ -106,9 +101,7 @@ def test_resume_never_takes_a_used_name(tmp_path: Path) -> None:
     assert not taken & used
 
 
-def test_a_torn_line_keeps_its_number(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_torn_line_keeps_its_number(tmp_path, caplog):
     """Its episode is lost, and the next one is not taken for it; the log says so."""
     journal = write_journal(tmp_path, "0.7", 0, 1, run={"env_info": ENV_INFO})
     journal.write_bytes(journal.read_bytes()[:-20])
@@ -117,14 +110,14 @@ def test_a_torn_line_keeps_its_number(
 
 
 @pytest.mark.parametrize("number", [True, -1, 1.5, "7", 10**4000, {}])
-def test_an_impossible_next_number_is_an_error(tmp_path: Path, number: object) -> None:
+def test_an_impossible_next_number_is_an_error(tmp_path, number):
     """A manifest may come from anybody; numbers go into names of files."""
     path = write_saved(tmp_path, "0.7", details={"next_episode_id": number})
     with pytest.raises(UnreadableFile, match=rf"{path.name}.*next_episode_id"):
         monitor(tmp_path, resume=True)
 
 
-def test_resume_over_another_environment_is_an_error(tmp_path: Path) -> None:
+def test_resume_over_another_environment_is_an_error(tmp_path):
     """Also while it is open, or killed with its journal alone left; both are named."""
     with monitor(tmp_path / "a") as env:
         with pytest.raises(DifferentEnvironment, match=rf"Corridor\).*{ANOTHER}"):
@@ -146,9 +139,7 @@ def test_resume_over_another_environment_is_an_error(tmp_path: Path) -> None:
         *(({"resume": r}, 'True, False, or "join"') for r in ("yes", 1, None)),
     ],
 )
-def test_wrong_options_make_nothing(
-    tmp_path: Path, options: dict[str, Any], what: str
-) -> None:
+def test_wrong_options_make_nothing(tmp_path, options, what):
     """A uid must make a file name; a slip is not taken for yes."""
     with pytest.raises(InvalidArgument, match=what):
         monitor(tmp_path / "new", **options)
@@ -156,7 +147,7 @@ def test_wrong_options_make_nothing(
 
 
 @pytest.mark.parametrize("path", ["{}/file", "/proc/self", "/proc/mjrec/recordings"])
-def test_an_impossible_directory_is_an_error(path: str, tmp_path: Path) -> None:
+def test_an_impossible_directory_is_an_error(path, tmp_path):
     """It names the path: a file, and where not even root may write."""
     (tmp_path / "file").touch()
     with pytest.raises(DirectoryNotWritable, match=path.removeprefix("{}")):
@@ -165,16 +156,14 @@ def test_an_impossible_directory_is_an_error(path: str, tmp_path: Path) -> None:
         monitor(tmp_path / ("x" * 300))
 
 
-def test_joining_looks_at_no_other_files(tmp_path: Path) -> None:
+def test_joining_looks_at_no_other_files(tmp_path):
     """Also where they cannot be read; numbers begin with 0."""
     write_video(tmp_path, "0.elsewhere", 7)
     (tmp_path / "openaigym.manifest.1.elsewhere.manifest.json").write_text("{")
     assert first_number(tmp_path, resume="join", env_id=ANOTHER) == 0
 
 
-def test_joining_leaves_dead_monitors_as_they_are(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_joining_leaves_dead_monitors_as_they_are(tmp_path, caplog):
     """`resume=True` recovers them."""
     env_id = ENV_INFO["env_id"]
     dead = write_log(tmp_path, infix=Infix(0, "1"), ended=False, env_id=env_id)
@@ -189,7 +178,7 @@ def test_joining_leaves_dead_monitors_as_they_are(
     assert "Not recovered" not in caplog.text
 
 
-def test_failed_opening_removes_what_it_made(tmp_path: Path) -> None:
+def test_failed_opening_removes_what_it_made(tmp_path):
     """On a full disk; directories made on the way go again."""
     with file_size_limit(0), pytest.raises(DirectoryNotWritable):
         monitor(tmp_path / "a" / "b")

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """How long something may make no progress."""
 
-from __future__ import annotations
-
 import functools
 import time
 
@@ -12,7 +10,7 @@ from mjrec import InvalidArgument
 from mjrec.patience import Patience, patience_s
 
 
-def test_the_environment_variable_counts(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_environment_variable_counts(monkeypatch):
     """Two minutes without it."""
     monkeypatch.delenv("MJREC_PATIENCE", raising=False)
     assert patience_s() == 120
@@ -22,24 +20,20 @@ def test_the_environment_variable_counts(monkeypatch: pytest.MonkeyPatch) -> Non
 
 
 @pytest.mark.parametrize("text", ["soon", "0", "-1", "inf", "nan"])
-def test_what_is_no_time_is_an_error(
-    text: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_is_no_time_is_an_error(text, monkeypatch):
     """It names the variable."""
     monkeypatch.setenv("MJREC_PATIENCE", text)
     with pytest.raises(InvalidArgument, match="MJREC_PATIENCE"):
         patience_s()
 
 
-def test_who_was_stopped_counts_no_more_than_he_was_to_wait(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_who_was_stopped_counts_no_more_than_he_was_to_wait(monkeypatch):
     """Sleeping for an hour makes nothing hang; progress gives the time anew."""
     now = [0.0]
     monkeypatch.setattr(time, "monotonic", lambda: now[0])
     patience = Patience(120)
 
-    def sleep(seconds: float, *, really: float = 0, news: bool = False) -> bool:
+    def sleep(seconds, *, really=0, news=False):
         now[0] += really or seconds
         return news
 

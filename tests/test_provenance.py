@@ -1,15 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a manifest says of what a recording was made with."""
 
-from __future__ import annotations
-
 import hashlib
 import importlib.metadata
 import json
 import subprocess
 import sys
-from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -26,7 +22,7 @@ with mjrec.Monitor(env, "out", render="off", policy_file="policy.bin") as env:
 """
 
 
-def git(directory: Path, *arguments: str) -> str:
+def git(directory, *arguments):
     done = subprocess.run(
         ["git", "-c", "user.name=A", "-c", "user.email=a@b.c", *arguments],
         cwd=directory,
@@ -37,14 +33,13 @@ def git(directory: Path, *arguments: str) -> str:
     return done.stdout.strip()
 
 
-def surroundings_of(directory: Path) -> dict[str, Any]:
+def surroundings_of(directory):
     [manifest] = directory.glob("*.manifest.json")
-    found: dict[str, Any] = json.loads(manifest.read_text())["mjrec"]["surroundings"]
-    return found
+    return json.loads(manifest.read_text())["mjrec"]["surroundings"]
 
 
 @pytest.fixture
-def repository(tmp_path: Path) -> Path:
+def repository(tmp_path):
     """A repository with a program in it, which is committed."""
     (tmp_path / "train.py").write_text(PROGRAM)
     git(tmp_path, "init", "-q")
@@ -55,7 +50,7 @@ def repository(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_a_program_in_a_repository(repository: Path) -> None:
+def test_a_program_in_a_repository(repository):
     """Its command line, packages, variables, commit and policy are in the manifest."""
     subprocess.run([sys.executable, "train.py"], cwd=repository, check=True)
     found = surroundings_of(repository / "out")
@@ -79,11 +74,8 @@ def test_a_program_in_a_repository(repository: Path) -> None:
 
 
 def test_code_that_changed_or_is_in_no_repository(
-    repository: Path,
-    tmp_path_factory: pytest.TempPathFactory,
-    corridor: Any,
-    tmp_path: Path,
-) -> None:
+    repository, tmp_path_factory, corridor, tmp_path
+):
     """Files that git knows count; elsewhere there is nothing to say of code.
 
     A policy's file must be there.
@@ -118,7 +110,7 @@ gripper-1.5.dist-info/METADATA,sha256=jkl,5
 gripper/__init__.py,sha256=abc,12"""
 
 
-def install(directory: Path, version: str, record: str | None = None) -> None:
+def install(directory, version, record=None):
     """Put what an installer leaves of a package called Gripper into a directory."""
     info = directory / f"gripper-{version}.dist-info"
     info.mkdir(parents=True, exist_ok=True)
@@ -128,14 +120,9 @@ def install(directory: Path, version: str, record: str | None = None) -> None:
 
 
 @pytest.fixture(params=["child", "no child", "child that fails"])
-def _way(
-    request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def _way(request, monkeypatch, tmp_path):
     """Whoever reads the packages: another process, or this one where none can."""
-    programs = {
-        "no child": None,
-        "child that fails": "#!/bin/sh\necho '{}'\nexit 3\n",
-    }
+    programs = {"no child": None, "child that fails": "#!/bin/sh\necho '{}'\nexit 3\n"}
     if request.param in programs:
         program, text = tmp_path / "python", programs[request.param]
         if text is not None:
@@ -148,7 +135,7 @@ every_way = pytest.mark.usefixtures("_way")
 
 
 @every_way
-def test_packages_are_those_that_python_itself_names() -> None:
+def test_packages_are_those_that_python_itself_names():
     """All of them, in the order of their names, each with its version."""
     found = installed_packages()
     expected = {
@@ -160,9 +147,7 @@ def test_packages_are_those_that_python_itself_names() -> None:
     assert {"mjrec", "numpy", "mujoco"} <= found.keys()
 
 
-def test_hashes_are_of_what_a_wheel_consists_of(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_hashes_are_of_what_a_wheel_consists_of(tmp_path, monkeypatch):
     """Whatever the order of its lines, and whatever its installer adds to them.
 
     Of several versions the first on the path counts, which is the one imported.

@@ -1,13 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-from __future__ import annotations
-
 import ast
-import subprocess
-import sys
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from other_python import run_python
 
 import mjrec
 from mjrec import errors
@@ -64,7 +60,7 @@ HEAVY = (
 )
 
 
-def modules() -> Iterator[tuple[str, Path]]:
+def modules():
     """Yield each module's dotted name below the package, and its file."""
     for path in sorted(PACKAGE.rglob("*.py")):
         parts = path.relative_to(PACKAGE).with_suffix("").parts
@@ -76,7 +72,7 @@ def modules() -> Iterator[tuple[str, Path]]:
 MODULES = list(modules())
 
 
-def imports(name: str, path: Path) -> Iterator[str]:
+def imports(name, path):
     """Yield what a module imports, ours as `mjrec.<name>`, also inside functions."""
     package = name.split(".") if path.name == "__init__.py" else name.split(".")[:-1]
     for node in ast.walk(ast.parse(path.read_text())):
@@ -93,7 +89,7 @@ def imports(name: str, path: Path) -> Iterator[str]:
                 yield ".".join([*module, alias.name] if not node.module else module)
 
 
-def _imported_by_call(call: ast.Call, package: list[str]) -> Iterator[str]:
+def _imported_by_call(call, package):
     """Yield what a call like `import_module("..a.b", __package__)` imports."""
     function = ast.unparse(call.func).rpartition(".")[2]
     first = call.args[0] if call.args else None
@@ -103,12 +99,12 @@ def _imported_by_call(call: ast.Call, package: list[str]) -> Iterator[str]:
         yield ".".join([*base, first.value.lstrip(".")])
 
 
-def row(name: str) -> int:
+def row(name):
     """Return the number of the row that a module belongs to."""
     return next(i for i, names in enumerate(ROWS) if name.split(".")[0] in names)
 
 
-def test_modules_import_only_from_rows_below() -> None:
+def test_modules_import_only_from_rows_below():
     """The layers of the design hold; every module has a row."""
     assert [
         (name, imported)
@@ -119,7 +115,7 @@ def test_modules_import_only_from_rows_below() -> None:
     ] == []
 
 
-def test_frameworks_stay_in_their_rows() -> None:
+def test_frameworks_stay_in_their_rows():
     """Only the row that is for a framework imports it."""
     assert [
         (name, imported)
@@ -130,7 +126,7 @@ def test_frameworks_stay_in_their_rows() -> None:
     ] == []
 
 
-def test_no_import_cycles() -> None:
+def test_no_import_cycles():
     """No module imports itself by way of others."""
     known = dict(modules())
     graph = {
@@ -145,26 +141,26 @@ def test_no_import_cycles() -> None:
         for name, path in known.items()
     }
 
-    def visit(name: str, trail: tuple[str, ...]) -> None:
+    def visit(name, trail):
         assert name not in trail, " -> ".join([*trail, name])
         if name not in done:
             for imported in graph[name]:
                 visit(imported, (*trail, name))
             done.add(name)
 
-    done: set[str] = set()
+    done = set()
     for name in graph:
         visit(name, ())
 
 
-def test_all_names_exist_and_are_sorted() -> None:
+def test_all_names_exist_and_are_sorted():
     """`__all__` is the public surface, and each name can be had."""
     assert mjrec.__all__ == sorted(mjrec.__all__)
     for name in mjrec.__all__:
         assert getattr(mjrec, name) is not None
 
 
-def test_every_error_is_public_and_an_error() -> None:
+def test_every_error_is_public_and_an_error():
     """The subclasses of Error are names of the package."""
     assert {"Error", "InvalidFrame", "UntrustedModel"} <= errors.KINDS.keys()
     drawn = errors.__doc__ or ""
@@ -174,13 +170,11 @@ def test_every_error_is_public_and_an_error() -> None:
         assert name in drawn
 
 
-def _run(code: str) -> str:
-    return subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=True
-    ).stdout
+def _run(code):
+    return run_python(code).stdout
 
 
-def test_import_is_inert() -> None:
+def test_import_is_inert():
     """No simulator, no OpenGL, no ffmpeg, and the environment stays as it is.
 
     Nor does a monitor load HDF5: trajectories are logs while an environment runs.
@@ -192,7 +186,7 @@ def test_import_is_inert() -> None:
     ).split() == ["[]", "True", "False"]
 
 
-def test_read_half_needs_no_simulator() -> None:
+def test_read_half_needs_no_simulator():
     """Results are read on a machine without mujoco, OpenGL or ffmpeg."""
     assert _run(
         "import sys; "
@@ -202,7 +196,7 @@ def test_read_half_needs_no_simulator() -> None:
     ).split() == ["read"]
 
 
-def test_no_module_hides_a_public_name() -> None:
+def test_no_module_hides_a_public_name():
     """After every submodule was imported, every public name is still what it was."""
     # In a process of its own: here, anything may have been imported before. Modules
     # first, because a name that was used once stays.
@@ -221,7 +215,7 @@ def test_no_module_hides_a_public_name() -> None:
     ).split() == ["[]", "[]"]
 
 
-def test_version_is_the_packages() -> None:
+def test_version_is_the_packages():
     """The one in pyproject.toml."""
     from importlib.metadata import version
 

@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-from __future__ import annotations
-
 from fractions import Fraction
-from typing import Any
 
 import numpy as np
 import pytest
@@ -21,13 +18,13 @@ from mjrec.rates import MAX_DENOMINATOR, rate_from_timestep, stride_for, to_rate
         (np.int64(60), Fraction(60)),
     ],
 )
-def test_rate_is_the_fraction_that_was_meant(fps: Any, rate: Fraction) -> None:
+def test_rate_is_the_fraction_that_was_meant(fps, rate):
     """Numbers of every kind are taken for what their decimals say."""
     assert to_rate(fps) == rate
 
 
 @pytest.mark.parametrize("fps", [0, -1, float("nan"), True, "30", 1e-9, 1e9])
-def test_impossible_rate_is_an_error(fps: Any) -> None:
+def test_impossible_rate_is_an_error(fps):
     """What is no number of frames a second is named."""
     with pytest.raises(InvalidArgument, match="fps must be"):
         to_rate(fps)
@@ -37,13 +34,13 @@ def test_impossible_rate_is_an_error(fps: Any) -> None:
     ("timestep", "rate"),
     [(0.015, Fraction(200, 3)), (0.1 + 0.2 - 0.25, Fraction(20)), (1 / 60, 60)],
 )
-def test_rate_of_a_timestep(timestep: float, rate: Fraction) -> None:
+def test_rate_of_a_timestep(timestep, rate):
     """Sums of binary floats are the decimal numbers that they stand for."""
     assert rate_from_timestep(timestep) == rate
 
 
 @pytest.mark.parametrize("timestep", [1.234567, 0.0166667, 1e-6, 12.3456789])
-def test_rate_of_any_timestep_fits_a_video_file(timestep: float) -> None:
+def test_rate_of_any_timestep_fits_a_video_file(timestep):
     """Both terms are at most a million, and the rate is right to a millionth."""
     rate = rate_from_timestep(timestep)
     assert max(rate.numerator, rate.denominator) <= MAX_DENOMINATOR
@@ -51,7 +48,7 @@ def test_rate_of_any_timestep_fits_a_video_file(timestep: float) -> None:
 
 
 @pytest.mark.parametrize("timestep", [0.0, -0.1, float("nan"), 4e-7, 5e-324])
-def test_impossible_timestep_is_an_error(timestep: float) -> None:
+def test_impossible_timestep_is_an_error(timestep):
     """Time goes forward."""
     with pytest.raises(InvalidArgument, match="timestep"):
         rate_from_timestep(timestep)
@@ -61,6 +58,6 @@ def test_impossible_timestep_is_an_error(timestep: float) -> None:
     ("rate", "max_fps", "stride"),
     [(20, None, 1), (20, 60, 1), (125, 25, 5), (125, Fraction(249, 10), 6)],
 )
-def test_stride_is_the_smallest_that_fits(rate: int, max_fps: Any, stride: int) -> None:
+def test_stride_is_the_smallest_that_fits(rate, max_fps, stride):
     """Every step, every second, every third ..."""
     assert stride_for(Fraction(rate), max_fps) == stride

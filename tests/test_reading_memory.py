@@ -1,12 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What stays in memory of thousands of manifests while they are read."""
 
-from __future__ import annotations
-
 import tracemalloc
-from collections.abc import Callable, Mapping
-from pathlib import Path
-from typing import Any
 
 from parts import parametrize
 
@@ -26,7 +21,7 @@ MONITORS = 40
 PACKAGES = {f"package-{n}": {"version": "1.0", "sha256": "0" * 64} for n in range(1000)}
 
 
-def write_monitors(directory: Path, said: Mapping[str, Any]) -> Path:
+def write_monitors(directory, said):
     """Write what many monitors leave that recorded an episode each."""
     directory.mkdir()
     for number in range(MONITORS):
@@ -44,12 +39,12 @@ def write_monitors(directory: Path, said: Mapping[str, Any]) -> Path:
     return directory
 
 
-def list_episodes(directory: Path) -> int:
+def list_episodes(directory):
     """Return how many episodes there are."""
     return sum(1 for _ in mjrec.iter_episodes(directory))
 
 
-def peak_of(read: Callable[[Path], object], path: Path) -> int:
+def peak_of(read, path):
     """Return the most bytes that were held while something was read."""
     # The first time, things are loaded that stay.
     read(path)
@@ -62,7 +57,7 @@ def peak_of(read: Callable[[Path], object], path: Path) -> int:
 
 
 @parametrize("read", [mjrec.load_results, list_episodes, gather])
-def test_manifests_are_not_kept(tmp_path: Path, read: Callable[[Path], object]) -> None:
+def test_manifests_are_not_kept(tmp_path, read):
     """What all of them say takes no more than what a few do."""
     large = write_monitors(tmp_path / "large", PACKAGES)
     small = write_monitors(tmp_path / "small", {})

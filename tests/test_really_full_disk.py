@@ -1,15 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """A file system that is full: what was recorded before and after is there."""
 
-from __future__ import annotations
-
 import os
 import subprocess
-import sys
-from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
+from other_python import run_python
 from recordings import manifest_of, stats_of
 
 import mjrec
@@ -18,7 +14,7 @@ STEPS = 8
 
 
 @pytest.fixture
-def disk(tmp_path: Path) -> Iterator[Path]:
+def disk(tmp_path):
     """A file system of two megabytes."""
     if os.geteuid() != 0:
         pytest.skip("mounting a small file system takes root")
@@ -60,21 +56,13 @@ monitor.close(wait=False)
 
 @pytest.mark.parametrize("ending", ["closed", "killed"])
 @pytest.mark.parametrize("room", [0, 4096, 65536])
-def test_episodes_of_a_full_disk_are_complete(
-    room: int, ending: str, disk: Path
-) -> None:
+def test_episodes_of_a_full_disk_are_complete(room, ending, disk):
     """Whether the monitor closes when there is room again, or never does.
 
     Rows tell what lines could not, and nothing claims what is not so. Without any room
     the third cannot begin; that it was played is said when there is room.
     """
-    done = subprocess.run(
-        [sys.executable, "-c", PROGRAM, str(disk), str(room), ending],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == (0 if ending == "closed" else -9), done.stderr
+    run_python(PROGRAM, disk, room, ending, status=0 if ending == "closed" else -9)
     (disk / "filler").unlink(missing_ok=True)
     run = disk / "run"
     assert not mjrec.recover(run).failures

@@ -1,46 +1,40 @@
 # SPDX-License-Identifier: Apache-2.0
-from __future__ import annotations
-
 import gc
 import os
-import subprocess
-import sys
 import tempfile
 from fractions import Fraction
-from pathlib import Path
-from typing import Any
 
 import mujoco
 import mujoco.rollout
 import numpy as np
 import pytest
+from other_python import run_python
 from processes import children
-from rides import HEIGHT, WIDTH, Ride, move, record, start
+from rides import HEIGHT, WIDTH, move, record, start
 from trajectories_by_hand import write_log
 
 import mjrec
 from mjrec.errors import InvalidArgument, NoPictures, UnknownName, UnreadableFile
 from mjrec.rendering.recorded_facts import chosen_frames
+from mjrec.simulation.renderer import SceneRenderer
 
 SPEC = mujoco.mjtState.mjSTATE_FULLPHYSICS
-SIZE: dict[str, Any] = {"height": HEIGHT, "width": WIDTH}
+SIZE = {"height": HEIGHT, "width": WIDTH}
 
 
 @pytest.fixture(scope="module")
-def ride(tmp_path_factory: pytest.TempPathFactory) -> Ride:
+def ride(tmp_path_factory):
     return record(tmp_path_factory.mktemp("ride"))
 
 
 @pytest.fixture
-def temporary(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def temporary(tmp_path, monkeypatch):
     """Where temporary files go."""
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     return tmp_path
 
 
-def states_of(
-    model: mujoco.MjModel, data: mujoco.MjData, count: int
-) -> tuple[np.ndarray, list[np.ndarray]]:
+def states_of(model, data, count):
     """Return states, and what MuJoCo's own renderer shows of them."""
     states = np.empty((count, mujoco.mj_stateSize(model, int(SPEC))))
     shown = []
@@ -56,7 +50,7 @@ def states_of(
 # Recorded episodes
 
 
-def test_a_recording_is_drawn_again(ride: Ride) -> None:
+def test_a_recording_is_drawn_again(ride):
     """From its path or what was loaded of it, as it was seen."""
     before = children()
     assert np.array_equal(list(mjrec.render(str(ride.path))), ride.frames)
@@ -66,49 +60,26 @@ def test_a_recording_is_drawn_again(ride: Ride) -> None:
     assert children() == before
 
 
-@pytest.mark.thorough
-def test_a_recording_is_drawn_another_way(ride: Ride) -> None:
-    """Camera, size, quality and rate."""
-    camera = mujoco.MjvCamera()
-    camera.lookat[:], camera.distance = (1, 0, 0.5), 6
-    members = {"lookat": [1, 0, 0.5], "distance": 6}
-    pictures = {
-        str(given): list(
-            mjrec.render(
-                ride.path,
-                camera=given,
-                width=40,
-                height=30,
-                quality="draft",
-                max_fps=4,
-            )
-        )
-        for given in (camera, members, "side")
-    }
+MEMBERS = {"lookat": [1, 0, 0.5], "distance": 3.0, "azimuth": 70, "elevation": -20}
 
-    first, second, side = pictures.values()
+
+@pytest.mark.parametrize("kind", ["name", "members", "own"])
+def test_another_view_takes_the_place_of_the_recorded_one(ride, kind):
+    """Camera, size, quality and rate; visual options stay."""
+    shown, option = mujoco.MjvCamera(), mujoco.MjvOption()
+    for name, value in MEMBERS.items():
+        setattr(shown, name, value)
+    option.flags[mujoco.mjtVisFlag.mjVIS_INERTIA] = True
+    camera = {"name": "side", "members": MEMBERS, "own": shown}[kind]
+    view = {"height": 30, "width": 50, "quality": "draft"}
     # Ten a second are recorded: 0, 3, 6, and the last.
-    assert [frame.shape for frame in first] == [(30, 40, 3)] * 4
-    assert np.array_equal(first, second)
-    assert not np.array_equal(first, side)
-
-
-@pytest.mark.thorough
-def test_a_recording_that_is_left_early(ride: Ride) -> None:
-    """Closing, or dropping what was returned, ends the workers."""
-    before = children()
-    pictures: Any = mjrec.render(ride.path, workers=2)
-    next(pictures)
-    pictures.close()
-    assert list(pictures) == []
-    assert children() == before
-
-    pictures = mjrec.render(ride.path, workers=2)
-    next(pictures)
-    assert len(children() - before) == 2
-    del pictures
-    gc.collect()
-    assert children() == before
+    drawn = list(mjrec.render(ride.path, camera=camera, max_fps=4, **view))
+    assert [frame.shape for frame in drawn] == [(30, 50, 3)] * 4
+    model, data = start()
+    shown = "side" if kind == "name" else shown
+    with SceneRenderer(model, camera=shown, scene_option=option, **view) as renderer:
+        move(model, data, 0)
+        assert np.array_equal(drawn[0], renderer.render(data))
 
 
 WRONG = [
@@ -127,13 +98,7 @@ WRONG = [
     ("arguments", "kind", "message"),
     [*WRONG, ({"max_fps": 0}, InvalidArgument, "positive")],
 )
-def test_arguments_are_checked_by_the_call(
-    ride: Ride,
-    temporary: Path,
-    arguments: dict[str, Any],
-    kind: type[Exception],
-    message: str,
-) -> None:
+def test_arguments_are_checked_by_the_call(ride, temporary, arguments, kind, message):
     """Not by the first frame; nothing is left running, and no file."""
     before = children()
     with pytest.raises(kind, match=message):
@@ -146,14 +111,14 @@ def test_arguments_are_checked_by_the_call(
     assert list(temporary.iterdir()) == []
 
 
-def test_what_is_no_recording(tmp_path: Path) -> None:
+def test_what_is_no_recording(tmp_path):
     """One error each."""
     with pytest.raises(UnreadableFile, match=r"lost\.h5"):
         mjrec.render(tmp_path / "lost.h5")
     with pytest.raises(NoPictures, match="no snapshots"):
         mjrec.render(write_log(tmp_path, frames=False, scene=None))
     with pytest.raises(InvalidArgument, match="trajectory is a path"):
-        mjrec.render(3)  # type: ignore[arg-type]  that is the test
+        mjrec.render(3)
 
 
 @pytest.mark.parametrize(
@@ -169,9 +134,7 @@ def test_what_is_no_recording(tmp_path: Path) -> None:
         (0, 1, []),
     ],
 )
-def test_pictures_are_chosen_by_rate(
-    count: int, max_fps: Any, chosen: list[int]
-) -> None:
+def test_pictures_are_chosen_by_rate(count, max_fps, chosen):
     """Every n-th of those that were recorded, and the last."""
     facts = {"rate": "20", "stride": 2}
     assert chosen_frames(count, facts, max_fps).indices == chosen
@@ -184,7 +147,7 @@ def test_pictures_are_chosen_by_rate(
 # Given states
 
 
-def test_states_are_drawn_as_mujoco_would(temporary: Path) -> None:
+def test_states_are_drawn_as_mujoco_would(temporary):
     """After `mj_forward`, over an infinite plane, by one worker and by three."""
     model, data = start()
     states, shown = states_of(model, data, 7)
@@ -200,7 +163,7 @@ def test_states_are_drawn_as_mujoco_would(temporary: Path) -> None:
 
 
 @pytest.mark.thorough
-def test_states_that_are_left_early_leave_no_files(temporary: Path) -> None:
+def test_states_that_are_left_early_leave_no_files(temporary):
     """Nor do they at interpreter exit."""
     model, _ = start()
     pictures = mjrec.render_states(model, np.zeros((50, 3)), SPEC, **SIZE)
@@ -217,9 +180,6 @@ def test_states_that_are_left_early_leave_no_files(temporary: Path) -> None:
         "kept = mjrec.render_states(model, states, 1, height=8, width=8)\n"
         "next(kept)\n"
     )
-    subprocess.run(
-        [sys.executable, "-W", "error", "-c", script],
-        env={**os.environ, "TMPDIR": str(temporary)},
-        check=True,
-    )
+    variables = {"TMPDIR": str(temporary), "PYTHONWARNINGS": "error"}
+    run_python(script, env={**os.environ, **variables})
     assert list(temporary.iterdir()) == []

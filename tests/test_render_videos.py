@@ -1,17 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """`mjrec.render_videos`: pending or another way, here or by an engine's workers."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil
-from collections.abc import Callable, Mapping
-from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from concurrent.futures import Executor, ThreadPoolExecutor
 from contextlib import suppress
 from fractions import Fraction
 from pathlib import Path
-from typing import Any
 
 import gymnasium
 import h5py
@@ -21,7 +17,6 @@ from parts import parametrize
 from recordings import frames_of, in_flight
 from trajectories_by_hand import (
     INFIX,
-    Painter,
     write_finished,
     write_log,
     write_pending_manifest,
@@ -51,16 +46,14 @@ class Here(Executor):
         dies: parts of the keys of these jobs.
     """
 
-    def __init__(self, *dies: str) -> None:
+    def __init__(self, *dies):
         self.dies = dies
-        self.works: list[Mapping[str, Any]] = []
-        self.jobs: list[Mapping[str, Any]] = []
+        self.works = []
+        self.jobs = []
         self._thread = ThreadPoolExecutor(1)
         self._worker = VideoWorker()
 
-    def submit(
-        self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any
-    ) -> Future[Any]:
+    def submit(self, fn, /, *args, **kwargs):
         place, job = json.loads(json.dumps(args))
         work = json.loads(Path(place, "work.json").read_bytes())
         if work not in self.works:
@@ -69,7 +62,7 @@ class Here(Executor):
         self.jobs.append(job)
         return self._thread.submit(self._do, job)
 
-    def _do(self, job: Mapping[str, Any]) -> Mapping[str, Any]:
+    def _do(self, job):
         if any(name in job["key"] for name in self.dies):
             return {"died": "was killed by SIGKILL.", "begun": True}
         value = self._worker(job["arguments"])
@@ -77,7 +70,7 @@ class Here(Executor):
 
 
 @pytest.fixture(params=[None, Here], ids=["here", "engine"])
-def engine(request: pytest.FixtureRequest) -> Here | None:
+def engine(request):
     """Where it is done."""
     return request.param and Here()
 
@@ -85,9 +78,7 @@ def engine(request: pytest.FixtureRequest) -> Here | None:
 # What comes of each
 
 
-def test_pending_videos_are_made_once(
-    tmp_path: Path, painter: Painter, engine: Here | None
-) -> None:
+def test_pending_videos_are_made_once(tmp_path, painter, engine):
     """The result says what became of each; a second call has nothing to do."""
     write_finished(tmp_path, 0)
     write_finished(tmp_path, 1).write_bytes(b"torn")
@@ -109,7 +100,7 @@ def test_pending_videos_are_made_once(
 
 
 @parametrize("given", [None, "local", LocalEngine(1)])
-def test_every_engine_makes_them(tmp_path: Path, given: Any) -> None:
+def test_every_engine_makes_them(tmp_path, given):
     """By its name, or as it is given; and another view beside the original."""
     environment = gymnasium.make("InvertedPendulum-v5", width=40, height=32)
     run = tmp_path / "run"
@@ -126,7 +117,7 @@ def test_every_engine_makes_them(tmp_path: Path, given: Any) -> None:
         assert len(frames_of(run / name)) == frames
     assert render_videos(run, engine=given).is_empty
     out = tmp_path / "other.mp4"
-    view: dict[str, Any] = {"camera": -1, "height": 24, "width": 24}
+    view = {"camera": -1, "height": 24, "width": 24}
     other = render_videos(run, episode=1, **view, out=out, engine=given)
     assert (list(other.videos), other.directory) == (["other.mp4"], tmp_path)
     assert frames_of(out)[0].shape == (24, 24, 3)
@@ -134,11 +125,11 @@ def test_every_engine_makes_them(tmp_path: Path, given: Any) -> None:
 
 @pytest.mark.parametrize("options", [{}, {"fps": 30}], ids=["pending", "another way"])
 def test_where_nothing_can_be_drawn_one_try_is_enough(
-    tmp_path: Path, painter: Painter, engine: Here | None, options: dict[str, Any]
-) -> None:
+    tmp_path, painter, engine, options
+):
     """And each video is told with the reason."""
 
-    def fail(*_: object) -> None:
+    def fail(*_):
         raise GLError("nothing renders here")
 
     painter.breaks_at = fail
@@ -151,20 +142,18 @@ def test_where_nothing_can_be_drawn_one_try_is_enough(
 
 
 @pytest.mark.parametrize("options", [{}, {"max_fps": 10}])
-def test_ctrl_c_leaves_what_is_finished(
-    tmp_path: Path, painter: Painter, options: dict[str, Any]
-) -> None:
+def test_ctrl_c_leaves_what_is_finished(tmp_path, painter, options):
     """And nothing half-done; models were trusted during the call only."""
     for number in (0, 1):
         write_finished(tmp_path, number)
-    seen: list[tuple[Progress, str | None]] = []
+    seen = []
 
-    def interrupt(progress: Progress) -> None:
+    def interrupt(progress):
         seen.append((progress, os.environ.get("MJREC_TRUST_MODELS")))
         if progress.videos_done and progress.frames_done > 4:
             raise KeyboardInterrupt
 
-    trusted: dict[str, Any] = {"trust_models": True, **options}
+    trusted = {"trust_models": True, **options}
     with pytest.raises(KeyboardInterrupt):
         render_videos(tmp_path, on_progress=interrupt, **trusted)
     assert [path.name[:31] for path in tmp_path.glob("*.mp4")] == [VIDEO]
@@ -181,7 +170,7 @@ def test_ctrl_c_leaves_what_is_finished(
     )
 
 
-WRONG: list[tuple[dict[str, Any], type[Exception], str]] = [
+WRONG = [
     ({"episode": 4}, InvalidArgument, "It has those of 0"),
     ({"workers": 0}, InvalidArgument, "workers"),
     ({"height": -1}, InvalidArgument, "height"),
@@ -199,9 +188,7 @@ WRONG: list[tuple[dict[str, Any], type[Exception], str]] = [
 
 
 @pytest.mark.parametrize(("options", "kind", "words"), WRONG)
-def test_what_cannot_be_is_one_clear_error(
-    tmp_path: Path, options: dict[str, Any], kind: type[Exception], words: str
-) -> None:
+def test_what_cannot_be_is_one_clear_error(tmp_path, options, kind, words):
     """And nothing is written."""
     write_finished(tmp_path)
     before = sorted(tmp_path.iterdir())
@@ -210,7 +197,7 @@ def test_what_cannot_be_is_one_clear_error(
     assert sorted(tmp_path.iterdir()) == before
 
 
-def test_what_is_no_recording_is_said(tmp_path: Path) -> None:
+def test_what_is_no_recording_is_said(tmp_path):
     """A directory without any, a path to nothing, and a file of another name."""
     with pytest.raises(InvalidArgument, match="holds no recordings"):
         render_videos(tmp_path)
@@ -224,7 +211,7 @@ def test_what_is_no_recording_is_said(tmp_path: Path) -> None:
 # By an engine's workers
 
 
-def content_of(directory: Path) -> dict[str, Any]:
+def content_of(directory):
     """Return what each file holds; of trajectories the arrays and what they say."""
     return {
         path.name: _of_hdf5(path) if path.suffix == ".h5" else path.read_bytes()
@@ -232,10 +219,10 @@ def content_of(directory: Path) -> dict[str, Any]:
     }
 
 
-def _of_hdf5(path: Path) -> dict[str, Any]:
-    found: dict[str, Any] = {}
+def _of_hdf5(path):
+    found = {}
 
-    def note(name: str, item: Any) -> None:
+    def note(name, item):
         said = {key: np.asarray(value).tolist() for key, value in item.attrs.items()}
         rows = item[()].tobytes() if isinstance(item, h5py.Dataset) else None
         found[name] = (said, rows)
@@ -247,10 +234,10 @@ def _of_hdf5(path: Path) -> dict[str, Any]:
 
 
 @pytest.fixture(scope="module")
-def interrupted(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def interrupted(tmp_path_factory):
     """A clip, and episodes by two cameras; interrupted, so that all are logs."""
     directory = tmp_path_factory.mktemp("recorded") / "run"
-    small: dict[str, Any] = {"height": 32, "width": 40, "quality": "draft"}
+    small = {"height": 32, "width": 40, "quality": "draft"}
     for options in (
         {"step_trigger": lambda step: step == 2, "video_length": 5},
         {"video_callable": lambda _: True, "camera": ["track", -1]},
@@ -270,7 +257,7 @@ def interrupted(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return directory
 
 
-OTHER: dict[str, Any] = {
+OTHER = {
     "camera": {"type": 0, "distance": 5.0},
     "height": 24,
     "width": 32,
@@ -283,8 +270,8 @@ OTHER: dict[str, Any] = {
 @pytest.mark.thorough
 @pytest.mark.parametrize(("options", "count"), [({}, 7), (OTHER, 3)])
 def test_two_workers_make_the_files_that_this_process_makes(
-    interrupted: Path, tmp_path: Path, options: dict[str, Any], count: int
-) -> None:
+    interrupted, tmp_path, options, count
+):
     """Byte for byte: videos, metadata, frame hashes, manifests, trajectories."""
     here, there = (
         shutil.copytree(interrupted, tmp_path / name) for name in ("here", "there")
@@ -297,21 +284,19 @@ def test_two_workers_make_the_files_that_this_process_makes(
     assert content_of(there) == content_of(here)
 
 
-def test_progress_counts_videos_as_they_come(tmp_path: Path, painter: Painter) -> None:
+def test_progress_counts_videos_as_they_come(tmp_path, painter):
     """Each recording is taken for a video until it is over; frames are not known."""
     write_finished(tmp_path, 0)
     write_finished(tmp_path, 1, frames=False)
     write_log(tmp_path, 2, video=None)
-    seen: list[Progress] = []
+    seen = []
     render_videos(tmp_path, engine=Here(), on_progress=seen.append)
     counts = [(now.videos, now.videos_done, now.frames_done) for now in seen]
     assert counts == [(3, 0, 0), (3, 1, 5), (3, 2, 5), (2, 2, 5)]
     assert {now.frames for now in seen} == {None}
 
 
-def test_a_job_whose_workers_die_is_that_videos_failure(
-    tmp_path: Path, painter: Painter
-) -> None:
+def test_a_job_whose_workers_die_is_that_videos_failure(tmp_path, painter):
     """The manifest says so, and the rest goes on."""
     for number in (0, 1):
         write_finished(tmp_path, number)
@@ -323,9 +308,7 @@ def test_a_job_whose_workers_die_is_that_videos_failure(
     assert pending["reason"] == DIED
 
 
-def test_workers_get_what_rendering_needs(
-    tmp_path: Path, painter: Painter, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_workers_get_what_rendering_needs(tmp_path, painter, monkeypatch):
     """One thread each, this user's models and trust, and where all see files."""
     monkeypatch.setenv("MJREC_TRUST_MODELS", "1")
     monkeypatch.delenv("LP_NUM_THREADS", raising=False)
@@ -340,18 +323,3 @@ def test_workers_get_what_rendering_needs(
     assert work["environ"] == {"LP_NUM_THREADS": "1", "MJREC_TRUST_MODELS": "1"}
     assert work["settings"] == {"models": [digest]}
     assert engine.jobs[0]["arguments"]["directory"] == str(tmp_path)
-
-
-def test_who_stops_listening_ends_the_run(tmp_path: Path, painter: Painter) -> None:
-    """As Ctrl-C does; what is finished stays."""
-    for number in range(4):
-        write_finished(tmp_path, number)
-
-    def interrupt(progress: Progress) -> None:
-        if progress.videos_done:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        render_videos(tmp_path, engine=Here(), on_progress=interrupt)
-    # One was at work.
-    assert 1 <= len(list(tmp_path.glob("*.mp4"))) <= 3

@@ -129,26 +129,6 @@ def test_a_killed_encoder_gets_a_second_try(
     check_nothing_is_half(two)
 
 
-def test_an_encoder_that_is_killed_again_leaves_the_video_pending(
-    two: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """With what it said; the other video is rendered."""
-    use_encoder(tmp_path, monkeypatch, of="video000000", instead=KILLED)
-    first, second = finish(two)
-    [failure] = first.failures.values()
-    assert "video000000.mp4 could not be encoded" in failure
-    assert "exit status: -9" in failure
-    assert "no memory" in failure
-    assert second.videos == {VIDEO.format(1): FRAMES}
-    [(name, reason)] = reasons_in(two).items()
-    assert name == VIDEO.format(0)
-    assert reason is not None
-    assert reason.endswith("no memory")
-    check_nothing_is_half(two)
-    monkeypatch.delenv("IMAGEIO_FFMPEG_EXE")
-    check_all_is_there_after_another_try(two)
-
-
 # Takes more than five seconds: the encoder's timeout, twice.
 @parametrize("instead", ["exec sleep 60", "cat >/dev/null; sleep 60"])
 def test_an_encoder_that_hangs_leaves_the_video_pending(

@@ -1,20 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """What is pending in a directory is found, shared out, and done once."""
 
-from __future__ import annotations
-
-import contextlib
 import json
 import time
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
 
 import pytest
 from recordings import add_facts
 from trajectories_by_hand import (
     INFIX,
-    Painter,
     add_row,
     grey,
     new_logs,
@@ -23,7 +16,7 @@ from trajectories_by_hand import (
     write_pending_manifest,
 )
 
-from mjrec import UnreadableFile, load_results
+from mjrec import UnreadableFile
 from mjrec.formats.locks import Lock
 from mjrec.formats.monitor_directory import (
     lock_name,
@@ -33,15 +26,9 @@ from mjrec.formats.monitor_directory import (
 from mjrec.formats.spans import is_in_flight
 from mjrec.formats.trajectory_file import open_trajectory
 from mjrec.rendering import finish as module
-from mjrec.rendering.finisher import Finisher
-from mjrec.rendering.jobs import RecordingKey, RenderedVideos, VideoJob
-from mjrec.rendering.pool import WorkerPool
+from mjrec.rendering.jobs import RecordingKey
 from mjrec.rendering.recorded_facts import open_for_rendering
-from mjrec.rendering.recordings import (
-    claim,
-    look_at,
-    may_be_left,
-)
+from mjrec.rendering.recordings import claim, look_at, may_be_left
 from mjrec.results.manifest_writing import write_manifest_and_stats
 
 pytestmark = pytest.mark.usefixtures("painter")
@@ -52,15 +39,14 @@ SECOND = "openaigym.video.0.7.video000001.mp4"
 ENDS = ("framehash", "meta.json", "mp4")
 
 
-def finish(directory: Path, **options: Any) -> list[RenderedVideos]:
+def finish(directory, **options):
     options = {"workers": 1, **options}
     return list(module.finish(directory, **options))
 
 
-def manifest_in(directory: Path) -> dict[str, Any]:
+def manifest_in(directory):
     [path] = directory.glob("*.manifest.json")
-    content: dict[str, Any] = json.loads(path.read_text())
-    return content
+    return json.loads(path.read_text())
 
 
 # What is pending
@@ -68,8 +54,8 @@ def manifest_in(directory: Path) -> dict[str, Any]:
 
 @pytest.mark.parametrize("write", [write_log, write_finished])
 def test_a_deferred_video_is_pending_until_it_and_its_metadata_are_there(
-    write: Callable[..., Path], tmp_path: Path
-) -> None:
+    write, tmp_path
+):
     """Whether or not the trajectory has its final form."""
     trajectory = write(tmp_path)
     plan = look_at(tmp_path, KEY)
@@ -85,26 +71,8 @@ def test_a_deferred_video_is_pending_until_it_and_its_metadata_are_there(
         (tmp_path / f"{VIDEO}.meta.json").unlink()
 
 
-@pytest.mark.parametrize("video", [None, "live"])
-def test_a_log_without_a_deferred_video_gets_its_final_form_only(
-    video: str | None,
-    tmp_path: Path,
-    painter: Painter,
-    names: Callable[[Path], list[str]],
-) -> None:
-    """What was drawn live, or not wanted, is not drawn."""
-    log = write_log(tmp_path, video=video)
-    [result] = finish(tmp_path)
-    assert result == RenderedVideos(directory=tmp_path, trajectories=(log.name,))
-    assert [n for n in names(tmp_path) if "mp4" in n or "trajectory" in n] == [log.name]
-    assert painter.asked == []
-    assert finish(tmp_path) == []
-
-
 @pytest.mark.parametrize(("facts", "ended"), [({"candidate": True}, True), ({}, False)])
-def test_what_an_open_monitor_has_not_ended_is_its_own(
-    facts: dict[str, Any], ended: bool, tmp_path: Path
-) -> None:
+def test_what_an_open_monitor_has_not_ended_is_its_own(facts, ended, tmp_path):
     """Running or undecided, it may still be deleted; that of a dead one is pending."""
     log = write_log(tmp_path, ended=ended, **facts)
     write_log(tmp_path, 1)
@@ -121,9 +89,7 @@ def test_what_an_open_monitor_has_not_ended_is_its_own(
     assert result.videos
 
 
-def test_a_trajectory_that_is_not_kept_goes_with_its_video_only(
-    tmp_path: Path, names: Callable[[Path], list[str]]
-) -> None:
+def test_a_trajectory_that_is_not_kept_goes_with_its_video_only(tmp_path, names):
     """While that fails it stays: nobody could ever render it."""
     write_log(tmp_path, kept=False)
     log = write_log(tmp_path, 1, kept=False, frames=False)
@@ -135,9 +101,7 @@ def test_a_trajectory_that_is_not_kept_goes_with_its_video_only(
 # Who does it
 
 
-def test_what_another_process_has_is_left_to_it(
-    tmp_path: Path, painter: Painter
-) -> None:
+def test_what_another_process_has_is_left_to_it(tmp_path, painter):
     """It is told, and not done twice; the lock file of a dead one is nobody's."""
     write_finished(tmp_path)
     lock = claim(tmp_path, KEY)
@@ -155,22 +119,10 @@ def test_what_another_process_has_is_left_to_it(
     assert not list(tmp_path.glob(".*"))
 
 
-def test_one_whose_model_is_still_being_written_waits(tmp_path: Path) -> None:
-    """And no other comes before it."""
-    write_finished(tmp_path, 0, model={"mjb": "m.mjb.gz", "xml": None})
-    with contextlib.closing(Finisher(WorkerPool(1))) as finisher:
-        finisher.add(VideoJob.finishing(tmp_path, KEY))
-        assert not finisher.is_ready()
-        (tmp_path / "m.mjb.gz").write_bytes(b"")
-        assert finisher.is_ready()
-
-
 # What fails
 
 
-def test_what_cannot_be_rendered_stops_nothing_else(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture, painter: Painter
-) -> None:
+def test_what_cannot_be_rendered_stops_nothing_else(tmp_path, caplog, painter):
     """It is told with its reason, and stays pending."""
     write_finished(tmp_path, 0).write_bytes(b"not HDF5 at all")
     write_finished(tmp_path, 1, frames=False, refusal="a plugin draws")
@@ -194,32 +146,7 @@ def test_what_cannot_be_rendered_stops_nothing_else(
 # The manifest
 
 
-def test_the_manifest_of_a_closed_monitor_gets_the_videos(tmp_path: Path) -> None:
-    """In the order of the episodes; what nothing can be rendered of is none."""
-    for episode_id in (0, 1):
-        write_finished(tmp_path, episode_id)
-    write_finished(tmp_path, 3, frames=False, broken_reason="a marker")
-    write_pending_manifest(tmp_path, 1, 0, 2, 3, schedule={"name": "cubic"})
-    (tmp_path / "openaigym.episode_batch.0.7.stats.json").write_text(
-        '{"initial_reset_timestamp": 1, "timestamps": [2], "episode_lengths": [4], '
-        '"episode_rewards": [2.0], "episode_types": ["t"]}'
-    )
-    finish(tmp_path)
-    manifest = manifest_in(tmp_path)
-    assert manifest["videos"] == [
-        [f"openaigym.video.0.7.video{k:06d}.{end}" for end in ("mp4", "meta.json")]
-        for k in (0, 1)
-    ]
-    assert manifest["mjrec"]["pending"] == []
-    assert manifest["mjrec"]["broken"] == ["openaigym.video.0.7.video000003.meta.json"]
-    assert manifest["mjrec"]["schedule"]["name"] == "cubic"
-    assert manifest["env_info"] == {"gym_version": "mjrec-1", "env_id": "Grey-v0"}
-    results = load_results(tmp_path)
-    assert results is not None
-    assert len(results["videos"]) == 2
-
-
-def test_the_manifest_of_an_open_monitor_is_left_to_it(tmp_path: Path) -> None:
+def test_the_manifest_of_an_open_monitor_is_left_to_it(tmp_path):
     """What a race leaves, a later run repairs, though there is nothing to render."""
     write_finished(tmp_path)
     path = write_pending_manifest(tmp_path, 0)
@@ -233,7 +160,7 @@ def test_the_manifest_of_an_open_monitor_is_left_to_it(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["../elsewhere/x.mp4", "/x.mp4", "", 7, None])
-def test_a_manifest_names_no_video_elsewhere(name: Any, tmp_path: Path) -> None:
+def test_a_manifest_names_no_video_elsewhere(name, tmp_path):
     """Such an entry is dropped."""
     path = write_pending_manifest(tmp_path, 0)
     content = json.loads(path.read_text())
@@ -243,7 +170,7 @@ def test_a_manifest_names_no_video_elsewhere(name: Any, tmp_path: Path) -> None:
     assert manifest_in(tmp_path)["mjrec"]["pending"] == []
 
 
-def test_the_manifest_says_why_a_video_is_still_pending(tmp_path: Path) -> None:
+def test_the_manifest_says_why_a_video_is_still_pending(tmp_path):
     """What became of the latest try; a try that succeeds takes it away."""
     write_log(tmp_path, 0)
     write_pending_manifest(tmp_path, 0)
@@ -262,10 +189,10 @@ def test_the_manifest_says_why_a_video_is_still_pending(tmp_path: Path) -> None:
 
 # Facts, which may be anybody's
 
-FACTS: dict[str, Any] = {"name": "x.mp4", "recording": "deferred"}
+FACTS = {"name": "x.mp4", "recording": "deferred"}
 
 
-def write_saying(directory: Path, **facts: Any) -> Path:
+def write_saying(directory, **facts):
     """Write a log of two frames that says these facts, of any kind."""
     usual = write_finished(directory, 1)
     with open_trajectory(usual) as reader:
@@ -302,7 +229,7 @@ def write_saying(directory: Path, **facts: Any) -> Path:
         ),
     ],
 )
-def test_a_fact_that_cannot_be_is_named(key: str, value: Any, tmp_path: Path) -> None:
+def test_a_fact_that_cannot_be_is_named(key, value, tmp_path):
     """With its file, at once, before anything of it is drawn."""
     path = write_saying(tmp_path, **{key: value})
     start = time.monotonic()
@@ -321,9 +248,7 @@ def test_a_fact_that_cannot_be_is_named(key: str, value: Any, tmp_path: Path) ->
         {"video": {**FACTS, "fps": "8435894437147607/281474976710656"}},
     ],
 )
-def test_what_recorders_write_is_accepted(
-    facts: dict[str, Any], tmp_path: Path
-) -> None:
+def test_what_recorders_write_is_accepted(facts, tmp_path):
     """Also what is not known yet in a recording that broke off."""
     with open_for_rendering(write_saying(tmp_path, **facts)) as reader:
         assert reader.frame_count == 2

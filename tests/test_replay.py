@@ -1,11 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Recorded states follow from each other."""
 
-from __future__ import annotations
-
 import importlib.util
-from pathlib import Path
-from typing import Any
 
 import gymnasium
 import mujoco
@@ -28,7 +24,7 @@ SUITE = ("humanoid-run", "cheetah-run", "finger-spin")
 STEPS = 8
 
 
-def replayed(path: Path, substeps: int) -> tuple[Any, Any]:
+def replayed(path, substeps):
     """Return recorded states, and what follows from the ones before, from the first."""
     trajectory = mjrec.load_trajectory(path)
     model = trajectory.model()
@@ -44,7 +40,7 @@ def replayed(path: Path, substeps: int) -> tuple[Any, Any]:
 
 
 @parametrize("env_id", GYMNASIUM, default=3, part=pytest.mark.environments)
-def test_gymnasium_states_follow_bit_for_bit(env_id: str, tmp_path: Path) -> None:
+def test_gymnasium_states_follow_bit_for_bit(env_id, tmp_path):
     """State k, the controls of step k + 1, and stepping give state k + 1."""
     env = gymnasium.make(env_id)
     env.action_space.seed(0)
@@ -59,7 +55,7 @@ def test_gymnasium_states_follow_bit_for_bit(env_id: str, tmp_path: Path) -> Non
     assert recorded.tobytes() == followed.tobytes()
 
 
-def suite_tasks() -> list[str]:
+def suite_tasks():
     """Return the names of all tasks."""
     if importlib.util.find_spec("dm_control") is None:
         return []
@@ -70,7 +66,7 @@ def suite_tasks() -> list[str]:
 
 @pytest.mark.dm_control
 @parametrize("name", suite_tasks(), default=SUITE, part=pytest.mark.environments)
-def test_suite_states_follow_bit_for_bit(name: str, tmp_path: Path) -> None:
+def test_suite_states_follow_bit_for_bit(name, tmp_path):
     """Also where a task changes its model at every reset."""
     suite = pytest.importorskip("dm_control.suite", reason="dm_control not installed")
     env = suite.load(*name.split("-", 1), task_kwargs={"random": 0})
@@ -104,7 +100,7 @@ EVERYTHING = """
 """
 
 
-def simulated() -> tuple[Any, Any]:
+def simulated():
     model = mujoco.MjModel.from_xml_string(EVERYTHING)
     data = mujoco.MjData(model)
     data.ctrl[:], data.xfrc_applied[:], data.userdata[:] = 0.3, 0.1, [7, 8]
@@ -113,7 +109,7 @@ def simulated() -> tuple[Any, Any]:
 
 
 @pytest.mark.parametrize("order", [1, -1])
-def test_a_state_comes_back_by_the_names_of_its_parts(order: int) -> None:
+def test_a_state_comes_back_by_the_names_of_its_parts(order):
     """Also in the order in which another MuJoCo, with other bits, would write it."""
     model, row = simulated()
     own = columns_of(state_dtype(model))
@@ -135,7 +131,7 @@ def test_a_state_comes_back_by_the_names_of_its_parts(order: int) -> None:
         ({"aura": slice(0, 1)}, r"aura, which MuJoCo .* not know"),
     ],
 )
-def test_a_state_of_another_model_is_refused_whole(change: Any, said: str) -> None:
+def test_a_state_of_another_model_is_refused_whole(change, said):
     """The message names what differs, and nothing is set."""
     model, row = simulated()
     data = mujoco.MjData(model)

@@ -1,13 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Results are found, merged and cleared as in gym, without its mistakes."""
 
-from __future__ import annotations
-
 import json
 import logging
 import math
 from pathlib import Path
-from typing import Any
 
 import pytest
 from result_files import ENV_INFO, write_journal, write_saved
@@ -32,18 +29,18 @@ HIDDEN_FILES = [
 OTHER_FILES = ["openaigym.notes.txt", "openaigymfoo", "policy.pt", ".hidden"]
 
 
-def load(directory: Path) -> dict[str, Any]:
+def load(directory):
     results = mjrec.load_results(directory)
     assert results is not None
     return results
 
 
-def touch(directory: Path, *names: str) -> None:
+def touch(directory, *names):
     for name in names:
         (directory / name).touch()
 
 
-def test_detecting_takes_exact_names_in_order(tmp_path: Path) -> None:
+def test_detecting_takes_exact_names_in_order(tmp_path):
     """Left-overs of gym and others' files are none; `files` stands for the listing."""
     assert mjrec.detect_monitor_files(str(tmp_path / "missing")) == []
     touch(tmp_path, *MONITOR_FILES, *HIDDEN_FILES, *OTHER_FILES)
@@ -59,9 +56,7 @@ def test_detecting_takes_exact_names_in_order(tmp_path: Path) -> None:
     assert named == [str(tmp_path / "x" / early), str(tmp_path / "x" / late)]
 
 
-def test_clearing_removes_monitor_files_and_nothing_else(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_clearing_removes_monitor_files_and_nothing_else(tmp_path, caplog):
     """Locks and unfinished files too; a link and not its target; none while in use."""
     caplog.set_level(logging.INFO, "mjrec")
     touch(tmp_path, *MONITOR_FILES[:-1], HIDDEN_FILES[1], *OTHER_FILES)
@@ -81,20 +76,18 @@ def test_clearing_removes_monitor_files_and_nothing_else(
     mjrec.clear_monitor_files(tmp_path / "missing")
 
 
-def test_clearing_removes_first_what_lists_the_rest(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_clearing_removes_first_what_lists_the_rest(tmp_path, monkeypatch):
     """If it is interrupted, no results are left without their files."""
     write_saved(tmp_path, "0.7", 1)
     write_journal(tmp_path, "1.7", 1)
-    removed: list[str] = []
+    removed = []
     monkeypatch.setattr(Path, "unlink", lambda path, **_: removed.append(path.name))
     mjrec.clear_monitor_files(tmp_path)
     assert {name.split(".")[1] for name in removed[:2]} == {"manifest", "episodes"}
     assert len(removed) == 3
 
 
-def test_merging_sorts_by_time_and_keeps_rows_together(tmp_path: Path) -> None:
+def test_merging_sorts_by_time_and_keeps_rows_together(tmp_path):
     """Lengths, rewards, types and sources follow their timestamps; it is stable."""
     write_saved(tmp_path, "0.7", 1, 4, start=0.5, types="te")
     write_saved(tmp_path, "1.7", 2, 3, start=0.25, types="et")
@@ -126,18 +119,14 @@ def test_merging_sorts_by_time_and_keeps_rows_together(tmp_path: Path) -> None:
         ((None, None), None),
     ],
 )
-def test_types_belong_to_their_episodes(
-    tmp_path: Path, types: tuple[str | None, str | None], merged: list[str] | None
-) -> None:
+def test_types_belong_to_their_episodes(tmp_path, types, merged):
     """Surplus ones are dropped; episodes without one are training."""
     write_saved(tmp_path, "0.7", 1, types=types[0])
     write_saved(tmp_path, "1.7", 2, 3, types=types[1])
     assert load(tmp_path)["episode_types"] == merged
 
 
-def test_every_monitor_keeps_its_place_in_every_list(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_every_monitor_keeps_its_place_in_every_list(tmp_path, caplog):
     """With a manifest or without, with episodes or without; in gym's order.
 
     Where there is none, or no directory, the result is None, as in gym.
@@ -160,9 +149,7 @@ def test_every_monitor_keeps_its_place_in_every_list(
     assert results["initial_reset_timestamp"] == 0.5
 
 
-def test_unequal_env_infos_are_merged_with_one_warning(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_unequal_env_infos_are_merged_with_one_warning(tmp_path, caplog):
     """It shows what differs and where; the newest results' info counts."""
     newest = {"gym_version": "mjrec-1", "extra": [1]}
     write_saved(tmp_path, "0.7", 9, start=99.0, env_info=newest)
@@ -177,9 +164,7 @@ def test_unequal_env_infos_are_merged_with_one_warning(
     assert "1.7.manifest.json has {'gym_version': '0.21.0'}" in record.getMessage()
 
 
-def test_videos_are_pairs_of_paths_in_order(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_videos_are_pairs_of_paths_in_order(tmp_path, caplog):
     """Also of a moved directory; one warning for all that are gone."""
     pairs = [(f"v{i}.mp4", f"v{i}.meta.json") for i in range(4)]
     (tmp_path / "old").mkdir()
@@ -195,7 +180,7 @@ def test_videos_are_pairs_of_paths_in_order(
     assert "v1.mp4, v3.mp4" in record.getMessage()
 
 
-def test_missing_and_damaged_files_are_named(tmp_path: Path) -> None:
+def test_missing_and_damaged_files_are_named(tmp_path):
     """First the statistics, then the manifest. NaN and infinity are no damage."""
     times, rewards = (1.0, 2.0, 3.0), (math.nan, math.inf, -math.inf)
     stats = StatsFile(0.0, times, (1,) * 3, rewards, None)

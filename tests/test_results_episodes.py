@@ -1,10 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Episodes are listed one by one, of open, closed, dead and gym's monitors."""
 
-from __future__ import annotations
-
 import tracemalloc
-from pathlib import Path
 
 import pytest
 from result_files import entry, write_journal, write_saved
@@ -15,13 +12,13 @@ from mjrec.errors import UnreadableFile
 from mjrec.formats.monitor_directory import Infix
 
 
-def video(directory: Path, infix: str, episode_id: int, suffix: str) -> Path:
+def video(directory, infix, episode_id, suffix):
     path = directory / f"openaigym.video.{infix}.video{episode_id:06d}{suffix}"
     path.touch()
     return path
 
 
-def test_an_episode_of_a_journal_has_its_files(tmp_path: Path) -> None:
+def test_an_episode_of_a_journal_has_its_files(tmp_path):
     """Numbers, seeds and flags as the monitor knew them; no other monitor's video."""
     facts = {"type": "e", "options": {"x": 1}, "terminated": False, "truncated": True}
     write_journal(tmp_path, "0.7", entry(27, **facts), 28)
@@ -41,15 +38,13 @@ def test_an_episode_of_a_journal_has_its_files(tmp_path: Path) -> None:
         monitor="0.7",
         video=mp4,
         metadata=meta,
-        **facts,  # type: ignore[arg-type]  # as above
+        **facts,
     )
     assert (second.episode_id, second.video, second.metadata) == (28, None, None)
 
 
 @pytest.mark.parametrize("has_journal", [True, False])
-def test_pending_is_what_was_promised_and_is_not_there(
-    tmp_path: Path, has_journal: bool
-) -> None:
+def test_pending_is_what_was_promised_and_is_not_there(tmp_path, has_journal):
     """In flight or finished; neither what is there, nor what failed or is live."""
     infix = Infix(0, "7")
     kinds = ["deferred", "deferred", "deferred", "deferred", "live"]
@@ -71,7 +66,7 @@ def test_pending_is_what_was_promised_and_is_not_there(
     assert [each.trajectory for each in episodes] == trajectories
 
 
-def test_gyms_episodes_have_what_gym_wrote(tmp_path: Path) -> None:
+def test_gyms_episodes_have_what_gym_wrote(tmp_path):
     """Numbered by their index; the rest is None. A gym may die before its manifest."""
     write_saved(tmp_path, "0.7", 1, 2, types="te").unlink()
     text, meta = (video(tmp_path, "0.7", 1, end) for end in (".json", ".meta.json"))
@@ -91,9 +86,7 @@ def test_gyms_episodes_have_what_gym_wrote(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("types", "linked"), [(None, True), ("ttt", True), ("tttt", False)]
 )
-def test_a_video_is_never_shown_for_another_episode(
-    tmp_path: Path, types: str | None, linked: bool
-) -> None:
+def test_a_video_is_never_shown_for_another_episode(tmp_path, types, linked):
     """Gym numbers videos by resets; more of them than ends and a next are in doubt."""
     write_saved(tmp_path, "0.7", 1, 2, types=types)
     video(tmp_path, "0.7", 0, ".mp4")
@@ -102,7 +95,7 @@ def test_a_video_is_never_shown_for_another_episode(
     assert (first.type, second.type) == ("t", "t")
 
 
-def test_monitors_come_in_the_order_of_their_numbers(tmp_path: Path) -> None:
+def test_monitors_come_in_the_order_of_their_numbers(tmp_path):
     """10 after 9, for the monitor and for the process."""
     infixes = ["0.9", "0.10", "1.7", "9.7", "10.7"]
     for infix in reversed(infixes):
@@ -110,14 +103,14 @@ def test_monitors_come_in_the_order_of_their_numbers(tmp_path: Path) -> None:
     assert [episode.monitor for episode in mjrec.iter_episodes(tmp_path)] == infixes
 
 
-def test_a_missing_directory_is_an_error_at_once(tmp_path: Path) -> None:
+def test_a_missing_directory_is_an_error_at_once(tmp_path):
     """Before the first episode is asked for; an empty one has no episodes."""
     with pytest.raises(UnreadableFile, match="no such directory"):
         mjrec.iter_episodes(tmp_path / "missing")
     assert list(mjrec.iter_episodes(tmp_path)) == []
 
 
-def test_memory_does_not_grow_with_the_episodes(tmp_path: Path) -> None:
+def test_memory_does_not_grow_with_the_episodes(tmp_path):
     """Episodes are read as they are asked for."""
     items = (entry(number, options="x" * 1000) for number in range(5000))
     path = write_journal(tmp_path, "0.7", *items)

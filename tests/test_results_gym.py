@@ -7,14 +7,11 @@
 asked under `scripts/test --all`.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import os
 import subprocess
 from pathlib import Path
-from typing import Any
 
 import pytest
 from result_files import write_saved
@@ -28,7 +25,7 @@ VERSIONS = ["0.7.4", "0.9.6", "0.12.1", "0.17.3", "0.19.0", "0.21.0", "0.22.0"]
 NAN, INF = math.nan, math.inf
 
 # What was played in each case: lengths, rewards, types.
-PLAYED: dict[str, tuple[list[int], list[float], str | None]] = {
+PLAYED = {
     "plain": ([3, 1, 2], [4.5, -2.0, 0.5], "ttt"),
     "text": ([3, 1, 2], [4.5, -2.0, 0.5], "ttt"),
     "not_finite": ([3, 1, 2], [NAN, INF, -INF], "ttt"),
@@ -43,14 +40,14 @@ RECORDED = [f"{version}/{case}" for version in sorted(VERSIONS) for case in PLAY
 ENV_INFO = {"gym_version": "mjrec-1", "env_id": "Hopper-v5"}
 
 
-def load(directory: Path) -> dict[str, Any]:
+def load(directory):
     results = mjrec.load_results(directory)
     assert results is not None
     return results
 
 
 @pytest.mark.parametrize("version", VERSIONS)
-def test_monitors_and_text_recordings_of_a_gym_are_found(version: str) -> None:
+def test_monitors_and_text_recordings_of_a_gym_are_found(version):
     """Also past the one that only began; texts with their episodes."""
     results = load(DATA / version / "two_monitors")
     assert results["data_sources"] == [0, 2, 0, 2]
@@ -67,7 +64,7 @@ def test_monitors_and_text_recordings_of_a_gym_are_found(version: str) -> None:
     assert second.video is None
 
 
-def write_ours(directory: Path) -> None:
+def write_ours(directory):
     """Write two monitors with videos, a key of our own, and infinity."""
     directory.mkdir()
     for monitor, (name, shift) in enumerate([("0.7", 0.0), ("1.7", 0.5)]):
@@ -89,19 +86,19 @@ def write_ours(directory: Path) -> None:
         )
 
 
-def recorded_answer(name: str) -> dict[str, Any]:
+def recorded_answer(name):
     """Return what gym made of a directory, by the recorded answers."""
     return as_ours(json.loads((DATA / "answers.json").read_text())[name])
 
 
-def as_ours(answer: dict[str, Any]) -> dict[str, Any]:
+def as_ours(answer):
     """JSON has no tuples."""
     videos = answer.get("videos")
     pairs = {} if videos is None else {"videos": [tuple(pair) for pair in videos]}
     return {**answer, **pairs}
 
 
-def assert_same(ours: Any, gyms: Any, *, but: tuple[str, ...] = ()) -> None:
+def assert_same(ours, gyms, *, but=()):
     """Compare key by key; keys of `but` are compared elsewhere."""
     assert list(ours) == list(gyms)
     for key in [key for key in ours if key not in but]:
@@ -110,7 +107,7 @@ def assert_same(ours: Any, gyms: Any, *, but: tuple[str, ...] = ()) -> None:
 
 
 @pytest.mark.parametrize("name", RECORDED)
-def test_what_a_gym_wrote_is_read(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_a_gym_wrote_is_read(name, monkeypatch):
     """What was played, and as gym read it, except where gym is known to be wrong."""
     monkeypatch.chdir(DATA)
     version, _, case = name.partition("/")
@@ -140,9 +137,7 @@ def test_what_a_gym_wrote_is_read(name: str, monkeypatch: pytest.MonkeyPatch) ->
             assert_same(ours, gyms)
 
 
-def test_gym_agreed_on_what_we_write(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_gym_agreed_on_what_we_write(tmp_path, monkeypatch):
     """Both our files and what we read in them are those that gym was asked about."""
     monkeypatch.chdir(tmp_path)
     write_ours(Path("ours"))
@@ -151,9 +146,7 @@ def test_gym_agreed_on_what_we_write(
     assert_same(load(Path("ours")), gyms)
 
 
-def test_a_monitor_writes_the_keys_of_gym(
-    tmp_path: Path, corridor: Any, play: Any
-) -> None:
+def test_a_monitor_writes_the_keys_of_gym(tmp_path, corridor, play):
     """All of gym 0.21's files, and `mjrec` beside them."""
     with mjrec.Monitor(corridor, tmp_path) as env:
         play(env, 1)
@@ -164,19 +157,19 @@ def test_a_monitor_writes_the_keys_of_gym(
         assert keys_of(ours) == keys_of(gyms) | added
 
 
-def keys_of(path: Path) -> set[str]:
+def keys_of(path):
     return set(json.loads(path.read_text()))
 
 
 @pytest.fixture(scope="session")
-def gym_python() -> Path:
+def gym_python():
     """Return the Python of an environment that holds gym 0.21.0."""
     if "MJREC_TEST_GYM" not in os.environ:
         pytest.skip("no environment with gym 0.21.0: scripts/test --all makes one")
     return Path(os.environ["MJREC_TEST_GYM"])
 
 
-def run(*command: str | Path) -> str:
+def run(*command):
     """Run a program; show what it said where it fails."""
     # Warnings are errors in these tests, not in gym.
     environment = {k: v for k, v in os.environ.items() if k != "PYTHONWARNINGS"}
@@ -192,17 +185,15 @@ def run(*command: str | Path) -> str:
     return done.stdout
 
 
-def ask_gym(python: Path, *directories: Path | str) -> dict[str, Any]:
+def ask_gym(python, *directories):
     """Return what gym's own `load_results` returns for each directory."""
     script = TESTS / "legacy" / "gym_load_results.py"
-    answers: dict[str, Any] = json.loads(run(python, script, *directories))
+    answers = json.loads(run(python, script, *directories))
     return {k: v if v is None else as_ours(v) for k, v in answers.items()}
 
 
 @pytest.mark.old_gym
-def test_gym_answers_as_recorded(
-    gym_python: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_gym_answers_as_recorded(gym_python, tmp_path, monkeypatch):
     """About all the directories that the tests above compare."""
     monkeypatch.chdir(tmp_path)
     for version in VERSIONS:
@@ -214,8 +205,8 @@ def test_gym_answers_as_recorded(
 
 @pytest.mark.old_gym
 def test_gym_agrees_on_what_a_monitor_writes(
-    gym_python: Path, tmp_path: Path, corridor: Any, make_corridor: Any, play: Any
-) -> None:
+    gym_python, tmp_path, corridor, make_corridor, play
+):
     """Two runs, the second resumed, with videos, a mode, and an unfinished episode."""
     with mjrec.Monitor(corridor, tmp_path) as env:
         play(env, 2)
@@ -232,7 +223,7 @@ def test_gym_agrees_on_what_a_monitor_writes(
 
 
 @pytest.mark.old_gym
-def test_gym_reads_null_where_we_wrote_nan(gym_python: Path, tmp_path: Path) -> None:
+def test_gym_reads_null_where_we_wrote_nan(gym_python, tmp_path):
     """The file is JSON; the other episodes' rewards are unharmed."""
     stats = StatsFile(1.0, (2.0, 3.0), (1, 1), (math.nan, 2.5), ("t", "t"))
     write_saved(tmp_path, "0.7", stats=stats, env_info=ENV_INFO)

@@ -1,11 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Nothing that was completed is lost with a monitor that never closed."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
-from typing import Any
 
 import pytest
 from result_files import ENV_INFO, entry, write_journal, write_saved
@@ -18,7 +15,7 @@ ENTRIES = [entry(number, **(FILMED if number in (0, 4) else {})) for number in r
 
 
 @pytest.fixture
-def late(tmp_path: Path) -> Path:
+def late(tmp_path):
     """A monitor died after its fifth episode; its manifest has four, and one video."""
     videos = [
         tuple(
@@ -35,24 +32,24 @@ def late(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def load(directory: Path) -> dict[str, Any]:
+def load(directory):
     results = mjrec.load_results(directory)
     assert results is not None
     return results
 
 
-def only(directory: Path, pattern: str) -> Path:
+def only(directory, pattern):
     (path,) = directory.glob(pattern)
     return path
 
 
-def video(directory: Path, number: int) -> Path:
+def video(directory, number):
     path = directory / f"openaigym.video.0.7.video{number:06d}.mp4"
     path.touch()
     return path
 
 
-def test_a_journal_is_enough(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_journal_is_enough(tmp_path, caplog):
     """The episode in flight does not count."""
     journal = write_journal(
         *(tmp_path, "0.7", entry(0), entry(1), entry(2, type="e", seed=None)),
@@ -75,7 +72,7 @@ def test_a_journal_is_enough(tmp_path: Path, caplog: pytest.LogCaptureFixture) -
     assert {record.levelname for record in caplog.records} == {"WARNING"}
 
 
-def test_an_older_manifest_does_not_hide_the_last_episodes(late: Path) -> None:
+def test_an_older_manifest_does_not_hide_the_last_episodes(late):
     """The journal has one more; finished videos are found, broken ones are not."""
     manifest = only(late, "*.manifest.json")
     results = load(late)
@@ -91,9 +88,7 @@ def test_an_older_manifest_does_not_hide_the_last_episodes(late: Path) -> None:
     assert load(late)["videos"] == videos[1:]
 
 
-def test_open_and_resumed_monitors_are_merged_with_the_dead(
-    late: Path, make_corridor: Any, play: Any
-) -> None:
+def test_open_and_resumed_monitors_are_merged_with_the_dead(late, make_corridor, play):
     """Each once, and numbered on; an open one as if it had died now."""
     with mjrec.Monitor(
         make_corridor(2), late, resume=True, video_callable=False
@@ -113,9 +108,7 @@ def test_open_and_resumed_monitors_are_merged_with_the_dead(
 @pytest.mark.parametrize(
     ("journal", "count"), [((3, 4), 3), ((4, 5, 6), 3), ((1, 2, 3, 4), 4)]
 )
-def test_the_source_with_more_episodes_wins(
-    tmp_path: Path, journal: tuple[int, ...], count: int
-) -> None:
+def test_the_source_with_more_episodes_wins(tmp_path, journal, count):
     """Never both; the statistics file where they are equal. Lines do not count."""
     write_saved(tmp_path, "0.7", 1, 2, 3)
     write_journal(tmp_path, "0.7", *journal, *journal[-1:] * 4)
@@ -125,8 +118,8 @@ def test_the_source_with_more_episodes_wins(
 
 @pytest.mark.parametrize("lock", ["dead", "link", "", "[1]"])
 def test_without_a_manifest_journal_and_lock_say_what_was_recorded(
-    tmp_path: Path, lock: str, caplog: pytest.LogCaptureFixture
-) -> None:
+    tmp_path, lock, caplog
+):
     """What no file says is no difference; no link in place of a lock is read."""
     write_journal(tmp_path, "0.7", 1)
     path, said = tmp_path / ".openaigym.0.7.lock", {"run": {"env_info": ENV_INFO}}
@@ -144,12 +137,7 @@ def test_without_a_manifest_journal_and_lock_say_what_was_recorded(
 
 @pytest.mark.parametrize("pattern", ["*.manifest.json", "*.stats.json"])
 @pytest.mark.parametrize("content", [None, b"{", b'{"stats": "../x"}'])
-def test_a_journal_stands_in_for_damaged_files(
-    tmp_path: Path,
-    pattern: str,
-    content: bytes | None,
-    caplog: pytest.LogCaptureFixture,
-) -> None:
+def test_a_journal_stands_in_for_damaged_files(tmp_path, pattern, content, caplog):
     """With a warning that names the file; without a journal it is an error."""
     write_saved(tmp_path, "0.7", 1, 2)
     journal = write_journal(tmp_path, "0.7", 1, 2, run={"env_info": ENV_INFO})
@@ -169,9 +157,7 @@ def test_a_journal_stands_in_for_damaged_files(
                 read(tmp_path)
 
 
-def test_statistics_stand_in_for_a_damaged_journal(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_statistics_stand_in_for_a_damaged_journal(tmp_path, caplog):
     """With every line damaged; then a link, which is named and never followed."""
     details = {"first_episode_id": 1, "next_episode_id": 3}
     manifest = write_saved(tmp_path, "0.7", 1, 2, details=details)
@@ -194,9 +180,7 @@ def test_statistics_stand_in_for_a_damaged_journal(
 
 
 @pytest.mark.parametrize("lost", [0, 3])
-def test_a_lost_line_of_a_journal_costs_its_details_only(
-    tmp_path: Path, lost: int
-) -> None:
+def test_a_lost_line_of_a_journal_costs_its_details_only(tmp_path, lost):
     """The statistics have the episode, and its neighbours a number for it."""
     details = {"first_episode_id": 5, "next_episode_id": 9}
     write_saved(tmp_path, "0.7", 5, 6, 7, 8, details=details)
@@ -205,7 +189,7 @@ def test_a_lost_line_of_a_journal_costs_its_details_only(
     lines[lost] = b"\0" * 100 + b"\n"
     journal.write_bytes(b"".join(lines))
     video(tmp_path, 5 + lost)
-    expected: list[Any] = [(n, n) for n in (5, 6, 7, 8)]
+    expected = [(n, n) for n in (5, 6, 7, 8)]
     expected[lost] = (5 + lost, None)
     episodes = list(mjrec.iter_episodes(tmp_path))
     assert [(each.episode_id, each.seed) for each in episodes] == expected
@@ -223,8 +207,8 @@ def test_a_lost_line_of_a_journal_costs_its_details_only(
     ],
 )
 def test_an_episode_in_doubt_shows_no_video(
-    tmp_path: Path, saved: Any, journal: Any, following: int, numbers: Any, shown: Any
-) -> None:
+    tmp_path, saved, journal, following, numbers, shown
+):
     """Where its number is lost, and it may be that of another."""
     details = {"first_episode_id": 5, "next_episode_id": following}
     write_saved(tmp_path, "0.7", *saved, details=details)

@@ -1,14 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """What is drawn from recorded states is what `render()` shows, byte for byte."""
 
-from __future__ import annotations
-
 import gc
 import importlib.util
 import json
-from collections.abc import Callable, Iterator
-from pathlib import Path
-from typing import Any
 
 import gymnasium
 import mujoco
@@ -27,7 +22,7 @@ from mjrec.rendering.pool import WorkerPool
 from mjrec.simulation.cameras import raw_data, raw_model
 from mjrec.simulation.find_simulation import simulation_in
 
-SIZE: dict[str, Any] = {"height": 48, "width": 64}
+SIZE = {"height": 48, "width": 64}
 STEPS = 5
 SEEDS = (3, 4)
 
@@ -37,10 +32,9 @@ GYMNASIUM = sorted(
     if "gymnasium.envs.mujoco" in str(spec.entry_point) and env_id.endswith("-v5")
 )
 has_dm_control = importlib.util.find_spec("dm_control") is not None
-Picture = Callable[[], Any]
 
 
-def suite_tasks() -> list[tuple[str, str]]:
+def suite_tasks():
     if not has_dm_control:
         return []
     from dm_control import suite
@@ -48,25 +42,19 @@ def suite_tasks() -> list[tuple[str, str]]:
     return list(suite.ALL_TASKS)
 
 
-def every(names: str, cases: list[Any], *default: Any) -> pytest.MarkDecorator:
+def every(names, cases, *default):
     """Try all environments under `scripts/test --all`, and these by default."""
     return parametrize(names, cases, default=default, part=pytest.mark.environments)
 
 
 @pytest.fixture(scope="module")
-def workers() -> Iterator[list[WorkerPool]]:
+def workers():
     """A process that draws, and three that share a video."""
     with WorkerPool(1) as one, WorkerPool(3) as three:
         yield [one, three]
 
 
-def check_frames(
-    directory: Path,
-    live: list[list[Any]],
-    workers: list[WorkerPool],
-    *,
-    is_seen_to_move: bool = True,
-) -> None:
+def check_frames(directory, live, workers, *, is_seen_to_move=True):
     """Check that the frames of a recording are the pictures of their moments."""
     paths = {*directory.glob("*.h5"), *in_flight(directory)}
     for episode, frames in enumerate(live):
@@ -80,19 +68,12 @@ def check_frames(
         assert len({frame.tobytes() for frames in live for frame in frames}) > len(live)
 
 
-def monitored(env: Any, directory: Path, **options: Any) -> Any:
-    deferred: Any = {"render": "deferred", "workers": 0, "allow_early_reset": True}
+def monitored(env, directory, **options):
+    deferred = {"render": "deferred", "workers": 0, "allow_early_reset": True}
     return mjrec.Monitor(env, directory, lambda _: True, **deferred, **options)
 
 
-def record(
-    env: Any,
-    directory: Path,
-    picture: Picture | None = None,
-    *,
-    each_step: Callable[[int], None] = lambda _: None,
-    **options: Any,
-) -> list[list[Any]]:
+def record(env, directory, picture=None, *, each_step=lambda _: None, **options):
     """Record two episodes, and return the pictures of every moment."""
     # MuJoCo frees what an environment has drawn with in whatever OpenGL context is
     # current: one that an earlier test has left is not to go between two pictures.
@@ -116,7 +97,7 @@ def record(
     return live
 
 
-def _action(env: Any, random: Any) -> Any:
+def _action(env, random):
     if hasattr(env, "action_space"):
         space = env.action_space
         low, high, shape = space.low, space.high, space.shape
@@ -126,13 +107,13 @@ def _action(env: Any, random: Any) -> Any:
     return random.uniform(np.clip(low, -1, 1), np.clip(high, -1, 1), shape)
 
 
-def draw_quickly(model: Any) -> None:
+def draw_quickly(model):
     """Make a model whose pictures cost a software renderer little."""
     model.vis.quality.shadowsize = 256
     model.vis.quality.offsamples = 0
 
 
-def make(env_id: str, **kwargs: Any) -> Any:
+def make(env_id, **kwargs):
     env = gymnasium.make(env_id, **{"render_mode": "rgb_array", **SIZE, **kwargs})
     draw_quickly(env.get_wrapper_attr("model"))
     return env
@@ -141,7 +122,7 @@ def make(env_id: str, **kwargs: Any) -> Any:
 # --- Gymnasium -----------------------------------------------------------------------
 
 
-def test_quality_that_the_model_asks_for(workers: Any, tmp_path: Path) -> None:
+def test_quality_that_the_model_asks_for(workers, tmp_path):
     """Gymnasium's own, with shadows and smooth edges; all others are simpler."""
     env = gymnasium.make("InvertedPendulum-v5", render_mode="rgb_array")
     live = record(gymnasium.wrappers.TimeLimit(env, 2), tmp_path)
@@ -149,29 +130,27 @@ def test_quality_that_the_model_asks_for(workers: Any, tmp_path: Path) -> None:
 
 
 @every("env_id", GYMNASIUM, "HalfCheetah-v5")
-def test_gymnasium(env_id: str, workers: Any, tmp_path: Path) -> None:
+def test_gymnasium(env_id, workers, tmp_path):
     """The default camera, which the first picture settles."""
     check_frames(tmp_path, record(make(env_id), tmp_path), workers)
 
 
 @every("env_id", GYMNASIUM, "Hopper-v5")
-def test_gymnasium_cameras_of_the_model(
-    env_id: str, workers: Any, tmp_path: Path
-) -> None:
+def test_gymnasium_cameras_of_the_model(env_id, workers, tmp_path):
     """Made with the environment, by name or number; or asked of the monitor."""
-    model: Any = gymnasium.make(env_id).unwrapped
+    model = gymnasium.make(env_id).unwrapped
     for number in range(model.model.ncam):
         name = model.model.camera(number).name
         camera = {"camera_name": name} if name else {"camera_id": number}
         live = record(make(env_id, **camera), tmp_path / str(number))
         check_frames(tmp_path / str(number), live, workers[:1])
         asked = make(env_id, render_mode=None, height=9, width=9)
-        view: Any = {"camera": name or number, **SIZE}
+        view = {"camera": name or number, **SIZE}
         record(asked, tmp_path / f"{number} asked", list, **view)
         check_frames(tmp_path / f"{number} asked", live, workers[:1])
 
 
-def test_camera_and_options_that_the_user_gave(workers: Any, tmp_path: Path) -> None:
+def test_camera_and_options_that_the_user_gave(workers, tmp_path):
     """Those of the environment's arguments, and of its viewer in mid-episode."""
     env = make(
         "Ant-v5",
@@ -179,7 +158,7 @@ def test_camera_and_options_that_the_user_gave(workers: Any, tmp_path: Path) -> 
         visual_options={int(mujoco.mjtVisFlag.mjVIS_COM): True},
     )
 
-    def change(step: int) -> None:
+    def change(step):
         viewer = env.unwrapped.mujoco_renderer.viewer
         viewer.cam.azimuth += 20 * step
         viewer.vopt.flags[int(mujoco.mjtVisFlag.mjVIS_TRANSPARENT)] = step == 3
@@ -188,7 +167,7 @@ def test_camera_and_options_that_the_user_gave(workers: Any, tmp_path: Path) -> 
 
 
 @every("env_id", robotics_ids(), "FetchPickAndPlace-v4", "AntMaze_UMaze-v5")
-def test_robotics(env_id: str, workers: Any, tmp_path: Path) -> None:
+def test_robotics(env_id, workers, tmp_path):
     """Also where each `render` moves goals."""
     with robots_that_reset():
         live = record(make(env_id), tmp_path)
@@ -199,11 +178,11 @@ def test_robotics(env_id: str, workers: Any, tmp_path: Path) -> None:
 # --- dm_control ----------------------------------------------------------------------
 
 
-def record_dm(env: Any, directory: Path, camera: int | None) -> list[list[Any]]:
-    def picture() -> Any:
+def record_dm(env, directory, camera):
+    def picture():
         return env.physics.render(**SIZE, camera_id=-1 if camera is None else camera)
 
-    view: Any = {"camera": camera, **SIZE}
+    view = {"camera": camera, **SIZE}
     return record(env, directory, picture, env_id="dm_control/any", **view)
 
 
@@ -214,9 +193,7 @@ def record_dm(env: Any, directory: Path, camera: int | None) -> list[list[Any]]:
     ("finger", "turn_easy", True),
     ("quadruped", "escape", False),
 )
-def test_suite(
-    domain: str, task: str, visualize_reward: bool, workers: Any, tmp_path: Path
-) -> None:
+def test_suite(domain, task, visualize_reward, workers, tmp_path):
     """Every task, from every camera, and with colours that show the reward."""
     from dm_control import suite
 
@@ -230,7 +207,7 @@ def test_suite(
         check_frames(place, live, workers[:1], is_seen_to_move=camera in (None, 0))
 
 
-def composer_environments() -> dict[str, Callable[[], Any]]:
+def composer_environments():
     """Return what makes each; no soccer, whose rewards are one for each player."""
     if not has_dm_control:
         return {}
@@ -256,7 +233,7 @@ def composer_environments() -> dict[str, Callable[[], Any]]:
     [(name, camera) for name in composer_environments() for camera in (None, 0)],
     ("reach_site_features", None),
 )
-def test_composer(name: str, camera: int | None, workers: Any, tmp_path: Path) -> None:
+def test_composer(name, camera, workers, tmp_path):
     """Tasks that compile another model for every episode."""
     live = record_dm(composer_environments()[name](), tmp_path, camera)
     check_frames(tmp_path, live, workers[:1])
@@ -299,7 +276,7 @@ ENDLESS = """
 """
 
 
-def test_own_model_over_an_infinite_plane(workers: Any, tmp_path: Path) -> None:
+def test_own_model_over_an_infinite_plane(workers, tmp_path):
     """It is drawn around the camera of the picture before; and a tendon is taut."""
     path = tmp_path / "endless.xml"
     path.write_text(ENDLESS)
@@ -308,26 +285,16 @@ def test_own_model_over_an_infinite_plane(workers: Any, tmp_path: Path) -> None:
     check_frames(tmp_path / "out", record(env, tmp_path / "out"), workers)
 
 
-class Overlay(gymnasium.Wrapper[Any, Any, Any, Any]):
-    """Draws something on top."""
-
-    def render(self) -> Any:
-        frame = super().render().copy()
-        frame[:4] = 255
-        return frame
-
-
 class Negative(InvertedPendulumEnv):
     """Shows itself in other colours."""
 
-    def render(self) -> Any:
+    def render(self):
         return 255 - super().render()
 
 
 @pytest.mark.parametrize(
     ("make_env", "named"),
     [
-        (lambda: Overlay(make("InvertedPendulum-v5")), "Overlay overrides render()"),
         (
             lambda: Negative(render_mode="rgb_array", **SIZE),
             "Negative overrides render()",
@@ -336,8 +303,8 @@ class Negative(InvertedPendulumEnv):
     ],
 )
 def test_deferred_where_it_would_lie_is_an_error_and_never_chosen(
-    make_env: Callable[[], Any], named: str, tmp_path: Path
-) -> None:
+    make_env, named, tmp_path
+):
     """Said in the error, or in the metadata of the video of what render() shows."""
     env = make_env()
     with pytest.raises(mjrec.PicturesDiffer) as error:
@@ -351,13 +318,10 @@ def test_deferred_where_it_would_lie_is_an_error_and_never_chosen(
         shown = monitor.render()
     assert named in json.dumps(metadata_of(tmp_path, 0))
     [frame] = frames_in(tmp_path, 0)
-    # Encoded, but bright where the overlay is, or everywhere.
     assert np.abs(frame.astype(int) - shown).mean() < 12
 
 
-def test_frames_end_where_markers_come(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_frames_end_where_markers_come(tmp_path, caplog):
     """In the middle of an episode; nothing is shown that `render()` does not."""
     env = make("InvertedPendulum-v5")
     monitor = monitored(env, tmp_path)
@@ -375,7 +339,7 @@ def test_frames_end_where_markers_come(
 # --- recording disturbs nothing ------------------------------------------------------
 
 
-def whole_run(env: Any, wrapped: Any, random_numbers: Picture) -> list[Any]:
+def whole_run(env, wrapped, random_numbers):
     """Return all that two episodes give, states and random numbers among it."""
     simulation = simulation_in(env)
     spec = int(mujoco.mjtState.mjSTATE_INTEGRATION)
@@ -399,12 +363,12 @@ def whole_run(env: Any, wrapped: Any, random_numbers: Picture) -> list[Any]:
     ["HalfCheetah-v5", *robotics_ids()],
     *("HalfCheetah-v5", "FetchPickAndPlace-v4", "HandManipulateBlock-v1"),
 )
-def test_recording_disturbs_nothing(env_id: str, tmp_path: Path) -> None:
+def test_recording_disturbs_nothing(env_id, tmp_path):
     """Everything is bit for bit as without, also where render() would change it."""
 
-    def run(wrap: Callable[[Any], Any]) -> tuple[Any, list[Any]]:
+    def run(wrap):
         env = gymnasium.make(env_id)
-        inner: Any = env.unwrapped
+        inner = env.unwrapped
         return env, whole_run(env, wrap(env), lambda: inner.np_random.random())
 
     with robots_that_reset():
@@ -416,11 +380,11 @@ def test_recording_disturbs_nothing(env_id: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.dm_control
-def test_recording_disturbs_nothing_of_dm_controls(tmp_path: Path) -> None:
+def test_recording_disturbs_nothing_of_dm_controls(tmp_path):
     """Random numbers included; and no context is made."""
     from dm_control import suite
 
-    def run(wrap: Callable[[Any], Any]) -> tuple[Any, list[Any]]:
+    def run(wrap):
         env = suite.load("quadruped", "escape", task_kwargs={"random": 0})
         physics = env.physics
         return physics, whole_run(env, wrap(env), lambda: env.task.random.rand())

@@ -1,43 +1,36 @@
 # SPDX-License-Identifier: Apache-2.0
 """`save_video` against Gymnasium's contract."""
 
-from __future__ import annotations
-
-from collections.abc import Iterator
-from pathlib import Path
-from typing import Any
-
 import av
 import numpy as np
 import pytest
 
 import mjrec
 from mjrec.errors import InvalidArgument, UnknownName
-from mjrec.frames import Frame
 
 LEVELS = 6
 
 
-def shade(number: int) -> Frame:
+def shade(number):
     return np.full((16, 16, 3), 20 + LEVELS * number, np.uint8)
 
 
-def shades(count: int) -> list[Frame]:
+def shades(count):
     return [shade(number) for number in range(count)]
 
 
-def shown(path: Path) -> list[int]:
+def shown(path):
     """Return the numbers of the shades that a video shows."""
     with av.open(str(path)) as container:
         frames = [frame.to_ndarray(format="gray") for frame in container.decode()]
     return [round((frame.mean() - 20) / LEVELS) for frame in frames]
 
 
-def names(folder: Path) -> list[str]:
+def names(folder):
     return sorted(path.name for path in folder.iterdir())
 
 
-def test_the_default_is_the_capped_cubic_schedule(tmp_path: Path) -> None:
+def test_the_default_is_the_capped_cubic_schedule(tmp_path):
     """Without triggers: cubes and thousands, under Gymnasium's name, every frame."""
     for episode in (2, 8, 999, 1000):
         mjrec.save_video(shades(30), tmp_path, fps=30, episode_index=episode)
@@ -47,7 +40,7 @@ def test_the_default_is_the_capped_cubic_schedule(tmp_path: Path) -> None:
         assert shown(path) == list(range(30))
 
 
-def reused(count: int, made: list[int]) -> Iterator[Frame]:
+def reused(count, made):
     """Yield one buffer again and again, and note the frames that are made."""
     buffer = shade(0)
     for number in range(count):
@@ -57,7 +50,7 @@ def reused(count: int, made: list[int]) -> Iterator[Frame]:
 
 
 @pytest.mark.parametrize("kind", ["array", "generator"])
-def test_both_triggers_may_be_used(tmp_path: Path, kind: str) -> None:
+def test_both_triggers_may_be_used(tmp_path, kind):
     """Videos end after `video_length` frames, or with the last one."""
     frames = np.array(shades(8)) if kind == "array" else reused(8, [])
     mjrec.save_video(
@@ -75,20 +68,20 @@ def test_both_triggers_may_be_used(tmp_path: Path, kind: str) -> None:
 
 @pytest.mark.parametrize(("length", "count"), [(3, 3), (None, 9), (50, 9)])
 def test_a_generator_is_streamed_and_read_no_further_than_needed(
-    tmp_path: Path, length: int | None, count: int
-) -> None:
+    tmp_path, length, count
+):
     """Only the asked-for frames are made."""
-    made: list[int] = []
+    made = []
     mjrec.save_video(
         reused(9, made), tmp_path, lambda _: True, video_length=length, fps=30
     )
     assert made == shown(tmp_path / "rl-video-episode-0.mp4") == [*range(count)]
 
 
-def test_the_frames_before_an_error_are_kept(tmp_path: Path) -> None:
+def test_the_frames_before_an_error_are_kept(tmp_path):
     """What the generator raises goes through, and the video holds what came before."""
 
-    def frames() -> Iterator[Frame]:
+    def frames():
         yield from shades(4)
         raise ZeroDivisionError
 
@@ -105,9 +98,7 @@ def test_the_frames_before_an_error_are_kept(tmp_path: Path) -> None:
         ({"fps": 30, "video_length": 0}, InvalidArgument, "video_length"),
     ],
 )
-def test_options_are_checked_first(
-    tmp_path: Path, options: dict[str, Any], error: type[Exception], message: str
-) -> None:
+def test_options_are_checked_first(tmp_path, options, error, message):
     """Before the folder is made."""
     with pytest.raises(error, match=message):
         mjrec.save_video(shades(2), tmp_path / "videos", **options)

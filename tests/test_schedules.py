@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-from __future__ import annotations
-
 import doctest
-from typing import Any
 
 import numpy as np
 import pytest
@@ -16,7 +13,7 @@ from mjrec import (
 from mjrec.schedules import schedule_from_text, schedule_name, to_schedule
 
 
-def test_cubes_below_1000_and_then_every_1000th() -> None:
+def test_cubes_below_1000_and_then_every_1000th():
     """The docstring's example runs; the answer is a bool for any whole number."""
     chosen = [n for n in range(5000) if capped_cubic_video_schedule(n)]
     assert chosen == [n**3 for n in range(10)] + [1000, 2000, 3000, 4000]
@@ -25,7 +22,7 @@ def test_cubes_below_1000_and_then_every_1000th() -> None:
     assert capped_cubic_video_schedule(-8) is False
 
 
-def test_none_is_cubic_and_what_equals_false_disables() -> None:
+def test_none_is_cubic_and_what_equals_false_disables():
     """As in gym; a function is itself."""
     assert to_schedule(None) is capped_cubic_video_schedule
     assert to_schedule(max) is max
@@ -35,7 +32,7 @@ def test_none_is_cubic_and_what_equals_false_disables() -> None:
 
 
 @pytest.mark.parametrize("wrong", [True, 1, "cubic", [0, 1], np.array([0, 1])])
-def test_other_values_are_an_error(wrong: Any) -> None:
+def test_other_values_are_an_error(wrong):
     """The error says what may be given."""
     with pytest.raises(InvalidArgument, match="must be a function"):
         to_schedule(wrong)
@@ -51,7 +48,7 @@ def test_other_values_are_an_error(wrong: Any) -> None:
         ("at:9,0,5", [0, 5, 9], "at:0,5,9"),
     ],
 )
-def test_schedules_by_name(text: str, chosen: list[int], name: str | None) -> None:
+def test_schedules_by_name(text, chosen, name):
     """What the command line offers; the manifest names them with parameters."""
     schedule = schedule_from_text(text)
     assert [n for n in range(12) if schedule(n)] == chosen
@@ -62,7 +59,7 @@ def test_schedules_by_name(text: str, chosen: list[int], name: str | None) -> No
     "text",
     ["", "cube", "every", "every:", "every:0", "every:x", "at:", "at:-1", "at:a"],
 )
-def test_unknown_names_are_an_error(text: str) -> None:
+def test_unknown_names_are_an_error(text):
     """And nothing is guessed."""
     with pytest.raises(InvalidArgument):
         schedule_from_text(text)

@@ -1,13 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Videos have a second name where one was asked for, and nothing of anybody is lost."""
 
-from __future__ import annotations
-
 import json
 import os
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NoReturn
 
 import pytest
 
@@ -24,12 +20,12 @@ SECOND = "rl-video-episode-27"
 
 
 @pytest.fixture
-def video(tmp_path: Path) -> Path:
+def video(tmp_path):
     """An episode with a further camera, as far as files go."""
     return write_episode(tmp_path)
 
 
-def write_episode(directory: Path, **metadata: Any) -> Path:
+def write_episode(directory, **metadata):
     for name in (f"{STEM}.mp4", f"{STEM}.side.mp4"):
         (directory / name).write_bytes(name.encode())
     (directory / f"{STEM}.side.meta.json").write_text("{}")
@@ -42,7 +38,7 @@ def write_episode(directory: Path, **metadata: Any) -> Path:
     return directory / f"{STEM}.mp4"
 
 
-def seconds(directory: Path) -> list[str]:
+def seconds(directory):
     return sorted(p.name for p in directory.iterdir() if "openaigym" not in p.name)
 
 
@@ -50,12 +46,10 @@ ALL = [f"{SECOND}.{end}" for end in ("meta.json", "mp4", "side.meta.json", "side
 
 
 @pytest.mark.parametrize("has_hard_links", [True, False])
-def test_all_of_an_episode_has_a_second_name(
-    video: Path, monkeypatch: pytest.MonkeyPatch, has_hard_links: bool
-) -> None:
+def test_all_of_an_episode_has_a_second_name(video, monkeypatch, has_hard_links):
     """Links, which take no room; one that is missing comes back."""
 
-    def refuse(*_: Any) -> NoReturn:
+    def refuse(*_):
         raise OSError("no links here")
 
     if not has_hard_links:
@@ -73,9 +67,7 @@ def test_all_of_an_episode_has_a_second_name(
     assert list(video.parent.iterdir()) == []
 
 
-def test_somebody_elses_file_stays(
-    video: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_somebody_elses_file_stays(video, caplog):
     """It is said which one is in the way, and nobody removes it either."""
     mine = video.with_name(f"{SECOND}.mp4")
     mine.write_text("mine")
@@ -89,7 +81,7 @@ def test_somebody_elses_file_stays(
 
 
 @pytest.mark.parametrize("way", ["hardlink_to", "symlink_to"])
-def test_clearing_removes_links_to_the_files(way: str, video: Path) -> None:
+def test_clearing_removes_links_to_the_files(way, video):
     """Also where the metadata is gone that would say so; not other links."""
     getattr(video.with_name(f"{SECOND}.mp4"), way)(video)
     os.link(video, video.with_name("my favourite.mp4"))
@@ -99,9 +91,7 @@ def test_clearing_removes_links_to_the_files(way: str, video: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["../x-episode-1.mp4", "openaigym.x-episode-1.mp4", 5])
-def test_a_name_that_is_none_is_passed_over(
-    name: Any, tmp_path: Path, names: Callable[[Path], list[str]]
-) -> None:
+def test_a_name_that_is_none_is_passed_over(name, tmp_path, names):
     """Metadata may be anybody's."""
     directory = tmp_path / "recordings"
     directory.mkdir()
@@ -115,7 +105,7 @@ def test_a_name_that_is_none_is_passed_over(
     "name",
     ["x.mp4", f"{STEM}.mp4/../x.mp4", 7, f"{STEM}.gone.mp4", f"{STEM[:-1]}8.side.mp4"],
 )
-def test_only_files_of_the_episode_are_its_videos(name: Any, tmp_path: Path) -> None:
+def test_only_files_of_the_episode_are_its_videos(name, tmp_path):
     """And only those that are there."""
     (tmp_path / "x.mp4").write_text("")
     video = write_episode(tmp_path, further_videos=[name, f"{STEM}.side.mp4"])

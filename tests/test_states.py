@@ -1,11 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a row holds of a simulation, and the memory that it is gathered from."""
 
-from __future__ import annotations
-
-from typing import Any
-
-import gymnasium
 import mujoco
 import numpy as np
 import pytest
@@ -29,15 +24,13 @@ FULL = """
 """
 EQUALITY = '<equality><weld body1="moved" body2="free"/></equality>'
 
-Simulation = tuple[mujoco.MjModel, mujoco.MjData]
 
-
-def simulated(xml: str) -> Simulation:
+def simulated(xml):
     model = mujoco.MjModel.from_xml_string(xml)
     return model, mujoco.MjData(model)
 
 
-def check_memory(model: mujoco.MjModel, data: mujoco.MjData) -> None:
+def check_memory(model, data):
     """Check that the same words hold the state, step after step."""
     words = state_words(model, data)
     assert words is not None
@@ -52,7 +45,7 @@ def check_memory(model: mujoco.MjModel, data: mujoco.MjData) -> None:
 
 
 @pytest.mark.parametrize("xml", [FULL.format(equality=""), "<mujoco/>"])
-def test_the_words_of_a_state_are_what_mujoco_gives(xml: str) -> None:
+def test_the_words_of_a_state_are_what_mujoco_gives(xml):
     """Mocap bodies, user data, activations and forces from outside as well."""
     model, data = simulated(xml)
     data.mocap_pos[:] = 7
@@ -60,19 +53,12 @@ def test_the_words_of_a_state_are_what_mujoco_gives(xml: str) -> None:
     check_memory(model, data)
 
 
-@pytest.mark.parametrize("env_id", ["HalfCheetah-v5", "Humanoid-v5"])
-def test_the_states_of_environments_can_be_gathered(env_id: str) -> None:
-    """As Gymnasium makes them."""
-    env: Any = gymnasium.make(env_id).unwrapped
-    check_memory(env.model, env.data)
-
-
-def test_a_component_of_another_type_has_to_be_asked_for() -> None:
+def test_a_component_of_another_type_has_to_be_asked_for():
     """Whether an equality is active is a byte here and a number there."""
     assert state_words(*simulated(FULL.format(equality=EQUALITY))) is None
 
 
-def test_components_are_where_mujoco_puts_them() -> None:
+def test_components_are_where_mujoco_puts_them():
     """The arrays of `MjData` are found in its vector by name; empty ones are none."""
     model, data = simulated(FULL.format(equality=EQUALITY))
     data.ctrl[:], data.xfrc_applied[:], data.userdata[:] = 0.3, 0.1, [7, 8, 9]

@@ -1,11 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-from __future__ import annotations
-
 import json
 import math
 import time
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -21,13 +18,11 @@ from mjrec.formats.manifest import read_stats_file
 
 
 @pytest.fixture
-def recorder(tmp_path: Path) -> StatsRecorder:
+def recorder(tmp_path):
     return StatsRecorder(str(tmp_path), "openaigym.episode_batch.0.1", env_id="Env-v0")
 
 
-def run_episode(
-    recorder: StatsRecorder, rewards: list[Any], *, end: bool = True
-) -> None:
+def run_episode(recorder, rewards, *, end=True):
     recorder.before_reset()
     recorder.after_reset(None)
     for index, reward in enumerate(rewards):
@@ -35,7 +30,7 @@ def run_episode(
         recorder.after_step(None, reward, end and index == len(rewards) - 1, {})
 
 
-def test_only_complete_episodes_are_written(recorder: StatsRecorder) -> None:
+def test_only_complete_episodes_are_written(recorder):
     """With length, return, type and wall clock; a closed recorder refuses."""
     before = time.time()
     run_episode(recorder, [1.0, 2.5])
@@ -63,9 +58,7 @@ def test_only_complete_episodes_are_written(recorder: StatsRecorder) -> None:
         *(([value], value) for value in (math.nan, math.inf, -math.inf)),
     ],
 )
-def test_rewards_add_up_in_float64(
-    recorder: StatsRecorder, rewards: list[Any], total: float
-) -> None:
+def test_rewards_add_up_in_float64(recorder, rewards, total):
     """Whatever kind of number they are; the file is JSON, and gives them back."""
     run_episode(recorder, rewards)
     recorder.close()
@@ -75,13 +68,13 @@ def test_rewards_add_up_in_float64(
 
 
 @pytest.mark.parametrize("reward", [None, "much", np.zeros(2), [1.0, 2.0]])
-def test_other_rewards_are_an_error(recorder: StatsRecorder, reward: Any) -> None:
+def test_other_rewards_are_an_error(recorder, reward):
     """What is not one number is named in the error."""
     with pytest.raises(InvalidArgument, match="one number"):
         run_episode(recorder, [reward])
 
 
-def test_calls_out_of_order_are_errors(recorder: StatsRecorder) -> None:
+def test_calls_out_of_order_are_errors(recorder):
     """They name the environment, how far the episode is, and the way out."""
     with pytest.raises(ResetNeeded, match="Env-v0 before the first reset"):
         recorder.before_step(None)
@@ -93,7 +86,7 @@ def test_calls_out_of_order_are_errors(recorder: StatsRecorder) -> None:
         recorder.before_reset()
 
 
-def test_an_early_reset_drops_the_episode(tmp_path: Path) -> None:
+def test_an_early_reset_drops_the_episode(tmp_path):
     """Its steps count only in the total; without a step nothing is lost."""
     recorder = StatsRecorder(str(tmp_path), "x", allow_early_reset=True)
     run_episode(recorder, [5.0], end=False)
@@ -104,7 +97,7 @@ def test_an_early_reset_drops_the_episode(tmp_path: Path) -> None:
     assert recorder.total_steps == 2
 
 
-def test_a_type_takes_effect_at_the_next_reset(recorder: StatsRecorder) -> None:
+def test_a_type_takes_effect_at_the_next_reset(recorder):
     """Types stay aligned with the completed episodes; there are two."""
     run_episode(recorder, [0.0], end=False)
     recorder.type = "e"

@@ -1,13 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the trackers have in common."""
 
-from __future__ import annotations
-
-import subprocess
-import sys
-from pathlib import Path
-
 import pytest
+from other_python import run_python
 
 import mjrec.trackers
 from mjrec.errors import InvalidArgument
@@ -25,13 +20,11 @@ sys.meta_path.insert(0, Lack())
 """
 
 
-def run(code: str, cwd: Path) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-c", code], cwd=cwd, capture_output=True, text=True
-    )
+def run(code, cwd):
+    return run_python(code, cwd=cwd, status=None)
 
 
-def test_import_loads_no_service(tmp_path: Path) -> None:
+def test_import_loads_no_service(tmp_path):
     """Nor does importing each tracker."""
     answer = run(
         "import sys; from mjrec.trackers import *; "
@@ -52,9 +45,7 @@ def test_import_loads_no_service(tmp_path: Path) -> None:
         ("wandb", "WandbTracker(mode='offline')"),
     ],
 )
-def test_missing_package_is_named_with_the_way_out(
-    package: str, call: str, tmp_path: Path
-) -> None:
+def test_missing_package_is_named_with_the_way_out(package, call, tmp_path):
     """By the constructor, before anything is written."""
     answer = run(
         LACK.format(package=package) + f"import mjrec.trackers as t\nt.{call}", tmp_path

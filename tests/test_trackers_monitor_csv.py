@@ -1,13 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """`monitor.csv`, as text; Stable-Baselines3's own readers have tests of their own."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import math
 import time
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,11 +16,11 @@ from mjrec.trackers import MonitorCsvTracker, Run
 
 
 @pytest.fixture
-def run(tmp_path: Path) -> Run:
+def run(tmp_path):
     return Run(directory=tmp_path / "recordings", infix="0.4711", env_id="Hopper-v5")
 
 
-def test_header_and_rows(run: Run) -> None:
+def test_header_and_rows(run):
     """Times count from the header's; rewards are as exact as they were."""
     before = time.time()
     tracker = MonitorCsvTracker()
@@ -47,9 +44,7 @@ def test_header_and_rows(run: Run) -> None:
     assert float(cells[2][2]) == pytest.approx(before + 100 - start["t_start"])
 
 
-def test_each_run_has_a_file_of_its_own(
-    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_each_run_has_a_file_of_its_own(run, tmp_path, monkeypatch):
     """Sub-environments in one directory, wherever the script has gone meanwhile."""
     (tmp_path / "logs").mkdir()
     monkeypatch.chdir(tmp_path)
@@ -72,9 +67,7 @@ def test_each_run_has_a_file_of_its_own(
         ("logs/monitor.csv", {"1.monitor.csv", "2.monitor.csv", "monitor.csv"}),
     ],
 )
-def test_file_that_is_there_is_never_written_to(
-    run: Run, path: str, made: set[str], tmp_path: Path
-) -> None:
+def test_file_that_is_there_is_never_written_to(run, path, made, tmp_path):
     """The next free name is taken, one that Stable-Baselines3 finds too."""
     first = tmp_path / "logs" / max(made)
     first.parent.mkdir()
@@ -89,7 +82,7 @@ def test_file_that_is_there_is_never_written_to(
         MonitorCsvTracker(first / "a").begin(run)
 
 
-def test_full_disk_is_named_and_tears_no_row(run: Run) -> None:
+def test_full_disk_is_named_and_tears_no_row(run):
     """Half a row would be read as another one."""
     tracker = MonitorCsvTracker()
     tracker.begin(run)

@@ -1,50 +1,41 @@
 # SPDX-License-Identifier: Apache-2.0
 """Event files, read back by TensorBoard's own reader."""
 
-from __future__ import annotations
-
 import dataclasses
 import io
 import json
 import math
-from collections.abc import Callable
 from fractions import Fraction
-from pathlib import Path
-from typing import Any
 
 import pytest
-from finished_files import Finished, episode, record
+from finished_files import episode, record
 from PIL import Image
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from mjrec.errors import (
-    DirectoryNotWritable,
-    EncoderError,
-    UnreadableFile,
-)
+from mjrec.errors import DirectoryNotWritable, EncoderError, UnreadableFile
 from mjrec.trackers import TensorBoardTracker
 from mjrec.trackers.tensorboard import animated_gif
 
 
 @pytest.fixture
-def finished(tmp_path: Path, make_corridor: Any, play: Callable[..., None]) -> Finished:
+def finished(tmp_path, make_corridor, play):
     """A video of eleven frames at ten a second."""
     return record(tmp_path / "recordings", make_corridor(10), play)
 
 
-def read(directory: Path) -> EventAccumulator:
+def read(directory):
     events = EventAccumulator(str(directory))
     events.Reload()
     return events
 
 
-def picture(gif: bytes, index: int) -> Any:
+def picture(gif, index):
     with Image.open(io.BytesIO(gif)) as image:
         image.seek(index)
         return image.convert("RGB")
 
 
-def test_scalars_stand_over_the_steps_of_the_run(finished: Finished) -> None:
+def test_scalars_stand_over_the_steps_of_the_run(finished):
     """Success only where it is known, evaluation apart, NaN as it is."""
     tracker, run = TensorBoardTracker(), finished.run
     tracker.begin(run)
@@ -62,7 +53,7 @@ def test_scalars_stand_over_the_steps_of_the_run(finished: Finished) -> None:
     assert [(e.step, e.value) for e in events.Scalars("evaluation/return")] == [(30, 3)]
 
 
-def test_video_is_played_as_a_gif_of_the_file(finished: Finished) -> None:
+def test_video_is_played_as_a_gif_of_the_file(finished):
     """It shows the whole episode, moves on, and stands at its episode's step."""
     tracker, run = TensorBoardTracker(), finished.run
     tracker.begin(run)
@@ -97,7 +88,7 @@ def test_video_is_played_as_a_gif_of_the_file(finished: Finished) -> None:
     assert text.step == 10
 
 
-def test_runs_are_told_apart(finished: Finished, tmp_path: Path) -> None:
+def test_runs_are_told_apart(finished, tmp_path):
     """Sub-environments, and two directories with one infix, in one `log_dir`."""
     first = finished.run
     runs = [
@@ -124,7 +115,7 @@ def test_runs_are_told_apart(finished: Finished, tmp_path: Path) -> None:
     }
 
 
-def test_damaged_files_are_named(finished: Finished, tmp_path: Path) -> None:
+def test_damaged_files_are_named(finished, tmp_path):
     """Ffmpeg's error comes home at the end at the latest; events before it stay."""
     finished.video.path.write_bytes(b"no video")
     tracker, run = TensorBoardTracker(), finished.run

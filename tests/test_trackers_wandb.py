@@ -1,23 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
 """Weights & Biases, offline: its files are read back."""
 
-from __future__ import annotations
-
 import dataclasses
-from collections.abc import Callable, Iterator
-from pathlib import Path
-from typing import Any
 
 import pytest
 import wandb
-from finished_files import Finished, episode, record
+from finished_files import episode, record
 from wandb_files import axes, history
 
 from mjrec.trackers import WandbTracker
 
 
 @pytest.fixture(autouse=True)
-def quiet(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+def quiet(monkeypatch):
     """Nothing of a user's account or console is touched, and no run is left."""
     monkeypatch.setenv("WANDB_SILENT", "true")
     monkeypatch.setenv("WANDB_CONSOLE", "off")
@@ -28,29 +23,27 @@ def quiet(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
 
 @pytest.fixture
-def finished(tmp_path: Path, make_corridor: Any, play: Callable[..., None]) -> Finished:
+def finished(tmp_path, make_corridor, play):
     return record(tmp_path / "recordings", make_corridor(10), play)
 
 
-def offline(directory: Path) -> dict[str, Any]:
+def offline(directory):
     """Return the arguments of an offline run in `directory`."""
     return {"project": "p", "mode": "offline", "dir": str(directory)}
 
 
-def log_of(directory: Path) -> Path:
+def log_of(directory):
     # A run that is finished may still be on its way to the disk.
     wandb.teardown()
     [path] = directory.glob("wandb/offline-run-*/*.wandb")
     return path
 
 
-def logged(directory: Path, key: str) -> list[Any]:
+def logged(directory, key):
     return [row[key] for row in history(log_of(directory)) if key in row]
 
 
-def test_scalars_have_the_steps_of_the_run_as_their_axis(
-    finished: Finished, tmp_path: Path
-) -> None:
+def test_scalars_have_the_steps_of_the_run_as_their_axis(finished, tmp_path):
     """Success only where it is known, evaluation and sub-environments apart."""
     tracker, run = WandbTracker(**offline(tmp_path)), finished.run
     second = dataclasses.replace(run, infix="1.4711", env_index=3)
@@ -75,9 +68,7 @@ def test_scalars_have_the_steps_of_the_run_as_their_axis(
     assert over["training/env3/*"] == "training/env3/total_steps"
 
 
-def test_video_is_the_file_itself_and_may_come_late(
-    finished: Finished, tmp_path: Path
-) -> None:
+def test_video_is_the_file_itself_and_may_come_late(finished, tmp_path):
     """Byte for byte, at its own episode's step, after later episodes."""
     tracker, run = WandbTracker(**offline(tmp_path)), finished.run
     tracker.begin(run)
@@ -99,9 +90,7 @@ def test_video_is_the_file_itself_and_may_come_late(
 
 
 @pytest.mark.parametrize("how", ["given", "active", "beside"])
-def test_a_run_of_others_stays_open(
-    how: str, finished: Finished, tmp_path: Path
-) -> None:
+def test_a_run_of_others_stays_open(how, finished, tmp_path):
     """One that is given, or is active; asked for another, it makes and ends that."""
     for name in ("theirs", "ours"):
         (tmp_path / name).mkdir()

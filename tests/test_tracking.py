@@ -1,67 +1,62 @@
 # SPDX-License-Identifier: Apache-2.0
 """What trackers are told."""
 
-from __future__ import annotations
-
 import logging
-from pathlib import Path
-from typing import Any
 
 import gymnasium
 import numpy as np
-import pytest
 from recordings import frames_of, manifest_of
 
 import mjrec
-from mjrec.recorder.tracking import FinishedEpisode, FinishedVideo, Run, Tracker
+from mjrec.recorder.tracking import Tracker
 
 
 class Listening(Tracker):
     """Writes down all that it is told."""
 
-    def __init__(self) -> None:
-        self.told: list[tuple[str, Any]] = []
-        self.runs: list[Run] = []
+    def __init__(self):
+        self.told = []
+        self.runs = []
 
-    def begin(self, run: Run) -> None:
+    def begin(self, run):
         self._note(run, "begin", None)
 
-    def episode(self, run: Run, episode: FinishedEpisode) -> None:
+    def episode(self, run, episode):
         self._note(run, "episode", episode)
 
-    def video(self, run: Run, video: FinishedVideo) -> None:
+    def video(self, run, video):
         assert video.path.exists()
         assert video.metadata_path.exists()
         self._note(run, "video", video)
 
-    def end(self, run: Run) -> None:
+    def end(self, run):
         self._note(run, "end", None)
 
-    def _note(self, run: Run, what: str, facts: Any) -> None:
+    def _note(self, run, what, facts):
         self.runs.append(run)
         self.told.append((what, facts))
 
-    def of(self, what: str) -> list[Any]:
+    def of(self, what):
         return [facts for told, facts in self.told if told == what]
 
 
 class Failing(Tracker):
     """Has lost its server."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         self.calls = 0
         self.ends = 0
 
-    def episode(self, run: Run, episode: FinishedEpisode) -> None:
+    def episode(self, run, episode):
         self.calls += 1
         raise ConnectionError("no server")
 
-    def end(self, run: Run) -> None:
+    def end(self, run):
         self.ends += 1
         raise ConnectionError("no server here either")
 
 
-def record(directory: Path, env_id: str, *, episodes: int = 2, **options: Any) -> Any:
+def record(directory, env_id, *, episodes=2, **options):
     """Record short episodes; return the monitor, closed."""
     size = {"height": 32, "width": 32}
     if "camera" in options:
@@ -83,12 +78,12 @@ def record(directory: Path, env_id: str, *, episodes: int = 2, **options: Any) -
     return env
 
 
-def test_tracker_is_told_every_episode_and_live_video(tmp_path: Path) -> None:
+def test_tracker_is_told_every_episode_and_live_video(tmp_path):
     """In order, with the facts of each, and of which run."""
     tracker = Listening()
     env = record(tmp_path, "InvertedPendulum-v5", trackers=tracker)
     assert [what for what, _ in tracker.told] == [
-        *("begin", "episode", "video", "episode", "video", "end"),
+        *("begin", "episode", "video", "episode", "video", "end")
     ]
     first, second = tracker.of("episode")
     assert (first.episode_id, first.length, first.reward) == (0, 3, 3.0)
@@ -100,7 +95,7 @@ def test_tracker_is_told_every_episode_and_live_video(tmp_path: Path) -> None:
     assert {run.env_id for run in tracker.runs} == {"InvertedPendulum-v5"}
 
 
-def test_tracker_is_told_deferred_videos_when_they_are_there(tmp_path: Path) -> None:
+def test_tracker_is_told_deferred_videos_when_they_are_there(tmp_path):
     """At the latest in close; each once, whole."""
     tracker = Listening()
     record(tmp_path, "HalfCheetah-v5", render="deferred", trackers=[tracker])
@@ -116,9 +111,7 @@ def test_tracker_is_told_deferred_videos_when_they_are_there(tmp_path: Path) -> 
     assert not pending.of("video")
 
 
-def test_tracker_that_raises_is_dismissed_and_the_rest_goes_on(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_tracker_that_raises_is_dismissed_and_the_rest_goes_on(tmp_path, caplog):
     """The log has why, the manifest too, and the others are told all."""
     failing, listening = Failing(), Listening()
     with caplog.at_level(logging.ERROR, "mjrec"):
@@ -127,8 +120,4 @@ def test_tracker_that_raises_is_dismissed_and_the_rest_goes_on(
     assert len(listening.of("episode")) == 2
     assert "Failing has failed" in caplog.text
     [fault] = manifest_of(tmp_path)["mjrec"]["faults"]
-    assert fault == {
-        "episode_id": 0,
-        "what": "tracker",
-        "reason": "Failing: no server",
-    }
+    assert fault == {"episode_id": 0, "what": "tracker", "reason": "Failing: no server"}

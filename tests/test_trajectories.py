@@ -1,18 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Recorded episodes are read back as arrays, and replayed bit for bit."""
 
-from __future__ import annotations
-
-import subprocess
-import sys
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import gymnasium
 import mujoco
 import numpy as np
 import pytest
+from other_python import run_python
 from trajectories_by_hand import INFIX, add_row, new_logs
 
 import mjrec
@@ -48,7 +43,7 @@ SUBSTEPS = 5
 SNAPSHOT = packed([("geom_xpos", ("<f8", (2, 3)))])
 
 
-def state(model: Any, data: Any) -> Any:
+def state(model, data):
     row = np.empty(mujoco.mj_stateSize(model, STATE_SPEC))
     mujoco.mj_getState(model, data, row, STATE_SPEC)
     return row
@@ -60,16 +55,8 @@ class Recording:
     A frame is taken after every second step; changes are of the model, by steps.
     """
 
-    def __init__(
-        self,
-        directory: Path,
-        model: Any,
-        *,
-        steps: int = 12,
-        changes: Mapping[int, Mapping[str, Any]] | None = None,
-        **facts: Any,
-    ) -> None:
-        self.states: list[Any] = []
+    def __init__(self, directory, model, *, steps=12, changes=None, **facts):
+        self.states = []
         self.actions = np.random.default_rng(5).uniform(-1, 1, (steps, model.nu))
         store = ModelStore(directory)
         known = {"model": store.add(model), "env_id": "Heap-v0", **facts}
@@ -89,7 +76,7 @@ class Recording:
         self._span.end({"complete": True})
         logs.close()
 
-    def _simulate(self, model: Any, steps: int) -> None:
+    def _simulate(self, model, steps):
         data = mujoco.MjData(model)
         # As a reset that lets things settle: it leaves a warm start behind.
         mujoco.mj_step(model, data, nstep=40)
@@ -99,7 +86,7 @@ class Recording:
             mujoco.mj_step(model, data, nstep=SUBSTEPS)
             self._add(model, data, step)
 
-    def _add(self, model: Any, data: Any, step: int) -> None:
+    def _add(self, model, data, step):
         if step in self._changes:
             fields = {k: np.asarray(v) for k, v in self._changes[step].items()}
             self._span.log.add_change(ModelChange(step=step, fields=fields))
@@ -111,20 +98,20 @@ class Recording:
         add_row(self._span, step, observation=step, **values, **ending)
 
 
-def model_of(name: str) -> Any:
+def model_of(name):
     return mujoco.MjModel.from_xml_string(MODELS[name])
 
 
-def finished(recording: Recording) -> Path:
+def finished(recording):
     return finish_trajectory(recording.path)
 
 
-def as_is(recording: Recording) -> Path:
+def as_is(recording):
     return recording.path
 
 
 @pytest.mark.parametrize("form", [as_is, finished])
-def test_everything_is_there_as_arrays(tmp_path: Path, form: Any) -> None:
+def test_everything_is_there_as_arrays(tmp_path, form):
     """In flight and in the finished file alike, with the documented shapes."""
     environment = {"framework": "gymnasium", "id": "Heap-v0", "kwargs": {}}
     facts = {"episode_id": 3, "seed": 7, "environment": environment}
@@ -154,7 +141,7 @@ def test_everything_is_there_as_arrays(tmp_path: Path, form: Any) -> None:
     assert "Heap-v0, 12 steps" in repr(trajectory)
 
 
-def test_states_are_told_by_component(tmp_path: Path) -> None:
+def test_states_are_told_by_component(tmp_path):
     """By MuJoCo's names; another name is an error that lists them."""
     model = model_of("heap")
     trajectory = mjrec.load_trajectory(Recording(tmp_path, model).path)
@@ -170,7 +157,7 @@ def test_states_are_told_by_component(tmp_path: Path) -> None:
         trajectory.component("qqpos")
 
 
-def test_the_model_is_that_of_the_step(tmp_path: Path) -> None:
+def test_the_model_is_that_of_the_step(tmp_path):
     """Step 0 is what the reset set; later changes hold from their steps on.
 
     A step that is not there is an error that says how many there are.
@@ -199,7 +186,7 @@ def test_the_model_is_that_of_the_step(tmp_path: Path) -> None:
                 use(step)
 
 
-def test_a_recording_without_a_simulation_has_no_model(tmp_path: Path) -> None:
+def test_a_recording_without_a_simulation_has_no_model(tmp_path):
     """Its rewards are there all the same."""
     logs, name = new_logs(tmp_path), trajectory_prefix(INFIX, 0)
     span = logs.begin(name, {"model": None}, row_dtype())
@@ -213,7 +200,7 @@ def test_a_recording_without_a_simulation_has_no_model(tmp_path: Path) -> None:
         trajectory.model()
 
 
-def test_a_directory_is_answered_with_what_is_in_it(tmp_path: Path) -> None:
+def test_a_directory_is_answered_with_what_is_in_it(tmp_path):
     """The names that could have been meant."""
     with pytest.raises(InvalidArgument, match="holds no trajectories"):
         mjrec.load_trajectory(tmp_path)
@@ -222,7 +209,7 @@ def test_a_directory_is_answered_with_what_is_in_it(tmp_path: Path) -> None:
         mjrec.load_trajectory(tmp_path)
 
 
-def test_reading_needs_no_simulator(tmp_path: Path) -> None:
+def test_reading_needs_no_simulator(tmp_path):
     """Arrays are read on a machine without mujoco; a model is not."""
     path = finished(Recording(tmp_path, model_of("heap")))
     code = (
@@ -233,7 +220,4 @@ def test_reading_needs_no_simulator(tmp_path: Path) -> None:
         "try: t.model()\n"
         "except ModuleNotFoundError as error: print(error.name)\n"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=True
-    )
-    assert done.stdout == "12 (13, 15) 7\nmujoco\n"
+    assert run_python(code).stdout == "12 (13, 15) 7\nmujoco\n"

@@ -1,13 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-from __future__ import annotations
-
 import functools
 import gc
 import json
 import pickle
-from collections.abc import Iterator
-from pathlib import Path
-from typing import Any
 
 import gymnasium
 import numpy as np
@@ -30,7 +25,6 @@ from vector_environments import (
 
 import mjrec
 from mjrec import (
-    Error,
     InvalidArgument,
     NoPictures,
     PicturesDiffer,
@@ -42,10 +36,10 @@ LENGTHS = (2, 3)
 
 
 @pytest.fixture
-def corridors(make_corridor: Any) -> Any:
+def corridors(make_corridor):
     """Make corridors that are 2 and 3 steps long, in a list or in one object."""
 
-    def make(mode: Any = NEXT_STEP, *, inside: bool = True) -> Any:
+    def make(mode=NEXT_STEP, *, inside=True):
         if not inside:
             return VectorCorridor(LENGTHS, mode)
         each = [functools.partial(make_corridor, length) for length in LENGTHS]
@@ -58,9 +52,7 @@ def corridors(make_corridor: Any) -> Any:
     ("inside", "mode"),
     [*((True, mode) for mode in MODES), (False, NEXT_STEP), (False, DISABLED)],
 )
-def test_every_sub_environment_has_whole_videos(
-    corridors: Any, tmp_path: Path, inside: bool, mode: Any
-) -> None:
+def test_every_sub_environment_has_whole_videos(corridors, tmp_path, inside, mode):
     """Each shows its reset and all its steps, the terminal one included."""
     with mjrec.Monitor(corridors(mode, inside=inside), tmp_path) as env:
         play(env, 8)
@@ -71,9 +63,7 @@ def test_every_sub_environment_has_whole_videos(
             assert "final_frame" not in metadata_at(path.with_suffix(".meta.json"))
 
 
-def test_a_frame_that_nobody_sees_is_said_to_be_missing(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_frame_that_nobody_sees_is_said_to_be_missing(tmp_path, caplog):
     """In SAME_STEP the metadata says so, and one warning for all."""
     with mjrec.Monitor(VectorCorridor(LENGTHS, SAME_STEP), tmp_path) as env:
         play(env, 8)
@@ -91,7 +81,7 @@ def test_a_frame_that_nobody_sees_is_said_to_be_missing(
 
 
 @pytest.mark.parametrize("mode", MODES)
-def test_statistics_are_those_of_gymnasium(tmp_path: Path, mode: Any) -> None:
+def test_statistics_are_those_of_gymnasium(tmp_path, mode):
     """Lengths and returns are those that RecordEpisodeStatistics has."""
     counted = RecordEpisodeStatistics(VectorCorridor((2, 3, 5), mode))
     with mjrec.Monitor(counted, tmp_path, False) as env:
@@ -111,14 +101,10 @@ def test_statistics_are_those_of_gymnasium(tmp_path: Path, mode: Any) -> None:
 
 
 # Takes more than five seconds: 64 videos.
-def test_sixty_four_sub_environments(tmp_path: Path) -> None:
+def test_sixty_four_sub_environments(tmp_path):
     """Each has its trajectory and its video; their logs' tails have 4 MiB together."""
     make = functools.partial(
-        gymnasium.make,
-        "InvertedPendulum-v5",
-        max_episode_steps=2,
-        height=16,
-        width=16,
+        gymnasium.make, "InvertedPendulum-v5", max_episode_steps=2, height=16, width=16
     )
     vector = SyncVectorEnv([make] * 64)
     with mjrec.Monitor(vector, tmp_path, workers=2, quality="draft") as env:
@@ -136,7 +122,7 @@ def test_sixty_four_sub_environments(tmp_path: Path) -> None:
         assert len(frames_of(tmp_path / name.format("video", "video", "mp4"))) == 3
 
 
-def test_closing_puts_the_environments_back(corridors: Any, tmp_path: Path) -> None:
+def test_closing_puts_the_environments_back(corridors, tmp_path):
     """Each is closed once; until then calls reach them through their monitors."""
     vector = corridors()
     originals = list(vector.envs)
@@ -166,9 +152,7 @@ def test_closing_puts_the_environments_back(corridors: Any, tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize("resume", [False, True])
-def test_a_failing_constructor_leaves_no_trace(
-    make_corridor: Any, tmp_path: Path, names: Any, resume: bool
-) -> None:
+def test_a_failing_constructor_leaves_no_trace(make_corridor, tmp_path, names, resume):
     """The last sub-environment cannot be drawn: nothing was made of the first."""
     target = tmp_path / "a" / "b"
     if resume:
@@ -187,27 +171,12 @@ def test_a_failing_constructor_leaves_no_trace(
         assert not list(tmp_path.iterdir())
 
 
-def test_forgotten_monitors_are_closed(corridors: Any, tmp_path: Path) -> None:
-    """What nobody refers to any more is finished, and the environment closed."""
-    vector = corridors()
-    originals = list(vector.envs)
-    env = mjrec.Monitor(vector, tmp_path)
-    play(env, 3)
-    del env
-    gc.collect()
-    assert vector.envs == originals
-    assert [each.closed for each in originals] == [1, 1]
-    assert len(list(tmp_path.glob("*.manifest.json"))) == 2
-
-
 @pytest.mark.parametrize("inside", [True, False])
-def test_errors_are_noted_in_all_running_episodes(
-    corridors: Any, tmp_path: Path, inside: bool
-) -> None:
+def test_errors_are_noted_in_all_running_episodes(corridors, tmp_path, inside):
     """Their videos say what has ended them; nothing can be pickled or misused."""
     vector = corridors(inside=inside)
 
-    def explode(action: Any) -> None:
+    def explode(action):
         raise RuntimeError("the motor burns")
 
     env = mjrec.Monitor(vector, tmp_path)
@@ -225,7 +194,7 @@ def test_errors_are_noted_in_all_running_episodes(
         assert said["exception"]["message"] == "the motor burns"
 
 
-def test_an_unknown_autoreset_mode_is_refused(tmp_path: Path) -> None:
+def test_an_unknown_autoreset_mode_is_refused(tmp_path):
     """The error says what to set; nothing is made."""
     target = tmp_path / "run"
     with pytest.raises(InvalidArgument, match="autoreset_mode"):
@@ -233,9 +202,7 @@ def test_an_unknown_autoreset_mode_is_refused(tmp_path: Path) -> None:
     assert not target.exists()
 
 
-def test_sub_environments_of_different_names_need_a_common_one(
-    corridors: Any, tmp_path: Path
-) -> None:
+def test_sub_environments_of_different_names_need_a_common_one(corridors, tmp_path):
     """Results of one directory belong to one environment."""
     vector = corridors()
     vector.envs[0].spec = gymnasium.spec("CartPole-v1")
@@ -245,7 +212,7 @@ def test_sub_environments_of_different_names_need_a_common_one(
         play(env, 2)
 
 
-def test_it_draws_once_a_step_and_only_for_videos(tmp_path: Path) -> None:
+def test_it_draws_once_a_step_and_only_for_videos(tmp_path):
     """One call of `render` is for all; without a running video there is none."""
     vector = VectorCorridor((3, 3), NEXT_STEP)
     with mjrec.Monitor(vector, tmp_path, lambda n: n == 0) as env:
@@ -259,7 +226,7 @@ def test_it_draws_once_a_step_and_only_for_videos(tmp_path: Path) -> None:
     assert vector.closings == [{"reason": "done"}]
 
 
-def test_trajectories_hold_what_can_be_seen(tmp_path: Path) -> None:
+def test_trajectories_hold_what_can_be_seen(tmp_path):
     """Actions, rewards and observations; the last one is the episode's own."""
     vector = VectorCorridor(LENGTHS, SAME_STEP)
     with mjrec.Monitor(
@@ -282,7 +249,7 @@ def test_trajectories_hold_what_can_be_seen(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("mode", MODES)
-def test_episode_info_is_that_of_gymnasium(tmp_path: Path, mode: Any) -> None:
+def test_episode_info_is_that_of_gymnasium(tmp_path, mode):
     """The step that ends episodes says their return and length, as a wrapper does."""
     arguments = {"episode_info": True, "video_callable": False}
     ours = mjrec.Monitor(VectorCorridor(LENGTHS, mode), tmp_path, **arguments)
@@ -298,7 +265,7 @@ def test_episode_info_is_that_of_gymnasium(tmp_path: Path, mode: Any) -> None:
     assert infos[0]["episode"]["t"].shape == (2,)
 
 
-def test_a_list_of_seeds_is_told_one_by_one(tmp_path: Path) -> None:
+def test_a_list_of_seeds_is_told_one_by_one(tmp_path):
     """A single seed, for one generator of all, is what each is told."""
     with mjrec.Monitor(VectorCorridor((2, 2), DISABLED), tmp_path, False) as env:
         for seed in ([5, 9], 3):
@@ -314,7 +281,7 @@ def test_a_list_of_seeds_is_told_one_by_one(tmp_path: Path) -> None:
     assert said == [[5, 3], [9, 3]]
 
 
-def test_a_masked_reset_leaves_the_others_alone(tmp_path: Path) -> None:
+def test_a_masked_reset_leaves_the_others_alone(tmp_path):
     """Their episodes go on. Others are refused before anything is reset, if asked."""
     with mjrec.Monitor(
         VectorCorridor(LENGTHS, DISABLED), tmp_path, allow_early_reset=False
@@ -333,10 +300,10 @@ def test_a_masked_reset_leaves_the_others_alone(tmp_path: Path) -> None:
     assert shown(path_of(env.monitors[1], 0, "mp4"), step=16) == [0, 1, 2, 3]
 
 
-def test_pictures_must_be_one_for_each(tmp_path: Path) -> None:
+def test_pictures_must_be_one_for_each(tmp_path):
     """Said at the first reset."""
     vector = VectorCorridor()
-    vector.render = lambda: (np.zeros((8, 8, 3), np.uint8),)  # type: ignore[method-assign]
+    vector.render = lambda: (np.zeros((8, 8, 3), np.uint8),)
     with (
         mjrec.Monitor(vector, tmp_path) as env,
         pytest.raises(InvalidArgument, match="each of its 2 sub-environments"),
@@ -353,9 +320,7 @@ def test_pictures_must_be_one_for_each(tmp_path: Path) -> None:
         ({}, NoPictures, "render_mode"),
     ],
 )
-def test_what_cannot_be_had_from_outside(
-    tmp_path: Path, options: dict[str, Any], error: type[Error], message: str
-) -> None:
+def test_what_cannot_be_had_from_outside(tmp_path, options, error, message):
     """The error says where it can be had, and nothing is left."""
     vector = VectorCorridor(render_mode="rgb_array" if options else None)
     with pytest.raises(error, match=message):
@@ -366,9 +331,7 @@ def test_what_cannot_be_had_from_outside(
 
 
 @pytest.mark.parametrize("mode", MODES)
-def test_environments_of_other_processes(
-    make_corridor: Any, tmp_path: Path, mode: Any
-) -> None:
+def test_environments_of_other_processes(make_corridor, tmp_path, mode):
     """Videos of all their frames, but the last where nobody sees it."""
     each = [lambda length=n: make_corridor(length) for n in LENGTHS]
     vector = AsyncVectorEnv(each, autoreset_mode=mode)
@@ -382,7 +345,7 @@ def test_environments_of_other_processes(
     assert vector.closed
 
 
-def test_what_other_processes_know(tmp_path: Path) -> None:
+def test_what_other_processes_know(tmp_path):
     """Their name and the time of their steps are asked for."""
     vector = AsyncVectorEnv(
         [
@@ -402,7 +365,7 @@ def test_what_other_processes_know(tmp_path: Path) -> None:
 
 
 @pytest.fixture(autouse=True)
-def no_process_is_left() -> Iterator[None]:
+def no_process_is_left():
     """See that every test ends its processes."""
     before = children()
     yield

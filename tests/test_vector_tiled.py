@@ -1,23 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
-from __future__ import annotations
-
 import contextlib
 import gc
 import hashlib
 from pathlib import Path
-from typing import Any
 
 import gymnasium
 import numpy as np
 import pytest
 from gymnasium.vector import SyncVectorEnv
-from recordings import frames_of
+from recordings import frames_of, hashes_at
 from vector_environments import (
     DISABLED,
     NEXT_STEP,
     SAME_STEP,
     VectorCorridor,
-    hashes_at,
     metadata_at,
     path_of,
     play,
@@ -31,10 +27,10 @@ LENGTHS = (2, 3, 2)
 
 
 @pytest.fixture
-def corridors(make_corridor: Any) -> Any:
+def corridors(make_corridor):
     """Make three corridors in this process, or one object that has three."""
 
-    def make(mode: Any, *, inside: bool) -> Any:
+    def make(mode, *, inside):
         if not inside:
             return VectorCorridor(LENGTHS, mode)
         each = [lambda n=n: make_corridor(n, size=(32, 64)) for n in LENGTHS]
@@ -43,7 +39,7 @@ def corridors(make_corridor: Any) -> Any:
     return make
 
 
-def tiles_at(path: Path, *, step: int) -> list[list[int]]:
+def tiles_at(path, *, step):
     """Return the position that each tile of a 2x2 grid of 32x64 pictures shows."""
     shown = []
     for frame in frames_of(path):
@@ -55,9 +51,7 @@ def tiles_at(path: Path, *, step: int) -> list[list[int]]:
 
 @pytest.mark.parametrize("inside", [True, False])
 @pytest.mark.parametrize("mode", [NEXT_STEP, DISABLED])
-def test_one_video_shows_all(
-    corridors: Any, tmp_path: Path, mode: Any, inside: bool
-) -> None:
+def test_one_video_shows_all(corridors, tmp_path, mode, inside):
     """It follows the first's episodes, and is listed in its manifest."""
     with mjrec.Monitor(corridors(mode, inside=inside), tmp_path, tiled=True) as env:
         play(env, 8)
@@ -82,8 +76,8 @@ def test_one_video_shows_all(
 
 @pytest.mark.parametrize("inside", [True, False])
 def test_the_frame_that_a_reset_hides_is_said_to_be_missing(
-    corridors: Any, tmp_path: Path, inside: bool
-) -> None:
+    corridors, tmp_path, inside
+):
     """In SAME_STEP the first tile shows the reset at last."""
     with mjrec.Monitor(
         corridors(SAME_STEP, inside=inside), tmp_path, tiled=True
@@ -99,9 +93,7 @@ def test_the_frame_that_a_reset_hides_is_said_to_be_missing(
 
 
 @pytest.mark.parametrize("how", ["reset", "close", "error"])
-def test_a_video_that_is_cut_off_says_so(
-    corridors: Any, tmp_path: Path, how: str
-) -> None:
+def test_a_video_that_is_cut_off_says_so(corridors, tmp_path, how):
     """Its metadata has the reason."""
     vector = corridors(NEXT_STEP, inside=False)
     with (
@@ -120,14 +112,14 @@ def test_a_video_that_is_cut_off_says_so(
     assert (said["length"], said["frame_count"]) == (1, 2)
 
 
-def drawn_by(env: Any) -> Any:
+def drawn_by(env):
     """Return its picture; Gymnasium draws into whichever context is current."""
     env.unwrapped.mujoco_renderer.viewer.make_context_current()
     return env.render()
 
 
 # Takes more than five seconds: every environment alone, and all in one video.
-def test_pixels_are_those_of_each_environment(tmp_path: Path) -> None:
+def test_pixels_are_those_of_each_environment(tmp_path):
     """Each tile is what its own environment's `render()` gives."""
     view = {"render_mode": "rgb_array", "width": 64, "height": 64}
     several = [gymnasium.make("Hopper-v5", **view) for _ in range(2)]
@@ -145,9 +137,7 @@ def test_pixels_are_those_of_each_environment(tmp_path: Path) -> None:
     assert hashes_at(path)[1:] == expected
 
 
-def test_a_bad_picture_can_be_tolerated(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_bad_picture_can_be_tolerated(tmp_path, caplog):
     """Sizes that differ are an error, or with `on_error="warn"` no tiled video."""
     vector = VectorCorridor(heights=(32, 48))
     with (

@@ -1,11 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-from __future__ import annotations
-
 import json
 import re
 from fractions import Fraction
 from pathlib import Path
-from typing import Any
 
 import av
 import gymnasium
@@ -16,12 +13,12 @@ from recordings import frames_of
 from mjrec import InvalidArgument, VideoRecorder
 
 
-def metadata_of(recorder: VideoRecorder) -> dict[str, Any]:
+def metadata_of(recorder):
     assert recorder.metadata_path is not None
     return dict(json.loads(Path(recorder.metadata_path).read_text()))
 
 
-def record(recorder: VideoRecorder, env: Any, steps: int) -> dict[str, Any]:
+def record(recorder, env, steps):
     env.reset()
     recorder.capture_frame()
     for _ in range(steps):
@@ -31,7 +28,7 @@ def record(recorder: VideoRecorder, env: Any, steps: int) -> dict[str, Any]:
     return metadata_of(recorder)
 
 
-def rate_in(recorder: VideoRecorder) -> Fraction | None:
+def rate_in(recorder):
     with av.open(str(recorder.path)) as container:
         return container.streams.video[0].average_rate
 
@@ -41,27 +38,27 @@ class Frames:
 
     render_mode = "rgb_array"
 
-    def __init__(self, *frames: Any, **metadata: Any) -> None:
+    def __init__(self, *frames, **metadata):
         self.frames = list(frames)
         self.metadata = metadata
 
-    def render(self) -> Any:
+    def render(self):
         frame = self.frames.pop(0)
         if isinstance(frame, Exception):
             raise frame
         return frame
 
 
-def grey(brightness: int = 90) -> Any:
+def grey(brightness=90):
     return np.full((8, 10, 3), brightness, np.uint8)
 
 
 @pytest.fixture
-def path(tmp_path: Path) -> Path:
+def path(tmp_path):
     return tmp_path / "v.mp4"
 
 
-def test_every_capture_is_a_frame(corridor: Any, path: Path) -> None:
+def test_every_capture_is_a_frame(corridor, path):
     """The reset's and the last one are in the file, in order; nothing comes later."""
     given = {"episode_id": 1}
     recorder = VideoRecorder(corridor, path, given)
@@ -82,10 +79,10 @@ def test_every_capture_is_a_frame(corridor: Any, path: Path) -> None:
     assert given == {"episode_id": 1}
 
 
-class Repeat(gymnasium.Wrapper[Any, Any, Any, Any]):
+class Repeat(gymnasium.Wrapper):
     """Repeats actions, which makes the step longer, whatever is declared."""
 
-    def step(self, action: Any) -> Any:
+    def step(self, action):
         self.env.step(action)
         return self.env.step(action)
 
@@ -101,10 +98,10 @@ class Repeat(gymnasium.Wrapper[Any, Any, Any, Any]):
     ],
 )
 def test_rate_is_the_simulated_time_of_a_step(
-    *, env_id: str, wrapper: Any, options: Any, fps: str, speed: float, path: Path
-) -> None:
+    *, env_id, wrapper, options, fps, speed, path
+):
     """Exact, also in the file."""
-    env: Any = gymnasium.make(env_id, render_mode="rgb_array", width=32, height=32)
+    env = gymnasium.make(env_id, render_mode="rgb_array", width=32, height=32)
     env = wrapper(env) if wrapper else env
     recorder = VideoRecorder(env, path, **options)
     metadata = record(recorder, env, 2)
@@ -117,18 +114,14 @@ def test_rate_is_the_simulated_time_of_a_step(
 
 
 @pytest.mark.parametrize(("steps", "frames"), [(2, 3), (0, 1)])
-def test_rate_without_simulation_is_the_declared_one(
-    corridor: Any, path: Path, steps: int, frames: int
-) -> None:
+def test_rate_without_simulation_is_the_declared_one(corridor, path, steps, frames):
     """Also of a single frame, which is a video."""
     recorder = VideoRecorder(corridor, path)
     assert record(recorder, corridor, steps)["fps"] == "10"
     assert len(frames_of(recorder.path)) == frames
 
 
-def test_nothing_declared_is_30_and_a_warning(
-    path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_nothing_declared_is_30_and_a_warning(path, caplog):
     """The warning names the argument that chooses."""
     with VideoRecorder(Frames(grey(), grey()), path) as recorder:
         recorder.capture_frame()
@@ -138,7 +131,7 @@ def test_nothing_declared_is_30_and_a_warning(
     assert "fps=" in caplog.text
 
 
-def test_a_frame_list_is_drained_in_order(make_corridor: Any, path: Path) -> None:
+def test_a_frame_list_is_drained_in_order(make_corridor, path):
     """All the frames of a step are recorded, and the rate fits them."""
     env = make_corridor(render_mode="rgb_array_list")
     # Three frames for each tenth of a second.
@@ -154,9 +147,7 @@ def test_a_frame_list_is_drained_in_order(make_corridor: Any, path: Path) -> Non
     assert rate_in(recorder) == 30
 
 
-def test_a_text_environment_becomes_an_asciicast(
-    make_corridor: Any, tmp_path: Path
-) -> None:
+def test_a_text_environment_becomes_an_asciicast(make_corridor, tmp_path):
     """Frames of the mode ansi are text, shown at the declared rate."""
     env = make_corridor(render_mode="ansi")
     recorder = VideoRecorder(env, base_path=tmp_path / "v")
@@ -169,13 +160,8 @@ def test_a_text_environment_becomes_an_asciicast(
     assert cast["stdout"][0][0] == 0.1
 
 
-@pytest.mark.parametrize(
-    ("mode", "enabled"),
-    [("human", True), ("rgb_array", False)],
-)
-def test_a_recorder_without_frames_does_nothing(
-    make_corridor: Any, path: Path, mode: str | None, enabled: bool
-) -> None:
+@pytest.mark.parametrize(("mode", "enabled"), [("human", True), ("rgb_array", False)])
+def test_a_recorder_without_frames_does_nothing(make_corridor, path, mode, enabled):
     """It leaves nothing, as in gym; none is drawn where it is not enabled."""
     env = make_corridor(render_mode=mode)
     recorder = VideoRecorder(env, path, enabled=enabled)
@@ -197,9 +183,7 @@ def test_a_recorder_without_frames_does_nothing(
         (np.zeros((8, 12, 3), np.uint8), "one size"),
     ],
 )
-def test_a_bad_frame_keeps_the_good_ones(
-    path: Path, bad: Any, reason: str, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_bad_frame_keeps_the_good_ones(path, bad, reason, caplog):
     """The video ends there, playable; one warning and the metadata say why."""
     recorder = VideoRecorder(Frames(grey(), grey(120), bad, grey(), bad), path)
     for _ in range(5):
@@ -213,7 +197,7 @@ def test_a_bad_frame_keeps_the_good_ones(
     assert re.search(reason, said)
 
 
-def test_without_a_frame_there_is_only_metadata(path: Path) -> None:
+def test_without_a_frame_there_is_only_metadata(path):
     """An error of render() is raised unchanged, and breaks nothing."""
     recorder = VideoRecorder(Frames(RuntimeError("no GL")), path, {"episode_id": 3})
     with pytest.raises(RuntimeError, match="no GL"):
@@ -238,17 +222,15 @@ def test_without_a_frame_there_is_only_metadata(path: Path) -> None:
         ("ansi", {"path": "v.mp4"}, r"end in \.json"),
     ],
 )
-def test_impossible_options_are_an_error(
-    make_corridor: Any, mode: str, options: dict[str, Any], words: str
-) -> None:
+def test_impossible_options_are_an_error(make_corridor, mode, options, words):
     """At construction, before anything is written."""
     with pytest.raises(InvalidArgument, match=words):
         VideoRecorder(make_corridor(render_mode=mode), **options)
 
 
 def test_a_relative_path_is_fixed_and_a_missing_one_is_made(
-    corridor: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    corridor, tmp_path, monkeypatch
+):
     """A later chdir parts nothing; without a path it is in a new directory."""
     (tmp_path / "elsewhere").mkdir()
     monkeypatch.chdir(tmp_path)

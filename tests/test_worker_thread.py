@@ -1,22 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
 """The bounded worker thread; what else it promises is seen in `test_video_writer`."""
 
-from __future__ import annotations
-
-import subprocess
-import sys
-
 import pytest
+from other_python import run_python
 
 from mjrec.worker_thread import WorkerThread
 
 
 @pytest.mark.parametrize("call", ["close", "abort"])
-def test_an_end_on_the_thread_itself_waits_for_nothing(call: str) -> None:
+def test_an_end_on_the_thread_itself_waits_for_nothing(call):
     """As when the consumer's garbage collection ends the worker's owner."""
-    seen: list[int] = []
+    seen = []
 
-    def consume(item: int) -> None:
+    def consume(item):
         seen.append(item)
         getattr(worker, call)()
 
@@ -26,7 +22,7 @@ def test_an_end_on_the_thread_itself_waits_for_nothing(call: str) -> None:
     assert seen == [1]
 
 
-def test_neither_forks_nor_the_interpreter_wait_for_the_thread() -> None:
+def test_neither_forks_nor_the_interpreter_wait_for_the_thread():
     """A fork is told that it has none; a script whose consumer hangs still ends."""
     code = (
         "import os, threading\n"
@@ -44,4 +40,4 @@ def test_neither_forks_nor_the_interpreter_wait_for_the_thread() -> None:
         "        os._exit(7)\n"
         "assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 7\n"
     )
-    subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
+    run_python(code, timeout=60)

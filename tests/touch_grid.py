@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A model with a plugin that draws: a ball near a floor that feels what touches it."""
 
-from __future__ import annotations
-
 TOUCH_GRID = """
 <mujoco>
   <extension><plugin plugin="mujoco.sensor.touch_grid"/></extension>

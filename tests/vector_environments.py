@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Vector environments for the tests; they need no simulator."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any
@@ -29,13 +27,8 @@ class VectorCorridor(gymnasium.vector.VectorEnv[Any, Any, Any]):
     """
 
     def __init__(
-        self,
-        lengths: tuple[int, ...] = (2, 3),
-        mode: Any = NEXT_STEP,
-        *,
-        render_mode: str | None = "rgb_array",
-        heights: tuple[int, ...] | None = None,
-    ) -> None:
+        self, lengths=(2, 3), mode=NEXT_STEP, *, render_mode="rgb_array", heights=None
+    ):
         self.num_envs = len(lengths)
         self.lengths = np.array(lengths)
         self.metadata = {"render_fps": 10, "autoreset_mode": mode}
@@ -51,21 +44,19 @@ class VectorCorridor(gymnasium.vector.VectorEnv[Any, Any, Any]):
         )
         self.positions = np.zeros(self.num_envs, int)
         self.rendered = 0
-        self.closings: list[dict[str, Any]] = []
+        self.closings = []
 
-    def reset(
-        self, *, seed: Any = None, options: dict[str, Any] | None = None
-    ) -> tuple[Any, dict[str, Any]]:
+    def reset(self, *, seed=None, options=None):
         mask = (options or {}).pop("reset_mask", np.ones(self.num_envs, bool))
         self.positions[mask] = 0
         return self._observations(), {}
 
-    def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
+    def step(self, actions):
         mode = self.metadata["autoreset_mode"]
         begins = (self.positions >= self.lengths) & (mode == NEXT_STEP)
         self.positions = np.where(begins, 0, self.positions + 1)
         ends = self.positions >= self.lengths
-        infos: dict[str, Any] = {}
+        infos = {}
         if mode == SAME_STEP and ends.any():
             last = np.full(self.num_envs, None, object)
             for index in np.flatnonzero(ends):
@@ -80,27 +71,27 @@ class VectorCorridor(gymnasium.vector.VectorEnv[Any, Any, Any]):
         rewards = np.where(begins, 0.0, 0.5)
         return self._observations(), rewards, ends, np.zeros_like(ends), infos
 
-    def render(self) -> Any:
+    def render(self):
         self.rendered += 1
         return tuple(
             _picture(position, height)
             for position, height in zip(self.positions, self.heights, strict=True)
         )
 
-    def close_extras(self, **kwargs: Any) -> None:
+    def close_extras(self, **kwargs):
         self.closings.append(kwargs)
 
-    def _observations(self) -> Any:
+    def _observations(self):
         return self.positions[:, None].astype(float)
 
 
-def _picture(position: int, height: int) -> Any:
+def _picture(position, height):
     frame = np.zeros((height, 64, 3), np.uint8)
     frame[:, : 16 * position + 16] = (200, 40, 10)
     return frame
 
 
-def play(env: Any, steps: int, *, seed: int | None = None) -> None:
+def play(env, steps, *, seed=None):
     """Reset, and step so often; reset by mask what nobody else resets."""
     env.reset(seed=seed)
     env.action_space.seed(seed)
@@ -111,25 +102,18 @@ def play(env: Any, steps: int, *, seed: int | None = None) -> None:
             env.reset(options={"reset_mask": ends})
 
 
-def path_of(monitor: Any, episode: int, ending: str) -> Path:
+def path_of(monitor, episode, ending):
     """Return where a file of a sub-environment's episode is."""
     name = f"openaigym.video.{monitor.infix}.video{episode:06d}.{ending}"
     return Path(monitor.directory) / name
 
 
-def shown(path: Path, *, step: int = 4) -> list[int]:
+def shown(path, *, step=4):
     """Return the corridor positions that a video shows, by its columns of colour."""
     columns = [int((frame[0, :, 0] > 128).sum()) for frame in frames_of(path)]
     return [round(count / step) - 1 for count in columns]
 
 
-def metadata_at(path: Path) -> dict[str, Any]:
+def metadata_at(path):
     """Return what a JSON file holds."""
-    content: dict[str, Any] = json.loads(path.read_text())
-    return content
-
-
-def hashes_at(path: Path) -> list[str]:
-    """Return the sha256 of each frame, as a framehash file says them."""
-    lines = [line for line in path.read_text().splitlines() if line[:1] != "#"]
-    return [line.rpartition(",")[2].strip() for line in lines]
+    return json.loads(path.read_text())

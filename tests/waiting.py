@@ -1,20 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Waiting for what other processes and threads do."""
 
-from __future__ import annotations
-
 import time
-from collections.abc import Callable
 
 _MOMENT = 0.01
 
 
-def wait_until(
-    holds: Callable[[], object],
-    *,
-    seconds: float = 30,
-    told: Callable[[], object] = lambda: "it has not come to hold",
-) -> None:
+def wait_until(holds, *, seconds=30, told=lambda: "it has not come to hold"):
     """Look again and again, until something holds.
 
     Args:

@@ -6,13 +6,8 @@ header of seven bytes: blocks of 32 KiB, in which a record is one whole piece (1
 first (2), middle ones (3) and a last one (4), each with its check sum and length.
 """
 
-from __future__ import annotations
-
 import json
 import struct
-from collections.abc import Iterable, Iterator
-from pathlib import Path
-from typing import Any
 
 from wandb.proto import wandb_internal_pb2
 
@@ -22,7 +17,7 @@ _BLOCK = 1 << 15
 _WHOLE, _FIRST, _LAST = 1, 2, 4
 
 
-def records(path: Path) -> Iterator[Any]:
+def records(path):
     """Yield the records of a `.wandb` file."""
     for data in _pieces(path.read_bytes()):
         record = wandb_internal_pb2.Record()
@@ -30,7 +25,7 @@ def records(path: Path) -> Iterator[Any]:
         yield record
 
 
-def history(path: Path) -> list[dict[str, Any]]:
+def history(path):
     """Return what was logged, without W&B's own."""
     return [
         _row(record.history.item)
@@ -39,14 +34,14 @@ def history(path: Path) -> list[dict[str, Any]]:
     ]
 
 
-def axes(path: Path) -> dict[str, str]:
+def axes(path):
     """Return what each metric, or each pattern of metrics, is drawn over."""
     metrics = [r.metric for r in records(path) if r.HasField("metric")]
     return {m.name or m.glob_name: m.step_metric for m in metrics if m.step_metric}
 
 
-def _row(items: Iterable[Any]) -> dict[str, Any]:
-    row: dict[str, Any] = {}
+def _row(items):
+    row = {}
     for item in items:
         # A video is several items, such as its path.
         *outer, last = list(item.nested_key) or [item.key]
@@ -57,7 +52,7 @@ def _row(items: Iterable[Any]) -> dict[str, Any]:
     return {key: value for key, value in row.items() if not key.startswith("_")}
 
 
-def _pieces(data: bytes) -> Iterator[bytes]:
+def _pieces(data):
     magic, _, _ = _HEADER.unpack_from(data)
     assert magic == b":W&B"
     begun = b""

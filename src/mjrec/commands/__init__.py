@@ -6,14 +6,17 @@ from __future__ import annotations
 import argparse
 import contextlib
 import importlib
+import importlib.metadata
 import logging
 import os
 import re
 import sys
 from collections.abc import Iterator, Sequence
+from pathlib import Path
 
 from ..errors import Error
 from ..signals import exiting_on_signals
+from .overview import EXAMPLES, examples, overview, recordings_in
 
 __all__ = ["main"]
 
@@ -22,18 +25,19 @@ __all__ = ["main"]
 # does.
 COMMANDS = {
     "record": ("record", "Record episodes of an environment."),
-    "render": ("render", "Render pending videos, or recorded episodes again."),
-    "recover": ("recover", "Put a directory in order after a kill."),
+    "render": ("render", "Render pending videos, or episodes once more."),
+    "recover": ("recover", "Finish what a killed run left."),
     "list": ("list_episodes", "List recorded episodes."),
     "replay": ("replay", "Write a page that shows an episode in 3D."),
     "view": ("view", "Show a run in a browser while it goes on."),
-    "strip": ("strip", "Make a film strip of an episode."),
+    "strip": ("strip", "Put frames of an episode side by side."),
     "evaluate": ("evaluate", "Evaluate a policy on tasks and seeds."),
     "compare": ("compare", "Compare evaluations."),
-    "report": ("report", "Write a page that shows recordings."),
-    "pack": ("pack", "Pack a monitor directory into one file."),
-    "verify": ("verify", "Check a packed run."),
-    "doctor": ("doctor", "Show whether this machine can record."),
+    "report": ("report", "Make a web page of recordings or results."),
+    "pack": ("pack", "Pack a run into one file for others."),
+    "verify": ("verify", "Run a packed run again and compare."),
+    "doctor": ("doctor", "Check whether this machine can render."),
+    "completion": ("completion", "Print tab completion for a shell."),
 }
 
 _FAILED = 1
@@ -87,24 +91,38 @@ def _run(argv: Sequence[str] | None) -> int:
     return status
 
 
+class _Parser(argparse.ArgumentParser):
+    """Knows the commands; the help is a list in groups."""
+
+    def format_help(self) -> str:
+        return overview(COMMANDS)
+
+
 def _arguments(argv: Sequence[str] | None) -> Sequence[str]:
     """Return the arguments, which begin with a command.
 
     Raises:
-        SystemExit: it is none, or help was asked for; that is printed.
+        SystemExit: there is no such command, or help was asked for; that is printed.
     """
-    parser = argparse.ArgumentParser(
-        prog="mjrec",
-        description="A headless MuJoCo recorder.",
-        epilog="mjrec COMMAND --help says what a command takes.",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    commands = parser.add_subparsers(metavar="COMMAND", required=True, dest="command")
-    for name, (_, what) in COMMANDS.items():
-        commands.add_parser(name, help=what, add_help=False, prefix_chars="\0")
     given = list(sys.argv[1:] if argv is None else argv)
+    if not given:
+        found = recordings_in(Path.cwd())
+        sys.stdout.write(found or overview(COMMANDS))
+        raise SystemExit(0 if found else 2)
+    parser = _Parser(prog="mjrec", usage="mjrec COMMAND [OPTION ...]")
+    parser.add_argument("--version", action="version", version=_version())
+    commands = parser.add_subparsers(metavar="COMMAND", required=True, dest="command")
+    for name in COMMANDS:
+        commands.add_parser(name, add_help=False, prefix_chars="\0")
     parser.parse_args(given[:1])
+    if len(given) == 1 and given[0] in EXAMPLES:
+        sys.stderr.write(examples(given[0]))
+        raise SystemExit(2)
     return given
+
+
+def _version() -> str:
+    return f"mjrec {importlib.metadata.version('mjrec')}"
 
 
 @contextlib.contextmanager

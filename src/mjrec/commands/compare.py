@@ -47,37 +47,37 @@ def compare(
     allow_nan: bool = False,
     as_json: AsJson = False,
 ) -> int:
-    """Compare evaluations: every figure is of B against A.
+    """Compare evaluations: how much better is B than A?
 
-    A and B are two directories: mjrec compare A B. Or they are several each, one for
-    each training: mjrec compare A... --against B... Then the figures are of the
-    evaluations' mean returns, and say how much better the method of B is.
+    Compare two directories, mjrec compare A B, or several trainings on each side,
+    mjrec compare A... --against B... With several, each evaluation counts as one
+    training with its mean return.
 
-    For each task that all have: the means, their difference B - A, the probability of
-    improvement (that B has a higher return than A), and the p-value of the Mann-Whitney
-    test, adjusted (Holm) for the number of tasks. Over all of them: that probability on
-    average, and the difference of the interquartile means of scores.
+    For each common task: both means, their difference B - A, the probability of
+    improvement (B's return is higher than A's), and the p-value of the Mann-Whitney
+    test, adjusted for the number of tasks (Holm). Across tasks: the mean probability
+    of improvement and the difference of the interquartile means of scores.
 
-    The exit status is 1 where a task cannot be compared (no episode was completed, or
-    returns are NaN). With --require or --no-worse-than also where that does not hold,
-    and where an episode of B (with --no-worse-than B: of A) failed.
+    The exit status is 1 if a task cannot be compared (no completed episode, or NaN),
+    and if what --require or --no-worse-than asks for is not met. With one of these it
+    is also 1 if an episode of B failed (with --no-worse-than B: of A).
 
     Args:
         a: A and B; with --against, the directories of A.
         against: the directories of B.
         require: [TASK: ]FIGURE > NUMBER, also >=, < and <=, such as 'probability of
-            improvement > 0.75'. Figures of all tasks: probability of improvement, IQM
-            A, IQM B, IQM difference. Of the task named or, without one, of each: mean
-            A, mean B, difference, paired difference, p-value. Behind a figure, low or
-            high is that end of its interval. May be given several times.
-        no_worse_than: A requires of B that the interquartile mean of its scores is not
-            lower by --margin or more, as the interval has it; B the same of A.
-        margin: of scores, such as 0.05.
-        confidence: the share of intervals that hold the true value.
-        resamples: of the bootstrap that intervals come from.
-        seed: of its generator.
-        allow_nan: returns that are NaN or infinite do not make the exit status 1.
-        as_json: print one JSON object, instead of text.
+            improvement > 0.75'. Figures across tasks: probability of improvement, IQM
+            A, IQM B, IQM difference. Figures of TASK, or of each task: mean A, mean B,
+            difference, paired difference, p-value. A figure followed by low or high is
+            that end of its interval. May be repeated.
+        no_worse_than: A requires that B's interquartile mean score is not lower by
+            --margin or more, as far as the interval tells; B requires the same of A.
+        margin: a score difference, such as 0.05.
+        confidence: confidence level of the intervals.
+        resamples: bootstrap resamples.
+        seed: seed of the bootstrap.
+        allow_nan: NaN and infinite returns do not set the exit status to 1.
+        as_json: print one JSON object instead of text.
     """
     if not against:
         if len(a) != 2:

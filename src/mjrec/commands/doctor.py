@@ -32,14 +32,14 @@ class _Row:
 
 
 def doctor(*, json: bool = False) -> int:
-    """Show whether this machine can record, and what to do if it cannot.
+    """Check whether this machine can render, and show what to do if not.
 
-    Tries each OpenGL backend with a real picture, ffmpeg with a real video, and each
-    package with its simplest task, all in processes of their own. The exit status is 0
-    if a recording would get pictures, else 1.
+    Renders a frame with each OpenGL backend, encodes a video with ffmpeg, and tries the
+    simplest task of each package, in separate processes. The exit status is 0 if a
+    recording would get frames, else 1.
 
     Args:
-        json: print one JSON object instead.
+        json: print one JSON object instead of text.
     """
     waiting = Console(stderr=True)
     with waiting.status("Trying OpenGL, ffmpeg and the packages ..."):

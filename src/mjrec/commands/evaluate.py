@@ -56,9 +56,9 @@ def evaluate(
     policy: str | None = None,
     out: Path | None = None,
     episodes: int | None = None,
-    seeds: str | None = None,
     num_seeds: int | None = None,
     workers: int | None = None,
+    seeds: str | None = None,
     keep: str | None = None,
     protocol: Literal["seeded", "suite"] | None = None,
     resume: bool = False,
@@ -78,56 +78,53 @@ def evaluate(
     as_json: AsJson = False,
     engine_options: Engine = NO_ENGINE,
 ) -> int:
-    """Evaluate a policy: so many episodes of each task, and what came of them.
+    """Evaluate a policy: run episodes of each task and summarise the returns.
 
-    The exit status is 1 where an episode failed (the policy raised, or gave NaN or the
-    wrong shape, or the environment raised), a return is NaN, or a task fell short of
-    --fail-under; the results are written all the same. What was interrupted goes on
-    with mjrec evaluate --resume DIR.
+    The exit status is 1 if an episode failed (the policy or the environment raised, or
+    an action was NaN or misshaped), if a return is NaN, or if a task is below
+    --fail-under. The results are written in any case. mjrec evaluate --resume DIR
+    continues an interrupted evaluation.
 
     Args:
         tasks: environments as in mjrec record, sets (dm_control:benchmarking,
             dm_control:all, dm_control:easy, dm_control:hard, dm_control:extra,
-            gymnasium:mujoco), or patterns in quotes ('dm_control/walker-*').
-        policy: random, zero, module:name or module:name(), as in mjrec record.
-        out: the directory of the evaluation, empty or new.
-        episodes: how many of each task and seed; 10, if it is not given.
-        seeds: of the runs, such as 0,1,2 or 0-99.
-        num_seeds: how many, from 0 on, instead of --seeds; 5, if neither is given.
-        workers: how many processes; one for each CPU, if it is not given. The results
-            do not depend on it. With --engine, how many workers it has.
+            gymnasium:mujoco), or quoted patterns ('dm_control/walker-*').
+        policy: random, zero, module:name, module:name() or a file, as in mjrec record.
+        out: the evaluation's directory, empty or new.
+        episodes: episodes per task and seed. By default 10.
+        num_seeds: number of seeds, from 0 on. By default 5.
+        workers: worker processes. By default one per CPU. Results do not depend on
+            it. With --engine, the number of its workers.
+        seeds: the seeds, such as 0,1,2 or 0-99, instead of --num-seeds.
         keep: which episodes of each task get a video: best, best:N, median, worst,
-            worst:N, failures and failures:N, separated by commas; or cubic, all or
-            none. If it is not given, best,median,worst.
-        protocol: seeded: episode i of seed s starts from NumPy's SeedSequence([s, i]).
-            suite: each task and seed has one random stream, seeded with s. If it is
-            not given, seeded.
-        resume: go on with the evaluation in the directory, and repeat nothing that is
-            finished. mjrec evaluate --resume DIR is enough: what is not given is as it
-            was. More tasks, seeds or episodes may be asked for.
-        force: delete the evaluation that is in the directory.
-        max_steps: ends an episode as truncated; 1000 where the environment itself has
-            no limit.
-        episode_timeout: an episode that takes more seconds has failed.
-        camera: name or number; the model's tracking camera, where there is one, if it
-            is not given.
-        size: of the videos, WIDTHxHEIGHT in pixels.
-        max_fps: the most frames for a second of simulated time; 60, if it is not given.
+            worst:N, failures, failures:N, joined by commas; or cubic, all or none. By
+            default best,median,worst.
+        protocol: seeded starts episode i of seed s from NumPy's SeedSequence([s, i]);
+            suite has one random stream per task and seed, seeded with s. By default
+            seeded.
+        resume: continue the evaluation in the directory and repeat nothing that is
+            finished. Options that are not given stay. You may add tasks, seeds and
+            episodes.
+        force: delete the evaluation in the directory first.
+        max_steps: truncate episodes after this many steps. By default the
+            environment's limit, or 1000.
+        episode_timeout: an episode that takes longer, in seconds, has failed.
+        camera: name or number. By default the model's tracking camera, if it has one.
+        size: size of the videos, WIDTHxHEIGHT in pixels.
+        max_fps: most frames per second of simulated time. By default 60.
         quality: full, or draft: several times faster, with coarser edges and shadows.
-            If it is not given, full.
-        env_kwargs: more arguments for each environment, as a JSON object.
-        policy_kwargs: more arguments for the policy, likewise.
-        score_range: TASK=LOW:HIGH, the returns that count as 0 and as 1 in what is said
-            over all tasks. Those of dm_control have theirs. May be given several
-            times.
-        fail_under: TASK=VALUE. The exit status is 1 where the mean return of this task
-            is below, or an episode of it failed. TASK may be a pattern. May be given
-            several times.
-        allow_nan: returns that are NaN or infinite do not make the exit status 1.
-        confidence: the share of intervals that hold the true value.
+            By default full.
+        env_kwargs: arguments for each environment, as a JSON object.
+        policy_kwargs: arguments for the policy, as a JSON object.
+        score_range: TASK=LOW:HIGH, the returns that count as scores 0 and 1 across
+            tasks. dm_control tasks have their own. May be repeated.
+        fail_under: TASK=VALUE: exit with 1 if the task's mean return is lower or one
+            of its episodes failed. TASK may be a pattern. May be repeated.
+        allow_nan: NaN and infinite returns do not set the exit status to 1.
+        confidence: confidence level of the intervals.
         as_json: print one JSON object at the end, and nothing else.
-        engine_options: where episodes are run and videos are drawn, in place of
-            processes of this command.
+        engine_options: where episodes and videos are computed, instead of processes of
+            this command.
     """
     height, width = size_of(size)
     least = _by_task("--fail-under", fail_under, float, "TASK=VALUE")

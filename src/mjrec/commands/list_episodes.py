@@ -34,16 +34,15 @@ def list_episodes(
     *,
     as_json: AsJson = False,
 ) -> int:
-    """List the recorded episodes of an evaluation, or of a monitor directory.
+    """List the episodes of a monitor directory or an evaluation.
 
-    Of an evaluation: task, seed, return and video of each; of one that is not finished
-    those that are over, whose videos are not chosen yet. Of another directory that has
-    no episodes of its own, those of the monitor directories in it.
+    For an evaluation: task, seed, return and video of each episode, also before it is
+    finished. A folder that only contains monitor directories lists theirs.
 
     Args:
-        directory: the evaluation's, the monitors', or one that holds some of these.
-        as_json: print one JSON object a line and episode, instead of a table; it says
-            `directory` where there are several.
+        directory: a monitor directory, an evaluation, or a folder that contains some.
+        as_json: print one JSON object per line and episode instead of a table. It has
+            `directory` if there are several.
     """
     if is_evaluation(directory):
         results = _fields_of_results(directory)

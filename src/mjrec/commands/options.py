@@ -75,16 +75,14 @@ class EngineOptions:
     """Where the work runs.
 
     Attributes:
-        engine: local, processes of this machine; ray, a Ray cluster; slurm, jobs of a
-            Slurm cluster; dask:ADDRESS, the Dask cluster whose scheduler is there. All
-            machines see the directory under the same name.
-        gpus: how much of a GPU each worker gets; with 0.25 four share one.
-        require_gpu: fail where a worker would draw in software.
-        address: of the Ray cluster, HOST:PORT, or auto for the one that runs here; the
-            one that RAY_ADDRESS names, else one that is started for this command, if it
-            is not given.
-        engine_option: KEY=VALUE, what only this engine has, such as
-            partition=gpu of Slurm. May be given several times.
+        engine: local (processes of this machine), ray, slurm, or dask:ADDRESS of a
+            scheduler. All machines see the directory under the same path.
+        gpus: part of a GPU for each worker; with 0.25 four share one.
+        require_gpu: fail if a worker would render in software.
+        address: of the Ray cluster: HOST:PORT, or auto for the one on this machine. By
+            default RAY_ADDRESS, else a Ray is started for this command.
+        engine_option: KEY=VALUE, an option of this engine, such as partition=gpu for
+            Slurm. May be repeated.
     """
 
     engine: str | None = None

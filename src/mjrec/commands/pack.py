@@ -28,30 +28,29 @@ def pack(
     /,
     *,
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])],
-    title: str | None = None,
     author: tyro.conf.UseAppendAction[tuple[str, ...]] = (),
     license: str | None = None,
-    episodes: str | None = None,
+    title: str | None = None,
     anonymous: bool = False,
+    episodes: str | None = None,
     max_size: str | None = None,
 ) -> int:
-    """Pack a monitor directory into one file that a stranger can verify.
+    """Pack a monitor directory into one file that others can verify.
 
-    It is a zip file: a BagIt bag around an RO-Crate, with the recordings, their
-    statistics as CSV, what they were made with, a README and a CITATION.cff. The same
-    recordings give the same bytes. Whoever gets it checks it with mjrec verify.
+    The zip file is a BagIt bag around an RO-Crate: recordings, statistics as CSV,
+    versions and machine, a README and a CITATION.cff. The same recordings give the
+    same bytes. Readers check it with mjrec verify.
 
     Args:
         directory: the monitor directory.
-        out: the archive, which must not exist; its name ends in .zip.
-        title: of the run; what was recorded, if left out.
-        author: "Name", "Name <address>" or "Name <ORCID>". May be given several times.
-        license: the SPDX identifier of the licence, such as CC-BY-4.0, or its URL.
-        episodes: the numbers of those whose videos and recorded states are packed,
-            such as 0,8,27; all, if left out. The archive says that a choice was made.
-        anonymous: take out everything that names a user, a machine or an author.
-        max_size: the most bytes of the archive, such as 50M. If it would be larger, the
-            videos are drawn again smaller, from the recorded states.
+        out: the archive, a new file that ends in .zip.
+        author: "Name", "Name <address>" or "Name <ORCID>". May be repeated.
+        license: SPDX identifier of the licence, such as CC-BY-4.0, or its URL.
+        title: title of the run. By default what was recorded.
+        anonymous: remove everything that names a user, a machine or an author.
+        episodes: pack videos and states of these episodes only, such as 0,8,27. The
+            archive says so.
+        max_size: size limit, such as 50M. If needed, videos are drawn again, smaller.
     """
     console = rich.console.Console(stderr=True)
     with render_progress(console, title="drawing smaller videos") as on_progress:

@@ -36,74 +36,72 @@ def record(
     *,
     out: Path,
     episodes: int = 1,
-    max_steps: int | None = None,
     policy: str = "random",
-    policy_kwargs: str = "{}",
     seed: int | None = None,
+    size: str | None = None,
+    max_steps: int | None = None,
+    camera: tyro.conf.UseAppendAction[tuple[str, ...]] = (),
     schedule: str | None = None,
     keep: str | None = None,
     force: bool = False,
     resume: bool = False,
-    camera: tyro.conf.UseAppendAction[tuple[str, ...]] = (),
+    quality: Literal["full", "draft"] = "full",
+    workers: int | None = None,
+    render: Literal["deferred", "live", "off"] | None = None,
+    max_fps: float = 60,
+    fps: float | None = None,
     tiled: bool = False,
     annotate: bool = False,
     name_prefix: str | None = None,
-    size: str | None = None,
-    fps: float | None = None,
-    max_fps: float = 60,
-    render: Literal["deferred", "live", "off"] | None = None,
-    workers: int | None = None,
-    quality: Literal["full", "draft"] = "full",
     env_kwargs: str = "{}",
+    policy_kwargs: str = "{}",
     allow_nan: bool = False,
     as_json: AsJson = False,
 ) -> int:
     """Record episodes of an environment.
 
-    The exit status is 1 where a return is NaN or infinite.
+    The exit status is 1 if a return is NaN or infinite.
 
     Args:
         env: a Gymnasium id (HalfCheetah-v5), dm_control/<domain>-<task>
             (dm_control/humanoid-run) or the path of an MJCF file.
         out: the monitor directory.
-        episodes: how many to record.
-        max_steps: ends an episode as truncated; 1000 where the environment itself has
-            no limit.
-        policy: random, zero, or module:name. A class is built with the environment, a
-            function is the policy, module:name() is called with the environment and
-            returns the policy. Or a file that you trust: model.zip of
-            Stable-Baselines3, TorchScript (.pt) or ONNX (.onnx).
-        policy_kwargs: more arguments for the class, the call or the file's reader
-            (device), as a JSON object.
-        seed: S; episode i starts from NumPy's SeedSequence([S, i]). A fresh one, which
-            is printed, if it is not given.
+        episodes: number of episodes.
+        policy: random, zero, module:name (a function, or a class that is built with
+            the environment), module:name() (called with the environment, returns
+            the policy), or a file you trust: model.zip of Stable-Baselines3,
+            TorchScript (.pt), ONNX (.onnx).
+        seed: S; episode i starts from NumPy's SeedSequence([S, i]). By default a new
+            seed, which is printed.
+        size: size of the videos, WIDTHxHEIGHT in pixels.
+        max_steps: truncate episodes after this many steps. By default the
+            environment's limit, or 1000.
+        camera: name or number. By default the model's tracking camera, if it has one.
+            Repeat it for a video from each.
         schedule: which episodes get a video: cubic (0, 1, 8, 27 ... and every 1000th),
-            all, none, every:N or at:0,5,9. If neither it nor keep is given, cubic.
-        keep: which episodes get a video, decided when they have ended: best:N or
-            worst:N (by return), failures or failures:N (the first N), or median.
-            Every episode is recorded, and what is not chosen is deleted.
-        force: delete the recordings that are in the directory.
-        resume: add to the recordings that are in the directory.
-        camera: name or number; the model's tracking camera, where there is one, if it
-            is not given. Given more than once: a video from each.
-        tiled: one video of all cameras side by side.
-        annotate: write episode, step, time and return on the frames.
-        name_prefix: videos get the names that Gymnasium's RecordVideo would give them,
-            PREFIX-episode-27.mp4, besides their own.
-        size: of the videos, WIDTHxHEIGHT in pixels.
-        fps: frames per second written into the videos; real time, if not given.
-        max_fps: the most frames for a second of simulated time; of a faster simulation
-            every second, third ... step is shown, and always the last.
-        render: deferred: record states, and draw the videos from them in processes of
-            their own. live: draw while the simulation runs. off: no videos, only
-            statistics and trajectories. If it is not given, deferred where the
-            pictures are known to be the same, else live.
-        workers: how many processes draw deferred videos; one for each CPU, if it is not
-            given. 0 draws nothing now, needs no OpenGL, and leaves the videos pending:
-            mjrec render DIR makes them.
+            all, none, every:N or at:0,5,9. By default cubic.
+        keep: choose the videos after the episodes have ended: best:N or worst:N (by
+            return), failures, failures:N (the first N) or median. Other recordings
+            are deleted.
+        force: delete the recordings in the directory first.
+        resume: add to the recordings in the directory.
         quality: full, or draft: several times faster, with coarser edges and shadows.
-        env_kwargs: more arguments for the environment, as a JSON object.
-        allow_nan: returns that are NaN or infinite do not make the exit status 1.
+        workers: processes that render deferred videos. By default one per CPU. 0
+            renders nothing now and needs no OpenGL; mjrec render DIR does it later.
+        render: deferred saves states and renders in worker processes; live renders
+            while the simulation runs; off makes no videos. By default deferred if
+            the frames are known to be the same, else live.
+        max_fps: most frames per second of simulated time. Steps in between are left
+            out of the video; the last step never is.
+        fps: frames per second written into the videos. By default real time.
+        tiled: one video with all cameras side by side.
+        annotate: write episode, step, time and return on the frames.
+        name_prefix: also give the videos the names of Gymnasium's RecordVideo:
+            PREFIX-episode-27.mp4.
+        env_kwargs: arguments for the environment, as a JSON object.
+        policy_kwargs: arguments for the policy's class, call or file reader, as a JSON
+            object.
+        allow_nan: NaN and infinite returns do not set the exit status to 1.
         as_json: print one JSON object at the end, and nothing else.
     """
     height, width = size_of(size)

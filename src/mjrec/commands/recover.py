@@ -25,18 +25,16 @@ def recover(
     timeout: float = 5.0,
     as_json: AsJson = False,
 ) -> int:
-    """Put a directory in order whose recording, or rendering, was killed.
+    """Finish what a killed recording or rendering left in a directory.
 
-    Videos that were recorded live get their names, logs become trajectories, and
-    statistics and manifest are made of the journal. What was cut off is marked
-    incomplete. Files of processes that are alive are left alone. Videos that were to
-    be rendered later stay pending: mjrec render DIR.
+    Live videos get their names, logs become trajectories, and statistics and manifest
+    are written from the journal. What was cut off is marked incomplete. Files of living
+    processes are not touched. Deferred videos stay pending: mjrec render DIR.
 
     Args:
-        directory: the monitor directory, or that of an evaluation.
-        timeout: how many seconds to wait for encoders that have outlived the process
-            that recorded, and are finishing their files.
-        as_json: print one JSON object, instead of text.
+        directory: a monitor directory or an evaluation.
+        timeout: seconds to wait for encoders that are still finishing their files.
+        as_json: print one JSON object instead of text.
     """
     recovery = _recover_all(directory, timeout)
     if as_json:

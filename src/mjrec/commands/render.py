@@ -36,58 +36,57 @@ def render(
     target: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="DIR|FILE")],
     /,
     *,
-    pending: bool = False,
     episode: int | None = None,
     camera: str | None = None,
     size: str | None = None,
-    max_fps: float | None = None,
     quality: Literal["full", "draft"] | None = None,
+    workers: int | None = None,
+    out: Path | None = None,
+    max_fps: float | None = None,
     fps: float | None = None,
     annotate: bool = False,
     no_annotate: bool = False,
-    out: Path | None = None,
-    workers: int | None = None,
+    pending: bool = False,
     strict: bool = False,
     trust_models: bool = False,
     as_json: AsJson = False,
     engine_options: Engine = NO_ENGINE,
 ) -> int:
-    """Render the pending videos of a directory, or recorded episodes again.
+    """Render pending videos, or recorded episodes once more.
 
-    Without an option that asks for something other than recorded, the videos that are
-    not there yet are rendered, as they were to be. Several of these commands on one
-    directory share the work. With one (--camera, --size, --max-fps, --quality, --fps,
-    --annotate, --no-annotate, --out) recorded episodes are rendered once more, into new
-    files beside the originals, which nothing changes:
-    openaigym.video.<...>.video000027.side.mp4. Of an episode that was recorded with
-    several cameras that is one video: of --camera, or of the first one, or of all side
-    by side where it was recorded so.
+    Without options, all pending videos of the directory are rendered as planned.
+    Several of these commands on one directory share the work.
+
+    With an option that asks for another video (such as --camera, --size, --quality,
+    or --out) recorded episodes are rendered once more, into new files beside the
+    originals: openaigym.video.<...>.video000027.side.mp4. An episode with several
+    cameras gives one video: of --camera, else of the first camera, or tiled if it was
+    recorded tiled.
 
     Args:
-        target: a monitor directory, or that of an evaluation; or a trajectory or video
-            in one, for that episode only.
-        pending: render the pending videos, which is also what is done without any
-            option.
-        episode: its number; all recorded ones, if it is not given. Of an evaluation the
-            one of this number in each task and seed.
-        camera: name or number; as recorded, if it is not given. So with all of these.
+        target: a monitor directory or an evaluation; or one of their trajectories or
+            videos, for that episode only.
+        episode: number of the episode. By default all recorded ones. In an evaluation,
+            the episode with this number of each task and seed.
+        camera: name or number. By default as recorded, like the options below.
         size: WIDTHxHEIGHT in pixels.
-        max_fps: the most frames per second of simulated time; every n-th recorded
-            frame is drawn, and the last.
         quality: full, the model's own settings, or draft, several times faster.
-        fps: frames per second written into the file; selects nothing.
+        workers: processes that render. By default one per free CPU. With --engine,
+            the number of its workers.
+        out: the file to write, for one episode. Its suffix chooses the format.
+        max_fps: most frames per second of simulated time; every n-th recorded frame
+            is drawn, and the last.
+        fps: frames per second written into the file. It does not select frames.
         annotate: write episode, step, time and return on the frames.
-        no_annotate: leave the frames without that, where it was recorded so.
-        out: the file to write, for one episode; its ending says which kind.
-        workers: how many processes draw; one for each CPU that is free, if it is not
-            given. With --engine, how many workers it has.
-        strict: fail where a video shows nothing: black, of one colour, or without any
-            movement; it is kept.
-        trust_models: load compiled models also where another user, or another machine,
-            has written them, as is needed where their sources are not there. A crafted
-            one can do anything to whoever loads it.
+        no_annotate: leave recorded captions out.
+        pending: render the pending videos only. This is the default.
+        strict: fail if a video shows nothing (black, one colour, no movement). The
+            video is kept.
+        trust_models: load compiled models that another user or machine wrote. Needed
+            if their sources are missing. A crafted model can run any code, so
+            use it only if you trust the author.
         as_json: print one JSON object at the end, and nothing else.
-        engine_options: where it is done, in place of processes of this command.
+        engine_options: where the work runs, instead of processes of this command.
     """
     height, width = size_of(size)
     if annotate and no_annotate:

@@ -29,25 +29,23 @@ def report(
     verification: tyro.conf.UseAppendAction[tuple[Path, ...]] = (),
     as_json: AsJson = False,
 ) -> int:
-    """Write a page that shows recordings: figures, curves, videos, how they came about.
+    """Make a web page of recordings: figures, curves, videos and their provenance.
 
-    It is a folder with an index.html that opens from the disk and needs no network;
-    videos are copied into it. It works for what mjrec evaluate and mjrec record have
-    written and for any monitor directory, also of old gym, and needs no MuJoCo and no
-    OpenGL. What cannot be read is named on the page, and the rest is shown.
+    The result is a folder with index.html and copies of the videos. It opens from disk
+    without a network, and making it needs no MuJoCo and no OpenGL. Directories of old
+    gym work too. Unreadable files are named on the page.
 
     Args:
-        directories: evaluations, monitor directories, or folders with such directories
-            directly in them.
-        out: the folder to write. A report that is there is replaced, another folder
-            that is not empty is not.
-        single_file: put posters and videos into the page itself, as far as they fit;
-            --out may then be the name of the page.
-        max_single_file_bytes: the most bytes of that page; videos that do not fit are
-            left out, with a note.
-        title: of the page.
-        verification: a file that mjrec verify --json has printed. May be given several
-            times; a verification.json in a directory is found by itself.
+        directories: evaluations, monitor directories, or folders that contain some.
+        out: the folder to write. An existing report is replaced; another folder that
+            is not empty is left alone.
+        single_file: put images and videos into the page itself. --out may then name
+            the page.
+        max_single_file_bytes: size limit of that page. Videos that do not fit are left
+            out, with a note.
+        title: title of the page.
+        verification: output of mjrec verify --json. May be repeated. A
+            verification.json in a directory is found by itself.
         as_json: print one JSON object at the end.
     """
     console = rich.console.Console(stderr=True)

@@ -18,28 +18,27 @@ def strip(
     file: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="FILE")],
     /,
     *,
-    frames: int = 8,
-    columns: int | None = None,
-    camera: str | None = None,
-    size: str | None = None,
-    quality: Literal["full", "draft"] | None = None,
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])] = Path("strip.png"),
+    frames: int = 8,
+    size: str | None = None,
+    camera: str | None = None,
+    columns: int | None = None,
+    quality: Literal["full", "draft"] | None = None,
     as_json: AsJson = False,
 ) -> int:
-    """Make a film strip: pictures of an episode side by side, with their times.
+    """Put frames of an episode side by side, with their times.
 
-    They are evenly spread, the first and the last one included. From a trajectory they
-    are drawn again, of any size and from any camera, as sharp as they were rendered;
-    from a video they are decoded.
+    Frames are evenly spread, first and last included. From a trajectory they are
+    rendered, in any size and from any camera; from a video they are decoded.
 
     Args:
         file: a trajectory (openaigym.trajectory.*.h5) or a video.
-        frames: how many pictures.
-        columns: how many side by side; all of up to eight, if it is not given.
-        camera: of a trajectory: name or number; as recorded, if it is not given.
-        size: of a trajectory: WIDTHxHEIGHT of each picture in pixels.
-        quality: of a trajectory: full, the model's own settings, or draft.
         out: the PNG to write.
+        frames: number of frames.
+        size: of a trajectory: WIDTHxHEIGHT of each frame in pixels.
+        camera: of a trajectory: name or number. By default as recorded.
+        columns: frames per row. By default up to eight.
+        quality: of a trajectory: full, the model's own settings, or draft.
         as_json: print one JSON object at the end.
     """
     height, width = size_of(size)

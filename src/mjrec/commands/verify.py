@@ -25,37 +25,36 @@ def verify(
     /,
     *,
     level: Literal["files", "stats", "physics", "pixels"] = "pixels",
-    sample: int | None = None,
-    seed: int | None = None,
-    trust: tyro.conf.UseAppendAction[tuple[str, ...]] = (),
-    allow: tyro.conf.UseAppendAction[tuple[str, ...]] = (),
     report: Path | None = None,
+    sample: int | None = None,
+    allow: tyro.conf.UseAppendAction[tuple[str, ...]] = (),
     verbose: bool = False,
+    trust: tyro.conf.UseAppendAction[tuple[str, ...]] = (),
+    seed: int | None = None,
     as_json: Annotated[bool, tyro.conf.arg(name="json")] = False,
 ) -> int:
-    """Make a packed run again from its seeds and actions, and compare.
+    """Run a packed run again from its seeds and actions, and compare.
 
-    What is verified may be anybody's: it is read, made again and compared in processes
-    with limits, without network and home, and no code that it names is run. The exit
-    status is 0 where everything was made again and is equal (PASS), 3 where nothing
-    contradicts it and something is believed (PARTLY), 1 else (FAIL).
+    The archive may come from a stranger: it is read, run and compared in processes with
+    limits, without network or home directory, and no code that it names is executed.
+    The exit status is 0 (PASS: all equal), 3 (PARTLY: nothing contradicts, but
+    something had to be believed) or 1 (FAIL).
 
     Args:
-        path: what mjrec pack has made, that unpacked, or a monitor directory.
-        level: where to stop. files is the bag only; stats makes rewards, ends,
-            statistics and the selection of episodes again; physics all states too;
-            pixels all frames and files too.
-        sample: how many frames of each video to draw; all, if left out.
-        seed: of the random choice of these frames; one that cannot be foreseen, if
-            left out. It is printed.
-        trust: the id of an environment that may be made though it is in no registry of
-            Gymnasium's or dm_control's. This runs code that you have installed. May be
-            given several times.
-        allow: an excuse that is taken, by name and value, "gl=NVIDIA H100" for
-            instance. May be given several times.
-        report: where to write a page about it (HTML, one file).
+        path: an archive of mjrec pack, an unpacked one, or a monitor directory.
+        level: where to stop. files checks the bag; stats also rewards, ends, statistics
+            and the selection of episodes; physics also all states; pixels also all
+            frames and files.
+        report: write an HTML page about the result to this file.
+        sample: check only this many frames of each video.
+        allow: accept an excuse, by name and value, such as "gl=NVIDIA H100". May be
+            repeated.
         verbose: show every finding.
-        as_json: print one JSON object, instead of text.
+        trust: id of an environment that may be made although it is not in Gymnasium's
+            or dm_control's registry. This runs code that you have installed. May be
+            repeated.
+        seed: seed for --sample. By default a random one, which is printed.
+        as_json: print one JSON object instead of text.
     """
     with progress_bar(rich.console.Console(stderr=True)) as show:
 

@@ -10,11 +10,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from ..formats.monitor_directory import Infix, trajectory_prefix, video_prefix
+from ..formats.notebook import shown
 from .episode_results import EpisodeResult
 from .plan import EvaluationPlan
 from .result_tables import EpisodeFiles
 from .results_files import ChosenEpisode
-from .statistics import Bootstrap
+from .statistics import Bootstrap, Interval
 from .summaries import AcrossTasks, TaskSummary
 
 
@@ -68,6 +69,20 @@ class Evaluation:
     selection: Mapping[str, Sequence[ChosenEpisode]]
     videos: Sequence[Path] = ()
     pending: Mapping[Path, str] = field(default_factory=dict)
+
+    def _repr_html_(self) -> str:
+        """Show the evaluation in a notebook: a row per task, and the chosen videos."""
+        facts = {"episodes": len(self.results), "directory": self.directory}
+        level = f"{100 * self.bootstrap.confidence:g} %"
+        columns = ("task", "episodes", "mean", level, "IQM", "success", "failed")
+        rows = [
+            (
+                *(each.task, each.episodes, each.mean, _extent(each.mean_interval)),
+                *(each.iqm, each.success_rate, each.failed),
+            )
+            for each in self.summaries
+        ]
+        return shown("Evaluation", facts, self.videos, columns=columns, rows=rows)
 
     @property
     def failed(self) -> Sequence[EpisodeResult]:
@@ -135,3 +150,7 @@ class Evaluation:
             KeyError: it was not evaluated.
         """
         return {each.task: each for each in self.summaries}[task]
+
+
+def _extent(interval: Interval | None) -> str:
+    return f"{interval.low:.4g} to {interval.high:.4g}" if interval else ""

@@ -26,6 +26,7 @@ from ..formats.monitor_directory import (
     video_lock_name,
     video_prefix,
 )
+from ..formats.notebook import shown
 from ..rates import to_rate
 from .views import Variant, View
 
@@ -214,6 +215,12 @@ class RenderedVideos:
             blank={name: why for part in parts for name, why in part.blank.items()},
             elsewhere=tuple(name for part in parts for name in part.elsewhere),
         )
+
+    def _repr_html_(self) -> str:
+        """Show the videos in a notebook, and why others are missing."""
+        facts = {"frames": sum(self.videos.values()), **self.failures, **self.blank}
+        title = f"{len(self.videos)} rendered, {len(self.failures)} failed"
+        return shown(title, facts, [self.directory / name for name in self.videos])
 
     @property
     def is_empty(self) -> bool:

@@ -12,6 +12,7 @@ from typing import Any
 from ..errors import UnreadableFile
 from ..formats.journal import JournalEntry, read_journal
 from ..formats.manifest import StatsFile
+from ..formats.notebook import shown
 from .journal_or_stats import MonitorResults
 from .monitor_files import MonitorFiles, monitors_of
 
@@ -63,6 +64,21 @@ class Episode:
     pending: bool = False
     success: bool | None = None
     evaluation: Mapping[str, Any] | None = None
+
+    def _repr_html_(self) -> str:
+        """Show the episode in a notebook: its numbers and its video."""
+        ended = "terminated" if self.terminated else "truncated"
+        facts = {
+            "steps": self.length,
+            "return": self.reward,
+            "ended": None if self.terminated is None else ended,
+            "success": self.success,
+            "seed": self.seed,
+            "monitor": self.monitor,
+            "video": "pending" if self.pending else None,
+        }
+        videos = [] if self.video is None else [self.video]
+        return shown(f"Episode {self.episode_id}", facts, videos)
 
 
 def iter_episodes(directory: str | os.PathLike[str]) -> Iterator[Episode]:

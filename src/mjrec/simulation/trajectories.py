@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from ..errors import InvalidArgument, UnknownName, UnreadableFile
 from ..formats.monitor_directory import infix_of, iter_monitor_files
+from ..formats.notebook import shown
 from ..formats.spans import recordings_in_flight
 from ..formats.trajectory import TrajectoryReader
 from .foreign_files import open_vetted_trajectory
@@ -127,6 +128,28 @@ class Trajectory:
         return (
             f"<Trajectory {self.path.name}: {self.env_id}, {len(self)} steps{ending}>"
         )
+
+    def _repr_html_(self) -> str:
+        """Show the episode in a notebook: its numbers and its video."""
+        title = f"{self.env_id}, episode {self.episode_id}"
+        facts = {
+            "steps": len(self),
+            "return": float(self.rewards.sum()),
+            "seed": self.seed,
+            "state": f"{len(self.states)} x {self.states.shape[1]}",
+            "frames": len(self.frame_steps),
+            "ended": None if self.complete else "incomplete",
+        }
+        return shown(title, facts, self._videos())
+
+    def _videos(self) -> list[Path]:
+        video = self.facts.get("video")
+        name = video.get("name") if isinstance(video, Mapping) else None
+        # A stranger's file may name any path.
+        if not isinstance(name, str) or Path(name).name != name:
+            return []
+        path = self.path.parent / name
+        return [path] if path.is_file() else []
 
     @property
     def env_id(self) -> str | None:

@@ -1,0 +1,162 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The list of commands, examples, and what `mjrec` alone says of a directory."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from ..evaluation.episode_results import EpisodeResult
+
+# Each command, in the group in which people look for it.
+GROUPS = {
+    "Record and render": (
+        "record",
+        "render",
+        "list",
+        "view",
+        "replay",
+        "strip",
+        "recover",
+    ),
+    "Evaluate": ("evaluate", "compare", "report"),
+    "Share": ("pack", "verify"),
+    "Help": ("doctor", "completion"),
+}
+
+# What a command without its arguments shows.
+EXAMPLES = {
+    "record": (
+        "mjrec record HalfCheetah-v5 --out recordings/first",
+        "mjrec record dm_control/walker-walk --out recordings/walker --episodes 10",
+    ),
+    "render": (
+        "mjrec render recordings/first",
+        "mjrec render recordings/first --episode 1 --camera side --size 640x480",
+    ),
+    "list": ("mjrec list recordings/first",),
+    "view": ("mjrec view recordings/first",),
+    "replay": ("mjrec replay recordings/first --episode 1 --out replay.html",),
+    "strip": ("mjrec strip openaigym.video.0.4711.video000001.mp4 -o strip.png",),
+    "recover": ("mjrec recover recordings/first",),
+    "evaluate": (
+        "mjrec evaluate dm_control/walker-walk --policy module:Policy --out results",
+        "mjrec evaluate --resume results",
+    ),
+    "compare": ("mjrec compare results-before results",),
+    "report": ("mjrec report results -o report",),
+    "pack": ("mjrec pack recordings/first -o run.zip",),
+    "verify": ("mjrec verify run.zip",),
+}
+
+_MOST_SHOWN = 10
+
+
+def overview(commands: Mapping[str, tuple[str, str]]) -> str:
+    """Return the commands in their groups, each with what it does."""
+    width = max(map(len, commands))
+    lines = ["mjrec COMMAND [OPTION ...]: a headless MuJoCo recorder", ""]
+    for group, names in GROUPS.items():
+        lines.append(group)
+        lines += (f"  {name:{width}}  {commands[name][1]}" for name in names)
+    lines += ["", "mjrec COMMAND --help shows the options of a command."]
+    return "\n".join(lines) + "\n"
+
+
+def examples(command: str) -> str:
+    """Return how a command is used that was given nothing to work on."""
+    lines = [f"mjrec {command} needs arguments. For example:"]
+    lines += (f"  {example}" for example in EXAMPLES[command])
+    lines.append(f"All options: mjrec {command} --help")
+    return "\n".join(lines) + "\n"
+
+
+def recordings_in(directory: Path) -> str:
+    """Return what is recorded in a directory, and what to do with it.
+
+    Looked at are the directory and two levels below it. Nothing is said of other
+    directories.
+    """
+    try:
+        places = list(itertools.islice(_places(directory, 2), _MOST_SHOWN + 1))
+    except OSError:
+        return ""
+    lines, pending = [], None
+    for place in places[:_MOST_SHOWN]:
+        shown = str(place.relative_to(directory))
+        summary, has_pending = _summary(place)
+        lines.append(f"{shown}: {summary}")
+        pending = pending or (shown if has_pending else None)
+    if not lines:
+        return ""
+    if len(places) > _MOST_SHOWN:
+        lines.append("and more")
+    first = places[0].relative_to(directory)
+    steps = {f"mjrec list {first}": "shows its episodes"}
+    if pending:
+        steps[f"mjrec render {pending}"] = "renders its pending videos"
+    steps[f"mjrec report {first}"] = "makes a web page of it"
+    steps["mjrec --help"] = "shows all commands"
+    width = max(map(len, steps))
+    lines += ["", *(f"{command:{width}}  {what}" for command, what in steps.items())]
+    return "\n".join(lines) + "\n"
+
+
+def _places(directory: Path, levels: int) -> Iterator[Path]:
+    """Yield the evaluations and monitor directories at and below a directory."""
+    # Not at the top: the list of commands is there at once without them.
+    from ..evaluation.results_files import is_evaluation
+    from ..formats.monitor_directory import iter_monitor_files
+
+    if is_evaluation(directory) or any(iter_monitor_files(directory)):
+        yield directory
+    elif levels:
+        for path in sorted(directory.iterdir()):
+            if path.is_dir() and not path.is_symlink() and path.name[0] != ".":
+                yield from _places(path, levels - 1)
+
+
+def _summary(directory: Path) -> tuple[str, bool]:
+    """Return what a directory holds, and whether a video is pending."""
+    from ..errors import Error
+    from ..evaluation.results_files import is_evaluation
+    from ..results import iter_episodes
+    from .terminal import counted
+
+    try:
+        if is_evaluation(directory):
+            results = list(_results(directory))
+            tasks = counted(len({result.task for result in results}), "task")
+            failed = sum(result.failure is not None for result in results)
+            text = f"evaluation of {tasks}, {counted(len(results), 'episode')}"
+            return text + f", {failed} failed" * bool(failed), False
+        episodes = list(iter_episodes(directory))
+    except Error as error:
+        return f"cannot be read: {error}", False
+    parts = [counted(len(episodes), "episode")]
+    if episodes:
+        returns = sorted(episode.reward for episode in episodes)
+        low, high = f"{returns[0]:.4g}", f"{returns[-1]:.4g}"
+        parts.append(f"return {low}" if low == high else f"return {low} to {high}")
+    pending = sum(episode.pending for episode in episodes)
+    videos = sum(episode.video is not None for episode in episodes)
+    parts.append(counted(videos, "video") + f" and {pending} pending" * bool(pending))
+    return ", ".join(parts), bool(pending)
+
+
+def _results(directory: Path) -> Iterator[EpisodeResult]:
+    """Yield the results of an evaluation, also of one that is not finished."""
+    from ..errors import UnreadableFile
+    from ..evaluation.chunk_results import recorded_results
+    from ..evaluation.results_files import read_results
+
+    try:
+        columns = read_results(directory).columns.values()
+    except UnreadableFile:
+        yield from (result for _, result in recorded_results(directory))
+        return
+    for each in columns:
+        yield from each

@@ -1,0 +1,94 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The wheel: what is in it, what it says of itself, and that it works alone."""
+
+from __future__ import annotations
+
+import email
+import os
+import subprocess
+import sys
+import zipfile
+from email.message import Message
+from pathlib import Path
+
+import pytest
+
+import mjrec
+
+ROOT = Path(__file__).parents[1]
+SOURCE = ROOT / "src"
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Build the wheel from the working tree, without a network."""
+    pytest.importorskip("build", reason="the packages' tools are not here")
+    folder = tmp_path_factory.mktemp("wheel")
+    subprocess.run(
+        [
+            *(sys.executable, "-m", "build", "--no-isolation", "--wheel"),
+            *("--outdir", str(folder), str(ROOT)),
+        ],
+        check=True,
+        capture_output=True,
+        timeout=280,
+    )
+    [path] = folder.glob("*.whl")
+    return path
+
+
+def test_wheel_holds_the_package_and_nothing_else(wheel: Path) -> None:
+    """Every file of the package, templates and tables too; no tests or benchmarks."""
+    with zipfile.ZipFile(wheel) as packed:
+        names = set(packed.namelist())
+    package = {
+        str(path.relative_to(SOURCE))
+        for path in (SOURCE / "mjrec").rglob("*")
+        if path.is_file() and "__pycache__" not in path.parts
+    }
+    assert any(name.endswith(".html.jinja") for name in package)
+    assert {name for name in names if ".dist-info/" not in name} == package
+    assert any(name.endswith("licenses/LICENSE") for name in names)
+
+
+def test_metadata_says_what_it_is_for(wheel: Path) -> None:
+    """README, licence, Pythons, and a typed package; no address that is made up."""
+    with zipfile.ZipFile(wheel) as packed:
+        [name] = [n for n in packed.namelist() if n.endswith("dist-info/METADATA")]
+        about: Message = email.message_from_bytes(packed.read(name))
+    assert about["Name"] == "mjrec"
+    assert about["Version"] == mjrec.__version__
+    assert about["License-Expression"] == "Apache-2.0"
+    assert about["Description-Content-Type"] == "text/markdown"
+    assert "Typing :: Typed" in about.get_all("Classifier", [])
+    assert f"version: {mjrec.__version__}\n" in (ROOT / "CITATION.cff").read_text()
+
+
+@pytest.mark.wheel
+def test_wheel_alone_records_renders_evaluates_and_reports(tmp_path: Path) -> None:
+    """In an environment that holds it and what it depends on, far from the sources."""
+    python = os.environ.get("MJREC_TEST_WHEEL")
+    if python is None:
+        pytest.fail("scripts/test --all names an environment with the wheel.")
+
+    def run(*arguments: str) -> str:
+        done = subprocess.run(
+            [python, *arguments],
+            cwd=tmp_path,
+            capture_output=True,
+            text=True,
+            timeout=280,
+        )
+        assert done.returncode == 0, done.stdout + done.stderr
+        return done.stdout
+
+    where = Path(run("-c", "import mjrec; print(mjrec.__file__)").strip())
+    assert not where.is_relative_to(ROOT / "src")
+    small = ("--max-steps", "3", "--size", "32x32")
+    run("-m", "mjrec", "record", "InvertedPendulum-v5", "--out", "a", *small)
+    run("-m", "mjrec", "render", "a", "--episode", "0", "--size", "48x48")
+    assert len(list((tmp_path / "a").glob("*.mp4"))) == 2
+    few = ("--policy", "random", "--episodes", "2", "--num-seeds", "1", *small)
+    run("-m", "mjrec", "evaluate", "InvertedPendulum-v5", "--out", "b", *few)
+    run("-m", "mjrec", "report", "a", "b", "-o", "page")
+    assert (tmp_path / "page" / "index.html").is_file()
