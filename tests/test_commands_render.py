@@ -170,8 +170,6 @@ def test_out_names_the_file(name, tmp_path, mjrec, painter):
         (["--out", f"{VIDEO}.mkv", "--episode", "0"], "name of a recorded video"),
         (["--out", "x.txt", "--episode", "0"], "ends in"),
         (["--out", "/no/such/directory/x.mp4", "--episode", "0"], "/no/such/directory"),
-        (["--address", "auto"], "--engine ray"),
-        (["--engine-option", "partition=gpu"], "--engine slurm"),
         (["--engine", "local", "--engine-option", "partition"], "KEY=VALUE"),
     ],
 )

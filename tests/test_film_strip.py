@@ -139,34 +139,25 @@ def test_usual_columns(video, frames, columns):
     assert strip.shape[1] == 2 + columns * (WIDTH + 2)
 
 
-def test_more_pictures_than_there_are(video, trajectory):
-    """The error says how many there are."""
-    for file in (video, trajectory):
-        with pytest.raises(InvalidArgument, match="has 11 pictures, and 12"):
-            film_strip(file, frames=12)
-
-
 @pytest.mark.parametrize(
-    ("options", "said"),
+    ("kind", "options", "said"),
     [
-        ({"frames": 0}, "frames"),
-        ({"columns": -1}, "columns"),
-        ({"frames": True}, "frames"),
-        ({"camera": "track"}, "trajectory"),
+        ("mp4", {"frames": 12}, "has 11 pictures, and 12"),
+        ("h5", {"frames": 12}, "has 11 pictures, and 12"),
+        ("mp4", {"frames": 0}, "frames"),
+        ("mp4", {"frames": True}, "frames"),
+        ("mp4", {"columns": -1}, "columns"),
+        ("mp4", {"camera": "track"}, "trajectory"),
+        ("mp4", {"frames": 4}, "Ask for fewer or smaller"),
     ],
 )
-def test_what_cannot_be_shown(video, options, said):
-    """Such numbers, and another camera of a video, are an error that says why."""
+def test_what_cannot_be_shown(recorded, monkeypatch, kind, options, said):
+    """Is an error that says what can."""
+    [file] = recorded.glob(f"*.{kind}")
+    monkeypatch.setattr(module, "_MOST_PIXELS", 3 * HEIGHT * WIDTH)
+    assert film_strip(file, frames=2).size
     with pytest.raises(InvalidArgument, match=said):
-        film_strip(video, **options)
-
-
-def test_a_strip_that_is_too_large(video, monkeypatch):
-    """It says what to ask for instead."""
-    monkeypatch.setattr(module, "_MOST_PIXELS", 4 * HEIGHT * WIDTH)
-    assert film_strip(video, frames=2).size
-    with pytest.raises(InvalidArgument, match="Ask for fewer or smaller"):
-        film_strip(video, frames=4)
+        film_strip(file, **options)
 
 
 def test_other_files(video, tmp_path):
