@@ -265,7 +265,7 @@ def test_wrong_usage_is_status_2(mjrec):
     assert left.value.code == 2
 
 
-@pytest.mark.thorough
+# Takes more than five seconds: three videos, by renderers that start for them.
 def test_cameras_are_a_video_each_or_one_side_by_side(mjrec, tmp_path):
     """All are listed; captions and second names are asked for likewise."""
     (tmp_path / "model.xml").write_text(PENDULUM)
