@@ -283,7 +283,8 @@ def test_cameras_are_a_video_each_or_one_side_by_side(mjrec, tmp_path):
     [frame, *_] = frames_in(tmp_path / "b", 0)
     assert frame.shape == (48, 128, 3)
     about = metadata_of(tmp_path / "b", 0)
-    assert (about["tiled"], about["annotated"]) == (True, True)
+    assert about["tiled"]
+    assert about["annotated"]
     assert (tmp_path / "b" / "rl-video-episode-0.mp4").exists()
 
 
