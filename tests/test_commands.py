@@ -432,34 +432,6 @@ def test_help_flows(mjrec, capsys, command):
     assert command != "record" or "By default the environment's limit, or 1000" in words
 
 
-@pytest.mark.parametrize(
-    ("arguments", "unneeded"),
-    [
-        (["--help"], {"tyro", "rich", "numpy", "mujoco", "h5py"}),
-        (["list", "."], {"mujoco", "gymnasium", "h5py", "scipy", "imageio"}),
-    ],
-)
-def test_a_command_loads_only_what_it_needs(tmp_path, arguments, unneeded):
-    """So that help is there at once, and a list nearly so."""
-    code = (
-        "import sys\n"
-        "from mjrec.commands import main\n"
-        "try:\n"
-        "    main(sys.argv[1:])\n"
-        "finally:\n"
-        "    print(*sys.modules, file=sys.stderr)"
-    )
-    done = subprocess.run(
-        [sys.executable, "-c", code, *arguments],
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    assert done.stdout
-    assert not unneeded & set(done.stderr.split())
-
-
 def test_what_is_said_by_mujoco_and_of_a_policy_is_said_once(
     mjrec, tmp_path, monkeypatch
 ):

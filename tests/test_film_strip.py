@@ -2,12 +2,11 @@
 """Film strips show the right pictures with the right times."""
 
 import json
-import subprocess
-import sys
 
 import gymnasium
 import numpy as np
 import pytest
+from engine_runs import run_python
 from PIL import Image
 from recordings import frames_of
 
@@ -227,10 +226,4 @@ def test_without_pillow(video):
         "try:\n    film_strip(sys.argv[1])\n"
         "except mjrec.MissingDependency as error:\n    print(error)"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", code, str(video)],
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    assert "Pillow" in done.stdout
+    assert "Pillow" in run_python("-c", code, str(video))

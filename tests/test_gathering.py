@@ -5,14 +5,13 @@ import json
 import os
 import shlex
 import shutil
-import subprocess
-import sys
 import tracemalloc
 from pathlib import Path
 
 import gymnasium
 import numpy as np
 import pytest
+from engine_runs import run_python
 from parts import parametrize
 
 import mjrec
@@ -369,13 +368,7 @@ def test_gathering_needs_no_simulator_no_opengl_and_no_ffmpeg(recorded):
         "contents = gather(sys.argv[1])\n"
         "print(contents.tasks[0].summary.episodes, len(contents.videos))"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", code, str(recorded)],
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    assert done.stdout.split() == ["2", "4"]
+    assert run_python("-c", code, str(recorded)).split() == ["2", "4"]
 
 
 @pytest.mark.thorough
