@@ -92,8 +92,8 @@ def pack(
         authors: each "Name", "Name <address>" or "Name <ORCID>".
         license: SPDX identifier of the licence, such as "CC-BY-4.0", or its URL.
         episodes: numbers of the episodes whose videos and states are packed. None is
-            all, as always of several directories. Statistics, actions and seeds of all are packed in any case, and the
-            archive says that a choice was made.
+            all, as always of several directories. Statistics, actions and seeds of all
+            are packed in any case, and the archive says that a choice was made.
         anonymous: remove everything that names a user, a machine or an author, for
             blind review.
         max_size: size limit in bytes, a number or `"50M"` (50 million). A larger
