@@ -9,6 +9,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from ..errors import DirectoryInUse
+from ..formats.bundle import trajectories_in
 from ..formats.journal import MOST_EPISODES
 from ..formats.locks import is_locked
 from ..formats.monitor_directory import (
@@ -16,6 +17,7 @@ from ..formats.monitor_directory import (
     VideoName,
     episode_of,
     infix_of,
+    is_bundle,
     is_manifest,
     iter_monitor_files,
     log_number,
@@ -44,7 +46,8 @@ class MonitorFiles:
         lock: what it claimed its infix with; it is left where the monitor was killed.
         videos: its videos, by the numbers of their episodes.
         metadata: their metadata, likewise.
-        trajectories: the recorded states, likewise; also what is in flight.
+        trajectories: the own files of recorded states, likewise; also what is in
+            flight, or in a bundle.
         logs: its row logs; also one of which only a file beside it is left.
         last_episode_id: the highest number of an episode in a name, also of a file
             that was never finished; -1 where there is none.
@@ -99,6 +102,9 @@ class MonitorFiles:
                 self.videos[video.episode_id] = path
             elif video.ending == "meta.json":
                 self.metadata[video.episode_id] = path
+        elif is_bundle(path.name):
+            for bundled in trajectories_in(path):
+                self._sort_in(bundled)
         elif log_number(path.name) is not None:
             self.logs.add(path.with_suffix(LOG))
         elif path.suffix == ".h5" and number is not None:
@@ -153,12 +159,11 @@ def detect_training_manifests(
 ) -> list[str]:
     """Return the paths of the manifests in `directory`, sorted.
 
-    Unfinished manifests and files with names like a manifest's are left out. A
-    directory that is not there has none.
+    Unfinished files and similar names are left out. A missing directory has none.
 
     Args:
-        directory: where to look; not below it.
-        files: the names to choose from, instead of what the directory holds.
+        directory: where to look, not below it.
+        files: names to choose from, instead of the directory's.
     """
     directory = Path(directory)
     if files is None:
@@ -167,9 +172,9 @@ def detect_training_manifests(
 
 
 def detect_monitor_files(directory: str | os.PathLike[str]) -> list[str]:
-    """Return the paths of all files in `directory` that monitors finished, sorted.
+    """Return the paths of all finished monitor files in `directory`, sorted.
 
-    Files that only begin like one (`openaigym.notes.txt`) are left out.
+    Other files with a similar name (`openaigym.notes.txt`) are left out.
     """
     return [str(path) for path in iter_monitor_files(Path(directory))]
 
@@ -177,13 +182,11 @@ def detect_monitor_files(directory: str | os.PathLike[str]) -> list[str]:
 def clear_monitor_files(directory: str | os.PathLike[str]) -> None:
     """Remove the files of all monitors in `directory`, also unfinished ones.
 
-    Also the second names of videos (`rl-video-episode-27.mp4`), where they lead to one
-    of these files. Nothing else is removed: no directory, and no file that only begins
-    like a monitor's.
+    Also removes links to their videos (`rl-video-episode-27.mp4`), and nothing else: no
+    directory, and no other file with a similar name.
 
     Raises:
-        DirectoryInUse: a monitor that is still open writes there. Nothing was
-            removed.
+        DirectoryInUse: a monitor there is open. Nothing was removed.
     """
     paths = list(iter_monitor_files(Path(directory), hidden=True))
     for path in paths:
