@@ -108,9 +108,12 @@ def pages() -> Iterator[Any]:
     complaints: list[str] = []
     with sync_playwright() as playwright:
         found = shutil.which("chromium") or playwright.chromium.executable_path
-        browser = playwright.chromium.launch(executable_path=found, args=_OPTIONS)
+        browsers = []
 
         def opened(address: str) -> Page:
+            # One for each page: they draw without a GPU, and would wait for each other.
+            browser = playwright.chromium.launch(executable_path=found, args=_OPTIONS)
+            browsers.append(browser)
             page = browser.new_page(viewport=_SIZE)
             page.set_default_timeout(120_000)
             page.on("pageerror", lambda error: complaints.append(str(error)))
@@ -120,7 +123,8 @@ def pages() -> Iterator[Any]:
             return page
 
         yield opened
-        browser.close()
+        for browser in browsers:
+            browser.close()
     known = ("file:", "data:", "blob:", "http://127.0.0.1:")
     assert [each for each in complaints if not each.startswith(known)] == []
 
