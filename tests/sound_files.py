@@ -1,12 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """One sound file of every kind that is read back, to be spoilt."""
 
-from __future__ import annotations
-
 import json
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
 
 import mujoco
 import numpy as np
@@ -24,30 +19,30 @@ PARTS = (".log", ".tail", ".looks")
 SPHERE = '<mujoco><worldbody><geom size=".1"/></worldbody></mujoco>'
 
 
-def manifest(directory: Path) -> Path:
+def manifest(directory):
     return write_saved(directory, "0.7", 3)
 
 
-def stats(directory: Path) -> Path:
+def stats(directory):
     write_saved(directory, "0.7", 3)
     return directory / "openaigym.episode_batch.0.7.stats.json"
 
 
-def journal(directory: Path) -> Path:
+def journal(directory):
     return write_journal(directory, "0.7", 3)
 
 
-def metadata(directory: Path) -> Path:
+def metadata(directory):
     path = directory / "openaigym.video.0.7.video000000.meta.json"
     path.write_text('{"broken": false}')
     return path
 
 
-def finished(directory: Path) -> Path:
+def finished(directory):
     return finish_trajectory(write_log(directory))
 
 
-def stored(directory: Path, xml: str = SPHERE) -> dict[str, Any]:
+def stored(directory, xml=SPHERE):
     source = directory.parent / "main.xml"
     source.write_text(xml)
     store = ModelStore(directory)
@@ -58,32 +53,32 @@ def stored(directory: Path, xml: str = SPHERE) -> dict[str, Any]:
     return facts
 
 
-def compiled(directory: Path) -> Path:
+def compiled(directory):
     facts = {**stored(directory), "xml": None}
     (directory / "facts.json").write_text(json.dumps(facts))
     return directory / facts["mjb"]
 
 
-def source(directory: Path) -> Path:
+def source(directory):
     facts = {**stored(directory), "mujoco": "3.1.4", "mjb": None}
     (directory / "facts.json").write_text(json.dumps(facts))
     return directory / facts["xml"]
 
 
-def mjcf(directory: Path) -> Path:
+def mjcf(directory):
     path = directory / "sphere.xml"
     path.write_text(SPHERE)
     return path
 
 
-def video(directory: Path) -> Path:
+def video(directory):
     path = directory / "openaigym.video.0.7.video000000.mp4"
     path.write_bytes(b"frames")
     metadata(directory)
     return path
 
 
-def killed(directory: Path) -> Path:
+def killed(directory):
     """Record an episode and be killed; return its log."""
     dtype = row_dtype(observation=np.dtype(("<f8", (9,))))
     logs = new_logs(directory, tail_bytes=1)
@@ -98,16 +93,16 @@ def killed(directory: Path) -> Path:
     return log
 
 
-def journal_of_killed(directory: Path) -> Path:
+def journal_of_killed(directory):
     return killed(directory).with_name(journal_name(INFIX))
 
 
-def killed_with(part: str) -> Callable[[Path], Path]:
+def killed_with(part):
     return lambda directory: killed(directory).with_suffix(part)
 
 
 # Each with the reader of `hostile_reading` that it is for.
-FILES: dict[str, tuple[str, Callable[[Path], Path]]] = {
+FILES = {
     "manifest": ("manifest", manifest),
     "stats": ("stats", stats),
     "journal": ("journal", journal),

@@ -8,7 +8,6 @@ import contextlib
 import functools
 import os
 import signal
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
@@ -30,8 +29,6 @@ from mjrec.engines.local import LocalEngine
 from mjrec.engines.ray import RayEngine
 from mjrec.engines.slurm import SlurmEngine
 from mjrec.errors import Error, InvalidArgument
-
-Begin = Callable[..., Run]
 
 pytestmark = [
     # Ray's own connections and pipes, of which it says so when they are collected.
@@ -104,7 +101,6 @@ def test_jobs_get_settings_and_arguments(begin):
         submit(run, "0", do="echo", text="ß\n")
         seen = []
         for outcome in run.results():
-            assert outcome is not None
             seen.append(outcome.key)
             if len(seen) < 4:
                 submit(run, str(len(seen)), do="echo")

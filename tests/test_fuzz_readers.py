@@ -6,21 +6,16 @@ checksums that are right again. It always makes the same ones. What could take t
 process with it is read in forks.
 """
 
-from __future__ import annotations
-
 import contextlib
 import copy
 import itertools
 import json
 import os
 import struct
-from collections.abc import Callable, Iterator
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
-from hostile_reading import Inspector, Outcome
+from hostile_reading import Inspector
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from sound_files import compiled, finished, source
@@ -58,17 +53,17 @@ FEWER = settings(FEW, max_examples=20)
 # --- JSON ----------------------------------------------------------------------------
 
 # What has broken readers: each is tried in every place.
-NASTY: list[Any] = [
+NASTY = [
     *(None, True, 0, 5, -1, 0.5, 10**400, 2**64, -(2**63), 1e308, float("inf")),
     *("", "5", "..", "../x", "a/b", "\ud800", "a" * 300, "1e999999999"),
     *([], {}, [5], [None], ["../x"], [[]], {"a": 1}, [{}], [{"video": 5}]),
 ]
 
 
-def spoilt(sound: Any) -> Iterator[Any]:
+def spoilt(sound):
     """Yield `sound` with each thing in it replaced by each nasty one, and left out."""
     if isinstance(sound, dict | list):
-        keys: list[Any] = [*sound] if isinstance(sound, dict) else [*range(len(sound))]
+        keys = [*sound] if isinstance(sound, dict) else [*range(len(sound))]
         for key in keys:
             for inner in spoilt(sound[key]):
                 changed = copy.copy(sound)
@@ -92,7 +87,7 @@ DAMAGE = st.lists(
 )
 
 
-def damaged(data: bytes, damage: list[tuple[float, str, int, int]]) -> bytes:
+def damaged(data, damage):
     """Return `data` with bytes flipped, set, overwritten, cut off or put in."""
     result = bytearray(data)
     for place, what, byte, number in damage:
@@ -148,7 +143,7 @@ ENTRY = {
 METADATA = {"broken": True, "frame_steps": [[0, 3]], "episode_id": 2}
 
 
-def manifest(path: Path) -> None:
+def manifest(path):
     """What is read can be written again, and names files of the directory only."""
     found = read_manifest(path)
     names = [found.stats, *(name for pair in found.videos for name in pair)]
@@ -159,25 +154,25 @@ def manifest(path: Path) -> None:
     update_manifests(path.parent)
 
 
-def statistics(path: Path) -> None:
+def statistics(path):
     found = read_stats_file(path)
     write_stats_file(path, found)
     assert read_stats_file(path).episode_lengths == found.episode_lengths
 
 
-def journal(path: Path) -> None:
+def journal(path):
     """The lines that cannot be written again are left out."""
     with contextlib.closing(JournalWriter(path.with_name("again"))) as writer:
         for entry in read_journal(path):
             writer.append(entry)
 
 
-def metadata(path: Path) -> None:
+def metadata(path):
     """What cannot be read calls no video broken."""
     assert is_broken(path) in (True, False)
 
 
-KINDS: dict[str, tuple[str, Any, Callable[[Path], None]]] = {
+KINDS = {
     "manifest": ("manifest.0.7.manifest.json", MANIFEST, manifest),
     "statistics": ("episode_batch.0.7.stats.json", STATS, statistics),
     "journal": ("episodes.0.7.jsonl", ENTRY, journal),
@@ -185,12 +180,12 @@ KINDS: dict[str, tuple[str, Any, Callable[[Path], None]]] = {
 }
 
 
-def read_or_refuse(directory: Path, kind: str, data: bytes) -> None:
+def read_or_refuse(directory, kind, data):
     """Read a file; the only error is one that names it."""
     name, _, read = KINDS[kind]
     path = directory / f"openaigym.{name}"
     path.write_bytes(data)
-    refusal: UnreadableFile | None = None
+    refusal = None
     try:
         read(path)
     except UnreadableFile as error:
@@ -200,7 +195,7 @@ def read_or_refuse(directory: Path, kind: str, data: bytes) -> None:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_every_file_with_one_thing_wrong(tmp_path: Path, kind: str) -> None:
+def test_every_file_with_one_thing_wrong(tmp_path, kind):
     """Each thing in it replaced by each nasty one, and left out."""
     for value in spoilt(KINDS[kind][1]):
         read_or_refuse(tmp_path, kind, json.dumps(value).encode())
@@ -217,7 +212,7 @@ VALUES = st.recursive(
 
 @FEW
 @given(value=VALUES)
-def test_any_value_can_be_written_and_read(value: Any) -> None:
+def test_any_value_can_be_written_and_read(value):
     """And gives the same text again."""
     assert dumps(loads(dumps(value))) == dumps(value)
 
@@ -226,7 +221,7 @@ def test_any_value_can_be_written_and_read(value: Any) -> None:
     "value",
     [{1: "a", "1": "b"}, {"a": [{None: 1, "null": 2}]}, {np.int64(3): 1, "3": 4}],
 )
-def test_keys_that_would_be_written_as_the_same_come_back(value: Any) -> None:
+def test_keys_that_would_be_written_as_the_same_come_back(value):
     """Shown as Python shows them: a text with a key twice would be refused."""
     assert "repr" in dumps(value)
     assert dumps(loads(dumps(value))) == dumps(value)
@@ -238,11 +233,9 @@ NAME = trajectory_prefix(INFIX, 0)
 JOURNAL, LOG = journal_name(INFIX), log_name(INFIX, 0)
 LOOKS, TAIL = LOG.replace(".log", ".looks"), LOG.replace(".log", ".tail")
 
-Files = dict[str, bytes]
-
 
 @pytest.fixture(scope="module")
-def sound_log(tmp_path_factory: pytest.TempPathFactory) -> Files:
+def sound_log(tmp_path_factory):
     """The files of a recording, by their names."""
     directory = tmp_path_factory.mktemp("log")
     write_log(directory)
@@ -254,7 +247,7 @@ def sound_log(tmp_path_factory: pytest.TempPathFactory) -> Files:
 _numbers = itertools.count()
 
 
-def put_log(tmp_path: Path, files: Files) -> Path:
+def put_log(tmp_path, files):
     """Write files into a directory of their own; return the recording's path."""
     directory = tmp_path / str(next(_numbers))
     directory.mkdir()
@@ -263,9 +256,9 @@ def put_log(tmp_path: Path, files: Files) -> Path:
     return directory / f"{NAME}.h5"
 
 
-def read_log(path: Path) -> Any:
+def read_log(path):
     """Return what is read, None where there is one error that names a file of it."""
-    refusal: UnreadableFile | None = None
+    refusal = None
     try:
         with open_trajectory(path) as reader:
             content = content_of(reader)
@@ -280,9 +273,7 @@ def read_log(path: Path) -> Any:
 
 
 @pytest.mark.parametrize("number", range(4))
-def test_every_line_with_one_thing_wrong(
-    tmp_path: Path, sound_log: Files, number: int
-) -> None:
+def test_every_line_with_one_thing_wrong(tmp_path, sound_log, number):
     """Of a journal; what is relied on in rendering is looked at there."""
     lines = sound_log[JOURNAL].splitlines()
     assert len(lines) == 4
@@ -294,9 +285,7 @@ def test_every_line_with_one_thing_wrong(
 
 @FEW
 @given(part=st.sampled_from([JOURNAL, LOG, LOOKS]), damage=DAMAGE)
-def test_any_damaged_log(
-    tmp_path: Path, sound_log: Files, part: str, damage: Any
-) -> None:
+def test_any_damaged_log(tmp_path, sound_log, part, damage):
     """Bytes changed anywhere in one of its files."""
     content = damaged(sound_log[part], damage)
     found = read_log(put_log(tmp_path, {**sound_log, part: content}))
@@ -311,16 +300,14 @@ def test_any_damaged_log(
 
 @FEW
 @given(damage=DAMAGE, written=st.integers(0, 4))
-def test_any_damaged_tail(
-    tmp_path: Path, sound_log: Files, damage: Any, written: int
-) -> None:
+def test_any_damaged_tail(tmp_path, sound_log, damage, written):
     """Rows are taken from it as far as they say that they are the next ones."""
     rows = sound_log[LOG]
     size = len(rows) // 5
     head = struct.pack("=QQQ", 5, size // 8, 5).ljust(TAIL_HEAD, b"\0")
     # Where it counts: most of a head is nothing.
     place = [(p / 20 if p < 0.5 else p, *rest) for p, *rest in damage]
-    tail = damaged(head[:24] + rows, place)  # type: ignore[arg-type]
+    tail = damaged(head[:24] + rows, place)
     tail = tail[:24].ljust(TAIL_HEAD, b"\0") + tail[24:]
     files = {**sound_log, LOG: rows[: written * size], TAIL: tail}
     found = read_log(put_log(tmp_path, files))
@@ -331,15 +318,15 @@ def test_any_damaged_tail(
 
 
 @pytest.fixture(scope="module")
-def inspector() -> Iterator[Inspector]:
+def inspector():
     with Inspector() as one:
         yield one
 
 
 @pytest.fixture(scope="module")
-def sound(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+def sound(tmp_path_factory):
     """A sound file of each kind, in a directory of its own."""
-    found: dict[str, Path] = {}
+    found = {}
     for name, write in {"h5": finished, "zip": source, "mjb": compiled}.items():
         directory = tmp_path_factory.mktemp(name) / "recordings"
         directory.mkdir()
@@ -347,7 +334,7 @@ def sound(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     return found
 
 
-def check(outcome: Outcome, path: Path) -> None:
+def check(outcome, path):
     assert outcome.kind in ("value", "refused"), outcome
     assert outcome.kind == "value" or outcome.names == str(path), outcome
 
@@ -357,9 +344,7 @@ def check(outcome: Outcome, path: Path) -> None:
 )
 @FEWER
 @given(damage=DAMAGE)
-def test_any_damaged_file(
-    inspector: Inspector, sound: dict[str, Path], kind: str, reader: str, damage: Any
-) -> None:
+def test_any_damaged_file(inspector, sound, kind, reader, damage):
     """Of HDF5, of a model's sources, of a compiled model: no crash, no hang."""
     path = sound[kind]
     data = path.read_bytes()

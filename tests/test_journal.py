@@ -1,14 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """The journal keeps every completed episode, whatever happens to the process."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 import re
 import threading
 from pathlib import Path
-from typing import Any
 
 import pytest
 from full_disk import file_size_limit
@@ -41,22 +38,22 @@ NEXT = dataclasses.replace(ENTRY, episode_id=4, seed=None, options=None)
 
 
 @pytest.fixture
-def path(tmp_path: Path) -> Path:
+def path(tmp_path):
     return tmp_path / "openaigym.episodes.0.1.jsonl"
 
 
-def write(path: Path, *entries: JournalEntry, **options: Any) -> None:
+def write(path, *entries, **options):
     writer = JournalWriter(path, **options)
     for entry in entries:
         writer.append(entry)
     writer.close()
 
 
-def changed(**facts: Any) -> JournalEntry:
+def changed(**facts):
     return dataclasses.replace(ENTRY, **facts)
 
 
-def read(path: Path) -> list[JournalEntry]:
+def read(path):
     return list(read_journal(path))
 
 
@@ -68,7 +65,7 @@ def read(path: Path) -> list[JournalEntry]:
         *({"reward": reward} for reward in (math.inf, -math.inf, math.nan)),
     ],
 )
-def test_entries_come_back_as_they_were(path: Path, facts: dict[str, Any]) -> None:
+def test_entries_come_back_as_they_were(path, facts):
     """Each as `append` returns, with what JSON has no number for; then it is closed."""
     writer = JournalWriter(path)
     assert not path.exists()
@@ -86,9 +83,7 @@ def test_entries_come_back_as_they_were(path: Path, facts: dict[str, Any]) -> No
 @pytest.mark.parametrize(
     ("options", "said"), [({"lock": threading.Lock()}, "lock"), ("x" * (1 << 24), "xx")]
 )
-def test_options_of_any_type_and_size_do_not_stop_a_run(
-    path: Path, options: Any, said: str
-) -> None:
+def test_options_of_any_type_and_size_do_not_stop_a_run(path, options, said):
     """They are written as their repr, and cut off."""
     write(path, changed(options=options))
     (entry,) = read_journal(path)
@@ -97,7 +92,7 @@ def test_options_of_any_type_and_size_do_not_stop_a_run(
     assert path.stat().st_size < 2000
 
 
-def test_events_are_reported_and_are_no_damage(path: Path) -> None:
+def test_events_are_reported_and_are_no_damage(path):
     """In their order, the run first and once; what is no event is left out."""
     writer = JournalWriter(path, run={})
     writer.note("cut", {"episode_id": 2})
@@ -107,7 +102,7 @@ def test_events_are_reported_and_are_no_damage(path: Path) -> None:
     write(path, NEXT, run={"env_info": {}})
     with path.open("a") as file:
         file.write('{"party": {}}\n')
-    events: list[Any] = []
+    events = []
     reader = JournalReader(path, on_event=lambda *event: events.append(event))
     assert list(reader) == [ENTRY, NEXT]
     assert events == [
@@ -118,9 +113,7 @@ def test_events_are_reported_and_are_no_damage(path: Path) -> None:
     assert reader.dropped == 1
 
 
-def test_a_last_line_cut_anywhere_is_left_out(
-    path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_last_line_cut_anywhere_is_left_out(path, caplog):
     """At each byte; one warning, its number is still known, and writing goes on."""
     later = changed(episode_id=5)
     write(path, ENTRY, NEXT)
@@ -151,9 +144,7 @@ def test_a_last_line_cut_anywhere_is_left_out(
         (b'{"episode_id": 1e99}\n', "larger than any count"),
     ],
 )
-def test_damage_in_the_middle_costs_one_line(
-    path: Path, damage: bytes, reason: str, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_damage_in_the_middle_costs_one_line(path, damage, reason, caplog):
     """The episodes before and after it are read; the warning says where and what."""
     late = changed(episode_id=10**14)
     write(path, late, NEXT, changed(reward=9.0, episode_id=4), ENTRY, late)
@@ -166,9 +157,7 @@ def test_damage_in_the_middle_costs_one_line(
     assert reason in record.getMessage()
 
 
-def test_what_is_no_journal_is_given_up_on(
-    path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_what_is_no_journal_is_given_up_on(path, caplog):
     """After a thousand damaged lines, or one without end; memory stays small."""
     write(path, ENTRY)
     line = path.read_bytes()
@@ -185,9 +174,7 @@ def test_what_is_no_journal_is_given_up_on(
     assert "too long" in caplog.text
 
 
-def test_what_cannot_be_read_is_one_error(
-    path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_cannot_be_read_is_one_error(path, monkeypatch):
     """A missing file, and a disk that fails while it is read."""
     with pytest.raises(UnreadableFile, match="No such file"):
         read(path)
@@ -198,7 +185,7 @@ def test_what_cannot_be_read_is_one_error(
         read(path)
 
 
-def test_a_line_that_does_not_fit_is_taken_back(path: Path) -> None:
+def test_a_line_that_does_not_fit_is_taken_back(path):
     """It comes before the next one; half a line left by Ctrl-C goes then."""
     writer = JournalWriter(path)
     writer.append(ENTRY)

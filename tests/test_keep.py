@@ -1,15 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Monitors that decide after the episodes which of them get a video."""
 
-from __future__ import annotations
-
 import logging
 import signal
 import subprocess
 import sys
-from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import gymnasium
 import pytest
@@ -27,28 +23,26 @@ from waiting import wait_until
 
 import mjrec
 from mjrec.formats.trajectory_file import open_trajectory
-from mjrec.recorder.tracking import FinishedVideo, Tracker
+from mjrec.recorder.tracking import Tracker
 from mjrec.rendering.finish import finish
 
 # Of the episodes of `pendulum`, in their order.
 RETURNS = [5.0, 2.0, 4.0, 1.0, 4.0, 2.0, 3.0, 6.0]
 
 
-class Limited(gymnasium.Wrapper[Any, Any, Any, Any]):
+class Limited(gymnasium.Wrapper):
     """Ends an episode after as many steps as its return is to be."""
 
-    def __init__(
-        self, env: Any, returns: Sequence[float], success: Sequence[bool] = ()
-    ) -> None:
+    def __init__(self, env, returns, success=()):
         super().__init__(env)
         self.lengths = [int(number) for number in returns]
         self.success = list(success)
 
-    def reset(self, **options: Any) -> Any:
+    def reset(self, **options):
         self.left = self.lengths.pop(0)
         return self.env.reset(**options)
 
-    def step(self, action: Any) -> Any:
+    def step(self, action):
         observation, _, _, _, info = self.env.step(action)
         self.left -= 1
         if not self.left and self.success:
@@ -59,20 +53,18 @@ class Limited(gymnasium.Wrapper[Any, Any, Any, Any]):
 class OneStep(Limited):
     """Ends an episode after a step, with its return as the reward."""
 
-    def step(self, action: Any) -> Any:
+    def step(self, action):
         observation, *_, info = self.env.step(action)
         return observation, float(self.left), False, True, info
 
 
-def pendulum(
-    returns: Sequence[float] = RETURNS, *, kind: type = Limited, **arguments: Any
-) -> Any:
+def pendulum(returns=RETURNS, *, kind=Limited, **arguments):
     """Return a small environment."""
     size = {"width": 64, "height": 64, "render_mode": "rgb_array"}
     return kind(gymnasium.make("InvertedPendulum-v5", **size), returns, **arguments)
 
 
-def run(env: Any, episodes: int) -> None:
+def run(env, episodes):
     """Run whole episodes."""
     for _ in range(episodes):
         env.reset(seed=0)
@@ -80,23 +72,23 @@ def run(env: Any, episodes: int) -> None:
             pass
 
 
-def h5_of(directory: Path) -> list[int]:
+def h5_of(directory):
     """Return the numbers of the episodes with a finished trajectory."""
     return sorted(int(path.stem[-6:]) for path in directory.glob("*.h5"))
 
 
-def logs_of(directory: Path) -> list[int]:
+def logs_of(directory):
     """Return the numbers of the episodes in flight."""
     return [int(path.stem[-6:]) for path in in_flight(directory)]
 
 
-def pending_in(directory: Path) -> list[int]:
+def pending_in(directory):
     """Return the numbers of the episodes whose videos the manifest calls pending."""
     entries = manifest_of(directory)["mjrec"]["pending"]
     return [entry["episode_id"] for entry in entries]
 
 
-def facts_of(directory: Path, episode: int) -> dict[str, Any]:
+def facts_of(directory, episode):
     """Return the facts of a trajectory."""
     found = {*directory.glob("*.h5"), *in_flight(directory)}
     [path] = [p for p in found if p.name.endswith(f".episode{episode:06d}.h5")]
@@ -104,7 +96,7 @@ def facts_of(directory: Path, episode: int) -> dict[str, Any]:
         return dict(reader.facts)
 
 
-def render(directory: Path) -> None:
+def render(directory):
     """Render what is pending."""
     outcomes = finish(directory, workers=1)
     assert not any(each.failures for each in outcomes)
@@ -113,10 +105,10 @@ def render(directory: Path) -> None:
 class Listener(Tracker):
     """Notes of which videos it is notified, and how long their episodes were."""
 
-    def __init__(self) -> None:
-        self.videos: dict[int, int] = {}
+    def __init__(self):
+        self.videos = {}
 
-    def video(self, run: Any, video: FinishedVideo) -> None:
+    def video(self, run, video):
         assert video.path.exists()
         assert video.episode is not None
         self.videos[video.episode_id] = video.episode.length
@@ -129,10 +121,10 @@ both_ways = pytest.mark.parametrize("way", ["live", "deferred"])
 
 
 @both_ways
-def test_the_worst_n_are_kept(tmp_path: Path, way: Any) -> None:
+def test_the_worst_n_are_kept(tmp_path, way):
     """Never more candidates than N; only the chosen are drawn, named, notified."""
     listener = Listener()
-    options: dict[str, Any] = {"workers": 1, "trackers": listener, "name_prefix": "w"}
+    options = {"workers": 1, "trackers": listener, "name_prefix": "w"}
     with mjrec.Monitor(
         pendulum(), tmp_path, keep="worst:2", render=way, **options
     ) as monitor:
@@ -164,9 +156,7 @@ def test_the_worst_n_are_kept(tmp_path: Path, way: Any) -> None:
 
 
 @parametrize("episodes", [100, 1000])
-def test_the_disk_holds_n_candidates_and_the_running_episode(
-    tmp_path: Path, episodes: int
-) -> None:
+def test_the_disk_holds_n_candidates_and_the_running_episode(tmp_path, episodes):
     """However long the run is; each goes when it is out."""
     # Most are worse than those before.
     returns = [episodes - number + 7 * number % 5 for number in range(episodes)]
@@ -182,7 +172,7 @@ def test_the_disk_holds_n_candidates_and_the_running_episode(
 
 
 @both_ways
-def test_failures_are_what_the_environment_calls_so(tmp_path: Path, way: Any) -> None:
+def test_failures_are_what_the_environment_calls_so(tmp_path, way):
     """Drawn at the end of each; after N no frame is recorded any more."""
     made = pendulum(success=[True, False, True, False, False, True, False, False])
     with mjrec.Monitor(
@@ -198,7 +188,7 @@ def test_failures_are_what_the_environment_calls_so(tmp_path: Path, way: Any) ->
     assert manifest_of(tmp_path)["mjrec"]["keep"]["chosen"] == [1, 3]
 
 
-def longest_two(episodes: Sequence[Any]) -> list[int]:
+def longest_two(episodes):
     """Choose by length."""
     return [e.episode_id for e in sorted(episodes, key=lambda e: -e.length)[:2]]
 
@@ -208,9 +198,7 @@ def longest_two(episodes: Sequence[Any]) -> list[int]:
     ("keep", "way", "kept"),
     [("median", "deferred", [6]), (longest_two, "live", [0, 7])],
 )
-def test_what_is_decided_at_the_end_holds_all(
-    keep: Any, way: str, kept: list[int], tmp_path: Path, caplog: Any
-) -> None:
+def test_what_is_decided_at_the_end_holds_all(keep, way, kept, tmp_path, caplog):
     """It says so once; the rule or the function's name stands in the manifest."""
     caplog.set_level(logging.INFO, "mjrec")
     with mjrec.Monitor(pendulum(), tmp_path, keep=keep, render=way, workers=1) as env:
@@ -230,9 +218,7 @@ def test_what_is_decided_at_the_end_holds_all(
         ({"trajectory_callable": lambda episode: episode == 1, "workers": 1}, [1]),
     ],
 )
-def test_trajectories_are_kept_as_asked(
-    tmp_path: Path, options: dict[str, Any], kept: list[int]
-) -> None:
+def test_trajectories_are_kept_as_asked(tmp_path, options, kept):
     """Whatever becomes of the videos; those that fell out promise none."""
     with mjrec.Monitor(pendulum([3, 2, 4, 1]), tmp_path, keep="best:1", **options) as e:
         run(e, 4)
@@ -247,9 +233,9 @@ def test_trajectories_are_kept_as_asked(
 
 
 @both_ways
-def test_incomplete_episodes_are_never_chosen(tmp_path: Path, way: Any) -> None:
+def test_incomplete_episodes_are_never_chosen(tmp_path, way):
     """Neither one that was reset nor the one that was closed; nothing of them stays."""
-    options: dict[str, Any] = {"render": way, "allow_early_reset": True}
+    options = {"render": way, "allow_early_reset": True}
     with mjrec.Monitor(
         pendulum([3, 5, 4]), tmp_path, keep="worst:3", workers=1, **options
     ) as monitor:
@@ -266,7 +252,7 @@ def test_incomplete_episodes_are_never_chosen(tmp_path: Path, way: Any) -> None:
 # --- ends ----------------------------------------------------------------------------
 
 
-def confused(episodes: Sequence[Any]) -> list[int]:
+def confused(episodes):
     """Return a number that is none of an episode."""
     return [len(episodes)]
 
@@ -276,9 +262,7 @@ def confused(episodes: Sequence[Any]) -> list[int]:
     [("live", {}), ("deferred", {"wait": True}), ("deferred", {"wait": False})],
     default=2,
 )
-def test_a_function_that_cannot_choose_loses_nothing(
-    tmp_path: Path, way: Any, options: dict[str, bool]
-) -> None:
+def test_a_function_that_cannot_choose_loses_nothing(tmp_path, way, options):
     """One error names it; all is closed, and all videos are there or pending."""
     env = mjrec.Monitor(pendulum(), tmp_path, keep=confused, workers=1, render=way)
     run(env, 3)
@@ -301,9 +285,7 @@ def test_a_function_that_cannot_choose_loses_nothing(
 
 
 @parametrize("on_error", ["warn", "raise"])
-def test_a_full_disk_at_the_end_loses_no_chosen_video(
-    tmp_path: Path, on_error: str
-) -> None:
+def test_a_full_disk_at_the_end_loses_no_chosen_video(tmp_path, on_error):
     """What the journal has no room for waits; it is pending all the same."""
     env = mjrec.Monitor(
         pendulum(), tmp_path, keep="worst:2", workers=0, on_error=on_error
@@ -344,9 +326,7 @@ os.kill(os.getpid(), 9)
     [("deferred", True), ("live", True), ("deferred", False)],
     default=2,
 )
-def test_a_killed_run_leaves_its_candidates(
-    tmp_path: Path, kind: str, recovers: bool
-) -> None:
+def test_a_killed_run_leaves_its_candidates(tmp_path, kind, recovers):
     """And the running episode, and nothing of what had fallen out; undecided."""
     here = str(Path(__file__).parent)
     command = [sys.executable, "-c", PROGRAM, str(tmp_path), kind, here]

@@ -2,7 +2,6 @@
 """Policies by their names, and the actions that they give."""
 
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -46,7 +45,6 @@ def write(tmp_path, monkeypatch):
         sys.modules.pop(name, None)
 
 
-Write = Callable[..., None]
 BOX = acting_in(spaces.Box(-1, 1, (2,), np.float32))
 
 
@@ -75,7 +73,7 @@ def test_random_actions_are_the_episodes(space):
     assert repr(space.sample()) == own
 
 
-def test_random_actions_are_those_that_gymnasium_draws() -> None:
+def test_random_actions_are_those_that_gymnasium_draws():
     """A policy draws bounded boxes in its own way, and gives what `sample` gives."""
     bounds = np.array([[-1, 0.3, -7], [1, 0.30001, 1e6]], np.float32)
     space = spaces.Box(*bounds)

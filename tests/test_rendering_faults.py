@@ -5,27 +5,18 @@ One clear error; the video stays pending, and the manifest says why; nothing is 
 half-written; all other episodes are rendered, and a later try finds all it needs.
 """
 
-from __future__ import annotations
-
 import contextlib
 import json
 import time
-from pathlib import Path
-from typing import Any
 
 import gymnasium
 import pytest
 from full_disk import file_size_limit
 from parts import parametrize
 from recordings import frames_in, frames_of, manifest_of, metadata_of
-from trajectories_by_hand import Painter, write_log, write_pending_manifest
+from trajectories_by_hand import write_log, write_pending_manifest
 
-from mjrec import (
-    BlankVideo,
-    Monitor,
-    RenderError,
-    render_videos,
-)
+from mjrec import BlankVideo, Monitor, RenderError, render_videos
 from mjrec.formats.ffmpeg import ffmpeg_executable
 from mjrec.formats.spans import recordings_in_flight
 from mjrec.formats.trajectory_file import (
@@ -35,7 +26,6 @@ from mjrec.formats.trajectory_file import (
 )
 from mjrec.formats.video_metadata import metadata_path
 from mjrec.rendering import finish as module
-from mjrec.rendering.jobs import Progress, RenderedVideos
 from mjrec.rendering.recordings import recordings
 
 VIDEO = "openaigym.video.0.7.video00000{}.mp4"
@@ -43,7 +33,7 @@ FRAMES = 5
 
 
 @pytest.fixture
-def two(tmp_path: Path, painter: Painter) -> Path:
+def two(tmp_path, painter):
     """A directory with two pending videos and a manifest that says so."""
     directory = tmp_path / "two"
     directory.mkdir()
@@ -54,18 +44,18 @@ def two(tmp_path: Path, painter: Painter) -> Path:
     return directory
 
 
-def finish(directory: Path, **options: Any) -> list[RenderedVideos]:
+def finish(directory, **options):
     return list(module.finish(directory, workers=1, **options))
 
 
-def reasons_in(directory: Path) -> dict[str, str | None]:
+def reasons_in(directory):
     """Return why the videos are pending, by their names."""
     [path] = directory.glob("*.manifest.json")
     pending = json.loads(path.read_text())["mjrec"]["pending"]
     return {entry["video"]: entry.get("reason") for entry in pending}
 
 
-def check_nothing_is_half(directory: Path) -> None:
+def check_nothing_is_half(directory):
     """Whatever has a final name is whole, and nothing else is there."""
     assert not list(directory.glob(".*"))
     for video in directory.glob("*.mp4"):
@@ -82,7 +72,7 @@ def check_nothing_is_half(directory: Path) -> None:
             assert reader.frame_count == FRAMES
 
 
-def check_all_is_there_after_another_try(directory: Path) -> None:
+def check_all_is_there_after_another_try(directory):
     assert not [each for each in finish(directory) if each.failures]
     check_nothing_is_half(directory)
     assert len(list(directory.glob("*.mp4"))) == 2
@@ -92,9 +82,7 @@ def check_all_is_there_after_another_try(directory: Path) -> None:
 # Encoders that are killed or hang
 
 
-def use_encoder(
-    folder: Path, monkeypatch: pytest.MonkeyPatch, *, of: str, instead: str
-) -> None:
+def use_encoder(folder, monkeypatch, *, of, instead):
     """Let one video's encoder do something else, in the shell; all others encode."""
     program = folder / "ffmpeg"
     program.write_text(
@@ -109,17 +97,12 @@ def use_encoder(
 KILLED = "head -c 3000 >/dev/null; echo no memory >&2; kill -9 $$"
 
 
-def test_a_killed_encoder_gets_a_second_try(
-    two: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    caplog: pytest.LogCaptureFixture,
-) -> None:
+def test_a_killed_encoder_gets_a_second_try(two, tmp_path, monkeypatch, caplog):
     """In mid-video; every frame is in the file once, and each is told once."""
     flag = tmp_path / "killed"
     once = f"if mkdir {flag} 2>/dev/null; then {KILLED}; fi"
     use_encoder(tmp_path, monkeypatch, of="video000000", instead=once)
-    told: list[Progress] = []
+    told = []
     results = finish(two, on_progress=told.append)
     assert flag.exists()
     assert not [each for each in results if each.failures]
@@ -132,8 +115,8 @@ def test_a_killed_encoder_gets_a_second_try(
 # Takes more than five seconds: the encoder's timeout, twice.
 @parametrize("instead", ["exec sleep 60", "cat >/dev/null; sleep 60"])
 def test_an_encoder_that_hangs_leaves_the_video_pending(
-    instead: str, two: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    instead, two, tmp_path, monkeypatch
+):
     """Whether it takes nothing or does not end; the other video is rendered."""
     monkeypatch.setenv("MJREC_PATIENCE", "2")
     use_encoder(tmp_path, monkeypatch, of="video000000", instead=instead)
@@ -158,9 +141,7 @@ ROOM = [30, 800, 1600, 2500, 3000]
     ("finished", "room"),
     [(False, 100), (False, 4000), *((True, room) for room in ROOM)],
 )
-def test_a_full_disk_is_one_clear_error_wherever_it_comes(
-    finished: bool, room: int, two: Path
-) -> None:
+def test_a_full_disk_is_one_clear_error_wherever_it_comes(finished, room, two):
     """Be it at the trajectory, the hashes, the video, its metadata or the manifest."""
     if finished:
         for recording in recordings_in_flight(two):
@@ -181,9 +162,7 @@ def test_a_full_disk_is_one_clear_error_wherever_it_comes(
 
 
 @pytest.mark.parametrize("line", [b"?\n", b'{"rows": {"number": 0, "version": 99}}\n'])
-def test_a_log_of_unknown_rows_is_told_and_costs_no_other(
-    line: bytes, two: Path
-) -> None:
+def test_a_log_of_unknown_rows_is_told_and_costs_no_other(line, two):
     """It stays; what it was of is not known."""
     [journal] = two.glob("*.jsonl")
     _, *rest = journal.read_bytes().splitlines(keepends=True)
@@ -218,7 +197,7 @@ DARK = """
 """
 
 
-def pendulum(folder: Path | None = None, **arguments: Any) -> Any:
+def pendulum(folder=None, **arguments):
     """Return a small environment; one without any light, if there is a folder."""
     if folder is not None:
         model = folder / "dark.xml"
@@ -229,7 +208,7 @@ def pendulum(folder: Path | None = None, **arguments: Any) -> Any:
     )
 
 
-def run(monitor: Any, *, episodes: int) -> None:
+def run(monitor, *, episodes):
     for episode in range(episodes):
         monitor.reset(seed=episode)
         done = False
@@ -238,9 +217,7 @@ def run(monitor: Any, *, episodes: int) -> None:
             done = terminated or truncated
 
 
-def test_a_killed_encoder_beside_a_simulation(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_killed_encoder_beside_a_simulation(tmp_path, monkeypatch):
     """`close` tells of it, all else is there, and `mjrec render` makes what lacks."""
     use_encoder(tmp_path, monkeypatch, of="video000001", instead=KILLED)
     directory = tmp_path / "run"
@@ -262,9 +239,7 @@ def test_a_killed_encoder_beside_a_simulation(
 
 
 @pytest.mark.parametrize("render", ["deferred", "live"])
-def test_a_dark_scene_is_suspect_whichever_way_it_is_drawn(
-    render: Any, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_dark_scene_is_suspect_whichever_way_it_is_drawn(render, tmp_path, caplog):
     """The metadata says so, and the log warns; with `strict` it is an error.
 
     Drawn live as its episode ends, else as the monitor closes. The video is there.

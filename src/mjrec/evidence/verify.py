@@ -80,8 +80,8 @@ def verify(
     `trust`.
 
     Args:
-        path: an archive of `mjrec pack`, an unpacked one, or a monitor directory (for
-            which missing files cannot be found).
+        path: an archive of `mjrec pack`, an unpacked one, or a monitor directory
+            or a folder of several (for which missing files cannot be found).
         level: where to stop: `"files"` (the bag holds what it lists), `"stats"`
             (rewards, ends, statistics and selection of episodes), `"physics"` (also all
             states) or `"pixels"` (also all frames and files).

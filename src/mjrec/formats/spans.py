@@ -36,6 +36,7 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from ..errors import DirectoryNotWritable, UnreadableFile
+from .bundle import FINISHED, is_finished
 from .journal import is_of_spans
 from .json_fields import base_name, integer, json_object, mapping, unreadable
 from .locks import is_locked
@@ -55,7 +56,7 @@ from .row_log import has_rows, tail_path
 from .trajectory import check_version, dtype_from_json
 from .video_metadata import is_done
 
-LOG, LOOKS, FINISHED = ".log", ".looks", ".h5"
+LOG, LOOKS = ".log", ".looks"
 
 _LONGEST_LINE = 1 << 24
 # So much of what was read last must still be there for the next reading to go on.
@@ -125,7 +126,7 @@ class Recording:
     def is_in_flight(self) -> bool:
         """Whether only the log has it."""
         path = self.path
-        return not (path.suffix == FINISHED and path.is_file()) and not self.is_gone
+        return not (path.suffix == FINISHED and is_finished(path)) and not self.is_gone
 
     @property
     def last_write(self) -> float:
@@ -227,10 +228,16 @@ class _Spans:
         return self.journal.with_name(log_name(infix or "", _count(number)))
 
 
+class _Known(threading.local):
+    """What this thread has read: a lock could be held when the process is forked."""
+
+    def __init__(self) -> None:
+        self.spans: dict[Path, _Spans] = {}
+
+
 # A journal only grows, and each recording is looked for by itself.
-_known: dict[Path, _Spans] = {}
+_known = _Known()
 _MOST_KNOWN = 64
-_lock = threading.Lock()
 
 
 def _read(journal: Path) -> _Spans:
@@ -239,20 +246,22 @@ def _read(journal: Path) -> _Spans:
     Raises:
         UnreadableFile: it cannot be read.
     """
-    with _lock, contextlib.ExitStack() as opened:
-        spans = _known.pop(journal, None) or _Spans(journal)
-        with unreadable(journal):
-            try:
-                file = opened.enter_context(open_regular(journal))
-            except FileNotFoundError:
-                return _Spans(journal)
+    known = _known.spans
+    # What is interrupted is read anew.
+    spans = known.pop(journal, None) or _Spans(journal)
+    with unreadable(journal):
+        try:
+            file = open_regular(journal)
+        except (FileNotFoundError, NotADirectoryError):
+            return _Spans(journal)
+        with file:
             if not spans.goes_on_in(file):
                 spans = _Spans(journal)
             spans.read_on(file)
-        while len(_known) >= _MOST_KNOWN:
-            del _known[next(iter(_known))]
-        _known[journal] = spans
-        return spans
+    while len(known) >= _MOST_KNOWN:
+        del known[next(iter(known))]
+    known[journal] = spans
+    return spans
 
 
 def _journal_of(path: Path) -> Path:
@@ -321,7 +330,7 @@ def is_in_flight(path: Path) -> bool:
     Raises:
         UnreadableFile: as `find_recording`.
     """
-    if path.suffix == FINISHED and path.is_file():
+    if path.suffix == FINISHED and is_finished(path):
         return False
     return find_recording(path) is not None
 

@@ -76,7 +76,10 @@ class Recovery:
 
 
 def recover(
-    directory: str | os.PathLike[str], *, timeout: float = _SECONDS
+    directory: str | os.PathLike[str],
+    *,
+    timeout: float = _SECONDS,
+    bundle: bool = False,
 ) -> Recovery:
     """Finish what killed monitors or renderers left in a directory.
 
@@ -92,6 +95,8 @@ def recover(
         directory: the monitor directory.
         timeout: seconds to wait, in all, for encoders that are still finishing files of
             a dead process.
+        bundle: put the trajectories made of a monitor's logs into one file, as an
+            evaluation does.
 
     Returns:
         What was done. If something failed, everything else was done.
@@ -127,7 +132,7 @@ def recover(
         # Once more, because another process may have done it meanwhile.
         dead, open_monitors = _dead_and_open(path)
         for infix in dead:
-            finish_dead_monitor(path, infix, report)
+            finish_dead_monitor(path, infix, report, bundles=bundle)
         for stale in stale_shared_files(path):
             report.remove(stale)
         give_all_second_names(path)
