@@ -18,10 +18,9 @@ import gymnasium
 
 import mjrec
 from mjrec.evaluation.episode_results import EpisodeResult
-from mjrec.evaluation.plan import Chunk, EvaluatedTask, EvaluationPlan
-from mjrec.evaluation.plan_file import write_plan
+from mjrec.evaluation.evaluation import write_results
+from mjrec.evaluation.plan import Chunk, EvaluatedTask, EvaluationPlan, write_plan
 from mjrec.evaluation.result_tables import EpisodeFiles
-from mjrec.evaluation.results_files import write_results
 from mjrec.evaluation.statistics import Bootstrap
 from mjrec.evaluation.summaries import summarize_results
 from mjrec.formats.journal import JournalEntry, JournalWriter

@@ -19,8 +19,8 @@ import gymnasium
 
 import mjrec
 from mjrec.evaluation.chunk_results import read_chunk
+from mjrec.evaluation.evaluation import write_results
 from mjrec.evaluation.plan import EvaluatedTask, EvaluationPlan
-from mjrec.evaluation.results_files import write_results
 from mjrec.evaluation.statistics import Bootstrap
 from mjrec.evaluation.summaries import summarize_results
 from mjrec.rendering.recordings import remove_unfinished

@@ -34,9 +34,11 @@ from .children import call
 from .results import Result
 from .rounds import Say, take_turns
 from .setups import MONITOR, UNENDING, Setup, random_actions
-from .time_to_video import Settings
+from .time_to_video import FULL, QUICK, Settings
 
 TITLE = "Time to video, part by part"
+# Of the same episodes.
+__all__ = ["FULL", "QUICK", "TITLE", "measure"]
 
 # As `child_python` asks for.
 _PIPE_BYTES = 1 << 20

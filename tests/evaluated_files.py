@@ -5,6 +5,7 @@ import csv
 
 import h5py
 
+from mjrec.formats.bundle import file_of, group_of
 from mjrec.formats.trajectory_file import open_trajectory
 
 
@@ -37,8 +38,9 @@ def datasets_in(path):
         if isinstance(item, h5py.Dataset):
             found[name] = (str(item.dtype), item.shape, item[()].tobytes())
 
-    with h5py.File(path) as file:
-        file.visititems(note)
+    holder = file_of(path)
+    with h5py.File(holder) as file:
+        (file if holder == path else file[group_of(path)]).visititems(note)
     assert "states" in found
     return found
 

@@ -5,9 +5,9 @@ import re
 
 from mjrec.evaluation.dataclass_json import to_json
 from mjrec.evaluation.episode_results import EpisodeResult
+from mjrec.evaluation.evaluation import ChosenEpisode, write_results
 from mjrec.evaluation.plan import EvaluatedTask, EvaluationPlan
 from mjrec.evaluation.result_tables import EpisodeFiles
-from mjrec.evaluation.results_files import ChosenEpisode, write_results
 from mjrec.evaluation.statistics import Bootstrap
 from mjrec.evaluation.summaries import (
     AcrossTasks,

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-import urllib.parse
+import re
 import zipfile
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
@@ -16,6 +16,7 @@ import h5py
 import numpy as np
 
 import mjrec
+from mjrec.evidence.compare_descriptions import written_again
 from mjrec.formats.trajectory_file import open_trajectory
 from mjrec.formats.trajectory_hdf5 import write_hdf5
 from mjrec.json_text import dumps
@@ -60,9 +61,19 @@ def zipped(bag: Path, archive: Path) -> Path:
 
 def make_bag_fit(bag: Path) -> None:
     """Let the lists of a packed run say what is there, whatever that is."""
-    if (bag / "data" / "ro-crate-metadata.json").exists():
-        edit_json(bag / "data" / "ro-crate-metadata.json", _make_crate_fit(bag))
+    sizes = [path.stat().st_size for path in _files(bag / "data")]
+    info, count = bag / "bag-info.txt", f"{sum(sizes)}.{len(sizes)}"
+    info.write_text(re.sub(r"(?<=Oxum: )[\d.]+", count, info.read_text()))
     make_manifests_fit(bag)
+
+
+def describe_again(bag: Path) -> None:
+    """Let all descriptions of a packed run follow from its recordings."""
+    # The second time with the sizes that the first has made.
+    for _ in range(2):
+        for name, text in written_again(bag).items():
+            is_tag = (bag / name).exists()
+            (bag / name if is_tag else bag / "data" / name).write_text(text)
 
 
 def make_manifests_fit(bag: Path) -> None:
@@ -115,35 +126,6 @@ def set_reward(path: Path, step: int, reward: float) -> None:
         lambda file: file["rewards"].__setitem__(slice(None), rewards),
         reward=float(np.add.accumulate(rewards)[-1]),
     )
-
-
-def _make_crate_fit(bag: Path) -> Callable[[Any], None]:
-    payload = bag / "data"
-    sizes = {
-        urllib.parse.quote(path.relative_to(payload).as_posix()): path.stat().st_size
-        for path in _files(payload)
-        if path.name != "ro-crate-metadata.json"
-    }
-
-    def edit(crate: Any) -> None:
-        graph = {entity["@id"]: entity for entity in crate["@graph"]}
-        files = {i for i, entity in graph.items() if entity["@type"] == "File"}
-        for entity_id in files - sizes.keys():
-            del graph[entity_id]
-        for entity_id, size in sizes.items():
-            new = {"@id": entity_id, "@type": "File"}
-            graph.setdefault(entity_id, new)["contentSize"] = str(size)
-        for whole, parts in (
-            ("./", [i for i in sizes if not i.startswith("recordings/")]),
-            ("recordings/", [i for i in sizes if i.startswith("recordings/")]),
-        ):
-            said = graph[whole]["hasPart"]
-            known = [p["@id"] for p in said if p["@id"] in {*sizes, "recordings/"}]
-            new = [i for i in parts if i not in known]
-            graph[whole]["hasPart"] = [{"@id": i} for i in (*known, *new)]
-        crate["@graph"] = list(graph.values())
-
-    return edit
 
 
 def _write_manifest(bag: Path, name: str, paths: Iterable[Path]) -> None:

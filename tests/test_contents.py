@@ -313,7 +313,7 @@ def test_names_with_a_percent_sign_make_an_older_bag(tmp_path: Path) -> None:
     """Which the `bagit` package, and sha512sum, read as they are."""
     (tmp_path / "data").mkdir()
     (tmp_path / "data/video.front%2Fleft.mp4").write_bytes(b"1")
-    make_bag(tmp_path, {})
+    make_bag(tmp_path, date="2026-11-24", title="Recordings")
     assert (tmp_path / "bagit.txt").read_text().startswith("BagIt-Version: 0.97\n")
     assert "data/video.front%2Fleft.mp4\n" in (
         (tmp_path / "manifest-sha512.txt").read_text()

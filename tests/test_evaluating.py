@@ -33,10 +33,12 @@ from mjrec import (
     UnknownName,
 )
 from mjrec.engines.choice import engine_from
+from mjrec.evaluation.chunk_results import recorded_results
 from mjrec.evaluation.evaluating import evaluate
+from mjrec.evaluation.evaluation import read_results
 from mjrec.evaluation.plan import EvaluationPlan
 from mjrec.evaluation.planning import chunks_of
-from mjrec.evaluation.results_files import read_results
+from mjrec.formats.bundle import finished_trajectories
 from mjrec.formats.locks import try_lock
 from mjrec.formats.video_metadata import metadata_path
 
@@ -95,8 +97,18 @@ def test_every_episode_of_every_task_and_seed_is_there(reference):
         for episode in (0, 1)
     ]
     assert all(each.failure is None and each.length <= 5 for each in results)
-    assert len(list(reference.glob("*/*/*.h5"))) == 8
+    files = [p for each in reference.glob("*/*") for p in finished_trajectories(each)]
+    assert len(files) == 8
     assert begun(reference) == 8
+
+
+# Takes more than five seconds: 200 episodes.
+def test_a_large_evaluation_is_a_few_files(tmp_path):
+    """Of 100 seeds with 2 episodes each at most 60; every trajectory is read back."""
+    evaluation = run(tmp_path / "e", num_seeds=100, max_steps=2)
+    assert sum(path.is_file() for path in evaluation.directory.rglob("*")) <= 60
+    for result in evaluation.results[::40]:
+        assert len(mjrec.load_trajectory(evaluation.file_of(result))) == 2
 
 
 def test_what_takes_long_begins_first(reference):
@@ -111,8 +123,8 @@ def test_the_chosen_episodes_get_videos(tmp_path):
     """By rule, for each task; table, metadata and report of it agree."""
     evaluation = run(tmp_path / "e", keep="best,worst")
     read = read_results(tmp_path / "e")
-    columns = read.columns[PENDULUM]
-    returns = columns.total_reward.tolist()
+    columns = read.by_task[PENDULUM]
+    returns = columns.rows["total_reward"].tolist()
     best, worst = read.selection[PENDULUM]
     assert (best.role, worst.role) == ("best", "worst")
     assert best.seed * 2 + best.episode == returns.index(max(returns))
@@ -212,6 +224,26 @@ def test_what_mujoco_warns_of_is_said_once(tmp_path, monkeypatch, caplog):
     assert [path.name for path in tmp_path.iterdir()] == ["e"]
 
 
+UNSTABLE = """
+<mujoco>
+  <worldbody>
+    <body><joint name="slide" type="slide"/><geom size="0.1"/></body>
+  </worldbody>
+  <actuator><motor joint="slide" gear="1e30" ctrllimited="true" ctrlrange="-1 1"/>
+  </actuator>
+</mujoco>
+"""
+
+
+def test_what_a_model_of_ones_own_warns_of_is_counted(tmp_path):
+    """As in other environments; and the results say what computed them."""
+    (tmp_path / "unstable.xml").write_text(UNSTABLE)
+    task = str(tmp_path / "unstable.xml")
+    evaluation = run(tmp_path / "e", tasks=[task], num_seeds=1, workers=1)
+    assert evaluation.summaries[0].warnings["BADQACC"] > 1
+    assert "scipy" in read_results(evaluation.directory).versions
+
+
 class Wandering(Executor):
     """An executor whose worker does each job as on a machine with another home.
 
@@ -250,7 +282,7 @@ def test_machines_with_other_homes_draw_what_others_recorded(tmp_path):
     )
     assert not list(evaluation.directory.rglob("*.model.*.zip"))
     assert len(list(evaluation.directory.rglob("*.mp4"))) == 1
-    for path in evaluation.directory.rglob("*.h5"):
+    for path in finished_trajectories(folders_of(evaluation)[0]):
         assert mjrec.load_trajectory(path).model().nv == 8
 
 
@@ -277,7 +309,7 @@ def test_without_opengl_videos_stay_pending(tmp_path, monkeypatch, caplog):
     (path,) = evaluation.pending
     assert "No video can be drawn here" in caplog.messages[0]
     assert f"mjrec render {path.parent}" in caplog.text
-    columns = read_results(tmp_path / "e").columns[PENDULUM]
+    columns = read_results(tmp_path / "e").by_task[PENDULUM]
     assert [*columns.videos.values()] == [path.name]
     monkeypatch.undo()
     assert run(tmp_path / "e", keep="best", resume=True).videos == [path]
@@ -460,6 +492,12 @@ def test_a_killed_evaluation_goes_on_where_it_was(whole, tmp_path, moment, engin
     assert ended(killed) == 24
     assert len(drawn_in(killed)) == 2
     assert drawn.items() <= drawn_in(killed).items()
+    # What the killed ones left came into bundles, and is no log any more.
+    kinds = ("openaigym.states.*", "openaigym.trajectory.*")
+    assert not [path for kind in kinds for path in killed.rglob(kind)]
+    for folder, result in recorded_results(killed):
+        name = f"openaigym.trajectory.{result.monitor}.episode{result.episode_id:06d}"
+        assert len(mjrec.load_trajectory(folder / f"{name}.h5")) == result.length
 
 
 @pytest.mark.parametrize(
@@ -605,7 +643,7 @@ def test_what_cannot_be_drawn_has_results_without_videos(tmp_path, caplog):
     assert not evaluation.pending
     # Nor is any announced.
     assert len(evaluation.selection["CartPole-v1"]) == is_drawn
-    assert len(read_results(tmp_path / "e").columns["CartPole-v1"].videos) == is_drawn
+    assert len(read_results(tmp_path / "e").by_task["CartPole-v1"].videos) == is_drawn
     said = [r.message for r in caplog.records if "no videos, only results" in r.message]
     assert len(said) == (not is_drawn)
 
@@ -721,9 +759,9 @@ def test_a_time_limit_of_the_environment_is_part_of_its_scale(tmp_path):
 @pytest.mark.parametrize(
     ("seeds", "episodes", "protocol", "names"),
     [
-        (range(100), 2, "seeded", ["seed-000-011", "seed-096-099"]),
+        (range(100), 2, "seeded", ["seeds-000-011", "seeds-096-099"]),
         ([3], 1, "seeded", ["seed-003", "seed-003"]),
-        ([1], 16, "seeded", ["seed-001-episode-000-001", "seed-001-episode-014-015"]),
+        ([1], 16, "seeded", ["seed-001-episodes-000-001", "seed-001-episodes-014-015"]),
         ([1], 60, "suite", ["seed-001", "seed-001"]),
     ],
 )

@@ -21,6 +21,7 @@ from mjrec.evaluation.chunk_results import read_chunk
 from mjrec.evaluation.dataclass_json import to_json
 from mjrec.evaluation.plan import Chunk, EvaluatedTask, EvaluationPlan
 from mjrec.evaluation.worker import EvaluationWorker
+from mjrec.formats.bundle import finished_trajectories
 from mjrec.formats.trajectory_file import open_trajectory
 from mjrec.recorder.options import RecorderOptions
 from mjrec.sessions import Session, record_session
@@ -179,7 +180,8 @@ def test_a_policy_that_fails_loses_its_episode_only(tmp_path, wrong, failure):
     # What comes after it is not the beginning once more.
     assert len(begun) == 3
     name = f"*.{failed.monitor}.episode{failed.episode_id:06d}.h5"
-    with open_trajectory(*folder.glob(name)) as reader:
+    [path] = (p for p in finished_trajectories(folder) if p.match(name))
+    with open_trajectory(path) as reader:
         assert (reader.facts["complete"], reader.facts["length"]) == (False, 2)
 
 
@@ -202,7 +204,7 @@ def test_a_random_stream_goes_on_where_it_was(tmp_path, fails_first):
             for folder, found in zip(folders, (whole, results), strict=True)
         ]
         assert np.array_equal(*states)
-    assert len(list(folders[1].glob("*.h5"))) == 5
+    assert len(list(finished_trajectories(folders[1]))) == 5
 
 
 class Unsteady(Corridor):

@@ -78,6 +78,8 @@ WITHIN, BELIEVED, NOTED, DIFFERENT = (
         ("h100", difference(Aspect.STATE, 1e-12), DIFFERENT),
         ("llvmpipe", frame(30.0, 30.0), DIFFERENT),
         ("llvmpipe", frame(36.0, 12.0), WITHIN),
+        ("llvmpipe", frame(48.0, 26.5, shadow=0.001), WITHIN),
+        ("llvmpipe", frame(48.0, 26.5, shadow=0.02), DIFFERENT),
         ("ffmpeg", frame(36.0, 12.0), WITHIN),
         ("ffmpeg", difference(Aspect.HASH, topic=Topic.PICTURES), BELIEVED),
         ("wrappers", difference(Aspect.EXACT, **REWARD), BELIEVED),

@@ -18,7 +18,7 @@ from typing import Any
 import h5py
 import numpy as np
 import pytest
-from packed_runs import edit_json, make_bag_fit, the, unpacked
+from packed_runs import describe_again, edit_json, make_bag_fit, the, unpacked
 from parts import parametrize
 
 import honest_runs as honest
@@ -518,7 +518,7 @@ def add_to_manifest(run: ForgedRun) -> None:
 
 
 def add_a_line(run: ForgedRun) -> None:
-    run.edit_journal(lambda lines: lines.insert(-1, {"note": {"success": True}}))
+    run.edit_journal(lambda lines: lines.insert(-1, {"remark": {"success": True}}))
 
 
 def add_to_a_line(run: ForgedRun) -> None:
@@ -547,6 +547,7 @@ def pending_worst(bag: Path) -> None:
     run.remove_video(0)
     promise = {"episode_id": 0, "video": name, "trajectory": trajectory}
     run.edit_json("*.manifest.json", lambda s: s["mjrec"].update(pending=[promise]))
+    describe_again(bag)
 
 
 def say_it_was_made_smaller(bag: Path) -> None:
@@ -555,6 +556,16 @@ def say_it_was_made_smaller(bag: Path) -> None:
     run.edit_json(
         "*000001.meta.json", lambda s: s.update(packed_smaller={"from": [480, 480]})
     )
+    describe_again(bag)
+
+
+def add_a_line_about_rows(bag: Path) -> None:
+    """Which packing takes out."""
+    path = the(bag, "*.jsonl")
+    lines = path.read_text().splitlines()
+    rows = json.dumps({"note": {"name": "all goals reached"}})
+    path.write_text("\n".join([*lines[:2], rows, *lines[2:]]) + "\n")
+    describe_again(bag)
 
 
 def edit_environment(**facts: Any) -> Callable[[Path], object]:
@@ -821,6 +832,11 @@ FORGERIES = (
         Forgery(f"{name} claimed", CLAIMS[name], "is claimed to be")
         for name in ("another MuJoCo", "another GPU")
     ),
+    Forgery(
+        "another MuJoCo claimed, the compiled model left out",
+        both(CLAIMS["another MuJoCo"], lambda run: run.the("*.mjb.gz").unlink()),
+        "mjb.gz",
+    ),
     # Additions.
     Forgery("a dataset added", add_to_hdf5, "success", quick=True),
     Forgery("an attribute added", add_an_attribute, "note"),
@@ -828,7 +844,8 @@ FORGERIES = (
     Forgery("a key in the statistics", add_to("*.stats.json"), "success_rate"),
     Forgery("a key in metadata", add_to("*000001.meta.json"), "success_rate"),
     Forgery("a key in the manifest", add_to_manifest, "award"),
-    Forgery("a line in the journal", add_a_line, "note"),
+    Forgery("a line in the journal", add_a_line, "remark"),
+    Forgery("a line about rows", bag=add_a_line_about_rows, line="goals"),
     Forgery("a key in a line of the journal", add_to_a_line, "judged"),
     Forgery(
         "a note beside the data",
@@ -849,6 +866,19 @@ FORGERIES = (
         bag=replace_in("README.md", "## Videos", "All reached the goal.\n\n## Videos"),
         line="README",
         quick=True,
+    ),
+    Forgery(
+        "a line at the end of the README that begins as one of the bag's own",
+        bag=lambda bag: the(bag, "README.md").write_text(
+            the(bag, "README.md").read_text() + "Payload-Oxum: all goals reached\n"
+        ),
+        line="README",
+    ),
+    Forgery(
+        "a claim in the README beside versions, with another MuJoCo claimed",
+        CLAIMS["another MuJoCo"],
+        bag=replace_in("README.md", "- Versions: ", "- Versions: best policy, "),
+        line="README",
     ),
     Forgery(
         "citation claims more",

@@ -19,8 +19,8 @@ import mjrec
 from evaluations import write_recorded
 from mjrec.commands import main
 from mjrec.errors import InvalidArgument, UnreadableFile
+from mjrec.evaluation.evaluation import read_results
 from mjrec.evaluation.kept_episodes import keep_rule
-from mjrec.evaluation.results_files import read_results
 from mjrec.formats.monitor_directory import infix_of
 from mjrec.reporting.contents import EPISODE
 from mjrec.reporting.episode_rows import episodes_with_roles

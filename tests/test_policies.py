@@ -75,7 +75,7 @@ def test_random_actions_are_the_episodes(space):
     assert repr(space.sample()) == own
 
 
-def test_random_actions_are_those_that_gymnasium_draws() -> None:
+def test_random_actions_are_those_that_gymnasium_draws():
     """A policy draws bounded boxes in its own way, and gives what `sample` gives."""
     bounds = np.array([[-1, 0.3, -7], [1, 0.30001, 1e6]], np.float32)
     space = spaces.Box(*bounds)

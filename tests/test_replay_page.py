@@ -4,6 +4,9 @@
 from __future__ import annotations
 
 import shutil
+import subprocess
+import sys
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -12,13 +15,17 @@ import gymnasium
 import mujoco
 import numpy as np
 import pytest
+from axe_playwright_python.sync_playwright import Axe
 from playwright.sync_api import Page, sync_playwright
+from waiting import wait_until
 
 import mjrec
 from mjrec.commands import main
 
 pytest.importorskip("viser")
 pytest.importorskip("mjviser")
+from mjrec.viewing.episodes import recorded_episodes
+from mjrec.viewing.live import LiveView
 
 _STEPS = 12
 _SIZE = {"width": 240, "height": 240}
@@ -55,6 +62,18 @@ _POSES = """() => {
     shown.map(([name, node]) => [name, [...node.position.toArray(),
       node.quaternion.w, node.quaternion.x, node.quaternion.y, node.quaternion.z]]));
 }"""
+_STEP = "Number(document.getElementById('replay-where').textContent.split(' ')[1])"
+_STEP_SHOWN = f"(step) => {_STEP} >= step"
+# An episode that goes on until the process is killed.
+_RUN = """
+import sys, time, gymnasium, mjrec
+env = gymnasium.make("HalfCheetah-v5", max_episode_steps=10**6)
+env = mjrec.Monitor(env, sys.argv[1], workers=0, video_callable=lambda _: True)
+env.reset(seed=0)
+while True:
+    env.step(env.action_space.sample())
+    time.sleep(0.05)
+"""
 _VERTICES = """(name) => {
   let found = null;
   window.__viserMutable.nodeRefFromName[name].traverse((part) => {
@@ -197,6 +216,51 @@ def test_a_named_camera_is_where_the_model_has_it(page: Page, cheetah: Path) -> 
     )
     assert shown[0] == pytest.approx(data.cam_xpos[0], abs=1e-4)
     assert shown[1] == pytest.approx(data.model.cam_fovy[0])
+
+
+@pytest.mark.browser
+@pytest.mark.axe
+def test_nothing_keeps_people_out_of_a_replay(page: Page) -> None:
+    """Axe finds nothing serious in the controls, with the keys shown."""
+    page.keyboard.press("?")
+    found = Axe().run(page, context=[["#replay"], ["#replay-keys"]])
+    page.keyboard.press("Escape")
+    bad = [
+        (each["id"], [node["html"][:200] for node in each["nodes"]][:3])
+        for each in found.response["violations"]
+        if each["impact"] in ("serious", "critical")
+    ]
+    assert bad == []
+
+
+@pytest.mark.browser
+@pytest.mark.thorough
+def test_the_live_view_follows_a_run_until_it_is_killed(
+    pages: Any, tmp_path: Path
+) -> None:
+    """A page shows the newest states of another process, and all that a kill leaves."""
+    run = subprocess.Popen([sys.executable, "-c", _RUN, str(tmp_path)])
+    thread = None
+    try:
+        wait_until(lambda: len(list(tmp_path.glob("*.log"))) > 0)
+        view = LiveView(tmp_path)
+        thread = threading.Thread(target=view.serve)
+        thread.start()
+        page = pages(view.url)
+        page.wait_for_function(_STEP_SHOWN, arg=1)
+        step = page.evaluate(_STEP)
+        page.wait_for_function(_STEP_SHOWN, arg=step + 1)
+        run.kill()
+        run.wait()
+        [path] = recorded_episodes(tmp_path)
+        last = len(mjrec.load_trajectory(path))
+        page.wait_for_function(_STEP_SHOWN, arg=last)
+    finally:
+        run.kill()
+        run.wait()
+        if thread is not None:
+            view.close()
+            thread.join()
 
 
 @pytest.mark.browser

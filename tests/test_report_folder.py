@@ -8,6 +8,7 @@ import json
 import re
 import shutil
 
+import gymnasium
 import numpy as np
 import pytest
 from PIL import Image
@@ -249,3 +250,24 @@ def test_where_nothing_can_be_written(recordings, tmp_path):
         write_report(recordings, tmp_path / "file" / "report")
     with pytest.raises(InvalidArgument, match="is a file"):
         write_report(recordings, tmp_path / "file")
+
+
+def test_replays_stand_beside_the_videos(tmp_path):
+    """With `replays` the best, median and worst episode have a page in 3D each."""
+    pytest.importorskip("mjviser")
+    env = gymnasium.make("Hopper-v5", max_episode_steps=3)
+    record(
+        *(env, tmp_path / "run", 4),
+        height=48,
+        width=64,
+        video_callable=lambda _: True,
+    )
+    page = write_report(tmp_path / "run", tmp_path / "report", replays=True)
+    links = re.findall(r'href="\./(replays/[^"]+)"', page.read_text())
+    assert len(set(links)) == 3
+    assert all("replay-data" in (page.parent / each).read_text() for each in links)
+    # It is still a report, which another one replaces.
+    write_report(tmp_path / "run", tmp_path / "report")
+    assert not (tmp_path / "report" / "replays").exists()
+    with pytest.raises(InvalidArgument, match="Replays are pages"):
+        write_report(tmp_path / "run", tmp_path / "x", single_file=True, replays=True)

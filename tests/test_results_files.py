@@ -8,14 +8,14 @@ import pytest
 
 from mjrec import UnreadableFile
 from mjrec.evaluation.episode_results import EpisodeResult
-from mjrec.evaluation.plan import EvaluatedTask, EvaluationPlan
-from mjrec.evaluation.result_tables import EpisodeFiles
-from mjrec.evaluation.results_files import (
+from mjrec.evaluation.evaluation import (
     ChosenEpisode,
     is_evaluation,
     read_results,
     write_results,
 )
+from mjrec.evaluation.plan import EvaluatedTask, EvaluationPlan
+from mjrec.evaluation.result_tables import EpisodeFiles
 from mjrec.evaluation.statistics import Bootstrap, Interval
 from mjrec.evaluation.summaries import AcrossTasks, Profile, TaskSummary
 
@@ -108,7 +108,7 @@ def test_what_is_written_is_read_back(tmp_path):
     assert failed.total_reward is None
     assert failed.failure == 'it said "no", and went =1+1 \\udc80'
     assert infinite == RESULTS[3]
-    columns = read.columns["a,b-v0"]
+    columns = read.by_task["a,b-v0"]
     assert columns.videos == {0: VIDEO}
     assert columns.places == {("a,b-v0/seed-007", "0.w"): 0}
     assert columns.failed.tolist() == [False, False, True, False]
@@ -237,6 +237,6 @@ def test_many_episodes_need_little_memory(tmp_path):
         _, most = tracemalloc.get_traced_memory()
     finally:
         tracemalloc.stop()
-    assert len(read.columns["T-v0"]) == count
+    assert len(read.by_task["T-v0"]) == count
     # 1 MB for what does not grow.
     assert most < count * 150 + 1_000_000

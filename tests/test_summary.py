@@ -12,6 +12,7 @@ from verifications import HOSTILE, excuse, finding, verification
 from mjrec.commands.verification_screen import show_verification
 from mjrec.evidence import summary
 from mjrec.evidence.findings import Finding, Level, Outcome, Topic, Verification
+from mjrec.plain_text import counted
 
 
 def screen(made: Verification, **options: bool) -> str:
@@ -156,4 +157,4 @@ def test_hostile_text_gives_a_terminal_no_orders() -> None:
 )
 def test_things_are_counted_in_words(count: int, unit: str, words: str) -> None:
     """With thousands set apart."""
-    assert summary.counted(count, unit) == words
+    assert counted(count, unit) == words

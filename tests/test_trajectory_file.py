@@ -31,9 +31,11 @@ from trajectory_contents import TrajectoryContent, content_of
 import mjrec.formats.trajectory_file as trajectory_file
 from mjrec.errors import FileNotWritten, UnreadableFile
 from mjrec.formats import trajectory_hdf5
+from mjrec.formats.bundle import bundle_of
 from mjrec.formats.spans import log_paths
 from mjrec.formats.trajectory import ModelChange, added_up, packed, row_dtype
 from mjrec.formats.trajectory_file import (
+    bundle_trajectories,
     finish_trajectory,
     open_trajectory,
 )
@@ -161,16 +163,17 @@ def test_the_example_of_the_specification_runs(
     """What docs/reference/trajectories.md shows a stranger works on a real file."""
     record(path)
     finish_trajectory(path).rename(path.with_name("episode.h5"))
-    text = (
-        Path(__file__)
-        .parents[1]
-        .joinpath("docs", "reference", "trajectories.md")
-        .read_text()
-    )
-    (code,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+    docs = Path(__file__).parents[1] / "docs"
+    text = (docs / "reference" / "trajectories.md").read_text()
+    of_one, of_several = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
     monkeypatch.chdir(path.parent)
-    exec(compile(code, "docs/reference/trajectories.md", "exec"), {})
+    exec(compile(of_one, "trajectories.md", "exec"), {})
     assert "E-v0" in capsys.readouterr().out
+    record(path)
+    bundle_trajectories([path])
+    bundle_of(path).rename(path.with_name("episodes.h5"))
+    exec(compile(of_several, "trajectories.md", "exec"), {})
+    assert capsys.readouterr().out == "episode000027 7 (41, 2)\n"
 
 
 def test_what_is_finished_meanwhile_is_read(

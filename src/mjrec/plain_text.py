@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Texts of strangers, made plain for a page."""
+"""Texts for people: numbers of things, and what strangers wrote."""
 
 from __future__ import annotations
 
@@ -21,3 +21,12 @@ def spelled_out(text: str, longest: int = 1000) -> str:
     return "".join(
         c if c.isprintable() or c in _SEEN else f"\\u{ord(c):04x}" for c in text
     )
+
+
+def counted(count: int, unit: str) -> str:
+    """Return a number of things: "1 step", "12 steps", "2 frame hashes"."""
+    if count == 1:
+        return f"1 {unit}"
+    if unit.endswith("y"):
+        return f"{count:,} {unit[:-1]}ies"
+    return f"{count:,} {unit}{'es' if unit.endswith('sh') else 's'}"

@@ -268,10 +268,14 @@ _PACKAGES = (
 
 
 @functools.cache
-def versions() -> Mapping[str, str]:
-    """Return the versions of Python and of the packages that are installed."""
+def versions(*more: str) -> Mapping[str, str]:
+    """Return the versions of Python and of the packages that are installed.
+
+    Args:
+        *more: the names of further packages.
+    """
     found = {"python": platform.python_version()}
-    for package in _PACKAGES:
+    for package in (*_PACKAGES, *more):
         try:
             distribution = importlib.metadata.distribution(package)
             found[package] = str(_name_and_version(distribution)[1])

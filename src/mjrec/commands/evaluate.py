@@ -19,9 +19,10 @@ from ..errors import InvalidArgument, UnknownName
 from ..evaluation.dataclass_json import to_json
 from ..evaluation.episode_results import EpisodeResult
 from ..evaluation.evaluating import evaluate as evaluate_policy
-from ..evaluation.evaluation import Evaluation, EvaluationProgress
+from ..evaluation.evaluation import Evaluation
+from ..evaluation.following import EvaluationProgress
 from ..evaluation.kept_episodes import keep_rule
-from ..evaluation.results_files import PLAN_NAME
+from ..evaluation.plan import PLAN_NAME
 from ..evaluation.statistics import Interval
 from ..evaluation.summaries import TaskSummary
 from ..evaluation.task_sets import tasks_from
@@ -345,7 +346,7 @@ def _lines(evaluation: Evaluation, short: Mapping[str, str]) -> Iterator[str]:
 
 def _across_lines(evaluation: Evaluation) -> Iterator[str]:
     across = evaluation.across
-    if len(across.tasks) < 2:
+    if across is None or len(across.tasks) < 2:
         return
     figures = [
         ("IQM", across.iqm, across.iqm_interval),
@@ -403,7 +404,7 @@ def _fields(evaluation: Evaluation, short: Mapping[str, str]) -> dict[str, Any]:
         "failed": len(evaluation.failed),
         "not_finite": len(evaluation.not_finite),
         "tasks": [to_json(each) for each in evaluation.summaries],
-        "across": to_json(evaluation.across),
+        "across": evaluation.across and to_json(evaluation.across),
         "videos": [str(path) for path in evaluation.videos],
         "pending": {str(path): why for path, why in evaluation.pending.items()},
         "below": dict(short),

@@ -13,11 +13,8 @@ import tyro
 from ..errors import UnreadableFile
 from ..evaluation.chunk_results import recorded_results
 from ..evaluation.episode_results import EpisodeResult
-from ..evaluation.results_files import is_evaluation, read_results
-from ..formats.monitor_directory import (
-    iter_monitor_files,
-    monitor_directories_in,
-)
+from ..evaluation.evaluation import is_evaluation, read_results
+from ..formats.monitor_directory import iter_monitor_files, recording_directories
 from ..formats.video_metadata import finished_videos, metadata_path
 from ..results import Episode, iter_episodes
 from .options import AsJson
@@ -52,9 +49,7 @@ def list_episodes(
             names = ("task", "seed", "episode", "steps", "return", "ended", "video")
             _print_table(directory, names, map(_row_of_result, results))
         return 0
-    has_own = not directory.is_dir() or any(iter_monitor_files(directory))
-    places = [directory] if has_own else monitor_directories_in(directory)
-    for place in places or [directory]:
+    for place in recording_directories(directory):
         more = {} if place == directory else {"directory": place.name}
         if as_json:
             _print_all({**more, **_fields(each)} for each in iter_episodes(place))
@@ -85,7 +80,7 @@ def _fields_of_results(directory: Path) -> Iterator[dict[str, Any]]:
         for _, result in recorded_results(directory):
             yield _fields_of_result(result, None)
         return
-    for columns in results.columns.values():
+    for columns in results.by_task.values():
         for index, result in enumerate(columns):
             video = columns.video_path(index)
             path = None if video is None else results.directory / video

@@ -108,7 +108,7 @@ def recordings_in(directory: Path) -> str:
 def _places(directory: Path, levels: int) -> Iterator[Path]:
     """Yield the evaluations and monitor directories at and below a directory."""
     # Not at the top: the list of commands is there at once without them.
-    from ..evaluation.results_files import is_evaluation
+    from ..evaluation.evaluation import is_evaluation
     from ..formats.monitor_directory import iter_monitor_files
 
     if is_evaluation(directory) or any(iter_monitor_files(directory)):
@@ -122,7 +122,7 @@ def _places(directory: Path, levels: int) -> Iterator[Path]:
 def _summary(directory: Path) -> tuple[str, bool]:
     """Return what a directory holds, and whether a video is pending."""
     from ..errors import Error
-    from ..evaluation.results_files import is_evaluation
+    from ..evaluation.evaluation import is_evaluation
     from ..results import iter_episodes
     from .terminal import counted
 
@@ -151,10 +151,10 @@ def _results(directory: Path) -> Iterator[EpisodeResult]:
     """Yield the results of an evaluation, also of one that is not finished."""
     from ..errors import UnreadableFile
     from ..evaluation.chunk_results import recorded_results
-    from ..evaluation.results_files import read_results
+    from ..evaluation.evaluation import read_results
 
     try:
-        columns = read_results(directory).columns.values()
+        columns = read_results(directory).by_task.values()
     except UnreadableFile:
         yield from (result for _, result in recorded_results(directory))
         return

@@ -35,14 +35,14 @@ def pack(
     episodes: str | None = None,
     max_size: str | None = None,
 ) -> int:
-    """Pack a monitor directory into one file that others can verify.
+    """Pack recordings into one file that others can verify.
 
     The zip file is a BagIt bag around an RO-Crate: recordings, statistics as CSV,
     versions and machine, a README and a CITATION.cff. The same recordings give the
     same bytes. Readers check it with mjrec verify.
 
     Args:
-        directory: the monitor directory.
+        directory: a monitor directory, or one with several, as of an evaluation.
         out: the archive, a new file that ends in .zip.
         author: "Name", "Name <address>" or "Name <ORCID>". May be repeated.
         license: SPDX identifier of the licence, such as CC-BY-4.0, or its URL.

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import tyro
 
-from ..evaluation.results_files import is_evaluation
+from ..evaluation.evaluation import is_evaluation
 from ..formats.monitor_directory import monitor_directories_in
 from ..rendering.recovery import RecoveredFile, Recovery
 from ..rendering.recovery import recover as recover_directory
@@ -48,7 +48,7 @@ def _recover_all(directory: Path, timeout: float) -> Recovery:
     """Recover a directory, and of an evaluation all monitor directories in it."""
     recovery = recover_directory(directory, timeout=timeout)
     for below in monitor_directories_in(directory) if is_evaluation(directory) else ():
-        found = recover_directory(below, timeout=timeout)
+        found = recover_directory(below, timeout=timeout, bundle=True)
         folder = below.relative_to(directory)
         files, failures = (
             tuple(RecoveredFile(f"{folder}/{each.name}", each.what) for each in of)

@@ -14,11 +14,10 @@ import tyro
 from ..annotation import check_annotation
 from ..errors import InvalidArgument
 from ..evaluation.chunk_results import recorded_results
-from ..evaluation.results_files import is_evaluation
+from ..evaluation.evaluation import is_evaluation
 from ..formats.monitor_directory import (
     Infix,
-    iter_monitor_files,
-    monitor_directories_in,
+    recording_directories,
     trajectory_prefix,
 )
 from ..monitors.progress import render_progress
@@ -163,9 +162,7 @@ def _places(target: Path, episode: int | None) -> tuple[list[Path], int | None]:
                 f"mjrec list {target}"
             )
         return found, None
-    if episode is None and target.is_dir() and not any(iter_monitor_files(target)):
-        return monitor_directories_in(target) or [target], None
-    return [target], episode
+    return ([target] if episode is not None else recording_directories(target)), episode
 
 
 def _trajectories(directory: Path, episode: int) -> Iterator[Path]:

@@ -25,6 +25,7 @@ def report(
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])] = Path("report"),
     single_file: bool = False,
     max_single_file_bytes: int = 50_000_000,
+    replay: bool = False,
     title: str | None = None,
     verification: tyro.conf.UseAppendAction[tuple[Path, ...]] = (),
     as_json: AsJson = False,
@@ -43,6 +44,8 @@ def report(
             the page.
         max_single_file_bytes: size limit of that page. Videos that do not fit are left
             out, with a note.
+        replay: put a page in 3D beside the videos of the best, median and worst
+            episode. It needs MuJoCo, and is loaded when it is opened.
         title: title of the page.
         verification: output of mjrec verify --json. May be repeated. A
             verification.json in a directory is found by itself.
@@ -56,6 +59,7 @@ def report(
             title=title,
             single_file=single_file,
             max_single_file_bytes=max_single_file_bytes,
+            replays=replay,
             verifications=verification,
             on_progress=lambda progress: show(
                 progress.what,

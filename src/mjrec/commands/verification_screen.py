@@ -13,6 +13,7 @@ import rich.table
 
 from ..evidence import summary
 from ..evidence.findings import Finding, Outcome, Verdict, Verification
+from ..plain_text import counted
 from .terminal import printable
 
 _MOST_SHOWN: Final = 8
@@ -66,7 +67,7 @@ def _table(verification: Verification) -> rich.table.Table:
 
 
 def _finding(finding: Finding) -> str:
-    many = summary.counted(finding.count, finding.unit)
+    many = counted(finding.count, finding.unit)
     excuse = f" (excuse: {finding.excuse})" if finding.excuse else ""
     parts = (finding.topic, finding.outcome, finding.item, many, finding.reason)
     return " | ".join(str(part) for part in parts if part) + excuse

@@ -41,7 +41,8 @@ def verify(
     something had to be believed) or 1 (FAIL).
 
     Args:
-        path: an archive of mjrec pack, an unpacked one, or a monitor directory.
+        path: an archive of mjrec pack, an unpacked one, a monitor directory, or one
+            with several, as of an evaluation.
         level: where to stop. files checks the bag; stats also rewards, ends, statistics
             and the selection of episodes; physics also all states; pixels also all
             frames and files.

@@ -15,16 +15,17 @@ All of it may be killed at any point and done again.
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterable, Mapping, Sequence
+import functools
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from ..errors import FileNotWritten
+from ..formats.bundle import FINISHED, is_finished
 from ..formats.frame_hashes import frame_hash_path
 from ..formats.journal import JournalWriter
 from ..formats.monitor_directory import Infix, infix_of, journal_name
-from ..formats.spans import FINISHED
-from ..formats.trajectory_file import amend_trajectory
+from ..formats.trajectory_file import amend_trajectories
 from ..formats.trajectory_hdf5 import open_hdf5
 from ..formats.video_metadata import amend_metadata, finished_videos, metadata_path
 from ..rendering.jobs import RecordingKey
@@ -63,19 +64,20 @@ def write_choice(
             continue
         run = Run.read(path)
         live = run.filmed - run.deferred - run.dropped
-        own: set[int] = set()
-        for key, roles in chosen.items():
-            selection = {**facts, "roles": list(roles)}
-            if key.infix != infix:
-                continue
-            if key.number in live:
-                video = folder / key.video_name
-                if metadata_path(video).exists():
-                    amend_metadata(video, {"selection": selection})
-            elif not _promise_video(folder / f"{key.name}{FINISHED}", selection):
-                continue
-            own.add(key.number)
-            drawable.add(key)
+        selections = {
+            key: {**facts, "roles": list(roles)}
+            for key, roles in chosen.items()
+            if key.infix == infix
+        }
+        filmed = {key for key in selections if key.number in live}
+        for key in filmed:
+            video = folder / key.video_name
+            if metadata_path(video).exists():
+                amend_metadata(video, {"selection": selections[key]})
+        others = {key: selections[key] for key in selections if key not in filmed}
+        can_be_drawn = filmed | _promise_videos(folder, others)
+        drawable |= can_be_drawn
+        own = {key.number for key in can_be_drawn}
         before = set((run.keep or {}).get("recorded", ()))
         recorded = sorted(before | own - run.dropped)
         losers = sorted(live.difference(recorded))
@@ -94,17 +96,32 @@ def write_choice(
     return drawable
 
 
-def _promise_video(path: Path, selection: Mapping[str, Any]) -> bool:
-    """Let a trajectory promise the video that it could have, if it could."""
-    if not path.exists():
-        # Drawing it will say so.
-        return True
-    with open_hdf5(path) as reader:
-        video, possible = reader.facts.get("video"), reader.facts.get("possible_video")
-    if possible is not None and (video or {}).get("selection") != selection:
-        promise = {**possible, "selection": selection}
-        amend_trajectory(path, lambda known: {**known, "video": promise})
-    return possible is not None or video is not None
+def _promise_videos(
+    folder: Path, selections: Mapping[RecordingKey, Mapping[str, Any]]
+) -> set[RecordingKey]:
+    """Let trajectories promise the videos that they could have; return which could."""
+    drawable: set[RecordingKey] = set()
+    changes: dict[Path, Callable[[Any], Any]] = {}
+    for key, selection in selections.items():
+        path = folder / f"{key.name}{FINISHED}"
+        if not is_finished(path):
+            # Drawing it will say so.
+            drawable.add(key)
+            continue
+        with open_hdf5(path) as reader:
+            facts = reader.facts
+        video, possible = facts.get("video"), facts.get("possible_video")
+        if possible is not None and (video or {}).get("selection") != selection:
+            promise = {**possible, "selection": selection}
+            changes[path] = functools.partial(_with_video, promise)
+        if possible is not None or video is not None:
+            drawable.add(key)
+    amend_trajectories(changes)
+    return drawable
+
+
+def _with_video(video: Mapping[str, Any], known: Mapping[str, Any]) -> Any:
+    return {**known, "video": video}
 
 
 def _remove_videos(video: Path) -> None:

@@ -28,8 +28,7 @@ from ..formats.json_fields import field as field_of
 from ..formats.json_fields import integer, mapping, number, optional, text, unreadable
 from ..formats.monitor_directory import infix_of, monitor_directories_in
 from .episode_results import EpisodeResult
-from .plan import Unit
-from .plan_file import read_plan
+from .plan import Unit, read_plan
 
 _JOURNALS = "openaigym.episodes.*.jsonl"
 

@@ -21,9 +21,9 @@ import numpy as np
 
 from ..errors import InvalidArgument
 from . import statistics
+from .evaluation import Evaluation, read_results
 from .plan import SEEDED
-from .result_tables import ResultColumns
-from .results_files import ReadResults, read_results
+from .result_tables import TaskResults
 from .statistics import Bootstrap, Estimate, FloatArray
 from .summaries import scaled
 
@@ -232,8 +232,8 @@ class _Side:
     @property
     def tasks(self) -> list[str]:
         """The tasks that are in all evaluations."""
-        rest = [each.columns for each in self.results[1:]]
-        first = self.results[0].columns
+        rest = [each.by_task for each in self.results[1:]]
+        first = self.results[0].by_task
         return [task for task in first if all(task in other for other in rest)]
 
     @property
@@ -246,8 +246,8 @@ class _Side:
 
     def returns(self, task: str) -> list[FloatArray]:
         """Return those of the completed episodes of each evaluation."""
-        columns = [each.columns[task] for each in self.results]
-        return [each.total_reward[~each.failed] for each in columns]
+        columns = [each.by_task[task] for each in self.results]
+        return [each.rows["total_reward"][~each.failed] for each in columns]
 
     def sample(self, task: str, is_single: bool) -> FloatArray:
         """Return what the figures are of: returns, or the mean of each evaluation."""
@@ -256,7 +256,7 @@ class _Side:
 
     def counts(self, task: str) -> tuple[int, int, int]:
         """Return how many episodes were completed, failed, and returned no number."""
-        failed = sum(len(each.columns[task].failures) for each in self.results)
+        failed = sum(len(each.by_task[task].failures) for each in self.results)
         returns = np.concatenate(self.returns(task))
         return len(returns), failed, _not_finite(returns)
 
@@ -308,24 +308,24 @@ def _overall_figures(
     return {name: figure.estimate(how) for name, figure in figures.items()}
 
 
-def _paired_differences(task: str, a: ReadResults, b: ReadResults) -> FloatArray:
+def _paired_differences(task: str, a: Evaluation, b: Evaluation) -> FloatArray:
     """Return B - A of the episodes that began in the same state in both."""
     if not (
         a.plan.protocol == b.plan.protocol == SEEDED
         and a.plan.env_kwargs == b.plan.env_kwargs
     ):
         return np.empty(0)
-    of_a, of_b = _by_unit(a.columns[task]), _by_unit(b.columns[task])
+    of_a, of_b = _by_unit(a.by_task[task]), _by_unit(b.by_task[task])
     return np.array([of_b[unit] - of_a[unit] for unit in of_a if unit in of_b])
 
 
-def _by_unit(columns: ResultColumns) -> dict[tuple[int, int], float]:
-    done = ~columns.failed
-    units = zip(columns.seed[done], columns.episode[done], strict=True)
-    return dict(zip(units, columns.total_reward[done].tolist(), strict=True))
+def _by_unit(columns: TaskResults) -> dict[tuple[int, int], float]:
+    done = columns.rows[~columns.failed]
+    units = zip(done["seed"], done["episode"], strict=True)
+    return dict(zip(units, done["total_reward"].tolist(), strict=True))
 
 
-def _scales(results: Sequence[ReadResults]) -> dict[str, tuple[float, float]]:
+def _scales(results: Sequence[Evaluation]) -> dict[str, tuple[float, float]]:
     """Return the returns that count as 0 and as 1, of tasks where all say the same."""
     said: dict[str, set[tuple[float, float] | None]] = {}
     for each in results:
@@ -362,13 +362,13 @@ def _cautions(a: _Side, b: _Side, tasks: Sequence[TaskComparison]) -> Iterator[s
                 )
 
 
-def _conditions(results: ReadResults) -> Mapping[str, object]:
+def _conditions(results: Evaluation) -> Mapping[str, object]:
     """Return what changes returns though the policy is the same."""
     plan = results.plan
     return {"max_steps": plan.max_steps, "env_kwargs": plan.env_kwargs}
 
 
-def _choices(results: ReadResults) -> Mapping[str, object]:
+def _choices(results: Evaluation) -> Mapping[str, object]:
     """Return what chooses which episodes are seen, and what ran them."""
     plan = results.plan
     return {
@@ -380,7 +380,7 @@ def _choices(results: ReadResults) -> Mapping[str, object]:
 
 
 def _different(
-    a: _Side, b: _Side, facts: Callable[[ReadResults], Mapping[str, object]]
+    a: _Side, b: _Side, facts: Callable[[Evaluation], Mapping[str, object]]
 ) -> Iterator[tuple[str, str, str]]:
     """Yield the facts that are not the same everywhere, as each side says them."""
     said = [[facts(each) for each in side.results] for side in (a, b)]

@@ -27,17 +27,30 @@ from ..errors import (
     InvalidArgument,
     PolicyError,
 )
+from ..formats.bundle import FINISHED, finished_trajectories
 from ..formats.locks import try_lock
-from ..formats.monitor_directory import names_in
+from ..formats.monitor_directory import (
+    Infix,
+    iter_monitor_files,
+    names_in,
+    trajectory_prefix,
+    video_prefix,
+)
 from ..gl.choice import choose
 from ..provenance import versions
 from ..rendering.engine_jobs import environ_for_drawing
 from ..results import clear_monitor_files
 from .dataclass_json import to_json
 from .episode_results import EpisodeResult
-from .evaluation import Evaluation, EvaluationProgress
+from .evaluation import (
+    RESULT_NAMES,
+    Evaluation,
+    read_results,
+    write_results,
+)
 from .following import (
     Choice,
+    EvaluationProgress,
     check_tasks,
     choose_videos,
     chunks_in,
@@ -46,12 +59,17 @@ from .following import (
     run_chunks,
 )
 from .kept_episodes import NO_GL, keep_rule
-from .plan import SEEDED, EvaluationPlan
-from .plan_file import check_continues, read_plan, write_plan
+from .plan import (
+    PLAN_NAME,
+    SEEDED,
+    EvaluationPlan,
+    check_continues,
+    read_plan,
+    write_plan,
+)
 from .planning import check_score_ranges, plan_from
 from .policy_objects import SentPolicy, sent_policy
 from .result_tables import EpisodeFiles
-from .results_files import PLAN_NAME, RESULT_NAMES, write_results
 from .statistics import Bootstrap, load_scipy
 from .summaries import default_score_range, summarize_across, summarize_results
 
@@ -240,9 +258,8 @@ def evaluate(
                 progress = run_chunks(run, chunks, tell)
         results = results_of(plan, chunks)
         choice = choose_videos(plan, chunks, results)
-        evaluation = _evaluation_of(plan, results, choice, place, ranges, how)
         # Before videos are drawn, which takes long.
-        _write(evaluation)
+        _write(place, plan, results, choice, ranges, how)
         videos, pending = draw_videos(
             choice,
             place,
@@ -251,7 +268,7 @@ def evaluate(
             progress=progress,
             tell=tell,
         )
-    return replace(evaluation, videos=videos, pending=pending)
+    return replace(read_results(place), videos=videos, pending=pending)
 
 
 def _begun(directory: Path, *, resume: bool, force: bool) -> EvaluationPlan | None:
@@ -382,14 +399,14 @@ def _held(directory: Path) -> Iterator[None]:
         yield
 
 
-def _evaluation_of(
+def _write(
+    directory: Path,
     plan: EvaluationPlan,
     results: Sequence[EpisodeResult],
     choice: Choice,
-    directory: Path,
     ranges: Mapping[str, tuple[float, float]],
     bootstrap: Bootstrap,
-) -> Evaluation:
+) -> None:
     scales = {
         task.name: ranges.get(task.name)
         or default_score_range(task.name, task.step_limit)
@@ -398,49 +415,60 @@ def _evaluation_of(
     by_task: dict[str, list[EpisodeResult]] = {name: [] for name in scales}
     for result in results:
         by_task[result.task].append(result)
-    return Evaluation(
-        directory=directory,
+    returns = {
+        name: [each.total_reward for each in own if each.total_reward is not None]
+        for name, own in by_task.items()
+    }
+    write_results(
+        directory,
         plan=plan,
         results=results,
         summaries=[
-            summarize_results(
-                name, by_task[name], score_range=scales[name], bootstrap=bootstrap
-            )
-            for name in by_task
+            summarize_results(name, own, score_range=scales[name], bootstrap=bootstrap)
+            for name, own in by_task.items()
         ],
-        across=summarize_across(
-            {
-                name: [
-                    each.total_reward for each in own if each.total_reward is not None
-                ]
-                for name, own in by_task.items()
-            },
-            scales,
-            bootstrap=bootstrap,
-        ),
+        across=summarize_across(returns, scales, bootstrap=bootstrap),
         bootstrap=bootstrap,
         selection=choice.selection,
+        # It computes the statistics.
+        versions=versions("scipy"),
+        files=_Files(directory, plan, choice),
     )
 
 
-def _write(evaluation: Evaluation) -> None:
-    names: dict[Path, set[str]] = {}
+class _Files:
+    """Tells which files are an episode's."""
 
-    def files(result: EpisodeResult) -> EpisodeFiles:
-        folder = evaluation.folder_of(result)
-        if folder not in names:
-            names.clear()
-            names[folder] = {*names_in(folder)} if folder.is_dir() else set()
-        return evaluation.files_of(result, names[folder])
+    def __init__(self, directory: Path, plan: EvaluationPlan, choice: Choice) -> None:
+        self._directory = directory
+        self._plan = plan
+        self._chosen = {
+            task: {(each.seed, each.episode) for each in chosen}
+            for task, chosen in choice.selection.items()
+        }
+        self._folders = {task.name: task.folder for task in plan.tasks}
+        # Of the folder of the episode before, which is listed once.
+        self._folder = ""
+        self._names: set[str] = set()
 
-    write_results(
-        evaluation.directory,
-        plan=evaluation.plan,
-        results=evaluation.results,
-        summaries=evaluation.summaries,
-        across=evaluation.across,
-        bootstrap=evaluation.bootstrap,
-        selection=evaluation.selection,
-        versions=versions(),
-        files=files,
-    )
+    def __call__(self, result: EpisodeResult) -> EpisodeFiles:
+        infix = Infix.parse(result.monitor or "")
+        chunk = self._plan.chunk_of(result.unit)
+        if infix is None or chunk is None or result.episode_id is None:
+            return EpisodeFiles()
+        folder = f"{self._folders[result.task]}/{chunk.folder}"
+        if folder != self._folder:
+            place = self._directory / folder
+            files = (*iter_monitor_files(place), *finished_trajectories(place))
+            self._folder, self._names = folder, {path.name for path in files}
+        trajectory = f"{trajectory_prefix(infix, result.episode_id)}{FINISHED}"
+        prefix = video_prefix(infix, result.episode_id)
+        # Text is recorded as such.
+        video = f"{prefix}.json" if f"{prefix}.json" in self._names else None
+        if video is None and result.unit in self._chosen.get(result.task, ()):
+            video = f"{prefix}.mp4"
+        return EpisodeFiles(
+            folder=folder,
+            trajectory=trajectory if trajectory in self._names else None,
+            video=video,
+        )

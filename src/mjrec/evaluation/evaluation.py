@@ -1,74 +1,119 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What an evaluation comes to, and how far it is."""
+"""An evaluation: its results, and the files in its directory that hold them.
+
+::
+
+    directory/
+    ├── evaluation.json     the plan, written before anything is run
+    ├── results.json        plan, choice of videos, summaries, versions: written last
+    ├── results.csv         one row for each episode
+    ├── timing.csv          wall times and files of the same episodes
+    └── <task>/<chunk>/     monitor directories, for each task a few
+
+`results.json` and `results.csv` follow from the plan and from what is installed: they
+are the same, byte for byte, whatever the number of workers, and however often the
+evaluation was killed and resumed. `result_tables` describes the tables.
+"""
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import math
-from collections.abc import Container, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
+from typing import Any, TextIO
 
-from ..formats.monitor_directory import Infix, trajectory_prefix, video_prefix
+from ..atomic_files import replacing, write_text
+from ..errors import FileNotWritten, UnreadableFile
+from ..formats.json_fields import (
+    field,
+    integer,
+    list_of,
+    mapping,
+    optional,
+    read_object,
+    text,
+    unreadable,
+)
+from ..formats.monitor_directory import Infix, video_prefix
 from ..formats.notebook import shown
+from ..formats.trajectory_file import find_trajectory
+from ..json_text import dumps
+from .dataclass_json import from_json, to_json
 from .episode_results import EpisodeResult
-from .plan import EvaluationPlan
-from .result_tables import EpisodeFiles
-from .results_files import ChosenEpisode
+from .plan import FORMAT_VERSION, PLAN_NAME, EvaluationPlan
+from .result_tables import (
+    EpisodeFiles,
+    TaskResults,
+    read_tables,
+    write_results_table,
+    write_timing_table,
+)
 from .statistics import Bootstrap, Interval
 from .summaries import AcrossTasks, TaskSummary
 
+RESULTS_NAME = "results.json"
+_TABLE_NAME = "results.csv"
+_TIMING_NAME = "timing.csv"
+RESULT_NAMES = (RESULTS_NAME, _TABLE_NAME, _TIMING_NAME, PLAN_NAME)
 
-@dataclass(frozen=True, kw_only=True)
-class EvaluationProgress:
-    """How far an evaluation is.
+
+@dataclass(frozen=True)
+class ChosenEpisode:
+    """An episode that was chosen to get a video.
 
     Attributes:
-        done: how many episodes are over, failed ones too, and those that were done
-            when it was resumed.
-        failed: how many of them failed.
-        total: how many there are.
-        videos_done: how many videos are over.
-        videos: how many there are, as far as is known.
-        frames_done: how many frames of these videos are drawn; 0 where the workers of
-            an engine draw.
-        frames: how many frames these videos have; likewise.
+        seed: of its run.
+        episode: its number in it.
+        role: why: `"best"`, `"median"`, `"worst"`, `"failure"`, `"cubic"`, `"all"`.
     """
 
-    done: int = 0
-    failed: int = 0
-    total: int = 0
-    videos_done: int = 0
-    videos: int = 0
-    frames_done: int = 0
-    frames: int = 0
+    seed: int
+    episode: int
+    role: str
 
 
 @dataclass(frozen=True, kw_only=True)
 class Evaluation:
-    """What an evaluation came to; the same stands in its directory.
+    """The results of an evaluation, as they stand in its directory.
 
     Attributes:
         directory: of the evaluation.
         plan: what was evaluated.
-        results: of every episode, in the order of the plan.
         summaries: of the tasks, in the order of the plan.
-        across: what is said of all tasks that have a scale.
+        across: what is said of all tasks that have a scale; None where nothing is.
         bootstrap: how intervals were made.
         selection: which episodes were chosen to get a video, by task.
-        videos: those that are there.
-        pending: why videos that were chosen are not there, by the path they will have.
+        versions: of what ran, by package.
+        by_task: the episodes of each task, in the order of the plan.
+        videos: those that are there, where it was just run.
+        pending: why videos that were chosen are not there, by the path they will have;
+            likewise.
     """
 
     directory: Path
     plan: EvaluationPlan
-    results: Sequence[EpisodeResult]
     summaries: Sequence[TaskSummary]
-    across: AcrossTasks
+    across: AcrossTasks | None
     bootstrap: Bootstrap
     selection: Mapping[str, Sequence[ChosenEpisode]]
+    versions: Mapping[str, str]
+    by_task: Mapping[str, TaskResults]
     videos: Sequence[Path] = ()
-    pending: Mapping[Path, str] = field(default_factory=dict)
+    pending: Mapping[Path, str] = dataclasses.field(default_factory=dict)
+
+    def __iter__(self) -> Iterator[EpisodeResult]:
+        """Yield the episodes in the order of the plan, without their warnings."""
+        for columns in self.by_task.values():
+            yield from columns
+
+    @functools.cached_property
+    def results(self) -> Sequence[EpisodeResult]:
+        """All episodes, in the order of the plan, without their warnings."""
+        return list(self)
 
     def _repr_html_(self) -> str:
         """Show the evaluation in a notebook: a row per task, and the chosen videos."""
@@ -95,54 +140,6 @@ class Evaluation:
         returns = ((each, each.total_reward) for each in self.results)
         return [each for each, r in returns if r is not None and not math.isfinite(r)]
 
-    def folder_of(self, result: EpisodeResult) -> Path:
-        """Return the monitor directory that an episode was recorded into."""
-        (folder,) = (t.folder for t in self.plan.tasks if t.name == result.task)
-        chunk = self.plan.chunk_of(result.unit)
-        return self.directory / folder / ("" if chunk is None else chunk.folder)
-
-    def file_of(self, result: EpisodeResult) -> Path | None:
-        """Return the video of an episode, or its trajectory where there is none."""
-        names = self.files_of(result, None)
-        folder = self.folder_of(result)
-        paths = [folder / each for each in (names.video, names.trajectory) if each]
-        return next((path for path in paths if path.exists()), None)
-
-    def files_of(
-        self, result: EpisodeResult, names: Container[str] | None
-    ) -> EpisodeFiles:
-        """Return which files are an episode's.
-
-        Args:
-            result: the episode.
-            names: of all files in its folder; None is any that it may have.
-        """
-        infix = Infix.parse(result.monitor or "")
-        if infix is None or result.episode_id is None:
-            return EpisodeFiles()
-        trajectory = f"{trajectory_prefix(infix, result.episode_id)}.h5"
-        prefix = video_prefix(infix, result.episode_id)
-        chosen = self._chosen.get(result.task, ())
-        video = f"{prefix}.mp4"
-        if names is not None:
-            # Text is recorded as such.
-            text = f"{prefix}.json"
-            is_chosen = result.unit in chosen
-            video = text if text in names else video if is_chosen else ""
-            trajectory = trajectory if trajectory in names else ""
-        return EpisodeFiles(
-            folder=self.folder_of(result).relative_to(self.directory).as_posix(),
-            trajectory=trajectory or None,
-            video=video or None,
-        )
-
-    @functools.cached_property
-    def _chosen(self) -> Mapping[str, set[tuple[int, int]]]:
-        return {
-            task: {(each.seed, each.episode) for each in chosen}
-            for task, chosen in self.selection.items()
-        }
-
     def summary(self, task: str) -> TaskSummary:
         """Return what is said of one task.
 
@@ -150,6 +147,192 @@ class Evaluation:
             KeyError: it was not evaluated.
         """
         return {each.task: each for each in self.summaries}[task]
+
+    def folder(self, task: str) -> Path:
+        """Return the folder with a task's monitor directories."""
+        (name,) = (each.folder for each in self.plan.tasks if each.name == task)
+        return self.directory / name
+
+    def file_of(self, result: EpisodeResult) -> Path | None:
+        """Return the video of an episode, or its trajectory where there is none."""
+        infix = Infix.parse(result.monitor or "")
+        if infix is None or result.episode_id is None:
+            return None
+        folders = {of: folder for folder, of in self.by_task[result.task].places}
+        folder = self.directory / folders[str(infix)]
+        video = folder / f"{video_prefix(infix, result.episode_id)}.mp4"
+        for each in (video, video.with_suffix(".json")):
+            if each.exists():
+                return each
+        return find_trajectory(folder, infix, result.episode_id)
+
+
+def is_evaluation(directory: Path) -> bool:
+    """Tell whether a directory is that of an evaluation, finished or not."""
+    return any((directory / name).is_file() for name in (PLAN_NAME, RESULTS_NAME))
+
+
+def write_results(
+    directory: Path,
+    *,
+    plan: EvaluationPlan,
+    results: Sequence[EpisodeResult],
+    summaries: Sequence[TaskSummary],
+    across: AcrossTasks | None,
+    bootstrap: Bootstrap,
+    selection: Mapping[str, Sequence[ChosenEpisode]],
+    versions: Mapping[str, str],
+    files: Callable[[EpisodeResult], EpisodeFiles] = lambda _: EpisodeFiles(),
+) -> None:
+    """Write the results of an evaluation, `results.json` last.
+
+    Where there were results, those are gone until the new ones are complete: tables
+    and summaries of two plans are never found together.
+
+    Args:
+        directory: of the evaluation.
+        plan: what was evaluated.
+        results: of every episode of the plan, in its order.
+        summaries: of the tasks, in the plan's order.
+        across: what is said of all tasks.
+        bootstrap: how intervals were made.
+        selection: see `Evaluation`.
+        versions: see `Evaluation`.
+        files: tells which files are an episode's.
+
+    Raises:
+        FileNotWritten: the disk is full, or the directory is gone or read-only.
+    """
+    value = {
+        "format_version": FORMAT_VERSION,
+        # How it was cut tells when more was asked for, which changes no result.
+        "plan": to_json(replace(plan, chunks=())),
+        "selection": {
+            "rule": plan.keep,
+            "by_task": {
+                task: [[each.seed, each.episode, each.role] for each in chosen]
+                for task, chosen in selection.items()
+            },
+        },
+        "bootstrap": to_json(bootstrap),
+        "tasks": [to_json(each) for each in summaries],
+        "across": None if across is None else to_json(across),
+        "versions": dict(versions),
+    }
+    (directory / RESULTS_NAME).unlink(missing_ok=True)
+    _write(directory / _TABLE_NAME, lambda file: write_results_table(file, results))
+    _write(
+        directory / _TIMING_NAME, lambda file: write_timing_table(file, results, files)
+    )
+    write_text(directory / RESULTS_NAME, dumps(value, indent=2) + "\n")
+
+
+def read_results(directory: Path, *, needs_timing: bool = False) -> Evaluation:
+    """Return the results that are in an evaluation's directory.
+
+    They may be anybody's: sizes, numbers, names and their order are checked, and no
+    file outside of the directory is opened.
+
+    Args:
+        directory: of the evaluation.
+        needs_timing: whether `timing.csv` must be there; else times and files are not
+            known where it is not.
+
+    Raises:
+        UnreadableFile: there are none, the evaluation is not finished, or a file is
+            damaged or missing.
+    """
+    read = read_summaries(directory)
+    table, timing = directory / _TABLE_NAME, directory / _TIMING_NAME
+    by_task = read_tables(table, timing, read.plan, needs_timing=needs_timing)
+    return replace(read, by_task=by_task)
+
+
+def read_summaries(directory: Path) -> Evaluation:
+    """Return the results without episodes: what `results.json` alone holds.
+
+    Raises:
+        UnreadableFile: there is no such file, or it is damaged.
+    """
+    path = directory / RESULTS_NAME
+    if not path.exists():
+        raise UnreadableFile(path, _why_missing(directory))
+    with unreadable(path):
+        value = read_object(path)
+        version = field(value, "format_version", integer)
+        if version != FORMAT_VERSION:
+            raise ValueError(
+                f"its format is version {version}, and this mjrec reads "
+                f"{FORMAT_VERSION}"
+            )
+        plan = field(value, "plan", _plan)
+        tasks = [each.name for each in plan.tasks]
+        summaries = field(value, "tasks", list_of(partial(from_json, TaskSummary)))
+        if [each.task for each in summaries] != tasks:
+            raise ValueError("its summaries are not those of the tasks of its plan")
+        across = field(value, "across", optional(partial(from_json, AcrossTasks)))
+        bootstrap = field(value, "bootstrap", partial(from_json, Bootstrap))
+        selection = field(value, "selection", _selection)
+        versions = field(value, "versions", _versions)
+    return Evaluation(
+        directory=directory,
+        plan=plan,
+        summaries=summaries,
+        across=across,
+        bootstrap=bootstrap,
+        selection=selection,
+        versions=versions,
+        by_task={},
+    )
+
+
+def _write(path: Path, write: Callable[[TextIO], None]) -> None:
+    try:
+        with (
+            replacing(path) as temporary,
+            temporary.open("w", encoding="utf-8", newline="") as file,
+        ):
+            write(file)
+    except OSError as error:
+        raise FileNotWritten(path, error.strerror) from error
+
+
+def _why_missing(directory: Path) -> str:
+    if (directory / PLAN_NAME).exists():
+        return (
+            "the evaluation is not finished; the command that began it goes on where "
+            "it was with --resume"
+        )
+    return "there is no evaluation in the directory"
+
+
+def _plan(value: Any) -> EvaluationPlan:
+    plan = from_json(EvaluationPlan, value)
+    for what, values in (
+        ("task", [each.name for each in plan.tasks]),
+        ("folder", [each.folder for each in plan.tasks]),
+        ("seed", plan.seeds),
+    ):
+        if len(set(values)) < len(values):
+            raise ValueError(f"a {what} is there twice")
+    return plan
+
+
+def _versions(value: Any) -> Mapping[str, str]:
+    return {text(name): text(version) for name, version in mapping(value).items()}
+
+
+def _selection(value: Any) -> Mapping[str, Sequence[ChosenEpisode]]:
+    by_task = field(mapping(value), "by_task", mapping)
+    read = list_of(_chosen)
+    return {text(task): read(chosen) for task, chosen in by_task.items()}
+
+
+def _chosen(value: Any) -> ChosenEpisode:
+    if not isinstance(value, list) or len(value) != 3:
+        raise ValueError("a chosen episode is seed, number and role")
+    seed, episode, role = value
+    return ChosenEpisode(integer(seed), integer(episode), text(role))
 
 
 def _extent(interval: Interval | None) -> str:

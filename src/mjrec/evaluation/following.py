@@ -27,16 +27,41 @@ from ..simulation.model_trust import note_models
 from .choosing import write_choice
 from .chunk_results import ChunkResults, read_chunk
 from .episode_results import EpisodeResult
-from .evaluation import EvaluationProgress
+from .evaluation import ChosenEpisode
 from .kept_episodes import keep_rule
 from .plan import Chunk, EvaluatedTask, EvaluationPlan
-from .results_files import ChosenEpisode
 
 logger = logging.getLogger(__name__)
 
 # How often progress is reported, and the most of the time that counting it takes.
 _SECONDS_BETWEEN_REPORTS = 0.25
 _MOST_OF_TIME = 0.05
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvaluationProgress:
+    """How far an evaluation is.
+
+    Attributes:
+        done: how many episodes are over, failed ones too, and those that were done
+            when it was resumed.
+        failed: how many of them failed.
+        total: how many there are.
+        videos_done: how many videos are over.
+        videos: how many there are, as far as is known.
+        frames_done: how many frames of these videos are drawn; 0 where the workers of
+            an engine draw.
+        frames: how many frames these videos have; likewise.
+    """
+
+    done: int = 0
+    failed: int = 0
+    total: int = 0
+    videos_done: int = 0
+    videos: int = 0
+    frames_done: int = 0
+    frames: int = 0
+
 
 _Tell = Callable[[EvaluationProgress], object]
 

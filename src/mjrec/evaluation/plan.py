@@ -1,15 +1,27 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is evaluated, and the chunks in which it is run."""
+"""What is evaluated, in which chunks, and `evaluation.json`, which says so.
+
+That file is written before anything is run.
+"""
 
 from __future__ import annotations
 
 import functools
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Annotated, Any, Literal, TypeAlias
 
-from ..formats.json_fields import base_name, one_of, positive
+from ..atomic_files import write_text
+from ..errors import DifferentEvaluation, UnreadableFile
+from ..formats import json_fields
+from ..formats.json_fields import base_name, one_of, positive, unreadable
 from ..frames import QUALITIES
+from ..json_text import dumps
+from .dataclass_json import from_json, to_json
+
+FORMAT_VERSION = 1
+PLAN_NAME = "evaluation.json"
 
 Protocol: TypeAlias = Literal["seeded", "suite"]
 SEEDED: Protocol = "seeded"
@@ -17,6 +29,9 @@ SUITE: Protocol = "suite"
 
 Unit: TypeAlias = tuple[int, int]
 """Seed and number, which tell an episode from the others of its task."""
+
+# What may be asked for anew, and what follows from it or changes no result.
+_MAY_DIFFER = ("tasks", "chunks", "episode_timeout")
 
 _Positive: TypeAlias = Annotated[int, positive]
 
@@ -131,3 +146,65 @@ class EvaluationPlan:
         for seed in self.seeds:
             for number in range(self.episodes):
                 yield seed, number
+
+
+def write_plan(directory: Path, plan: EvaluationPlan) -> None:
+    """Write the plan into an evaluation's directory.
+
+    Raises:
+        FileNotWritten: the disk is full, or the directory is gone or read-only.
+    """
+    value = {"format_version": FORMAT_VERSION, "plan": to_json(plan)}
+    write_text(directory / PLAN_NAME, dumps(value, indent=2) + "\n")
+
+
+def read_plan(directory: Path) -> EvaluationPlan:
+    """Return the plan of the evaluation in a directory.
+
+    Raises:
+        UnreadableFile: it is missing, damaged, or of a newer format.
+    """
+    path = directory / PLAN_NAME
+    with unreadable(path):
+        value = json_fields.read_object(path)
+        version = json_fields.field(value, "format_version", json_fields.integer)
+        if version != FORMAT_VERSION:
+            raise UnreadableFile(
+                path,
+                f"its format is version {version}, and this mjrec reads "
+                f"{FORMAT_VERSION}",
+            )
+        return json_fields.field(
+            value, "plan", lambda plan: from_json(EvaluationPlan, plan)
+        )
+
+
+def check_continues(
+    directory: Path, begun: EvaluationPlan, asked: EvaluationPlan
+) -> None:
+    """Check that what is asked for goes on with what was begun.
+
+    Other tasks and more seeds may be asked for, and more episodes; with the protocol
+    `"suite"` not those, whose number belongs to the unit of work. All else makes other
+    results, or other videos; and those who leave episodes out have seen their returns.
+
+    Raises:
+        DifferentEvaluation: it does not.
+    """
+    was, now = to_json(begun), to_json(asked)
+    for plan in (was, now):
+        plan["policy"] = "an object" if plan.pop("is_object") else plan["policy"]
+        for part, digest in plan.pop("policy_digests").items():
+            plan[f"policy ({part})"] = f"{digest[:12]}..."
+    may_differ = [*_MAY_DIFFER]
+    if set(begun.seeds) <= set(asked.seeds):
+        may_differ.append("seeds")
+    if asked.protocol != SUITE and asked.episodes > begun.episodes:
+        may_differ.append("episodes")
+    differences = {
+        name: (was.get(name), now.get(name))
+        for name in was | now
+        if was.get(name) != now.get(name) and name not in may_differ
+    }
+    if differences:
+        raise DifferentEvaluation(directory, differences)

@@ -149,13 +149,16 @@ def check_score_ranges(
 
 
 def _chunk_name(seeds: Sequence[int], first: int, stop: int, episodes: int) -> str:
-    name = f"seed-{seeds[0]:03d}"
-    if len(seeds) > 1:
-        name += f"-{seeds[-1]:03d}"
-    if (first, stop) != (0, episodes):
-        name += f"-episode-{first:03d}"
-        name += f"-{stop - 1:03d}" if stop - first > 1 else ""
-    return name
+    name = _range("seed", seeds[0], seeds[-1])
+    is_whole = (first, stop) == (0, episodes)
+    return name if is_whole else f"{name}-{_range('episode', first, stop - 1)}"
+
+
+def _range(what: str, first: int, last: int) -> str:
+    """Return `seed-003`, or `seeds-000-011` of several."""
+    if first == last:
+        return f"{what}-{first:03d}"
+    return f"{what}s-{first:03d}-{last:03d}"
 
 
 def _score_range(task: str, given: Any) -> tuple[float, float]:

@@ -27,7 +27,7 @@ import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Final, TextIO
+from typing import Any, Final, TextIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,6 +53,7 @@ _TIMING: Final = (
 _LONGEST_LINE: Final = 1 << 16
 _LONGEST_FAILURE: Final = 2000
 _MOST_ROWS: Final = 4_000_000
+_ROWS_AT_ONCE: Final = 4096
 
 _WHOLE: Final = re.compile(r"[0-9]{1,18}", re.ASCII)
 _NUMBER: Final = re.compile(
@@ -61,6 +62,8 @@ _NUMBER: Final = re.compile(
 _FOLDER: Final = re.compile(r"(?!\.)[^/\0]{1,255}(/(?!\.)[^/\0]{1,255})?")
 _TRUTH: Final = {"true": 1, "false": 0, "": -1}
 _MEANING: Final = {1: True, 0: False, -1: None}
+_TRUTHS: Final = ("terminated", "truncated", "success")
+_TIMES: Final = ("start_time", "seconds")
 
 
 @dataclass(frozen=True)
@@ -79,25 +82,28 @@ class EpisodeFiles:
     video: str | None = None
 
 
+# Of an episode. Where -1 or NaN stands, nothing is known.
+ROW: Final = np.dtype(
+    [
+        *(("seed", "<i8"), ("episode", "<i8"), ("total_reward", "<f8")),
+        *(("length", "<i8"), ("terminated", "i1"), ("truncated", "i1")),
+        *(("success", "i1"), ("start_time", "<f8"), ("seconds", "<f8")),
+        *(("monitor", "<i4"), ("episode_id", "<i8")),
+    ]
+)
+
+
 @dataclass(frozen=True, kw_only=True)
-class ResultColumns:
+class TaskResults:
     """The episodes of one task, in the order of the plan: by seed, then by number.
 
-    A million of them take 70 MB. Where -1 stands, nothing is known.
+    A million of them take 70 MB.
 
     Attributes:
         task: the environment's name.
-        seed: `(n,) int64`.
-        episode: `(n,) int64`, the number in its run.
-        total_reward: `(n,) float64`; NaN where it failed, and where that is the return.
-        length: `(n,) int64`, steps.
-        terminated: `(n,) int8`: 1, 0 or -1.
-        truncated: `(n,) int8`, likewise.
-        success: `(n,) int8`, likewise.
-        start_time: `(n,) float64`, wall clock in seconds; NaN where it is not known.
-        seconds: `(n,) float64`, how long it took, likewise.
-        monitor: `(n,) int32`, index into `monitors`, or -1.
-        episode_id: `(n,) int64`, the number in that monitor, or -1.
+        rows: `(n,)` of `ROW`, with what `EpisodeResult` has. `total_reward` is NaN
+            where it failed, and where that is the return; truth is 1, 0 or -1;
+            `monitor` is an index into `monitors`.
         failures: why, by index, of those that failed.
         places: the indices of the monitors that recorded them, by monitor directory, in
             that of the evaluation, and infix.
@@ -105,23 +111,13 @@ class ResultColumns:
     """
 
     task: str
-    seed: NDArray[np.int64]
-    episode: NDArray[np.int64]
-    total_reward: NDArray[np.float64]
-    length: NDArray[np.int64]
-    terminated: NDArray[np.int8]
-    truncated: NDArray[np.int8]
-    success: NDArray[np.int8]
-    start_time: NDArray[np.float64]
-    seconds: NDArray[np.float64]
-    monitor: NDArray[np.int32]
-    episode_id: NDArray[np.int64]
+    rows: NDArray[np.void]
     failures: dict[int, str] = field(default_factory=dict)
     places: dict[tuple[str, str], int] = field(default_factory=dict)
     videos: dict[int, str] = field(default_factory=dict)
 
     def __len__(self) -> int:
-        return len(self.seed)
+        return len(self.rows)
 
     @property
     def failed(self) -> NDArray[np.bool_]:
@@ -139,30 +135,30 @@ class ResultColumns:
         """Return the path of an episode's video in the evaluation's directory."""
         if index not in self.videos:
             return None
-        folder, _ = list(self.places)[self.monitor[index]]
+        folder, _ = list(self.places)[self.rows["monitor"][index]]
         return f"{folder}/{self.videos[index]}"
 
     def __iter__(self) -> Iterator[EpisodeResult]:
-        """Yield each episode as a result; its warnings are not in the columns."""
+        """Yield each episode as a result; its warnings are not known."""
         monitors = self.monitors
-        for index in range(len(self)):
-            failure = self.failures.get(index)
-            monitor = int(self.monitor[index])
-            yield EpisodeResult(
-                task=self.task,
-                seed=int(self.seed[index]),
-                episode=int(self.episode[index]),
-                total_reward=None if failure else float(self.total_reward[index]),
-                length=int(self.length[index]),
-                terminated=_MEANING[int(self.terminated[index])],
-                truncated=_MEANING[int(self.truncated[index])],
-                success=_MEANING[int(self.success[index])],
-                failure=failure,
-                monitor=None if monitor < 0 else monitors[monitor],
-                episode_id=None if monitor < 0 else int(self.episode_id[index]),
-                start_time=_known(self.start_time[index]),
-                seconds=_known(self.seconds[index]),
-            )
+        for index, row in enumerate(self._rows_in_python()):
+            failure, monitor = self.failures.get(index), row["monitor"]
+            for name in _TRUTHS:
+                row[name] = _MEANING[row[name]]
+            for name in _TIMES:
+                row[name] = None if math.isnan(row[name]) else row[name]
+            if failure:
+                row["total_reward"] = None
+            row["monitor"] = None if monitor < 0 else monitors[monitor]
+            if monitor < 0:
+                row["episode_id"] = None
+            yield EpisodeResult(task=self.task, failure=failure, **row)
+
+    def _rows_in_python(self) -> Iterator[dict[str, Any]]:
+        names = ROW.names or ()
+        for start in range(0, len(self), _ROWS_AT_ONCE):
+            for row in self.rows[start : start + _ROWS_AT_ONCE].tolist():
+                yield dict(zip(names, row, strict=True))
 
 
 def write_results_table(file: TextIO, results: Iterable[EpisodeResult]) -> None:
@@ -211,7 +207,7 @@ def write_timing_table(
 
 def read_tables(
     results: Path, timing: Path, plan: EvaluationPlan, *, needs_timing: bool = False
-) -> dict[str, ResultColumns]:
+) -> dict[str, TaskResults]:
     """Return the episodes of each task, in the plan's order.
 
     Args:
@@ -235,43 +231,35 @@ def read_tables(
     return columns
 
 
-def _nothing_known(task: str, plan: EvaluationPlan) -> ResultColumns:
-    count = len(plan.seeds) * plan.episodes
-    return ResultColumns(
-        task=task,
-        seed=np.repeat(np.array(plan.seeds, np.int64), plan.episodes),
-        episode=np.tile(np.arange(plan.episodes, dtype=np.int64), len(plan.seeds)),
-        total_reward=np.full(count, np.nan),
-        length=np.zeros(count, np.int64),
-        terminated=np.full(count, -1, np.int8),
-        truncated=np.full(count, -1, np.int8),
-        success=np.full(count, -1, np.int8),
-        start_time=np.full(count, np.nan),
-        seconds=np.full(count, np.nan),
-        monitor=np.full(count, -1, np.int32),
-        episode_id=np.full(count, -1, np.int64),
-    )
+def _nothing_known(task: str, plan: EvaluationPlan) -> TaskResults:
+    rows = np.zeros(len(plan.seeds) * plan.episodes, ROW)
+    rows["seed"] = np.repeat(np.array(plan.seeds, np.int64), plan.episodes)
+    rows["episode"] = np.tile(np.arange(plan.episodes), len(plan.seeds))
+    for name in (*_TRUTHS, "monitor", "episode_id"):
+        rows[name] = -1
+    for name in ("total_reward", *_TIMES):
+        rows[name] = np.nan
+    return TaskResults(task=task, rows=rows)
 
 
-def _read_result(columns: ResultColumns, index: int, values: Sequence[str]) -> None:
-    total_reward, length, terminated, truncated, success, failure = values
+def _read_result(of: TaskResults, index: int, values: Sequence[str]) -> None:
+    total_reward, length, *truths, failure = values
     if failure:
         if total_reward:
             raise ValueError("an episode that failed has no return")
         if not failure.isprintable() or len(failure) > _LONGEST_FAILURE:
             raise ValueError(f"{failure!r:.80} is not one line")
-        columns.failures[index] = failure
-    columns.total_reward[index] = _number(total_reward)
-    columns.length[index] = _whole(length)
-    columns.terminated[index] = _truth(terminated)
-    columns.truncated[index] = _truth(truncated)
-    columns.success[index] = _truth(success)
+        of.failures[index] = failure
+    row = of.rows[index]
+    row["total_reward"], row["length"] = _number(total_reward), _whole(length)
+    for name, text in zip(_TRUTHS, truths, strict=True):
+        row[name] = _truth(text)
 
 
-def _read_timing(columns: ResultColumns, index: int, values: Sequence[str]) -> None:
+def _read_timing(of: TaskResults, index: int, values: Sequence[str]) -> None:
     start, seconds, folder, monitor, episode_id, _, video = values
-    columns.start_time[index] = _number(start)
-    columns.seconds[index] = _number(seconds)
+    row = of.rows[index]
+    row["start_time"], row["seconds"] = _number(start), _number(seconds)
     if not folder:
         if any(values[2:]):
             raise ValueError("an episode without a folder has files")
@@ -280,20 +268,20 @@ def _read_timing(columns: ResultColumns, index: int, values: Sequence[str]) -> N
     infix = Infix.parse(monitor)
     if infix is None or not _FOLDER.fullmatch(folder):
         raise ValueError(f"{folder!r:.80}, {monitor!r:.80} is no monitor")
-    columns.monitor[index] = columns.places.setdefault(place, len(columns.places))
-    columns.episode_id[index] = number = _whole(episode_id)
+    row["monitor"] = of.places.setdefault(place, len(of.places))
+    row["episode_id"] = number = _whole(episode_id)
     if video:
         prefix = video_prefix(infix, number)
         if video not in (f"{prefix}{end}" for end in (".mp4", ".json", ".avi")):
             raise ValueError(f"{video!r:.200} is no video of its episode")
-        columns.videos[index] = video
+        of.videos[index] = video
 
 
 def _read_rows(
     path: Path,
     header: Sequence[str],
-    columns: Mapping[str, ResultColumns],
-    read: Callable[[ResultColumns, int, Sequence[str]], None],
+    columns: Mapping[str, TaskResults],
+    read: Callable[[TaskResults, int, Sequence[str]], None],
 ) -> None:
     """Read a table whose rows must be exactly those of the columns."""
     with open_regular(path) as binary:
@@ -308,7 +296,7 @@ def _read_rows(
                 row = next(reader, [])
                 if len(row) != len(header) or reader.line_num != line:
                     raise ValueError(f"it has not one row of {len(header)} values")
-                unit = [of.task, str(of.seed[index]), str(of.episode[index])]
+                unit = [_encodable(of.task), *map(str, of.rows[index].item()[:2])]
                 if row[:3] != unit:
                     raise ValueError(
                         f"the episode {', '.join(unit)} belongs there, not "
@@ -337,10 +325,6 @@ def _unit(result: EpisodeResult) -> tuple[str, str, str]:
 
 def _shown(value: float | None) -> str:
     return "" if value is None else repr(float(value))
-
-
-def _known(value: np.float64) -> float | None:
-    return None if np.isnan(value) else float(value)
 
 
 def _truth_text(value: bool | None) -> str:

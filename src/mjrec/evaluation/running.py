@@ -13,6 +13,7 @@ import contextlib
 import functools
 import logging
 import pickle
+import re
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -30,7 +31,7 @@ from ..environments.from_name import environment_from_name
 from ..environments.named_environment import EnvironmentOptions, NamedEnvironment
 from ..environments.names import working_directory_importable
 from ..environments.policies import Policy, load_policy, policy_file, policy_from
-from ..environments.scenes import new_warnings
+from ..environments.scenes import new_warnings, simulation_below
 from ..errors import Error, InvalidArgument, PolicyError
 from ..formats.monitor_directory import Infix, journal_name
 from ..json_text import dumps
@@ -38,7 +39,6 @@ from ..monitors import Monitor
 from ..monitors.base import rendering_choice
 from ..recorder.options import LIVE
 from ..schedules import record_all
-from ..simulation.find_simulation import simulation_in
 from .chunk_results import read_chunk
 from .kept_episodes import keep_rule
 from .plan import SUITE, Chunk, EvaluationPlan, Unit
@@ -53,6 +53,8 @@ logger = logging.getLogger(__name__)
 
 _OF_EPISODES = (PolicyError, InvalidArgument)
 _LONGEST_FAILURE = 2000
+_LONGEST_UID = 100
+_OUTSIDE_UID = re.compile(r"[^A-Za-z0-9_.-]")
 
 _Begin: TypeAlias = Callable[[NamedEnvironment, Any, EpisodeSeeds], Any]
 
@@ -333,7 +335,7 @@ class _ChunkRun:
                 # removed when the choice is made.
                 record_all if acting.is_drawn_live else False,
                 resume=True,
-                uid=self._chunk.folder,
+                uid=_uid(self._folder),
                 mode="evaluation",
                 max_fps=plan.max_fps,
                 quality=plan.quality,
@@ -344,6 +346,7 @@ class _ChunkRun:
             )
             # A name is that of one environment, never of a vector environment.
             self._monitor = cast("_Monitor", monitor)
+            self._monitor.recorder.bundle_trajectories()
             self._monitor.leave_environment_open()
             self._open.enter_context(self._monitor)
             infix = Infix.parse(self._monitor.infix)
@@ -386,13 +389,23 @@ def _play(acting: Acting, env: Any, seeds: EpisodeSeeds, begin: _Begin) -> None:
 
 
 def _warnings(environment: Any) -> dict[str, int]:
-    simulation = simulation_in(environment)
+    simulation = simulation_below(environment)
     if simulation is None:
         return {}
     # Not at the top, because it loads MuJoCo, which not every task has.
     from ..simulation.warnings import warning_counts
 
     return warning_counts(simulation)
+
+
+def _uid(folder: Path) -> str:
+    """Return what a chunk's files have in their names, which no other chunk's have.
+
+    So those of a whole evaluation fit into one directory.
+    """
+    room = _LONGEST_UID - len(folder.name) - 1
+    task = _OUTSIDE_UID.sub("_", folder.parent.name)[:room].lstrip(".")
+    return f"{task}-{folder.name}"
 
 
 def _failed(unit: Unit, why: str, **facts: Any) -> dict[str, Any]:

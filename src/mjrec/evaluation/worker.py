@@ -23,12 +23,12 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from ..environments.scenes import simulation_below
 from ..errors import DirectoryNotWritable, Error, GLError
 from ..formats.locks import wait_for_lock
 from ..gl import use_gl
 from ..messages import carried
 from ..rendering.recovery import recover
-from ..simulation.find_simulation import simulation_in
 from ..simulation.model_trust import noting_models
 from .dataclass_json import from_json
 from .kept_episodes import NO_GL
@@ -91,7 +91,7 @@ class EvaluationWorker:
             named = self._evaluator.acting(task, self._plan.seeds[0]).named
         except Error as error:
             return {"error": carried(error)}
-        simulation = simulation_in(named.environment)
+        simulation = simulation_below(named.environment)
         return {
             "step_limit": named.step_limit,
             "velocities": 0 if simulation is None else int(simulation.model.nv),
@@ -105,7 +105,7 @@ class EvaluationWorker:
             raise DirectoryNotWritable(folder, error.strerror) from error
         # That of a run whose driver was killed may be at it still.
         with wait_for_lock(folder / _LOCK), noting_models() as models:
-            recover(folder)
+            recover(folder, bundle=True)
             chunk = from_json(Chunk, arguments["chunk"])
             self._evaluator.complete(arguments["task"], folder, chunk)
         return {"models": list(dict.fromkeys(models))}

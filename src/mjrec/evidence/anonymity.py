@@ -36,7 +36,7 @@ from ..atomic_files import replacing
 from ..errors import FileNotWritten, InvalidArgument
 from ..formats.json_fields import unreadable
 from ..formats.monitor_directory import FILE_PREFIX, Infix, infix_of, is_second_name
-from ..formats.trajectory_file import amend_trajectory
+from ..formats.trajectory_file import amend_trajectories
 from ..json_text import dumps, loads
 from .anonymous_models import anonymous_sources, compiled_model
 from .identity import Identity
@@ -152,7 +152,7 @@ def _make_file_anonymous(path: Path, texts: _Texts, matcher: IdentityMatcher) ->
         _rewrite(path, lambda data: b"".join(_csv_lines(data, texts)))
     elif name.endswith(".h5"):
         with _writing(path):
-            amend_trajectory(path, texts.value)
+            amend_trajectories({path: texts.value})
     elif name.startswith(_MODEL) and name.endswith(".zip"):
         _rewrite(path, lambda data: anonymous_sources(data, matcher))
     elif name.startswith(_MODEL) and matcher.found_in_bytes(compiled_model(path)):

@@ -19,8 +19,15 @@ from pathlib import Path
 from typing import IO, Any
 
 from ..errors import FileNotWritten, UnreadableArchive
-from ..formats.monitor_directory import iter_monitor_files
+from ..formats.bundle import trajectories_in
+from ..formats.monitor_directory import (
+    infix_of,
+    is_bundle,
+    iter_monitor_files,
+    recording_directories,
+)
 from ..formats.regular_files import open_regular
+from ..formats.trajectory_hdf5 import open_hdf5, write_hdf5
 from .layout import PAYLOAD, RECORDINGS
 from .portable_names import check_distinct, portable_parts
 from .zip_contents import ZipContents, check_table, zip_contents
@@ -53,7 +60,7 @@ def bring_in(path: Path, into: Path) -> Mapping[str, Any]:
 
     Args:
         path: a zip file; a folder with a bag in it, or one folder with a bag in it; or
-            a monitor directory.
+            a monitor directory, or a folder of some.
         into: a folder that is not there yet.
 
     Returns:
@@ -99,17 +106,24 @@ def _hashed(path: Path) -> dict[str, Any]:
 def _of_folder(path: Path, into: Path) -> Mapping[str, Any]:
     bag = _bag_in(path)
     if bag is not None:
-        _copy_files(_files_below(bag), bag, into, given=path)
+        files = {each.relative_to(bag).as_posix(): each for each in _files_below(bag)}
+        _copy_files(files, into, given=path)
         _check_recordings(into, path)
         return {"kind": Kind.BAG}
-    recordings = list(iter_monitor_files(path))
+    recordings: dict[str, Path] = {}
+    for place in recording_directories(path):
+        for file in iter_monitor_files(place):
+            # Models are called by their content: another monitor may have the same.
+            if recordings.setdefault(file.name, file) != file and infix_of(file.name):
+                raise UnreadableArchive(path, f"{file.name} is in two of its folders")
     if not recordings:
         raise UnreadableArchive(
             path,
             "it is neither a packed run (a zip file, or a folder with bagit.txt) nor a "
             "monitor directory: nothing is recorded in it",
         )
-    _copy_files(recordings, path, into / PAYLOAD / RECORDINGS, given=path)
+    _copy_files(recordings, into / PAYLOAD / RECORDINGS, given=path)
+    _unbundle(into / PAYLOAD / RECORDINGS)
     return {"kind": Kind.DIRECTORY}
 
 
@@ -136,15 +150,20 @@ def _files_below(folder: Path) -> Iterator[Path]:
             raise ValueError(f"{entry.name!r} is neither a file nor a folder")
 
 
-def _copy_files(
-    files: Iterator[Path] | list[Path], top: Path, into: Path, *, given: Path
-) -> None:
-    paths = list(files)
-    names = [path.relative_to(top).as_posix() for path in paths]
-    check_distinct(names)
+def _unbundle(recordings: Path) -> None:
+    """Give each trajectory a file of its own, as a packed run has it."""
+    for bundle in [p for p in iter_monitor_files(recordings) if is_bundle(p.name)]:
+        for path in trajectories_in(bundle):
+            with open_hdf5(path) as reader:
+                write_hdf5(reader, path)
+        bundle.unlink()
+
+
+def _copy_files(files: Mapping[str, Path], into: Path, *, given: Path) -> None:
+    check_distinct([*files])
     into.mkdir(parents=True)
-    _check_room(sum(path.lstat().st_size for path in paths), into, given)
-    for path, name in zip(paths, names, strict=True):
+    _check_room(sum(path.lstat().st_size for path in files.values()), into, given)
+    for name, path in files.items():
         target = into.joinpath(*portable_parts(name))
         target.parent.mkdir(parents=True, exist_ok=True)
         with open_regular(path) as source, target.open("xb") as output:

@@ -73,28 +73,44 @@ def check_bagit() -> None:
         )
 
 
-def make_bag(folder: Path, info: Mapping[str, str]) -> None:
-    """Make a bag of a folder, whose payload is in `data` already.
+def bag_tags(folder: Path, *, date: str, title: str) -> dict[str, str]:
+    """Return the texts that describe a bag, by the names of their files.
 
     Args:
-        folder: the bag's.
-        info: what `bag-info.txt` says, besides the payload's size.
-
-    Raises:
-        PackError: the `bagit` package does not take the bag for a valid one.
+        folder: the bag's, whose payload is in `data` already.
+        date: of the run.
+        title: likewise.
     """
     payload = _files(folder / PAYLOAD)
     size = sum(path.stat().st_size for path in payload)
     # Since 1.0 a percent sign in a name is written as %25, which the `bagit` package
     # and `sha512sum --check` do not know. Names of cameras may have one.
     version = "0.97" if any("%" in path.name for path in payload) else "1.0"
-    tags = {**info, "Payload-Oxum": f"{size}.{len(payload)}"}
-    _write_tags(
-        folder / BAG_DECLARATION,
-        {"BagIt-Version": version, "Tag-File-Character-Encoding": "UTF-8"},
-    )
-    _write_tags(folder / _INFO, dict(sorted(tags.items())))
-    _write_manifest(folder, "manifest", payload)
+    declared = {"BagIt-Version": version, "Tag-File-Character-Encoding": "UTF-8"}
+    info = {
+        "Bag-Software-Agent": "mjrec <https://pypi.org/project/mjrec/>",
+        "Bagging-Date": date,
+        "External-Description": title,
+        FORMAT_KEY: str(FORMAT_VERSION),
+        "Payload-Oxum": f"{size}.{len(payload)}",
+    }
+    return {BAG_DECLARATION: _lines_of(declared), _INFO: _lines_of(info)}
+
+
+def make_bag(folder: Path, *, date: str, title: str) -> None:
+    """Make a bag of a folder, whose payload is in `data` already.
+
+    Args:
+        folder: the bag's.
+        date: of the run.
+        title: likewise.
+
+    Raises:
+        PackError: the `bagit` package does not take the bag for a valid one.
+    """
+    for name, text in bag_tags(folder, date=date, title=title).items():
+        (folder / name).write_text(text, encoding="utf-8", newline="\n")
+    _write_manifest(folder, "manifest", _files(folder / PAYLOAD))
     _write_manifest(folder, "tagmanifest", sorted(folder.glob("*.txt")))
     # Optional, so it is not imported with this module; it has no types.
     bagit: Any = importlib.import_module("bagit")
@@ -166,20 +182,16 @@ def _files(folder: Path) -> list[Path]:
     return sorted(found, key=lambda path: path.relative_to(folder).as_posix())
 
 
-def _write_tags(path: Path, tags: Mapping[str, str]) -> None:
-    _write_lines(path, (f"{key}: {value}" for key, value in tags.items()))
+def _lines_of(tags: Mapping[str, str]) -> str:
+    return "".join(f"{key}: {value}\n" for key, value in tags.items())
 
 
 def _write_manifest(folder: Path, kind: str, files: Iterable[Path]) -> None:
-    lines = (
-        f"{digest_of(path, _ALGORITHM)}  {path.relative_to(folder).as_posix()}"
+    text = "".join(
+        f"{digest_of(path, _ALGORITHM)}  {path.relative_to(folder).as_posix()}\n"
         for path in files
     )
-    _write_lines(folder / f"{kind}-{_ALGORITHM}.txt", lines)
-
-
-def _write_lines(path: Path, lines: Iterable[str]) -> None:
-    text = "".join(f"{line}\n" for line in lines)
+    path = folder / f"{kind}-{_ALGORITHM}.txt"
     path.write_text(text, encoding="utf-8", newline="\n")
 
 

@@ -20,6 +20,7 @@ from ..formats.json_fields import json_object, read_object
 from ..formats.monitor_directory import infix_of
 from ..formats.regular_files import open_regular
 from ..formats.trajectory_file import open_trajectory
+from .descriptions import packed_with
 from .excuses import excuse_of
 from .findings import Excuse
 from .layout import ENVIRONMENT, RECORDINGS
@@ -50,10 +51,10 @@ def claimed_excuses(given: Path, made: Path) -> list[Excuse]:
         except (Error, OSError, ValueError):
             # Whatever cannot be read is found when it is compared.
             continue
-    files = [folder / ENVIRONMENT for folder in (given, made)]
-    if all(path.is_file() for path in files):
-        packed, here = (read_object(path).get("packed_with") for path in files)
-        found += _versions(packed, here)
+    with contextlib.suppress(OSError, ValueError):
+        found += _versions(
+            read_object(given / ENVIRONMENT)["packed_with"], packed_with()
+        )
     # Several excuses reach one recording, which may have thousands of trajectories.
     models_of = functools.cache(functools.partial(_models, recordings))
     return [_with_models(excuse, models_of) for excuse in found]

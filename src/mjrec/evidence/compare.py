@@ -8,48 +8,47 @@ difference. Memory does not grow with the number of episodes, time does in propo
 
 from __future__ import annotations
 
-import dataclasses
 import filecmp
-import gzip
-import hashlib
-import re
-import zipfile
-import zlib
-from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Final, TypeAlias
 
 import numpy as np
 
-from .. import json_text
 from ..atomic_files import file_sha256
 from ..errors import Error, UnreadableFile
 from ..formats.frame_hashes import frame_hash_path
-from ..formats.json_fields import json_object, read_object
+from ..formats.json_fields import read_object
 from ..formats.monitor_directory import episode_of, infix_of
 from ..formats.trajectory_hdf5 import open_hdf5
+from .archive import BAG_DECLARATION
 from .claims import claimed_excuses
+from .compare_descriptions import compare_descriptions
 from .compare_json import (
     KEYS,
     Rule,
     Rules,
-    compare_crates,
     compare_journals,
     compare_objects,
     same_journal,
 )
+from .compare_models import (
+    compare_models,
+    compare_sources,
+    model_name,
+    recompiled,
+    renamed_models,
+)
 from .compare_rows import compare_rewards, compare_trajectories, same_trajectory
-from .compare_text import compare_frame_hashes, compare_tables, compare_texts
-from .compare_video import compare_sampled, compare_videos
+from .compare_video import compare_frame_hashes, compare_sampled, compare_videos
 from .differences import Aspect, Difference, Same, short
 from .excuses import NUMERIC, Trial, applicable, believed, merged, with_allowed
 from .findings import Excuse, Finding, Level, Outcome, Topic
 from .honesty import read_metadata, remarks_on_video
-from .layout import CRATE, ENVIRONMENT, PAYLOAD, RECORDINGS, SAMPLED, STATISTICS
+from .layout import PAYLOAD, RECORDINGS, SAMPLED
 from .notes import REWARDS_FILE, read_notes
+from .sums import Sums
 
-_TAGS: Final = ("bagit.txt", "bag-info.txt")
 # What stands in the middle or at the end of a file's name, and what kind it is then.
 _KINDS: Final[Mapping[str, str]] = {
     ".mjb.gz": "model",
@@ -87,14 +86,6 @@ _NOT_MADE: Final = "nothing made this file again"
 _NO_DIFFERENCES: Final = (Aspect.CLAIM, Aspect.STATEMENT)
 # Excuses of what was not played.
 _UNPLAYED: Final = ("environment", "wrappers", "actions not kept")
-_MOST_FAILURES: Final = 100
-_MODEL: Final = re.compile(r"openaigym\.model\.[0-9a-f]{16}")
-# Four numbers; the last is the version. A model of 1 GiB is beyond any.
-_MODEL_HEAD: Final = 16
-_LARGEST_MODEL: Final = 1 << 30
-# In the zip file of its sources.
-_CONTENTS: Final = "contents.json"
-
 _Found: TypeAlias = Iterator[Same | Difference]
 
 
@@ -125,6 +116,7 @@ class Comparison:
         on_progress: Callable[[int, int], object] = lambda *_: None,
     ) -> None:
         self._given, self._made = given / PAYLOAD, made / PAYLOAD
+        self._is_bag = (given / BAG_DECLARATION).exists()
         self._level = Level.PHYSICS if sampled else level
         self._sampled = made / SAMPLED if sampled else None
         self._allow = tuple(allow)
@@ -140,7 +132,7 @@ class Comparison:
         claims = claimed_excuses(self._given, self._made)
         excuses = applicable(merged([*claims, *(excuse for excuse, _ in noted)]))
         trial = Trial(with_allowed(excuses, self._allow))
-        sums, is_other_code = _Sums(), False
+        sums, is_other_code = Sums(), False
         for _, finding in noted:
             if finding is not None:
                 trial.use(str(finding.excuse))
@@ -167,9 +159,9 @@ class Comparison:
             yield _other_code()
 
     def _compare(self) -> Iterator[Same | Difference | Finding]:
-        self._renamed = _renamed_models(self._given, self._made)
-        for tag in _TAGS:
-            yield from self._compare_tags(tag)
+        self._renamed = renamed_models(self._given, self._made)
+        if self._is_bag:
+            yield from compare_descriptions(self._given.parent)
         names = [self._names(folder) for folder in (self._given, self._made)]
         files = sorted(names[0].keys() | names[1].keys(), key=_order)
         total, done = sum(names[0].values()), 0
@@ -188,29 +180,24 @@ class Comparison:
         """Return the files that are compared, and their sizes."""
         found = {
             path.relative_to(folder).as_posix(): path.lstat().st_size
-            for path in folder.rglob("*")
+            for path in (folder / RECORDINGS).rglob("*")
             if path.is_symlink() or not path.is_dir()
         }
         kinds: tuple[str, ...] = tuple(_KINDS.values())
         if self._level is not Level.PIXELS:
             kinds = _UNDRAWN if self._level is Level.PHYSICS else _UNDRAWN[:-1]
-        elif (self._given.parent / _TAGS[0]).exists():
+        elif self._is_bag:
             kinds = (*kinds, "")
         return {f: size for f, size in found.items() if _kind(f) in kinds}
 
-    def _compare_tags(self, tag: str) -> _Found:
-        given, made = (folder.parent / tag for folder in (self._given, self._made))
-        if given.is_file() and made.is_file() and not _is_equal(given, made):
-            yield from compare_texts(given, made, tag, self._rules())
-
     def _compare_names(self, file: str, is_given: bool, is_made: bool) -> _Found:
-        kind, model = _kind(file), _model(file)
+        kind, model = _kind(file), model_name(file)
         if is_given and is_made:
             return
         if model in self._renamed or model in self._renamed.values():
             # The sources are the same; they are in the name of what is made of them.
             if is_given and kind == "model":
-                yield _recompiled(file)
+                yield recompiled(file)
             return
         if is_made and self._level is not Level.PIXELS and kind == "trajectory":
             with open_hdf5(self._made / file) as reader:
@@ -274,24 +261,13 @@ class Comparison:
             case "hashes":
                 yield from compare_frame_hashes(given, made, file)
             case "model":
-                yield from _compare_models(given, made, file)
+                yield from compare_models(given, made, file)
             case "sources":
-                yield from _compare_sources(given, made, file)
+                yield from compare_sources(given, made, file)
             case "manifest":
                 yield from self._compare_manifests(given, made, file, rules)
             case "statistics" | "metadata" | "text":
                 yield from compare_objects(given, made, file, rules)
-            case _ if file == CRATE:
-                yield from compare_crates(given, made, file, rules)
-            case _ if file == ENVIRONMENT:
-                yield from compare_objects(given, made, file, rules)
-            case _ if file == STATISTICS:
-                own = self._own_sha256
-                yield from compare_tables(
-                    given, made, file, lambda name, v: own(f"{RECORDINGS}/{name}", v)
-                )
-            case _ if Path(file).suffix in (".md", ".cff"):
-                yield from compare_texts(given, made, file, rules)
             case _:
                 yield Difference(topic=Topic.FILES, file=file, how="its bytes differ")
 
@@ -324,10 +300,10 @@ class Comparison:
                 "decoded_sha256": lambda file, value: (
                     self._decoded.get(_video_of(file)) == value
                 ),
-                "contentSize": self._own_size,
             },
             left_out=left_out if kind == "manifest" else frozenset(),
             renamed=self._renamed,
+            is_packed=self._is_bag,
         )
 
     def _compare_rewards(self) -> _Found:
@@ -383,75 +359,6 @@ class Comparison:
         path = self._given / file
         return path.is_file() and file_sha256(path) == value
 
-    def _own_size(self, file: str, value: Any) -> bool:
-        for name, again in self._renamed.items():
-            file = file.replace(again, name)
-        path = self._given / file
-        return path.is_file() and str(path.stat().st_size) == value
-
-
-class _Sums:
-    """Counts findings that say the same of several items."""
-
-    def __init__(self) -> None:
-        self._sums: dict[tuple[Any, ...], Finding] = {}
-        self._counts: Counter[tuple[Any, ...]] = Counter()
-        self._failures: Counter[Topic] = Counter()
-
-    def same(self, found: Same) -> None:
-        """Count what is equal."""
-        self._add(
-            Finding(
-                topic=found.topic,
-                item=found.item,
-                outcome=Outcome.MADE_AGAIN,
-                count=found.count,
-                unit=found.unit,
-            ),
-            reason="",
-        )
-
-    def add(self, finding: Finding) -> None:
-        """Count a finding with those for the same excuse; the worst speaks for all."""
-        alike = (
-            finding.reason if finding.outcome is not Outcome.WITHIN_TOLERANCE else ""
-        )
-        self._add(finding, reason=alike)
-
-    def fail(self, finding: Finding) -> bool:
-        """Count what differs; return whether to list it by itself."""
-        self._failures[finding.topic] += 1
-        return self._failures[finding.topic] <= _MOST_FAILURES
-
-    def __iter__(self) -> Iterator[Finding]:
-        for key, finding in self._sums.items():
-            yield dataclasses.replace(finding, count=self._counts[key])
-        for topic, count in self._failures.items():
-            if count > _MOST_FAILURES:
-                yield Finding(
-                    topic=topic,
-                    item="",
-                    outcome=Outcome.DIFFERENT,
-                    reason="more places differ",
-                    count=count - _MOST_FAILURES,
-                    unit="place",
-                )
-
-    def _add(self, finding: Finding, *, reason: str) -> None:
-        key = (finding.topic, finding.outcome, finding.excuse, finding.unit, reason)
-        self._counts[key] += finding.count
-        known = self._sums.get(key)
-        if known is None:
-            self._sums[key] = finding
-            return
-        worst = max(known, finding, key=_size)
-        is_one = known.item == finding.item
-        self._sums[key] = worst if is_one else dataclasses.replace(worst, item="")
-
-
-def _size(finding: Finding) -> float:
-    return float(finding.figures.get("maximum", 0.0))
-
 
 def _order(file: str) -> tuple[int, str]:
     kind = _kind(file)
@@ -467,82 +374,6 @@ def _kind(file: str) -> str:
 
 def _is_equal(one: Path, other: Path) -> bool:
     return filecmp.cmp(one, other, shallow=False)
-
-
-def _model(file: str) -> str:
-    """Return the name of a model without what it is followed by; "" of other files."""
-    found = _MODEL.match(file.rpartition("/")[2])
-    return found[0] if found else ""
-
-
-def _renamed_models(given: Path, made: Path) -> dict[str, str]:
-    """Return the models that have another name made again, of the same sources."""
-    sources = [
-        {_sources(path): _model(path.name) for path in folder.rglob("*.model.*.zip")}
-        for folder in (given, made)
-    ]
-    return {
-        name: sources[1][digest]
-        for digest, name in sources[0].items()
-        if sources[1].get(digest, name) != name
-    }
-
-
-def _sources(path: Path) -> str:
-    """Return the hash of a model's sources, whatever their main file is called.
-
-    Some environments write it under a name that is random.
-    """
-    digest = hashlib.sha256()
-    try:
-        with zipfile.ZipFile(path) as sources:
-            if sum(each.file_size for each in sources.infolist()) > _LARGEST_MODEL:
-                raise ValueError("its sources are larger than any")
-            contents = json_object(sources.read(_CONTENTS))
-            main = f"source/{contents.get('main')}"
-            digest.update(json_text.dumps({**contents, "main": ""}).encode())
-            names = [name for name in sources.namelist() if name != _CONTENTS]
-            for name in [main, *sorted(set(names) - {main})]:
-                content = sources.read(name)
-                said = "" if name == main else name
-                digest.update(f"{said!r}: {len(content)}\n".encode())
-                digest.update(content)
-    except (KeyError, OSError, ValueError, zipfile.BadZipFile, zlib.error) as error:
-        raise UnreadableFile(path, error) from error
-    return digest.hexdigest()
-
-
-def _compare_sources(given: Path, made: Path, file: str) -> _Found:
-    is_equal = _sources(given) == _sources(made)
-    yield Difference(
-        topic=Topic.IDENTITY,
-        file=file,
-        # The name of the main file is a statement.
-        aspect=Aspect.STATEMENT if is_equal else Aspect.EXACT,
-        how="its sources are not those of the model that was made again",
-    )
-
-
-def _compare_models(given: Path, made: Path, file: str) -> _Found:
-    contents = []
-    for path in (given, made):
-        try:
-            with gzip.open(path) as model:
-                contents.append(model.read(_LARGEST_MODEL))
-        except (OSError, EOFError, zlib.error) as error:
-            raise UnreadableFile(path, error) from error
-    if contents[0][:_MODEL_HEAD] == contents[1][:_MODEL_HEAD]:
-        # The head has the version of MuJoCo that wrote it.
-        yield Same(topic=Topic.IDENTITY, file=file, unit="compiled model")
-    if contents[0] != contents[1]:
-        yield _recompiled(file)
-    else:
-        yield Difference(
-            topic=Topic.FILES,
-            file=file,
-            aspect=Aspect.STORED,
-            how="the same model, compressed otherwise",
-        )
 
 
 def _damaged(file: str, error: Error) -> Difference:
@@ -566,16 +397,6 @@ def _other_code() -> Finding:
         "other numbers were at work",
         unit="verification",
         is_headline=True,
-    )
-
-
-def _recompiled(file: str) -> Difference:
-    return Difference(
-        topic=Topic.IDENTITY,
-        file=file,
-        aspect=Aspect.MODEL,
-        unit="compiled model",
-        how="it was compiled otherwise",
     )
 
 

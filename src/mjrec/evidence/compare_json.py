@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Two files of JSON, value by value: journal, statistics, manifest, metadata, crate.
+"""Two files of JSON, value by value: journal, statistics, manifest, metadata.
 
 Each key that may be other than made again stands in a table here, with what it tells
 about and how it may differ. Any other key has to be equal, and to be there.
@@ -23,7 +23,6 @@ from .findings import Topic
 
 _LONGEST_LINE: Final = 1 << 24
 _LONGEST_FILE: Final = 1 << 28
-_SOFTWARE: Final = "SoftwareApplication"
 _EPISODE: Final = re.compile(rb'\{"episode_id": (\d{1,15}),')
 _ABSENT: Final = object()
 
@@ -54,14 +53,16 @@ class Rules:
         left_out: keys that are not looked at.
         renamed: names in the archive, and those of the same files made again: a
             compiled model has its hash in its name.
+        is_packed: packing took the lines about rows out of journals.
     """
 
     keys: Mapping[str, Rule] = field(default_factory=dict)
     usual: Rule = _OF_FILES
     own: Mapping[str, Own] = field(default_factory=dict)
-    claims: frozenset[str] = frozenset(("versions", "rendered_with", "packed_with"))
+    claims: frozenset[str] = frozenset(("versions", "rendered_with"))
     left_out: frozenset[str] = frozenset()
     renamed: Mapping[str, str] = field(default_factory=dict)
+    is_packed: bool = False
 
     def translated(self, text: bytes) -> bytes:
         """Return a text of the archive with the names that were made again."""
@@ -104,13 +105,7 @@ KEYS: Final[Mapping[str, Rule]] = {
     "model": _MODEL,
 }
 # The program's name and version; what it was told is no claim.
-_ENCODER: Final = (
-    *("encoder_version.version", "encoder_version.cmdline[0]"),
-    *("encoders[0].version",),
-)
-# What drew and what encoded is listed in `environment.json`, each once: the lists of
-# two machines have two entries, and one of them here.
-LISTED: Final[Mapping[str, Rule]] = {"pictures": _GL, "encoders": _FFMPEG}
+_ENCODER: Final = ("encoder_version.version", "encoder_version.cmdline[0]")
 
 
 def compare_objects(
@@ -125,55 +120,10 @@ def compare_objects(
     yield from _or_bytes(json_differences(one, read_object(made), file, rules), file)
 
 
-def compare_crates(
-    given: Path, made: Path, file: str, rules: Rules
-) -> Iterator[Same | Difference]:
-    """Yield how two crates differ: entities by their names, packages by theirs.
-
-    Raises:
-        UnreadableFile: one is damaged.
-    """
-    one = _translated_object(given, rules)
-    with unreadable(given):
-        view, again = _crate_view(one), _crate_view(read_object(made))
-    yield from _or_bytes(json_differences(view, again, file, rules), file)
-
-
 def _translated_object(given: Path, rules: Rules) -> Mapping[str, Any]:
     """Return an object of the archive, with the names that were made again."""
     with unreadable(given):
         return json_object(rules.translated(read_regular(given, limit=_LONGEST_FILE)))
-
-
-def _crate_view(crate: Mapping[str, Any]) -> dict[str, Any]:
-    graph = crate.get("@graph")
-    if not isinstance(graph, list) or not all(isinstance(e, dict) for e in graph):
-        raise ValueError("it has no graph of entities")
-    software = [each for each in graph if each.get("@type") == _SOFTWARE]
-    named = {str(each.get("@id")) for each in software}
-    entities: dict[str, Any] = {}
-    for entity in graph:
-        if entity.get("@type") == _SOFTWARE:
-            continue
-        key = str(entity.get("@id"))
-        if key in entities:
-            raise ValueError(f"the entity {key!r:.100} is there twice")
-        entities[key] = {name: _without(named, v) for name, v in entity.items()}
-    rest = {key: value for key, value in crate.items() if key != "@graph"}
-    # An entity whose name has the version in it cannot be found under another one.
-    return {
-        **rest,
-        "packed_with": {str(each.get("name")): each for each in software},
-        "graph": entities,
-    }
-
-
-def _without(names: set[str], value: Any) -> Any:
-    """Return a reference, or a list of them, without those to named entities."""
-    if isinstance(value, list):
-        return [each for each in value if _without(names, each) is not None]
-    is_named = isinstance(value, dict) and value.get("@id") in names
-    return None if is_named else value
 
 
 def compare_journals(
@@ -185,7 +135,8 @@ def compare_journals(
         UnreadableFile: one is damaged.
     """
     with unreadable(given), open_regular(given) as one, open_regular(made) as other:
-        pairs = itertools.zip_longest(_lines(one), _lines(other))
+        given_lines = _lines(one) if rules.is_packed else _without_rows(one)
+        pairs = itertools.zip_longest(given_lines, _without_rows(other))
         for number, (a, b) in enumerate(pairs, start=1):
             if a is None or b is None:
                 yield Difference(
@@ -258,7 +209,7 @@ def json_differences(
             inner = f"{where}.{key}" if where else key
             own = rules.own.get(key)
             value = given.get(key, _ABSENT)
-            if own is not None and key in made and own(_owner(given, file), value):
+            if own is not None and key in made and own(file, value):
                 if value != made[key]:
                     yield _leaf(value, made[key], file, inner, episode, _STATEMENT)
                 continue
@@ -271,9 +222,6 @@ def json_differences(
                 episode=episode,
                 rule=_rule(key, inner, rules, rule),
             )
-    elif _is_listed(given, made, where):
-        key = where.rpartition(".")[2]
-        yield _leaf(given, made, file, where, episode, LISTED[key])
     elif isinstance(given, list) and isinstance(made, list) and len(given) == len(made):
         for index, pair in enumerate(zip(given, made, strict=True)):
             inner = f"{where}[{index}]"
@@ -283,12 +231,6 @@ def json_differences(
             )
     else:
         yield _leaf(given, made, file, where, episode, rule or rules.usual)
-
-
-def _is_listed(given: Any, made: Any, where: str) -> bool:
-    """Tell whether two lists of what drew or encoded are not of one length."""
-    are_lists = isinstance(given, list) and isinstance(made, list)
-    return are_lists and len(given) != len(made) and where.endswith(tuple(LISTED))
 
 
 def _rule(key: str, where: str, rules: Rules, outer: Rule | None) -> Rule | None:
@@ -335,12 +277,6 @@ def _leaf(
     )
 
 
-def _owner(value: Mapping[str, Any], file: str) -> str:
-    """Return which file a hash or size is of: the one that the object names."""
-    name = value.get("@id")
-    return name if isinstance(name, str) else file
-
-
 def _or_bytes(found: Any, file: str) -> Iterator[Same | Difference]:
     """Yield differences; without one, that the same is written otherwise."""
     is_any = False
@@ -360,5 +296,8 @@ def _lines(file: BinaryIO) -> Iterator[bytes]:
     while line := file.readline(_LONGEST_LINE):
         if len(line) >= _LONGEST_LINE:
             raise ValueError("a line is too long")
-        if not is_of_spans(line):
-            yield line
+        yield line
+
+
+def _without_rows(file: BinaryIO) -> Iterator[bytes]:
+    return (line for line in _lines(file) if not is_of_spans(line))

@@ -9,23 +9,24 @@ from __future__ import annotations
 
 import hashlib
 import itertools
+import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Final
+from typing import BinaryIO, Final
 
 import imageio.v3
 import numpy as np
 
 from ..formats.json_fields import unreadable
-from ..formats.regular_files import read_regular
+from ..formats.regular_files import open_regular, read_regular
 from .decoded_video import DecodedVideo
 from .differences import Aspect, Difference, Same, short, unlike
 from .findings import Topic
 from .mp4_boxes import Box, read_boxes, shown_times
 from .picture_similarity import (
+    OTHER_CPU,
     OTHER_ENCODER,
-    OTHER_RENDERER,
     Planes,
     Similarity,
     but_for_shadows,
@@ -40,6 +41,8 @@ _ENCODED: Final = frozenset(
 # Only where frames are stored in another order than shown, or are no key frames.
 _OPTIONAL: Final = frozenset(("ctts", "stss"))
 _LONGEST_HASHES: Final = 1 << 28
+_LONGEST_LINE: Final = 1 << 20
+_HASH_BEGINS: Final = re.compile(rb"0, +\d+, +\d+, +1, +\d+, ")
 _EQUAL: Final = Similarity(100.0, 1.0, 0.0)
 
 
@@ -165,6 +168,35 @@ def compare_sampled(
         yield Same(topic=Topic.PICTURES, file=file, count=equal, unit="frame")
 
 
+def compare_frame_hashes(
+    given: Path, made: Path, file: str
+) -> Iterator[Same | Difference]:
+    """Yield how the hashes of two videos' frames differ, and how many are equal."""
+    differing, first, total = 0, "", -1
+    with unreadable(given), open_regular(made) as other:
+        total = sum(1 for line in other if _HASH_BEGINS.match(line))
+    for number, a, b in _different_lines(given, made):
+        begins = [_HASH_BEGINS.match(line or b"") for line in (a, b)]
+        if not all(begins) or begins[0][0] != begins[1][0]:  # type: ignore[index]
+            yield _differs(file, f"line {number}", *map(_text, (a, b)))
+        elif a is not None and b is not None:
+            differing += 1
+            first = first or _text(a).split(",")[1].strip()
+    if differing:
+        yield Difference(
+            topic=Topic.PICTURES,
+            file=file,
+            count=differing,
+            unit="frame hash",
+            aspect=Aspect.HASH,
+            where=f"frame {first}",
+            how="its hash is another",
+        )
+    if total > differing:
+        count = total - differing
+        yield Same(topic=Topic.PICTURES, file=file, count=count, unit="frame")
+
+
 class Worst:
     """Compares pairs of frames, and says how far the worst are apart."""
 
@@ -182,7 +214,7 @@ class Worst:
         self._differing += 1
         found = similarity(one, other)
         lit = found
-        if OTHER_RENDERER.strain(found) > 1:
+        if OTHER_CPU.strain(found) > 1:
             but, share = but_for_shadows(one, other)
             self._shadow = max(self._shadow, share)
             lit = similarity(one, but)
@@ -229,3 +261,22 @@ def _differs(file: str, where: str, given: str, made: str) -> Difference:
         where=where,
         how=unlike(given, made),
     )
+
+
+def _text(line: bytes | None) -> str:
+    return "nothing" if line is None else line.decode(errors="replace").rstrip("\n")
+
+
+def _different_lines(
+    given: Path, made: Path
+) -> Iterator[tuple[int, bytes | None, bytes | None]]:
+    with unreadable(given), open_regular(given) as one, open_regular(made) as other:
+        pairs = itertools.zip_longest(_lines(one), _lines(other))
+        for number, pair in enumerate(pairs, start=1):
+            if pair[0] != pair[1]:
+                yield number, *pair
+
+
+def _lines(file: BinaryIO) -> Iterator[bytes]:
+    while line := file.readline(_LONGEST_LINE):
+        yield line

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What of a monitor directory is packed: all that its manifests vouch for.
+"""What of monitor directories is packed: all that their manifests vouch for.
 
 Of each monitor: the manifest and what it names (statistics, finished videos, those
 that broke), the journal, the frame hashes, the trajectories, and the models of these.
@@ -28,6 +28,7 @@ from ..errors import (
     UnknownName,
     UnreadableFile,
 )
+from ..formats.bundle import file_of, finished_trajectories, trajectories_in
 from ..formats.frame_hashes import frame_hash_path
 from ..formats.json_fields import base_name, unreadable
 from ..formats.locks import is_locked
@@ -36,8 +37,10 @@ from ..formats.monitor_directory import (
     FILE_PREFIX,
     episode_of,
     infix_of,
+    is_bundle,
     is_manifest,
     iter_monitor_files,
+    recording_directories,
     where_recordings_are,
 )
 from ..formats.regular_files import regular_path
@@ -65,10 +68,11 @@ class Contents:
     """What is packed.
 
     Attributes:
-        directory: the monitor directory.
+        directory: as it was given.
         packed_episodes: the numbers of the chosen episodes; None where all are packed.
         files: those that are packed as they are, by name.
         manifests: by name, those that are packed with other content.
+        bundled: trajectories that get a file of their own, by the name of that.
         without_states: trajectories that are packed without states and snapshots.
         surroundings: what the manifests say of where their recordings were made.
     """
@@ -77,6 +81,7 @@ class Contents:
     packed_episodes: tuple[int, ...] | None
     files: dict[str, Path] = field(default_factory=dict)
     manifests: dict[str, Manifest] = field(default_factory=dict)
+    bundled: dict[str, Path] = field(default_factory=dict)
     without_states: dict[str, Path] = field(default_factory=dict)
     surroundings: list[Mapping[str, Any]] = field(default_factory=list)
 
@@ -103,11 +108,12 @@ def look_for_contents(directory: Path, episodes: Iterable[int] | None) -> Conten
     """Return what of a monitor directory is to be packed.
 
     Args:
-        directory: the monitor directory.
+        directory: the monitor directory, or one that holds some, as an evaluation's.
         episodes: those whose videos and states are packed; all, if None.
 
     Raises:
-        InvalidArgument: it is no monitor directory, or an episode is no number.
+        InvalidArgument: it is no monitor directory, an episode is no number, or those
+            of several directories are chosen from.
         UnknownName: there is no such episode.
         DirectoryInUse: a monitor is open, or a process renders.
         UnfinishedRecordings: videos are pending, or a monitor was killed.
@@ -115,23 +121,44 @@ def look_for_contents(directory: Path, episodes: Iterable[int] | None) -> Conten
             cannot hold everywhere.
         UnreadableFile: a file is damaged, or a link that leads out of the directory.
     """
-    _check_is_idle(directory)
-    files = list(iter_monitor_files(directory))
-    if not files:
+    places = recording_directories(directory)
+    if not any(map(any, map(iter_monitor_files, places))):
         raise InvalidArgument(
             f"{directory} holds no recordings that could be packed. "
             f"{where_recordings_are(directory)}"
         )
-    _check_all_is_done(directory)
-    chosen = None if episodes is None else _chosen(directory, files, episodes)
+    for place in places:
+        _check_is_idle(place)
+        _check_all_is_done(place)
+    chosen = None
+    if episodes is not None:
+        if len(places) > 1:
+            raise InvalidArgument(
+                f"{directory} holds {len(places)} monitor directories, and episodes "
+                "are counted in each. Pack the one whose episodes you choose."
+            )
+        chosen = _chosen(places[0], episodes)
     contents = Contents(directory=directory, packed_episodes=chosen)
-    of_infix: dict[str, list[Path]] = {}
-    for path in files:
-        of_infix.setdefault(infix_of(path.name) or "", []).append(path)
-    for monitor in monitors_of(directory):
-        if monitor.manifest is not None:
-            _add_monitor(contents, monitor.manifest, of_infix[monitor.infix])
+    infixes: dict[str, Path] = {}
+    for place in places:
+        _add_all(contents, place, infixes)
     return contents
+
+
+def _add_all(contents: Contents, place: Path, infixes: dict[str, Path]) -> None:
+    """Add the monitors of a directory, whose infixes none before them may have."""
+    of_infix: dict[str, list[Path]] = {}
+    for path in iter_monitor_files(place):
+        of_infix.setdefault(infix_of(path.name) or "", []).append(path)
+    for monitor in monitors_of(place):
+        if monitor.manifest is None:
+            continue
+        if (other := infixes.setdefault(monitor.infix, place)) != place:
+            raise PackError(
+                f"{other} and {place} have files of the same names, with "
+                f"{monitor.infix} in them. Pack each of them by itself."
+            )
+        _add_monitor(contents, monitor.manifest, of_infix[monitor.infix])
 
 
 def _check_is_idle(directory: Path) -> None:
@@ -173,9 +200,7 @@ def _check_all_is_done(directory: Path) -> None:
         raise UnfinishedRecordings(directory, pending, advice=_RENDER.format(directory))
 
 
-def _chosen(
-    directory: Path, files: Iterable[Path], episodes: Iterable[int]
-) -> tuple[int, ...]:
+def _chosen(directory: Path, episodes: Iterable[int]) -> tuple[int, ...]:
     """Return the numbers of the chosen episodes, sorted, each once."""
     given = list(episodes)
     try:
@@ -187,7 +212,8 @@ def _chosen(
             f"episodes is a list of the numbers of episodes, got {given!r}."
         )
     known = {episode.episode_id for episode in iter_episodes(directory)}
-    known |= {n for path in files if (n := episode_of(path.name)) is not None}
+    named = (*iter_monitor_files(directory), *finished_trajectories(directory))
+    known |= {n for path in named if (n := episode_of(path.name)) is not None}
     for number in numbers:
         if number not in known:
             there = [str(each) for each in sorted(known)]
@@ -202,6 +228,9 @@ def _add_monitor(contents: Contents, path: Path, files: list[Path]) -> None:
     for file in files:
         if file.name.endswith((".jsonl", ".monitor.csv")):
             contents.add(file)
+        elif is_bundle(file.name):
+            for bundled in trajectories_in(file):
+                _add_trajectory(contents, bundled)
         elif file.suffix == ".h5":
             _add_trajectory(contents, file)
     for video, metadata in manifest.videos:
@@ -248,13 +277,17 @@ def _add_trajectory(contents: Contents, path: Path) -> None:
         _check_name(path)
         contents.without_states[path.name] = path
         return
-    contents.add(path)
+    if is_bundle(file_of(path).name):
+        _check_name(path)
+        contents.bundled[path.name] = path
+    else:
+        contents.add(path)
     with open_for_rendering(path) as reader:
         model = reader.facts.get("model") or {}
     for name in filter(None, (model.get("mjb"), model.get("xml"))):
         # What it was made from may not be known, and a compiled one may be gone.
-        if (contents.directory / name).exists():
-            contents.add(contents.directory / name)
+        if path.with_name(name).exists():
+            contents.add(path.with_name(name))
 
 
 def _broken_of(manifest: Manifest) -> Iterator[str]:

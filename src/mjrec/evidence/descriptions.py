@@ -11,6 +11,7 @@ from __future__ import annotations
 import csv
 import dataclasses
 import importlib.metadata
+import io
 import json
 import platform
 import shlex
@@ -72,40 +73,61 @@ _HOMES = {
 }
 
 
-def write_descriptions(run: PackedRun, payload: Path) -> None:
-    """Write all of them; the crate last, which names the rest.
+def descriptions(
+    run: PackedRun, recordings: Path, *, packed_with: Mapping[str, str]
+) -> dict[str, str]:
+    """Return the texts of all of them, by the names of their files.
+
+    They depend on the recordings and on what is given here, and on nothing else.
+
+    Args:
+        run: what there is to say.
+        recordings: the folder of what was recorded, as it is packed.
+        packed_with: the versions of what packs it.
 
     Raises:
         UnreadableFile: a file is damaged.
         MissingDependency: Jinja is not installed.
     """
-    write_statistics(payload / RECORDINGS, payload / STATISTICS)
-    _write_json(payload / ENVIRONMENT, environment(run))
-    _write(payload / README, _rendered("README.md.jinja", run, finalize=_markdown))
-    _write(payload / CITATION, _rendered("CITATION.cff.jinja", run, finalize=_json))
-    text = _rendered(f"{CRATE}.jinja", run, finalize=_json, **_crate_facts(payload))
-    _write_json(payload / CRATE, _finished_crate(text))
+    texts = {
+        README: _rendered("README.md.jinja", run, finalize=_markdown),
+        CITATION: _rendered("CITATION.cff.jinja", run, finalize=_json),
+        ENVIRONMENT: _json_text(_environment(run, packed_with)),
+        STATISTICS: _statistics(recordings),
+    }
+    facts = _crate_facts(recordings, texts)
+    crate = _finished_crate(_rendered(f"{CRATE}.jinja", run, finalize=_json, **facts))
+    return {**texts, CRATE: _json_text(crate)}
 
 
-def write_statistics(recordings: Path, path: Path) -> None:
-    """Write the table of the episodes of a monitor directory.
+def packed_with() -> dict[str, str]:
+    """Return the versions of what packs here."""
+    return {
+        "mjrec": importlib.metadata.version("mjrec"),
+        "bagit": importlib.metadata.version("bagit"),
+        "python": platform.python_version(),
+        # What deflates, to the very byte.
+        "zlib": zlib.ZLIB_RUNTIME_VERSION,
+    }
 
-    Its columns are `layout.STATISTICS_COLUMNS`. The episodes come in the order of
-    `iter_episodes`. Numbers are written so that reading them gives the same bits;
-    what is not known is empty; truth is `true` or `false`; a seed is JSON.
 
-    Raises:
-        UnreadableFile: a file is damaged.
+def _statistics(recordings: Path) -> str:
+    """Return the table of the episodes, in the order of `iter_episodes`.
+
+    Its columns are `layout.STATISTICS_COLUMNS`. Numbers are written so that reading
+    them gives the same bits; what is not known is empty; truth is `true` or `false`; a
+    seed is JSON.
     """
-    with path.open("x", encoding="utf-8", newline="") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(STATISTICS_COLUMNS)
-        for episode in iter_episodes(recordings):
-            cells = _cells(episode)
-            writer.writerow(_cell(cells[column]) for column in STATISTICS_COLUMNS)
+    file = io.StringIO(newline="")
+    writer = csv.writer(file, lineterminator="\n")
+    writer.writerow(STATISTICS_COLUMNS)
+    for episode in iter_episodes(recordings):
+        cells = _cells(episode)
+        writer.writerow(_cell(cells[column]) for column in STATISTICS_COLUMNS)
+    return file.getvalue()
 
 
-def environment(run: PackedRun) -> dict[str, Any]:
+def _environment(run: PackedRun, packed_with: Mapping[str, str]) -> dict[str, Any]:
     """Return the content of `environment.json`.
 
     Returns:
@@ -116,14 +138,7 @@ def environment(run: PackedRun) -> dict[str, Any]:
     """
     return {
         "recordings": {session.infix: _made_with(session) for session in run.sessions},
-        "packed_with": {
-            "mjrec": importlib.metadata.version("mjrec"),
-            "bagit": importlib.metadata.version("bagit"),
-            "python": platform.python_version(),
-            # What deflates, to the very byte.
-            "zlib": zlib.ZLIB_RUNTIME_VERSION,
-            "options": dataclasses.asdict(run.options),
-        },
+        "packed_with": {**packed_with, "options": dataclasses.asdict(run.options)},
     }
 
 
@@ -230,24 +245,24 @@ def _json(value: object) -> str:
     return json.dumps(value, ensure_ascii=False)
 
 
-def _write_json(path: Path, content: Any) -> None:
-    _write(path, json_text.dumps(content, indent=2) + "\n")
+def _json_text(content: Any) -> str:
+    return json_text.dumps(content, indent=2) + "\n"
 
 
-def _write(path: Path, text: str) -> None:
-    path.write_text(text, encoding="utf-8", newline="\n")
-
-
-def _crate_facts(payload: Path) -> dict[str, Any]:
+def _crate_facts(recordings: Path, texts: Mapping[str, str]) -> dict[str, Any]:
     """Return what the template needs besides the run.
 
     Args:
-        payload: the folder of the crate, in which all other files are.
+        recordings: the folder of what was recorded.
+        texts: the other descriptions, by the names of their files.
     """
-    recordings = sorted((payload / RECORDINGS).iterdir())
+    files = sorted(recordings.iterdir())
     return {
-        "files": [_file(payload / name, name) for name in _DESCRIPTIONS],
-        "recordings": [_file(path, _recording_id(path.name)) for path in recordings],
+        "files": [_file(n, n, len(text.encode())) for n, text in texts.items()],
+        "recordings": [
+            _file(path.name, _recording_id(path.name), path.stat().st_size)
+            for path in files
+        ],
         "homes": _HOMES,
         "references": _references,
     }
@@ -277,14 +292,13 @@ def _finished_crate(text: str) -> dict[str, Any]:
     return {**crate, "@graph": list(graph.values())}
 
 
-def _file(path: Path, entity_id: str) -> dict[str, Any]:
+def _file(name: str, entity_id: str, size: int) -> dict[str, Any]:
     return {
         "id": entity_id,
-        "name": path.name,
-        # A description of the crate says the sizes of files that are there already.
-        "size": str(path.stat().st_size),
-        "format": _FORMATS.get(path.suffix),
-        "description": _DESCRIPTIONS.get(path.name),
+        "name": name,
+        "size": str(size),
+        "format": _FORMATS.get(Path(name).suffix),
+        "description": _DESCRIPTIONS.get(name),
     }
 
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The videos that an evaluation chose among the episodes of many recordings.
 
-Most of these are not in one archive, so that the choice cannot be made again.
+Most of these may not be in the archive: the choice is not made again.
 """
 
 from __future__ import annotations
@@ -13,9 +13,8 @@ from pathlib import Path
 from typing import Any
 
 from ..formats.journal import JournalWriter
-from ..formats.monitor_directory import Infix, journal_name, trajectory_prefix
-from ..formats.spans import FINISHED
-from ..formats.trajectory_file import amend_trajectory
+from ..formats.monitor_directory import Infix, journal_name
+from ..formats.trajectory_file import amend_trajectories, find_trajectory
 from ..results.manifest_writing import write_manifest_and_stats
 from .inputs import RecordingInputs
 from .notes import Notes
@@ -34,20 +33,21 @@ def choose_for_evaluation(
     infix, keep = Infix.parse(recording.infix), recording.evaluation_keep
     assert infix is not None
     assert keep is not None
-    for episode in recording.episodes:
-        path = directory / f"{trajectory_prefix(infix, episode.episode_id)}{FINISHED}"
-        if episode.selection is not None and path.exists():
-            amend_trajectory(
-                path, functools.partial(_with_promise, dict(episode.selection))
-            )
+    amend_trajectories(
+        {
+            path: functools.partial(_with_promise, dict(episode.selection))
+            for episode in recording.episodes
+            if episode.selection is not None
+            and (path := find_trajectory(directory, infix, episode.episode_id))
+        }
+    )
     with contextlib.closing(JournalWriter(directory / journal_name(infix))) as journal:
         journal.note("keep", dict(keep))
     write_manifest_and_stats(directory, infix, is_own=True)
     notes.add(
         recording.name,
         "rule",
-        "its videos were chosen among all episodes of an evaluation, which are not "
-        "here: that is believed",
+        "its videos were chosen among all episodes of an evaluation: that is believed",
         count=len(recording.episodes),
     )
 

@@ -21,6 +21,7 @@ from .differences import Aspect, Difference, Place, Same
 from .findings import Excuse, ExcuseKind, Finding, Outcome, Topic
 from .notes import Note
 from .picture_similarity import (
+    OTHER_BUILD,
     OTHER_CPU,
     OTHER_ENCODER,
     OTHER_RENDERER,
@@ -156,8 +157,6 @@ NUMERIC: Final = (
 _ANY_VERSION: Final = _Rule(
     kind=ExcuseKind.VERSION, costs="nothing but its own version", allows=_RESTORED
 )
-# In the README, all versions are one line.
-_VERSIONS: Final = "versions"
 _DESCRIPTIONS: Final = ("README.md", "CITATION.cff", "ro-crate-metadata.json")
 _OUTCOMES: Final = {
     Aspect.CLAIM: Outcome.NOTED,
@@ -395,8 +394,7 @@ def _outcome(excuse: Excuse, found: Difference) -> Outcome | None:
     if found.topic in rule.excludes:
         return Outcome.BELIEVED
     if found.aspect is Aspect.CLAIM:
-        is_version = found.claim == _VERSIONS and excuse.kind is ExcuseKind.VERSION
-        return Outcome.NOTED if is_version or found.claim == excuse.name else None
+        return Outcome.NOTED if found.claim == excuse.name else None
     if found.aspect is Aspect.EXACT:
         is_described = excuse.name == "mjrec" and found.file in _DESCRIPTIONS
         return Outcome.BELIEVED if is_described else None
@@ -416,7 +414,7 @@ def _allows(excuse: Excuse, rule: _Rule) -> _Allowed:
     if excuse.name == "mujoco" and _major(excuse.claimed) != _major(excuse.here):
         return {**rule.allows, **_OTHER_MAJOR}
     if excuse.name == "gl" and _family(excuse.claimed) == _family(excuse.here):
-        return {**rule.allows, Aspect.PICTURE: OTHER_ENCODER}
+        return {**rule.allows, Aspect.PICTURE: OTHER_BUILD}
     return rule.allows
 
 

@@ -37,12 +37,10 @@ from ..rendering.jobs import Progress
 from .anonymity import make_anonymous
 from .bag import TRY_AGAIN, check_bagit, make_bag, write_zip
 from .contents import Contents, look_for_contents
-from .descriptions import write_descriptions
+from .descriptions import descriptions, packed_with
 from .identity import Identity, identity_of_user
 from .identity_traces import remaining_identity
 from .layout import (
-    FORMAT_KEY,
-    FORMAT_VERSION,
     MOST_ENTRIES,
     PAYLOAD,
     RECORDINGS,
@@ -87,15 +85,15 @@ def pack(
         mjrec.verify("run.zip")
 
     Args:
-        directory: the monitor directory. Its monitors are closed, and its videos
-            rendered.
+        directory: the monitor directory, or one that holds some, such as an
+            evaluation's. Its monitors are closed, and its videos rendered.
         path: the archive; its name ends in `.zip`, and nothing of that name exists.
         title: of the run; what was recorded, if None.
         authors: each "Name", "Name <address>" or "Name <ORCID>", in their order.
         license: the SPDX identifier of the licence, such as "CC-BY-4.0", or its URL.
         episodes: the numbers of those whose videos and recorded states are packed;
-            all, if None. Statistics, actions and seeds are of all in any case, and the
-            archive says that a choice was made.
+            all, if None, as always of several directories. Statistics, actions and
+            seeds are of all in any case, and the archive says that a choice was made.
         anonymous: whether everything is taken out that names a user, a machine or an
             author; for blind reviews.
         max_size: the most bytes of the archive, as a number or as `"50M"` (50 million).
@@ -206,20 +204,11 @@ def _make_bag(
         _link_or_copy(path, recordings / path.name)
     if identity is not None:
         make_anonymous(recordings, identity=identity)
-    statements = state(
-        title=options.title, authors=options.authors, license=options.license
-    )
-    run = read_run(recordings, options=options, statements=statements)
-    write_descriptions(run, bag / PAYLOAD)
-    make_bag(
-        bag,
-        {
-            FORMAT_KEY: str(FORMAT_VERSION),
-            "Bagging-Date": run.date,
-            "External-Description": run.title,
-            "Bag-Software-Agent": "mjrec <https://pypi.org/project/mjrec/>",
-        },
-    )
+    run = read_run(recordings, options=options)
+    texts = descriptions(run, recordings, packed_with=packed_with())
+    for name, text in texts.items():
+        (bag / PAYLOAD / name).write_text(text, encoding="utf-8", newline="\n")
+    make_bag(bag, date=run.date, title=run.title)
     found = [] if identity is None else remaining_identity(bag.parent, identity)
     if found:
         raise IdentityLeft(found)
@@ -253,8 +242,9 @@ def _exists(path: Path) -> InvalidArgument:
 
 
 def _check_count(contents: Contents) -> None:
-    kinds = (contents.files, contents.manifests, contents.without_states)
-    count = sum(len(files) for files in kinds)
+    kinds = (contents.files, contents.manifests)
+    trajectories = (contents.bundled, contents.without_states)
+    count = sum(len(files) for files in (*kinds, *trajectories))
     if count > MOST_ENTRIES - _DESCRIPTIONS:
         raise PackError(
             f"The archive would hold {count} recorded files, and mjrec verify takes "
@@ -286,6 +276,9 @@ def _stage(contents: Contents, folder: Path) -> None:
             _leave_rows_out(folder / name)
     for name, manifest in contents.manifests.items():
         write_manifest(folder / name, manifest)
+    for name, path in contents.bundled.items():
+        with open_hdf5(path) as reader:
+            write_hdf5(reader, folder / name)
     for name, path in contents.without_states.items():
         _write_without_states(path, folder / name)
 

@@ -14,11 +14,12 @@ from ..environments.scenes import shown_arguments
 from ..formats.json_fields import read_object, unreadable
 from ..formats.monitor_directory import infix_of, iter_monitor_files
 from ..formats.trajectory_hdf5 import open_hdf5
+from ..plain_text import counted
 from ..results import Episode, iter_episodes
 from ..results.journal_or_stats import MonitorResults
 from ..results.monitor_files import MonitorFiles, monitors_of
 from .layout import STATES_LEFT_OUT
-from .statements import Statements
+from .statements import Statements, state
 
 _SHOWN = 3
 _NEVER = "1970-01-01"
@@ -171,14 +172,16 @@ class PackedRun:
         return max(filter(None, ends), default=_NEVER)[:10]
 
 
-def read_run(
-    recordings: Path, *, options: PackingOptions, statements: Statements
-) -> PackedRun:
+def read_run(recordings: Path, *, options: PackingOptions) -> PackedRun:
     """Return what there is to say of the recordings in a folder.
 
     Raises:
         UnreadableFile: a file is damaged.
+        InvalidArgument: a title, an author or a licence that cannot be.
     """
+    statements = state(
+        title=options.title, authors=options.authors, license=options.license
+    )
     tallies: dict[str, Tally] = {}
     for episode in iter_episodes(recordings):
         tallies.setdefault(episode.monitor, Tally()).add(episode)
@@ -198,11 +201,6 @@ def read_run(
             for monitor in monitors_of(recordings)
         ),
     )
-
-
-def counted(number: int, noun: str) -> str:
-    """Return how many there are of a noun."""
-    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
 
 
 def facts_in(value: object) -> Mapping[str, Any]:

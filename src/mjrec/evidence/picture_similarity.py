@@ -95,10 +95,14 @@ class Limits:
 # against the drawn ones. Two encodings of them are apart by at most twice the noise.
 # A square of two by two pixels that is painted over has 21 levels or more.
 OTHER_ENCODER: Final = Limits(psnr=32.0, ssim=0.97, block=20.0)
-# The same rasteriser and ffmpeg on another CPU: llvmpipe without AVX draws one pixel of
-# a thousand otherwise, by up to 5 levels (78 dB), and the encoder, that chooses
-# otherwise then, makes some levels of it.
-OTHER_CPU: Final = Limits(psnr=40.0, ssim=0.985, block=10.0)
+# The same rasteriser and ffmpeg on another CPU. llvmpipe draws alike on all that have
+# AVX. Without it (128 bits instead of 256) no frame of five videos of six was equal:
+# HalfCheetah, Humanoid, Ant, Hopper, Pusher and Swimmer of Gymnasium, from 64x64 to
+# 480x480, had 41.7 dB, 0.998 and 9.4 levels at the worst, apart from shadows in 0.14
+# per cent of a frame.
+OTHER_CPU: Final = Limits(psnr=38.0, ssim=0.985, block=14.0, shadow=0.01)
+# Its name says so many bits, and which LLVM built it.
+OTHER_BUILD: Final = Limits(psnr=32.0, ssim=0.97, block=20.0, shadow=0.01)
 # Another rasteriser besides, in the same scenes: Mesa's softpipe, which smooths no
 # edges, against llvmpipe gave 29.3 dB (32x32; 35.5 from 120x160 on), 0.903 and 34
 # levels at the worst. An NVIDIA H100 (driver 580.159) against llvmpipe, in 31 videos of

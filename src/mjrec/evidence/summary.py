@@ -13,6 +13,7 @@ from typing import Any, Final
 
 from .. import json_text
 from ..formats.monitor_directory import FILE_PREFIX
+from ..plain_text import counted
 from .findings import Excuse, Finding, Level, Outcome, Topic, Verdict, Verification
 
 _MOST_ITEMS: Final = 3
@@ -112,15 +113,6 @@ def sampled(verification: Verification) -> str | None:
     if count is None:
         return None
     return f"{count} frames of each video were drawn, chosen by --seed {seed}"
-
-
-def counted(count: int, unit: str) -> str:
-    """Return a number of things: "1 step", "12 steps", "2 frame hashes"."""
-    if count == 1:
-        return f"1 {unit}"
-    if unit.endswith("y"):
-        return f"{count:,} {unit[:-1]}ies"
-    return f"{count:,} {unit}{'es' if unit.endswith('sh') else 's'}"
 
 
 def _line(topic: Topic, found: list[Finding]) -> tuple[str, str]:

@@ -15,7 +15,7 @@ from typing import Any, Final
 
 from ..atomic_files import write_text
 from ..errors import MissingDependency
-from ..plain_text import spelled_out
+from ..plain_text import counted, spelled_out
 from . import summary
 from .findings import Finding, Outcome, Topic, Verdict, Verification
 
@@ -112,7 +112,7 @@ def _row(finding: Finding) -> dict[str, str]:
         "outcome": str(finding.outcome),
         "topic": str(finding.topic),
         "subject": finding.item or "the whole",
-        "extent": summary.counted(finding.count, finding.unit),
+        "extent": counted(finding.count, finding.unit),
         "reason": finding.reason,
     }
 

@@ -80,7 +80,8 @@ def verify(
     whose ids are in `trust`.
 
     Args:
-        path: what `mjrec pack` has made; or that, unpacked; or a monitor directory, of
+        path: what `mjrec pack` has made; or that, unpacked; or a monitor directory, or
+            one that holds some, such as an evaluation's, of
             which nothing can say whether files are missing.
         level: where to stop: `"files"` (the bag holds what it says), `"stats"`
             (rewards, ends, statistics and the selection of episodes are made again),

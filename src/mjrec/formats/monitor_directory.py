@@ -24,6 +24,7 @@
     ├── openaigym.states.<infix>.000000.tail            ... the last of these
     ├── openaigym.states.<infix>.000000.looks           ... changes of the model
     ├── openaigym.trajectory.<infix>.episode000027.h5   a recorded episode, finished
+    ├── openaigym.trajectories.<infix>.h5               ... or many in one file
     ├── openaigym.model.<16 hex digits>.mjb.gz          its compiled model ...
     ├── openaigym.model.<16 hex digits>.zip             ... and what that was made from
     ├── openaigym.results.<infix>.monitor.csv           Stable-Baselines3's, if wanted
@@ -103,6 +104,7 @@ _VISIBLE = {
     "video": re.compile(rf"{_VIDEO}\.[^/\n\0]*(mp4|avi|json|framehash)"),
     "clip": re.compile(rf"{_CLIP}\.failed\.json"),
     "trajectory": re.compile(rf"{_TRAJECTORY}\.h5"),
+    "trajectories": re.compile(rf"openaigym\.trajectories\.{_INFIX_PART}\.h5"),
     "states": re.compile(rf"{_STATES}\.(log|tail|looks)"),
     "model": re.compile(r"openaigym\.model\.[0-9a-f]{16}\.(zip|mjb\.gz)"),
     "results": re.compile(rf"openaigym\.results\.{_INFIX_PART}\.monitor\.csv"),
@@ -271,6 +273,16 @@ def trajectory_prefix(infix: Infix, episode_id: int) -> str:
     return f"{FILE_PREFIX}.trajectory.{infix}.episode{episode_id:06d}"
 
 
+def bundle_name(infix: Infix | str) -> str:
+    """Return the name of the file that many trajectories of a monitor lie in."""
+    return f"{FILE_PREFIX}.trajectories.{infix}.h5"
+
+
+def is_bundle(name: str) -> bool:
+    """Tell whether `name` is that of a file with many trajectories."""
+    return _VISIBLE["trajectories"].fullmatch(name) is not None
+
+
 def video_lock_name(infix: Infix, episode_id: int) -> str:
     """Return the name of the file that whoever renders an episode holds locked."""
     return f".{video_prefix(infix, episode_id)}.lock"
@@ -406,6 +418,13 @@ def monitor_directories_in(directory: Path) -> list[Path]:
         inner = [path, *sorted(each for each in path.iterdir() if each.is_dir())]
         found += [each for each in inner if any(iter_monitor_files(each))]
     return found
+
+
+def recording_directories(directory: Path) -> list[Path]:
+    """Return where the recordings of a directory are: in it, or else in those below."""
+    if not directory.is_dir() or any(iter_monitor_files(directory)):
+        return [directory]
+    return monitor_directories_in(directory) or [directory]
 
 
 def where_recordings_are(directory: Path) -> str:

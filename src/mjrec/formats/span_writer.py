@@ -21,10 +21,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import DirectoryNotWritable, FileNotWritten
+from .bundle import FINISHED
 from .journal import JournalWriter
 from .monitor_directory import Infix, log_name
 from .row_log import TAIL_BYTES, RowLog
-from .spans import FINISHED, LOOKS, remove_if_done, remove_log
+from .spans import LOOKS, remove_if_done, remove_log
 from .trajectory import (
     FORMAT_VERSION,
     FRAME,

@@ -36,6 +36,7 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from ..errors import DirectoryNotWritable, UnreadableFile
+from .bundle import FINISHED, is_finished
 from .journal import is_of_spans
 from .json_fields import base_name, integer, json_object, mapping, unreadable
 from .locks import is_locked
@@ -55,7 +56,7 @@ from .row_log import has_rows, tail_path
 from .trajectory import check_version, dtype_from_json
 from .video_metadata import is_done
 
-LOG, LOOKS, FINISHED = ".log", ".looks", ".h5"
+LOG, LOOKS = ".log", ".looks"
 
 _LONGEST_LINE = 1 << 24
 # So much of what was read last must still be there for the next reading to go on.
@@ -125,7 +126,7 @@ class Recording:
     def is_in_flight(self) -> bool:
         """Whether only the log has it."""
         path = self.path
-        return not (path.suffix == FINISHED and path.is_file()) and not self.is_gone
+        return not (path.suffix == FINISHED and is_finished(path)) and not self.is_gone
 
     @property
     def last_write(self) -> float:
@@ -321,7 +322,7 @@ def is_in_flight(path: Path) -> bool:
     Raises:
         UnreadableFile: as `find_recording`.
     """
-    if path.suffix == FINISHED and path.is_file():
+    if path.suffix == FINISHED and is_finished(path):
         return False
     return find_recording(path) is not None
 

@@ -9,6 +9,7 @@ structured dtype says what a row is. `docs/reference/trajectories.md` specifies 
 from __future__ import annotations
 
 import functools
+import json
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
@@ -86,8 +87,14 @@ def dtype_from_json(value: Any) -> np.dtype[Any]:
     Raises:
         ValueError: it is no row of a recording.
     """
+    return _dtype_from_text(json.dumps(value))
+
+
+# The same for all recordings of a log, and it takes Python long.
+@functools.lru_cache(maxsize=16)
+def _dtype_from_text(text: str) -> np.dtype[Any]:
     try:
-        dtype = np.lib.format.descr_to_dtype(value)
+        dtype = np.lib.format.descr_to_dtype(json.loads(text))
         names = dtype.names or ()
         own = row_dtype(**{name: dtype[name] for name in PARTS if name in names})
     # NumPy raises many things at what is no dtype.

@@ -1,57 +1,68 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A recorded episode, in flight still or an HDF5 file already."""
+"""A recorded episode: in flight still, an HDF5 file, or a group of a bundle."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import functools
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from ..errors import UnreadableFile
+from ..errors import Error, UnreadableFile
+from .bundle import FINISHED, bundle_of, file_of, is_finished
 from .journal import KILLED
 from .json_fields import unreadable
 from .monitor_directory import Infix, trajectory_prefix
 from .regular_files import open_regular
-from .spans import FINISHED, Recording, find_recording, remove_if_done
+from .spans import Recording, find_recording, is_in_flight, remove_if_done
 from .trajectory import TrajectoryReader, added_up
-from .trajectory_hdf5 import SIGNATURE, open_hdf5, write_hdf5
+from .trajectory_hdf5 import SIGNATURE, open_hdf5, write_bundle, write_hdf5
 from .trajectory_log import open_recording
 
 
 def open_trajectory(path: Path) -> TrajectoryReader:
-    """Open a trajectory for reading, whichever of its two forms it has.
+    """Open a trajectory for reading, whichever of its forms it has.
 
     Args:
-        path: of the finished file, which need not be there yet; or the name of a
-            clip's part, which never becomes a file.
+        path: of its own file, which need not be there; or the name of a clip's part,
+            which never becomes a file.
 
     Raises:
         UnreadableFile: there is neither such a file nor a log of it, or it is damaged,
             or of a newer format version.
     """
-    if not path.is_file() and find_recording(path) is not None:
+    if not is_finished(path) and find_recording(path) is not None:
         try:
             return open_recording(path)
         except UnreadableFile:
-            if not path.is_file():
+            if not is_finished(path):
                 raise
             # It was finished just now.
-    with unreadable(path), open_regular(path) as file:
-        if file.read(len(SIGNATURE)) != SIGNATURE:
-            raise ValueError("it is no trajectory")
+    if (holder := file_of(path)) == path:
+        with unreadable(path), open_regular(holder) as file:
+            if file.read(len(SIGNATURE)) != SIGNATURE:
+                raise ValueError("it is no trajectory")
     return open_hdf5(path)
 
 
 def find_trajectory(
     directory: Path, infix: Infix | str, episode_id: int
 ) -> Path | None:
-    """Return the file of an episode, which may be in flight still; None without any."""
+    """Return the path of an episode's own file; None where none is recorded."""
     known = infix if isinstance(infix, Infix) else Infix.parse(infix)
     if known is None:
         return None
     path = directory / f"{trajectory_prefix(known, episode_id)}{FINISHED}"
-    is_there = path.is_file() or find_recording(path) is not None
-    return path if is_there else None
+    return path if is_recorded(path) else None
+
+
+def is_recorded(path: Path) -> bool:
+    """Tell whether a trajectory is there in any form, by the path of its own file.
+
+    Raises:
+        UnreadableFile: it may be in a list of spans that cannot be read.
+    """
+    return is_finished(path) or find_recording(path) is not None
 
 
 def finish_trajectory(path: Path) -> Path:
@@ -74,10 +85,9 @@ def finish_trajectory(path: Path) -> Path:
         DirectoryNotWritable: the log cannot be removed.
     """
     recording = find_recording(path)
-    if not path.is_file():
+    if not is_finished(path):
         try:
-            with open_recording(path) as reader:
-                reader.facts = {**reader.facts, **_how_it_ended(reader, recording)}
+            with _ended(path, recording) as reader:
                 write_hdf5(reader, path)
         except UnreadableFile:
             if not path.is_file():
@@ -88,23 +98,75 @@ def finish_trajectory(path: Path) -> Path:
     return path
 
 
-def amend_trajectory(finished: Path, change: Callable[[Any], Any]) -> None:
-    """Change the facts of a finished trajectory.
+def finish_trajectories(paths: Iterable[Path]) -> dict[Path, Error]:
+    """Finish recordings that are in flight, and return why others could not be."""
+    failures: dict[Path, Error] = {}
+    for path in paths:
+        try:
+            if is_in_flight(path):
+                finish_trajectory(path)
+        except Error as error:
+            failures[path] = error
+    return failures
 
-    The file is written anew, whole or not at all: for what is seldom done. Nothing is
+
+def bundle_trajectories(paths: Iterable[Path]) -> dict[Path, Error]:
+    """Do so, and put them into the bundle of their monitor, written once for all.
+
+    To be called by the process that holds the lock of the monitor that they are of.
+    """
+    recordings: dict[Path, Recording] = {}
+    failures: dict[Path, Error] = {}
+    for path in paths:
+        try:
+            recording = None if is_finished(path) else find_recording(path)
+        except UnreadableFile as error:
+            failures[path] = error
+        else:
+            recordings |= {} if recording is None else {path: recording}
+    if not recordings:
+        return failures
+    added = {p: functools.partial(_ended, p, each) for p, each in recordings.items()}
+    try:
+        failures |= write_bundle(bundle_of(next(iter(added))), added, {})
+        for log in {each.log for each in recordings.values()}:
+            remove_if_done(log)
+    except Error as error:
+        failures |= dict.fromkeys(recordings, error)
+    return failures
+
+
+def amend_trajectories(changes: Mapping[Path, Callable[[Any], Any]]) -> None:
+    """Change the facts of finished trajectories.
+
+    Each file is written anew, whole or not at all: for what is seldom done. Nothing is
     in it that this package does not write; its arrays stay, bit for bit.
 
     Args:
-        finished: the HDF5 file.
-        change: returns the new facts.
+        changes: returns the new facts, by the path of the trajectory's own file.
 
     Raises:
         UnreadableFile: there is no such file, or it is damaged.
         FileNotWritten: the disk is full; the file is as before.
     """
-    with open_hdf5(finished) as reader:
-        reader.facts = change(dict(reader.facts))
-        write_hdf5(reader, finished)
+    bundled: dict[Path, dict[Path, Callable[[Any], Any]]] = {}
+    for path, change in changes.items():
+        holder = file_of(path)
+        if holder != path:
+            bundled.setdefault(holder, {})[path] = change
+            continue
+        with open_hdf5(path) as reader:
+            reader.facts = change(dict(reader.facts))
+            write_hdf5(reader, path)
+    for bundle, own in bundled.items():
+        write_bundle(bundle, {}, own)
+
+
+def _ended(path: Path, recording: Recording | None) -> TrajectoryReader:
+    """Open a recording whose facts say how it ended."""
+    reader = open_recording(path)
+    reader.facts = {**reader.facts, **_how_it_ended(reader, recording)}
+    return reader
 
 
 def _end_time(facts: Mapping[str, Any], recording: Recording | None) -> float:

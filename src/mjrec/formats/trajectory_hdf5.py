@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The HDF5 file of a recorded episode: as strangers read it, with plain h5py.
+"""Recorded episodes in HDF5 files: as strangers read them, with plain h5py.
+
+An episode has a file of its own, or a group of a bundle (`bundle`).
 
 `docs/reference/trajectories.md` has every dataset. States and snapshots are rows of a
 compound type, whose members bear MuJoCo's names: `file["states"]["qpos"]` is an array.
@@ -30,7 +32,9 @@ from numpy.typing import NDArray
 from ..atomic_files import replacing
 from ..errors import FileNotWritten, UnreadableFile
 from ..json_text import dumps
+from .bundle import file_of, group_of, index_of, index_size, trajectories_in
 from .json_fields import json_object, unreadable
+from .monitor_directory import episode_of
 from .regular_files import regular_path
 from .trajectory import (
     FORMAT_VERSION,
@@ -46,6 +50,7 @@ from .trajectory import (
 SIGNATURE = b"\x89HDF\r\n\x1a\n"
 
 _FORMAT = b"mjrec trajectory"
+_BUNDLE = b"mjrec trajectories"
 
 # Written so, h5py of 2019 and later reads it; `latest` makes files that h5py of 2025
 # cannot open.
@@ -77,15 +82,92 @@ def write_hdf5(reader: TrajectoryReader, path: Path) -> None:
         FileNotWritten: the disk is full, or the directory is gone.
         UnreadableFile: what is read turned out to be damaged.
     """
+    # Nothing is read any more after Ctrl-C, so that it is soon over.
+    with _new_file(path, reader.close) as (file, _):
+        _write(file, reader)
+
+
+def write_bundle(
+    bundle: Path,
+    added: Mapping[Path, Callable[[], TrajectoryReader]],
+    amended: Mapping[Path, Callable[[Any], Any]],
+) -> dict[Path, UnreadableFile]:
+    """Write a bundle anew with more trajectories, or other facts, whole or not at all.
+
+    What is in it already is copied as it is packed.
+
+    Args:
+        bundle: its file, which need not be there yet.
+        added: opens each new trajectory, by the path of its own file.
+        amended: returns the new facts of others.
+
+    Returns:
+        Why trajectories that cannot be read were not added.
+
+    Raises:
+        FileNotWritten: the disk is full, or the directory is gone.
+        UnreadableFile: the bundle is damaged.
+    """
+    failures: dict[Path, UnreadableFile] = {}
+    reading: list[TrajectoryReader] = []
+    before = trajectories_in(bundle)
+    size = index_size(len(before) + len(added))
+
+    def stop_reading() -> None:
+        for reader in reading:
+            reader.close()
+
+    with _new_file(bundle, stop_reading, userblock_size=size) as (file, output):
+        file.attrs["format"] = np.bytes_(_BUNDLE)
+        if before:
+            with _reading(bundle), h5py.File(regular_path(bundle), "r") as old:
+                for path in before:
+                    old.copy(_group(old, group_of(path)), file, group_of(path))
+        for path, change in amended.items():
+            _amend(file[group_of(path)].attrs, change)
+        written = [*before]
+        for path, opened in added.items():
+            try:
+                with opened() as reader:
+                    reading[:] = [reader]
+                    _write(file.create_group(group_of(path)), reader)
+            except UnreadableFile as error:
+                failures[path] = error
+                file.pop(group_of(path), None)
+            else:
+                written.append(path)
+        output.seek(0)
+        output.write(index_of(int(episode_of(path.name) or 0) for path in written))
+    return failures
+
+
+def _amend(attributes: Any, change: Callable[[Any], Any]) -> None:
+    facts = bytes(_attribute(attributes, "facts", "S"))
+    _write_facts(attributes, change(json_object(facts)))
+
+
+@contextlib.contextmanager
+def _new_file(
+    path: Path, on_signal: Callable[[], object], **options: Any
+) -> Iterator[tuple[h5py.File, _Unfailing]]:
+    """Yield a new HDF5 file, and what it is written through.
+
+    Args:
+        path: the name that it gets at the end of the block.
+        on_signal: called at once where a signal comes in the block.
+        **options: of `h5py.File`.
+
+    Raises:
+        FileNotWritten: the disk is full, or the directory is gone.
+    """
     try:
         with replacing(path) as temporary, temporary.open("x+b", buffering=0) as output:
             unfailing = _Unfailing(output)
-            # Nothing is read any more after Ctrl-C, so that it is soon over.
             with (
-                _signals_waiting(reader.close),
-                h5py.File(unfailing, "w", libver=_LIBVER) as file,
+                _signals_waiting(on_signal),
+                h5py.File(unfailing, "w", libver=_LIBVER, **options) as file,
             ):
-                _write(file, reader)
+                yield file, unfailing
             if unfailing.error is not None:
                 raise unfailing.error
             # The log is removed next: what it held must not be in a cache alone.
@@ -168,7 +250,10 @@ class _Unfailing(io.RawIOBase):
 
 
 def open_hdf5(path: Path) -> TrajectoryReader:
-    """Open the HDF5 file of a finished trajectory.
+    """Open a finished trajectory.
+
+    Args:
+        path: of its own file; it may lie in a bundle instead.
 
     Raises:
         UnreadableFile: it is no such file, of a newer version, or damaged.
@@ -176,13 +261,17 @@ def open_hdf5(path: Path) -> TrajectoryReader:
     with _reading(path), contextlib.ExitStack() as opened:
         # Without any wish about locking: HDF5 refuses a file that is open in this
         # process with another one, in the user's own code, say.
-        file = opened.enter_context(h5py.File(regular_path(path), "r"))
-        reader = _reader_of(file, path)
+        holder = file_of(path)
+        file = opened.enter_context(h5py.File(regular_path(holder), "r"))
+        group = file if holder == path else _group(file, group_of(path))
+        reader = _reader_of(group, path, file.close)
         opened.pop_all()
     return reader
 
 
-def _reader_of(file: h5py.File, path: Path) -> TrajectoryReader:
+def _reader_of(
+    file: h5py.Group, path: Path, release: Callable[[], None]
+) -> TrajectoryReader:
     attributes = file.attrs
     if "format" not in attributes or _attribute(attributes, "format", "S") != _FORMAT:
         raise ValueError("it is an HDF5 file, but no trajectory")
@@ -240,7 +329,7 @@ def _reader_of(file: h5py.File, path: Path) -> TrajectoryReader:
         dropped=int(_attribute(attributes, "dropped", "iu")),
         read=read,
         read_change=read_change,
-        release=file.close,
+        release=release,
     )
 
 
@@ -290,7 +379,7 @@ def _dataset(group: h5py.Group, name: str) -> Any:
     return dataset
 
 
-def _column(file: h5py.File, name: str, kind: str) -> NDArray[Any]:
+def _column(file: h5py.Group, name: str, kind: str) -> NDArray[Any]:
     dataset = _dataset(file, name)
     if dataset.dtype != kind or dataset.ndim != 1:
         raise ValueError(f"its {name} are of dtype {dataset.dtype}")
@@ -307,15 +396,19 @@ def _attribute(attributes: Any, name: str, kinds: str) -> Any:
     return attributes[name]
 
 
-def _write(file: h5py.File, reader: TrajectoryReader) -> None:
-    facts = dumps(dict(reader.facts)).encode()
+def _write_facts(attributes: Any, facts: Mapping[str, Any]) -> None:
+    text = dumps(dict(facts)).encode()
     # Texts of fixed length: see _attribute.
-    file.attrs["format"] = np.bytes_(_FORMAT)
-    file.attrs["format_version"] = np.int64(FORMAT_VERSION)
-    file.attrs["facts"] = np.bytes_(facts)
+    attributes["facts"] = np.bytes_(text)
     # HDF5 has checksums of its own for what it thinks of as its structure, and the
     # deflate filter for what it compressed; long texts have neither.
-    file.attrs["crc32"] = np.int64(zlib.crc32(facts))
+    attributes["crc32"] = np.int64(zlib.crc32(text))
+
+
+def _write(file: h5py.Group, reader: TrajectoryReader) -> None:
+    file.attrs["format"] = np.bytes_(_FORMAT)
+    file.attrs["format_version"] = np.int64(FORMAT_VERSION)
+    _write_facts(file.attrs, reader.facts)
     file.attrs["dropped"] = np.int64(reader.dropped)
     for name, dtype in _COLUMNS.items():
         values = getattr(reader, name)
@@ -345,7 +438,7 @@ def _cut(values: NDArray[Any], start: int, stop: int) -> NDArray[Any]:
 
 
 def _store(
-    file: h5py.File,
+    file: h5py.Group,
     name: str,
     kind: np.dtype[Any],
     count: int,

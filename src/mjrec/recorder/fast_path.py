@@ -10,13 +10,15 @@ that name is to be called.
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..formats.row_log import TAIL_HEAD
+from ..errors import FileNotWritten
+from ..formats.row_log import TAIL_HEAD, RowLog
 from ..formats.span_writer import SpanWriter
 from ..formats.trajectory import FRAME, STEP, TERMINATED, TRUNCATED
 from ..simulation.raw_memory import WORDS
@@ -103,7 +105,7 @@ def gathering(
 
     def step(reward: Any, *, terminated: bool = False, truncated: bool = False) -> bool:
         row = log.count
-        if row >= log.limit or not is_current():
+        if (row >= log.limit and not _makes_room(log)) or not is_current():
             return False
         if not isinstance(reward, float):
             if type(reward) is not int or abs(reward) > _LARGEST:
@@ -136,3 +138,11 @@ def gathering(
         return True
 
     return FastPath(before_step, step)
+
+
+def _makes_room(log: RowLog) -> bool:
+    """Write a full tail away; return False where rows do not stay in it, or cannot."""
+    # On a full disk the recorder tries again, and says so.
+    with contextlib.suppress(FileNotWritten):
+        log.make_room()
+    return log.count < log.limit

@@ -7,9 +7,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Protocol
 
-from ..errors import Error
 from ..formats.monitor_directory import ClipPart
-from ..formats.spans import is_in_flight
 
 
 class Finisher(Protocol):
@@ -40,9 +38,13 @@ class LaterFinisher:
     """Draws nothing; makes the trajectories when the monitor closes.
 
     It is a `Finisher` for runs whose videos are rendered another time, or never.
+
+    Attributes:
+        bundles: they lie in one file.
     """
 
     def __init__(self) -> None:
+        self.bundles = False
         self.failures: Mapping[str, str] = {}
         self._waiting: list[Path] = []
 
@@ -60,19 +62,15 @@ class LaterFinisher:
             Error: of the last that could not be made; the others are there.
         """
         # Not at the top: it loads h5py, which the simulation has no use for.
-        from ..formats.trajectory_file import finish_trajectory
+        from ..formats.trajectory_file import bundle_trajectories, finish_trajectories
 
-        failure: Error | None = None
-        waiting, self._waiting = self._waiting, []
-        for recording in waiting:
-            try:
-                if ClipPart.parse(recording.name) is None and is_in_flight(recording):
-                    finish_trajectory(recording)
-            except Error as error:
-                failure = error
-                self._waiting.append(recording)
-        if failure is not None:
-            raise failure
+        waiting = [each for each in self._waiting if ClipPart.parse(each.name) is None]
+        self._waiting = []
+        finish = bundle_trajectories if self.bundles else finish_trajectories
+        failures = finish(waiting)
+        self._waiting = [*failures]
+        if failures:
+            raise [*failures.values()][-1]
 
     def stop(self) -> None:
         """Do nothing."""

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import DirectoryNotWritable, Error, FileNotWritten
+from ..formats.bundle import FINISHED
 from ..formats.journal import JournalEntry
 from ..formats.manifest import GYM_VERSION
 from ..formats.monitor_directory import (
@@ -20,7 +21,7 @@ from ..formats.monitor_directory import (
     stats_prefix,
     video_prefix,
 )
-from ..formats.spans import FINISHED, recordings_in_flight
+from ..formats.spans import recordings_in_flight
 from ..formats.video_metadata import note_failure, reason_of
 from ..provenance import versions
 from ..results.manifest_writing import write_manifest_and_stats
@@ -155,6 +156,14 @@ class Recorder:
     def video_recorder(self) -> VideoRecorder | DeferredVideo | None:
         """What records the running episode, or not; None before the first reset."""
         return None if self._recording is None else self._recording.video
+
+    def bundle_trajectories(self) -> None:
+        """Let the trajectories lie in one file, which is written when this closes.
+
+        It is for a recorder that nothing renders beside.
+        """
+        assert isinstance(self.run.finisher, LaterFinisher)
+        self.run.finisher.bundles = True
 
     def set_mode(self, mode: str | None) -> None:
         """Set the type of the episodes from the next reset on.

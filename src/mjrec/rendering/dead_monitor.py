@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import Error, UnreadableFile
+from ..formats.bundle import FINISHED, is_finished
 from ..formats.journal import (
     KILLED,
     JournalEntry,
@@ -41,6 +42,7 @@ from ..formats.spans import (
     remove_log,
 )
 from ..formats.trajectory_file import (
+    bundle_trajectories,
     find_trajectory,
     finish_trajectory,
     open_trajectory,
@@ -97,18 +99,21 @@ class Report:
                 self.note(stale.name, "left behind, removed")
 
 
-def finish_dead_monitor(directory: Path, infix: Infix, report: Report) -> None:
+def finish_dead_monitor(
+    directory: Path, infix: Infix, report: Report, *, bundles: bool
+) -> None:
     """Do all that is left to do of one monitor but drawing, unless it is open.
 
     Args:
         directory: where it recorded.
         infix: the monitor's.
         report: takes what was done.
+        bundles: its trajectories lie in one file.
     """
     path = directory / lock_name(infix)
     with report.attempt(path.name):
         was_killed = path.exists()
-        monitor = _DeadMonitor(directory, infix, report)
+        monitor = _DeadMonitor(directory, infix, report, bundles=bundles)
         # Before there is a lock, which is what a killed monitor leaves.
         is_behind = lacks_results(files_of(directory, infix))
         lock = try_lock(path)
@@ -131,10 +136,13 @@ def finish_dead_monitor(directory: Path, infix: Infix, report: Report) -> None:
 class _DeadMonitor:
     """A monitor that is not open."""
 
-    def __init__(self, directory: Path, infix: Infix, report: Report) -> None:
+    def __init__(
+        self, directory: Path, infix: Infix, report: Report, *, bundles: bool
+    ) -> None:
         self._directory = directory
         self._infix = infix
         self._report = report
+        self._bundles = bundles
 
     def _left(self, kind: Kind) -> list[Path]:
         """Return what is left to do now, of one kind."""
@@ -187,16 +195,33 @@ class _DeadMonitor:
         Raises:
             UnreadableFile: the journal does not say what is in it; it stays.
         """
-        for recording in recordings_in(log):
-            path = recording.path
-            if path.suffix == ".h5" and recording.is_in_flight:
+        in_flight = [each for each in recordings_in(log) if each.is_in_flight]
+        episodes = [each for each in in_flight if each.path.suffix == FINISHED]
+        if self._bundles:
+            self._bundle(each.path for each in episodes)
+        else:
+            for recording in episodes:
+                path = recording.path
                 with self._report.attempt(path.name), self._claimed(path) as is_ours:
                     if is_ours and recording.is_in_flight:
-                        self._report.note(path.name, _finish_episode(path))
+                        finish_trajectory(path)
+                        self._report.note(path.name, _how_long(path))
         is_idle = not any(each.is_in_flight for each in recordings_in(log))
         if is_idle and any(map(Path.exists, files_beside(log))):
             remove_log(log)
             self._report.note(log.name, "nothing in flight, removed")
+
+    def _bundle(self, paths: Iterable[Path]) -> None:
+        """Put episodes into the monitor's bundle."""
+        with contextlib.ExitStack() as claims:
+            ours = [p for p in paths if claims.enter_context(self._claimed(p))]
+            ours = [path for path in ours if not is_finished(path)]
+            failures = bundle_trajectories(ours)
+            for path in ours:
+                with self._report.attempt(path.name):
+                    if path in failures:
+                        raise failures[path]
+                    self._report.note(path.name, _how_long(path))
 
     @contextlib.contextmanager
     def _claimed(self, path: Path) -> Iterator[bool]:
@@ -349,12 +374,10 @@ class _DeadMonitor:
             note(manifest_name(self._infix), what)
 
 
-def _finish_episode(path: Path) -> str:
-    """Give a recording in flight its final form; return what was done."""
+def _how_long(path: Path) -> str:
     with open_trajectory(path) as reader:
-        facts, steps = reader.facts, _counted(reader.step_count, "step")
-    finish_trajectory(path)
-    is_cut = "complete" not in facts and _facts_of(path).get("reason") == KILLED
+        steps = _counted(reader.step_count, "step")
+        is_cut = reader.facts.get("reason") == KILLED
     return f"{steps}, incomplete: killed" if is_cut else steps
 
 

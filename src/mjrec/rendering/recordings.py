@@ -19,15 +19,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import UnreadableFile
+from ..formats.bundle import FINISHED, finished_trajectories, is_finished
 from ..formats.frame_hashes import frame_hash_path
 from ..formats.locks import Lock, is_locked, try_lock
 from ..formats.monitor_directory import (
     ClipPart,
-    iter_monitor_files,
     lock_name,
     unfinished_files,
 )
-from ..formats.spans import FINISHED, find_recording, recordings_in_flight
+from ..formats.spans import find_recording, recordings_in_flight
 from ..formats.trajectory import added_up
 from ..formats.trajectory_file import find_trajectory
 from ..formats.video_metadata import is_done, metadata_path
@@ -147,7 +147,7 @@ def read_recording(parts: Sequence[Path]) -> Recorded:
 
 def recordings(directory: Path) -> list[RecordingKey]:
     """Return the episodes with a trajectory, then the clips in flight, in order."""
-    finished = (path for path in iter_monitor_files(directory) if path.suffix == ".h5")
+    finished = finished_trajectories(directory)
     in_flight = (recording.path for recording in recordings_in_flight(directory))
     keys = {key_of(path.name) for path in (*finished, *in_flight)} - {None}
     return sorted(
@@ -183,7 +183,7 @@ def _is_done(directory: Path, key: RecordingKey) -> bool:
     """Tell whether an episode has all that it can have."""
     if key.is_clip or not is_done(directory / key.video_name):
         return False
-    return (directory / f"{key.name}{FINISHED}").is_file()
+    return is_finished(directory / f"{key.name}{FINISHED}")
 
 
 def look_at(directory: Path, key: RecordingKey) -> Plan | None:
@@ -206,7 +206,7 @@ def look_at(directory: Path, key: RecordingKey) -> Plan | None:
     parts = parts_of(directory, key)
     if not parts:
         return None
-    is_log = key.is_clip or not parts[0].is_file()
+    is_log = key.is_clip or not is_finished(parts[0])
     recorded = read_recording(parts)
     first, facts, last = parts[0], recorded.facts[0], recorded.facts[-1]
     if is_log and is_open and ("complete" not in last or last.get("candidate", False)):

@@ -76,7 +76,10 @@ class Recovery:
 
 
 def recover(
-    directory: str | os.PathLike[str], *, timeout: float = _SECONDS
+    directory: str | os.PathLike[str],
+    *,
+    timeout: float = _SECONDS,
+    bundle: bool = False,
 ) -> Recovery:
     """Put a directory in order whose monitors, or renderers, were killed.
 
@@ -93,6 +96,8 @@ def recover(
         directory: the monitor directory.
         timeout: how many seconds to wait, in all, for encoders that have outlived the
             process that recorded, and are finishing their files.
+        bundle: the trajectories that are made of a monitor's log lie in one file, as
+            those of an evaluation.
 
     Returns:
         What was done. Where something could not be done, that is told there, and all
@@ -129,7 +134,7 @@ def recover(
         # Once more, because another process may have done it meanwhile.
         dead, open_monitors = _dead_and_open(path)
         for infix in dead:
-            finish_dead_monitor(path, infix, report)
+            finish_dead_monitor(path, infix, report, bundles=bundle)
         for stale in stale_shared_files(path):
             report.remove(stale)
         give_all_second_names(path)

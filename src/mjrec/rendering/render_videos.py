@@ -15,13 +15,15 @@ from typing import Any
 from ..annotation import check_annotation
 from ..engines.choice import given_engine
 from ..errors import InvalidArgument
+from ..formats.bundle import trajectories_in
 from ..formats.monitor_directory import (
     camera_part,
+    is_bundle,
     iter_monitor_files,
     name_part,
     where_recordings_are,
 )
-from ..formats.spans import is_in_flight
+from ..formats.trajectory_file import is_recorded
 from ..machine import check_workers, usable_cpus
 from ..simulation.model_trust import trusting_models
 from .engine_jobs import do_on_engine
@@ -200,7 +202,10 @@ def _recordings_of(
     Raises:
         InvalidArgument: there are none.
     """
-    if not target.exists() and not is_in_flight(target):
+    if is_bundle(target.name):
+        bundled = (key_of(path.name) for path in trajectories_in(target))
+        return target.parent, [key for key in bundled if key is not None]
+    if not target.exists() and not is_recorded(target):
         raise InvalidArgument(f"There is no directory or file {target}.")
     if not target.is_dir():
         key = key_of(target.name)
@@ -238,7 +243,7 @@ def _variant_jobs(
             the name of an original.
     """
     directory = target if target.is_dir() else target.parent
-    if target.suffix == ".h5" and directory != target:
+    if target.suffix == ".h5" and directory != target and not is_bundle(target.name):
         # Whatever its name is otherwise.
         names = [target.name]
     else:

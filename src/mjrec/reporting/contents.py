@@ -60,6 +60,8 @@ class ReportVideo:
         command: the shell command that renders it again; None where there is no
             recorded state.
         notes: what else is to be said, such as that it is incomplete.
+        trajectory: of the recorded states; None where there are none.
+        replay: the address of its page in 3D, relative to this one; empty without.
     """
 
     path: Path
@@ -77,6 +79,8 @@ class ReportVideo:
     sha256: str | None = None
     command: str | None = None
     notes: list[str] = field(default_factory=list)
+    trajectory: Path | None = None
+    replay: str = ""
 
 
 @dataclass(kw_only=True)

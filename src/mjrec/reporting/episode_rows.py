@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from ..evaluation.result_tables import ResultColumns
+from ..evaluation.result_tables import TaskResults
 from ..evaluation.statistics import Bootstrap
 from ..evaluation.summaries import TaskSummary, default_score_range, summarize_task
 from ..results.episodes import Episode
@@ -63,15 +63,15 @@ def in_time(rows: NDArray[np.void]) -> tuple[NDArray[np.void], NDArray[np.intp]]
     return rows, now_at
 
 
-def rows_of_results(results: ResultColumns) -> NDArray[np.void]:
+def rows_of_results(results: TaskResults) -> NDArray[np.void]:
     """Return the episodes of one task of an evaluation, in the order of its plan."""
-    rows = np.empty(len(results), EPISODE)
-    rows["run"] = results.seed
+    given, rows = results.rows, np.empty(len(results), EPISODE)
+    rows["run"] = given["seed"]
     for name in ("episode", "total_reward", "length", "success"):
-        rows[name] = getattr(results, name)
-    rows["end_time"] = results.start_time + results.seconds
-    rows["outcome"] = TERMINATED * (results.terminated == 1)
-    rows["outcome"] += (TRUNCATED * (results.truncated == 1)).astype(np.uint8)
+        rows[name] = given[name]
+    rows["end_time"] = given["start_time"] + given["seconds"]
+    rows["outcome"] = TERMINATED * (given["terminated"] == 1)
+    rows["outcome"] += (TRUNCATED * (given["truncated"] == 1)).astype(np.uint8)
     rows["outcome"][results.failed] = FAILED
     return rows
 

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InvalidArgument, UnreadableFile
-from ..evaluation.results_files import ReadResults, is_evaluation, read_results
+from ..evaluation.evaluation import Evaluation, is_evaluation, read_results
 from ..formats.json_fields import field as json_field
 from ..formats.json_fields import (
     list_of,
@@ -317,7 +317,7 @@ def _add_evaluation(contents: ReportContents, directory: Path) -> None:
         contents.across[str(directory)] = results.across
     for summary in results.summaries:
         task = summary.task
-        rows = rows_of_results(results.columns[task])
+        rows = rows_of_results(results.by_task[task])
         provenance = Provenance(pairs_of_results(results, task))
         videos = _videos_of_task(contents, results, task, provenance)
         provenance.add([("Recorded", recorded_when(rows))])
@@ -328,7 +328,7 @@ def _add_evaluation(contents: ReportContents, directory: Path) -> None:
                 is_evaluation=True,
                 summary=summary,
                 episodes=rows,
-                failures=results.columns[task].failures,
+                failures=results.by_task[task].failures,
                 videos=_in_order(videos, rows),
                 provenance=provenance.pairs(),
             )
@@ -340,13 +340,13 @@ def _places_of_task(folder: Path) -> list[Path]:
 
 
 def _videos_of_task(
-    contents: ReportContents, results: ReadResults, task: str, provenance: Provenance
+    contents: ReportContents, results: Evaluation, task: str, provenance: Provenance
 ) -> list[ReportVideo]:
     """Return the videos of a task's episodes, with the places of these.
 
     Others are of a batch that was begun, killed and done again.
     """
-    columns, folder = results.columns[task], results.folder(task)
+    columns, folder = results.by_task[task], results.folder(task)
     videos: list[ReportVideo] = []
     for place, monitor in _monitors(contents, _places_of_task(folder)):
         videos += recorded_videos(monitor, place, contents.problems)
@@ -354,8 +354,9 @@ def _videos_of_task(
     provenance.add(_renderers(videos))
     number = {infix: index for index, infix in enumerate(columns.monitors)}
     for video in videos:
-        of_monitor = columns.monitor == number.get(video.infix, _NO_MONITOR)
-        [rows] = np.nonzero(of_monitor & (columns.episode_id == video.episode_id))
+        given = columns.rows
+        of_monitor = given["monitor"] == number.get(video.infix, _NO_MONITOR)
+        [rows] = np.nonzero(of_monitor & (given["episode_id"] == video.episode_id))
         video.index = int(rows[0]) if len(rows) else None
     shown = [video for video in videos if video.index is not None]
     missing = len(columns.videos.keys() - {video.index for video in shown})

@@ -19,7 +19,7 @@ from typing import Any, BinaryIO, Final
 
 from imageio.v3 import imwrite
 
-from ..errors import Error, UnreadableFile
+from ..errors import Error, InvalidArgument, UnreadableFile
 from ..formats.json_fields import unreadable
 from ..formats.regular_files import open_regular
 from ..machine import usable_cpus
@@ -28,6 +28,7 @@ from .video_stream import frames_at, read_stream, video_kind
 
 VIDEOS: Final = "videos"
 POSTERS: Final = "posters"
+REPLAYS: Final = "replays"
 
 _TEXT: Final = ".json"
 _MEDIA_TYPES: Final = {
@@ -35,7 +36,7 @@ _MEDIA_TYPES: Final = {
     ".avi": "video/x-msvideo",
     ".mkv": "video/x-matroska",
 }
-_OWN_NAME: Final = re.compile(r"\d{4,18}-[a-z0-9-]{1,60}\.(mp4|avi|mkv|json|jpg)")
+_OWN_NAME: Final = re.compile(r"\d{4,18}-[a-z0-9-]{1,60}\.(mp4|avi|mkv|json|jpg|html)")
 _READ_SIZE: Final = 1 << 20
 _LONGEST_SLUG: Final = 60
 _POSTER_WIDTH: Final = 640
@@ -47,7 +48,7 @@ class ReportProgress:
     """How far the making of a report is.
 
     Attributes:
-        what: `"posters"` or `"videos"`.
+        what: `"posters"`, `"videos"` or `"replays"`.
         done: how many.
         total: of how many.
     """
@@ -135,6 +136,47 @@ def copy_videos(
             video.poster = f"{POSTERS}/{stem}.jpg"
             (folder / video.poster).write_bytes(poster)
         on_progress(ReportProgress(VIDEOS, index + 1, total))
+
+
+def write_replays(
+    contents: ReportContents, folder: Path, on_progress: OnProgress
+) -> None:
+    """Write a page in 3D of each best, median and worst episode whose states are there.
+
+    Args:
+        contents: whose videos are told of their pages.
+        folder: of the report.
+        on_progress: is told of each page.
+
+    Raises:
+        MissingDependency: viser is not installed.
+        FileNotWritten: the disk is full.
+    """
+    # Here, because it is an extra and needs MuJoCo: reports do without both.
+    from ..simulation.trajectories import load_trajectory
+    from ..viewing.replay import write_replay
+
+    wanted = [
+        (f"{index:04d}-{_slug(task.name)}", video)
+        for index, (task, video) in enumerate(
+            (task, video) for task in contents.tasks for video in task.videos
+        )
+        if video.roles and video.trajectory is not None
+    ]
+    done: dict[Path, str] = {}
+    for stem, video in wanted:
+        path = video.trajectory
+        assert path is not None
+        try:
+            if path not in done:
+                page = f"{REPLAYS}/{stem}.html"
+                write_replay(load_trajectory(path), folder / page)
+                done[path] = page
+            # The videos of further cameras show the same episode.
+            video.replay = done[path]
+        except (InvalidArgument, UnreadableFile) as error:
+            contents.problems.append(f"An episode is not shown in 3D: {error}")
+        on_progress(ReportProgress(REPLAYS, len(done), len(wanted)))
 
 
 def with_embedded_videos(

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import UnreadableFile
+from ..evaluation.evaluation import Evaluation
 from ..evaluation.plan import SEEDED
-from ..evaluation.results_files import ReadResults
 from ..formats.manifest import GYM_VERSION
 from ..results.journal_or_stats import MonitorResults
 
@@ -101,7 +101,7 @@ def pairs_of_monitor(monitor: MonitorResults) -> Pairs:
         yield "Versions", f"gym {gym}"
 
 
-def pairs_of_results(results: ReadResults, task: str) -> Iterator[tuple[str, str]]:
+def pairs_of_results(results: Evaluation, task: str) -> Iterator[tuple[str, str]]:
     """Yield how the episodes of one task of an evaluation came about."""
     plan = results.plan
     yield "Environment", task

@@ -90,7 +90,7 @@ def _video(path: Path, said: Mapping[str, Any], results: MonitorResults) -> Repo
     texts = [text[:_LONGEST_TEXT] for text in drawn_with if isinstance(text, str)]
     sha256 = said.get("file_sha256")
     is_hash = isinstance(sha256, str) and _SHA256.fullmatch(sha256)
-    command = None
+    command = trajectory = None
     if episode_id is not None and said.get("recording") == "deferred":
         trajectory = results.files.trajectories.get(episode_id)
         command = None if trajectory is None else _command(path, said, trajectory)
@@ -107,6 +107,7 @@ def _video(path: Path, said: Mapping[str, Any], results: MonitorResults) -> Repo
         sha256=sha256 if is_hash else None,
         command=command,
         notes=list(_notes(said)),
+        trajectory=trajectory,
     )
 
 

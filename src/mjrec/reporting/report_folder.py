@@ -6,7 +6,8 @@
     report/
     ├── index.html      opens from the disk and needs no network
     ├── videos/         copies: 0000-dm-control-walker-walk.mp4 ...
-    └── posters/        a picture of each: 0000-dm-control-walker-walk.jpg ...
+    ├── posters/        a picture of each: 0000-dm-control-walker-walk.jpg ...
+    └── replays/        pages in 3D of some: 0000-dm-control-walker-walk.html ...
 
 The folder can be moved, and is whole without the recordings. It appears under its name
 when it is complete; one that was there is replaced then, if it was a report and nothing
@@ -30,17 +31,20 @@ from .contents import ReportContents
 from .gathering import Directories, gather
 from .media import (
     POSTERS,
+    REPLAYS,
     VIDEOS,
     OnProgress,
     copy_videos,
     is_own_name,
     posters_of,
     with_embedded_videos,
+    write_replays,
 )
 from .page import page_of
 
 PAGE_NAME: Final = "index.html"
 
+_FOLDERS: Final = (VIDEOS, POSTERS, REPLAYS)
 _PAGE_ENDINGS: Final = (".html", ".htm")
 _GENERATOR: Final = re.compile(rb'<meta name="generator" content="mjrec [^"]*">')
 _BEGIN: Final = 4096
@@ -54,6 +58,7 @@ def write_report(
     title: str | None = None,
     single_file: bool = False,
     max_single_file_bytes: int = 50_000_000,
+    replays: bool = False,
     verifications: Iterable[str | os.PathLike[str]] = (),
     on_progress: OnProgress | None = None,
 ) -> Path:
@@ -75,15 +80,18 @@ def write_report(
             for `max_single_file_bytes` are left out, with a note: the posters come
             first, then the videos in the order of the gallery.
         max_single_file_bytes: the most bytes of the page with `single_file`.
+        replays: put a page in 3D beside the videos of the best, the median and the
+            worst episode, as `write_replay` makes it. It is loaded when it is opened.
         verifications: files that `mjrec verify --json` has printed; a
             `verification.json` in a directory is found by itself.
         on_progress: called with a `ReportProgress` for each poster and video.
 
     Raises:
         InvalidArgument: a directory has no recordings; `path` is something else than
-            a report; or the page alone is larger than `max_single_file_bytes`.
+            a report; the page alone is larger than `max_single_file_bytes`; or
+            replays are wanted in it.
         UnreadableFile: one of `verifications`.
-        MissingDependency: Jinja2 is not installed.
+        MissingDependency: Jinja2 is not installed, or viser for replays.
         FileNotWritten, DirectoryNotWritable: the disk is full, or read-only.
     """
     target = Path(os.path.realpath(path))
@@ -92,6 +100,11 @@ def write_report(
         raise InvalidArgument(
             f"{path} names a page, and a report is a folder: name the folder, or ask "
             "for one file (single_file=True, --single-file)."
+        )
+    if replays and single_file:
+        raise InvalidArgument(
+            "Replays are pages of their own, beside the report: write a folder "
+            "(single_file=False, without --single-file)."
         )
     _check_target(target, is_page=is_page)
     tell = on_progress or (lambda progress: None)
@@ -106,6 +119,8 @@ def write_report(
     with _replacing_folder(target) as folder:
         if not single_file:
             copy_videos(contents, posters, folder, tell)
+            if replays:
+                write_replays(contents, folder, tell)
             page = page_of(contents)
         write_text(folder / PAGE_NAME, page)
     return Path(path) / PAGE_NAME
@@ -148,9 +163,9 @@ def _check_target(target: Path, *, is_page: bool) -> None:
     names = {entry.name for entry in target.iterdir()}
     if not names:
         return
-    foreign = sorted(names - {PAGE_NAME, VIDEOS, POSTERS}) + sorted(
+    foreign = sorted(names - {PAGE_NAME, *_FOLDERS}) + sorted(
         f"{folder}/{entry.name}"
-        for folder in (VIDEOS, POSTERS)
+        for folder in _FOLDERS
         if (target / folder).is_dir()
         for entry in (target / folder).iterdir()
         if not is_own_name(entry.name)
@@ -189,13 +204,13 @@ def _replacing_folder(target: Path) -> Iterator[Path]:
     _make_parents(target)
     folder, before = temporary_path(target), temporary_path(target)
     try:
-        for name in ("", VIDEOS, POSTERS):
+        for name in ("", *_FOLDERS):
             (folder / name).mkdir()
     except OSError as error:
         raise DirectoryNotWritable(target.parent, error.strerror) from error
     try:
         yield folder
-        for name in (VIDEOS, POSTERS):
+        for name in _FOLDERS:
             if not any((folder / name).iterdir()):
                 (folder / name).rmdir()
         if target.exists():

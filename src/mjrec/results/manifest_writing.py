@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import UnreadableFile
+from ..formats.bundle import FINISHED, is_finished
 from ..formats.locks import Lock, is_locked, wait_for_lock
 from ..formats.manifest import (
     GYM_VERSION,
@@ -40,7 +41,7 @@ from ..formats.monitor_directory import (
     video_prefix,
     with_part,
 )
-from ..formats.spans import FINISHED, is_in_flight
+from ..formats.spans import is_in_flight
 from ..formats.video_metadata import (
     finished_videos,
     forget_failure,
@@ -273,7 +274,7 @@ def _pending(directory: Path, infix: Infix, run: Run) -> list[Mapping[str, Any]]
 def _is_recorded(directory: Path, entry: Mapping[str, Any]) -> bool:
     path = directory / entry.get("clip", f"{entry.get('trajectory')}{FINISHED}")
     try:
-        return path.is_file() or is_in_flight(path)
+        return is_finished(path) or is_in_flight(path)
     except UnreadableFile:
         # It may be in the list that cannot be read.
         return True

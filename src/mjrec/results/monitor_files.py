@@ -9,6 +9,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from ..errors import DirectoryInUse
+from ..formats.bundle import trajectories_in
 from ..formats.journal import MOST_EPISODES
 from ..formats.locks import is_locked
 from ..formats.monitor_directory import (
@@ -16,6 +17,7 @@ from ..formats.monitor_directory import (
     VideoName,
     episode_of,
     infix_of,
+    is_bundle,
     is_manifest,
     iter_monitor_files,
     log_number,
@@ -44,7 +46,8 @@ class MonitorFiles:
         lock: what it claimed its infix with; it is left where the monitor was killed.
         videos: its videos, by the numbers of their episodes.
         metadata: their metadata, likewise.
-        trajectories: the recorded states, likewise; also what is in flight.
+        trajectories: the own files of recorded states, likewise; also what is in
+            flight, or in a bundle.
         logs: its row logs; also one of which only a file beside it is left.
         last_episode_id: the highest number of an episode in a name, also of a file
             that was never finished; -1 where there is none.
@@ -99,6 +102,9 @@ class MonitorFiles:
                 self.videos[video.episode_id] = path
             elif video.ending == "meta.json":
                 self.metadata[video.episode_id] = path
+        elif is_bundle(path.name):
+            for bundled in trajectories_in(path):
+                self._sort_in(bundled)
         elif log_number(path.name) is not None:
             self.logs.add(path.with_suffix(LOG))
         elif path.suffix == ".h5" and number is not None:

@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..errors import UnreadableFile
+from ..formats.bundle import file_of, is_finished
 from ..formats.trajectory import TrajectoryReader
 from ..formats.trajectory_file import open_trajectory
 from ..sandbox import LIMITS, Sandbox, enter, is_inside
@@ -51,8 +52,8 @@ _COMPILING_MEMORY = 6 * _GIB
 _MEMORY_FACTOR = 8
 _COMPILED = "model.mjb"
 
-# Device, inode, size and times of the files that did no harm.
-_harmless: set[tuple[int, ...]] = set()
+# Name, device, inode, size and times of the files that did no harm.
+_harmless: set[tuple[str | int, ...]] = set()
 
 
 def open_vetted_trajectory(path: Path) -> TrajectoryReader:
@@ -62,10 +63,10 @@ def open_vetted_trajectory(path: Path) -> TrajectoryReader:
         UnreadableFile: as `open_trajectory`; or the file is a stranger's and does harm
             to the process that reads it.
     """
-    if path.is_file() and not (is_inside() or is_own_directory(path.parent)):
-        found = path.stat()
+    if is_finished(path) and not (is_inside() or is_own_directory(path.parent)):
+        found = file_of(path).stat()
         times = (found.st_mtime_ns, found.st_ctime_ns)
-        identity = (found.st_dev, found.st_ino, found.st_size, *times)
+        identity = (path.name, found.st_dev, found.st_ino, found.st_size, *times)
         if identity not in _harmless:
             # Holes count for nothing.
             size = min(found.st_size, 512 * found.st_blocks)

@@ -16,7 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InvalidArgument, UnknownName, UnreadableFile
-from ..formats.monitor_directory import infix_of, iter_monitor_files
+from ..formats.bundle import finished_trajectories, trajectories_in
+from ..formats.monitor_directory import infix_of, is_bundle
 from ..formats.notebook import shown
 from ..formats.spans import recordings_in_flight
 from ..formats.trajectory import TrajectoryReader
@@ -34,9 +35,10 @@ def load_trajectory(
     """Return a recorded episode.
 
     Args:
-        path: of its `openaigym.trajectory.*.h5`. Of an episode that is not over, or
-            whose process was killed, that file is not there yet, and what its
-            monitor's log has of it is returned.
+        path: of its `openaigym.trajectory.*.h5`. Of an evaluation's episode that file
+            is not there: it lies under this name in its monitor's bundle,
+            `openaigym.trajectories.*.h5`. Of an episode that is not over, or whose
+            process was killed, what its monitor's log has of it is returned.
         trust_models: whether `model()`, and `mjrec.render` of what is returned, load
             a compiled model that another user, or another machine, has written. A
             crafted one can do anything to whoever loads it; so without this, such a
@@ -46,14 +48,15 @@ def load_trajectory(
     Raises:
         UnreadableFile: there is no such file, or it is damaged, of a newer format, or
             a stranger's that does harm to the process that reads it.
-        InvalidArgument: it is a directory; the trajectories in it are named.
+        InvalidArgument: it is a directory or a bundle; the trajectories in it are
+            named.
     """
     path = Path(path)
     if path.is_symlink() and infix_of(path.name) is None:
         # The user's own name for a file, `latest.h5`; a link that bears the name of a
         # monitor's file was put there by whoever made the directory.
         path = Path(os.path.realpath(path))
-    if path.is_dir():
+    if path.is_dir() or (path.is_file() and is_bundle(path.name)):
         raise InvalidArgument(_what_is_in(path))
     with open_vetted_trajectory(path) as reader:
         return Trajectory(reader, trust_models=trust_models)
@@ -276,15 +279,18 @@ class Trajectory:
         return step % count
 
 
-def _what_is_in(directory: Path) -> str:
-    files = iter_monitor_files(directory)
-    finished = [path.name for path in files if path.suffix == ".h5"]
-    in_flight = [each.path.name for each in recordings_in_flight(directory)]
-    names = sorted({*finished, *in_flight})
+def _what_is_in(path: Path) -> str:
+    if is_bundle(path.name):
+        kind, names = "bundle", [each.name for each in trajectories_in(path)]
+    else:
+        kind = "directory"
+        finished = (each.name for each in finished_trajectories(path))
+        in_flight = (each.path.name for each in recordings_in_flight(path))
+        names = sorted({*finished, *in_flight})
     if not names:
-        return f"{directory} is a directory, and holds no trajectories."
+        return f"{path} is a {kind}, and holds no trajectories."
     more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
     return (
-        f"{directory} is a directory. Name one of the trajectories in it: "
+        f"{path} is a {kind}. Name one of the trajectories in it: "
         f"{', '.join(names[:_SHOWN])}{more}."
     )

@@ -6,12 +6,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from ..errors import InvalidArgument
-from ..formats.monitor_directory import (
-    episode_of,
-    iter_monitor_files,
-    where_recordings_are,
-)
-from ..formats.spans import recordings_in_flight
+from ..formats.monitor_directory import episode_of, where_recordings_are
+from ..results.monitor_files import monitors_of
 
 _SHOWN = 10
 
@@ -19,15 +15,13 @@ _SHOWN = 10
 def recorded_episodes(directory: Path) -> list[Path]:
     """Return the trajectories of a monitor directory, finished or in flight.
 
-    They come in the order of their numbers; of several monitors, monitor after monitor.
+    They come monitor after monitor, in the order of their numbers.
     """
-    finished = (p for p in iter_monitor_files(directory) if p.suffix == ".h5")
-    in_flight = (each.path for each in recordings_in_flight(directory))
-    found = {path: episode_of(path.name) for path in (*finished, *in_flight)}
-    episodes = [path for path, number in found.items() if number is not None]
-    return sorted(
-        episodes, key=lambda path: (path.name.split(".episode")[0], path.name)
-    )
+    return [
+        path
+        for files in monitors_of(directory)
+        for _, path in sorted(files.trajectories.items())
+    ]
 
 
 def trajectory_in(target: Path, episode: int | None) -> Path:

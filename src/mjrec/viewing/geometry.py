@@ -262,8 +262,10 @@ def _plane(model: mujoco.MjModel, shape: Shape, texture: int | None) -> trimesh.
 
 def _smoothed(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
     """Return a mesh whose edges stay sharp, and whose round parts look round."""
-    smoothed: trimesh.Trimesh = trimesh.graph.smooth_shade(mesh, angle=_SHARP)
-    return smoothed
+    made: trimesh.Trimesh = trimesh.graph.smooth_shade(
+        mesh, angle=_SHARP, facet_minarea=None
+    )
+    return made
 
 
 def _unit_square(vertices: NDArray[Any]) -> NDArray[np.float64]:

@@ -8,6 +8,7 @@ long as the answer took.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import os
@@ -119,7 +120,9 @@ class LiveView:
                 except (Error, OSError) as error:
                     # A file may go while it is read: the page asks again.
                     kind, body = "application/json", json.dumps({"error": str(error)})
-                self._send(kind, body.encode())
+                with contextlib.suppress(ConnectionError):
+                    # A browser may have left meanwhile.
+                    self._send(kind, body.encode())
 
             def _send(self, kind: str, body: bytes) -> None:
                 self.send_response(HTTPStatus.OK)

@@ -235,7 +235,7 @@ def _about(trajectory: Trajectory, stage: Stage, motion: Motion) -> dict[str, An
             for name, poses in motion.poses.items()
             if name.startswith("bone/")
         },
-        "notes": ["A view of the recorded states, not evidence.", *stage.notes],
+        "notes": stage.notes,
         "chunk": motion_chunk(motion),
     }
 

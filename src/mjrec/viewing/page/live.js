@@ -6,7 +6,7 @@
   const element = (id) => document.getElementById(id);
   const token = new URLSearchParams(location.search).get("token");
   const replay = () => window.mjrecReplay;
-  let episode = about.episode, known = 0, hasMore = false, returns = [];
+  let episode = about.episode, wanted = episode, known = 0, hasMore = false, returns = [];
 
   async function ask(page, options = {}) {
     const query = new URLSearchParams({ token, ...options });
@@ -18,9 +18,11 @@
   }
 
   async function motion() {
-    const asked = episode;
+    if (wanted !== episode) {
+      episode = wanted;
+      known = 0;
+    }
     const told = await ask("/motion", { episode, from: known });
-    if (asked !== episode) return;
     if (told.scene !== about.scene) {
       location.search = new URLSearchParams({ token, episode });
       return;
@@ -46,7 +48,7 @@
       button.setAttribute("aria-pressed", each.name === episode);
       button.addEventListener("click", () => {
         element("live-follow").checked = false;
-        choose(each.name);
+        wanted = each.name;
       });
       const item = document.createElement("li");
       item.append(button);
@@ -55,12 +57,7 @@
     element("live-episodes").replaceChildren(...rows);
     draw();
     const newest = told.episodes.at(-1)?.name;
-    if (element("live-follow").checked && newest && newest !== episode) choose(newest);
-  }
-
-  function choose(name) {
-    episode = name;
-    known = 0;
+    if (element("live-follow").checked && newest) wanted = newest;
   }
 
   function draw() {

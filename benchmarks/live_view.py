@@ -1,0 +1,108 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Steps with a viewer attached, and without: `python -m benchmarks.live_view`.
+
+A monitor records HalfCheetah-v5. In every other round `mjrec view` serves its directory
+in a process of its own, and another asks it as a page does: for new states and for the
+list of episodes, with the pauses of a page.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import subprocess
+import sys
+import tempfile
+import time
+import urllib.request
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+from urllib.parse import parse_qs, urlencode, urlsplit
+
+import gymnasium
+import numpy as np
+
+import mjrec
+
+from .setups import random_actions
+from .step_times import times
+
+STEPS = 6000
+ROUNDS = 5
+GOAL = 0.95
+
+
+@contextlib.contextmanager
+def viewer(directory: str) -> Iterator[None]:
+    """Serve a directory to something that asks like a page, over a block."""
+    view = [sys.executable, "-m", "mjrec", "view", directory]
+    with subprocess.Popen(view, stdout=subprocess.PIPE, text=True) as server:
+        assert server.stdout is not None
+        url = server.stdout.readline().strip()
+        page = [sys.executable, "-m", "benchmarks.live_view", url]
+        with subprocess.Popen(page, stdout=subprocess.PIPE, text=True) as asking:
+            assert asking.stdout is not None
+            # Its first answer, for which the model is loaded.
+            asking.stdout.readline()
+            yield
+            asking.kill()
+        server.kill()
+
+
+def ask(url: str) -> None:
+    """Ask for the newest states and for the list, as a page does, until killed."""
+    address = urlsplit(url)
+    token = parse_qs(address.query)["token"][0]
+    known: dict[str, int] = {}
+    while True:
+        began = time.perf_counter()
+        listed = answer(address.netloc, "/episodes", token)
+        name = str(listed["episodes"][-1]["name"])
+        first = known.get(name, 0)
+        options = {"episode": name, "from": str(first)}
+        told = answer(address.netloc, "/motion", token, **options)
+        known[name] = first + told.get("chunk", {}).get("count", 0)
+        print(name, known[name], flush=True)
+        time.sleep(max(0.3, 4 * (time.perf_counter() - began)))
+
+
+def answer(host: str, page: str, token: str, **options: str) -> dict[str, Any]:
+    """Return what the server says, in JSON."""
+    query = urlencode({"token": token, **options})
+    with urllib.request.urlopen(f"http://{host}{page}?{query}") as told:
+        found: dict[str, Any] = json.loads(told.read())
+    return found
+
+
+def main() -> None:
+    """Measure in rounds that take turns, and print the quantiles of all steps."""
+    env = gymnasium.make("HalfCheetah-v5")
+    actions = random_actions(env, STEPS)
+    alone: list[int] = []
+    viewed: list[int] = []
+    seconds = {"alone": 0.0, "viewed": 0.0}
+    with tempfile.TemporaryDirectory() as folder:
+        monitor = mjrec.Monitor(
+            *(env, Path(folder) / "run", lambda episode: True),
+            workers=0,
+            allow_early_reset=True,
+        )
+        for _ in range(ROUNDS):
+            began = time.perf_counter()
+            alone += times(monitor, actions)[0]
+            seconds["alone"] += time.perf_counter() - began
+            with viewer(str(Path(folder) / "run")):
+                began = time.perf_counter()
+                viewed += times(monitor, actions)[0]
+                seconds["viewed"] += time.perf_counter() - began
+        monitor.close(wait=False)
+    for quantile in (5, 25, 50, 75):
+        without, with_one = (np.percentile(t, quantile) / 1e3 for t in (alone, viewed))
+        print(f"{quantile:3}% {without:8.1f}us {with_one:8.1f}us", end="   ")
+        print(f"{without / with_one:.3f} of the speed (goal {GOAL})")
+    print(f"whole rounds {seconds['alone'] / seconds['viewed']:.3f} of the speed")
+
+
+if __name__ == "__main__":
+    ask(sys.argv[1]) if len(sys.argv) > 1 else main()

@@ -1,0 +1,103 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What describes a packed run: written again from the archive's own recordings.
+
+These are compared by themselves. README, citation, table, crate and the like say of
+them what their manifests, metadata and trajectories say, and not a word more.
+"""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, Final
+
+from ..errors import Error, UnreadableFile
+from ..formats.json_fields import read_object, unreadable
+from ..formats.regular_files import read_regular
+from .bag import bag_tags
+from .descriptions import descriptions, packed_with
+from .differences import Difference, Same, only_in, unlike
+from .findings import Topic
+from .layout import ENVIRONMENT, PAYLOAD, RECORDINGS
+from .packed_run import read_run
+from .read_inputs import packing_options
+
+_LONGEST_FILE: Final = 1 << 28
+_VERSION: Final = re.compile(r"[\w.+-]{1,40}", re.ASCII)
+
+
+def compare_descriptions(bag: Path) -> Iterator[Same | Difference]:
+    """Yield how the descriptions of a bag compare with those written again."""
+    try:
+        texts = written_again(bag)
+    except Error as error:
+        reason = error.reason if isinstance(error, UnreadableFile) else str(error)
+        yield _difference(ENVIRONMENT, f"nothing can be written again of it: {reason}")
+        return
+    payload = bag / PAYLOAD
+    there = {path.name: path for path in payload.iterdir() if path.name != RECORDINGS}
+    there |= {name: bag / name for name in texts if (bag / name).exists()}
+    for name in sorted(there.keys() | texts.keys()):
+        if name not in texts:
+            yield _difference(name, "nothing made this file again")
+        elif name not in there:
+            yield _difference(name, "no such file, but one was made again")
+        else:
+            yield _compare(name, there[name], texts[name])
+
+
+def written_again(bag: Path) -> dict[str, str]:
+    """Return the texts of a bag's descriptions, by their names, of its recordings.
+
+    Raises:
+        Error: a file is damaged, or says what cannot be.
+    """
+    path, recordings = bag / PAYLOAD / ENVIRONMENT, bag / PAYLOAD / RECORDINGS
+    with unreadable(path):
+        said = read_object(path).get("packed_with")
+        if not isinstance(said, dict):
+            raise ValueError("it does not say what it was packed with")
+        options = packing_options(said.get("options") or {})
+    run = read_run(recordings, options=options)
+    texts = descriptions(run, recordings, packed_with=_claimed(said))
+    return {**texts, **bag_tags(bag, date=run.date, title=run.title)}
+
+
+def _claimed(said: dict[str, Any]) -> dict[str, str]:
+    """Return the versions that packed it, as claimed."""
+    claimed = {name: str(said.get(name)) for name in packed_with()}
+    return {n: v for n, v in claimed.items() if _VERSION.fullmatch(v)}
+
+
+def _compare(name: str, path: Path, text: str) -> Same | Difference:
+    with unreadable(path):
+        given = read_regular(path, limit=_LONGEST_FILE)
+    if given == text.encode():
+        return Same(topic=Topic.FILES, file=name)
+    lines = (given.decode(errors="backslashreplace").split("\n"), text.split("\n"))
+    added, missing = (_first_more(*each) for each in (lines, lines[::-1]))
+    match added, missing:
+        case (number, one), (_, other):
+            return _difference(name, unlike(one, other), where=f"line {number}")
+        case (number, one), None:
+            return _difference(name, only_in(True, one), where=f"line {number}")
+        case None, (_, other):
+            return _difference(name, only_in(False, other))
+    return _difference(name, "its lines are other spaces, or in another order")
+
+
+def _first_more(lines: list[str], others: list[str]) -> tuple[int, str] | None:
+    """Return the first line, with its number, of which the others have fewer."""
+    more = Counter(lines) - Counter(others)
+    found = (
+        (number, line)
+        for number, line in enumerate(lines, start=1)
+        if line in more and any(map(str.isalnum, line))
+    )
+    return next(found, None)
+
+
+def _difference(name: str, how: str, *, where: str = "") -> Difference:
+    return Difference(topic=Topic.FILES, file=name, where=where, how=how)

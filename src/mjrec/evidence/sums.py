@@ -1,0 +1,77 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Findings that say the same of several items, as one with their count."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections import Counter
+from collections.abc import Iterator
+from typing import Any, Final
+
+from .differences import Same
+from .findings import Finding, Outcome, Topic
+
+_MOST_FAILURES: Final = 100
+
+
+class Sums:
+    """Counts findings that say the same of several items."""
+
+    def __init__(self) -> None:
+        self._sums: dict[tuple[Any, ...], Finding] = {}
+        self._counts: Counter[tuple[Any, ...]] = Counter()
+        self._failures: Counter[Topic] = Counter()
+
+    def same(self, found: Same) -> None:
+        """Count what is equal."""
+        self._add(
+            Finding(
+                topic=found.topic,
+                item=found.item,
+                outcome=Outcome.MADE_AGAIN,
+                count=found.count,
+                unit=found.unit,
+            ),
+            reason="",
+        )
+
+    def add(self, finding: Finding) -> None:
+        """Count a finding with those for the same excuse; the worst speaks for all."""
+        alike = (
+            finding.reason if finding.outcome is not Outcome.WITHIN_TOLERANCE else ""
+        )
+        self._add(finding, reason=alike)
+
+    def fail(self, finding: Finding) -> bool:
+        """Count what differs; return whether to list it by itself."""
+        self._failures[finding.topic] += 1
+        return self._failures[finding.topic] <= _MOST_FAILURES
+
+    def __iter__(self) -> Iterator[Finding]:
+        for key, finding in self._sums.items():
+            yield dataclasses.replace(finding, count=self._counts[key])
+        for topic, count in self._failures.items():
+            if count > _MOST_FAILURES:
+                yield Finding(
+                    topic=topic,
+                    item="",
+                    outcome=Outcome.DIFFERENT,
+                    reason="more places differ",
+                    count=count - _MOST_FAILURES,
+                    unit="place",
+                )
+
+    def _add(self, finding: Finding, *, reason: str) -> None:
+        key = (finding.topic, finding.outcome, finding.excuse, finding.unit, reason)
+        self._counts[key] += finding.count
+        known = self._sums.get(key)
+        if known is None:
+            self._sums[key] = finding
+            return
+        worst = max(known, finding, key=_size)
+        is_one = known.item == finding.item
+        self._sums[key] = worst if is_one else dataclasses.replace(worst, item="")
+
+
+def _size(finding: Finding) -> float:
+    return float(finding.figures.get("maximum", 0.0))

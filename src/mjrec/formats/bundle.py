@@ -1,0 +1,156 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where a finished trajectory lies: in a file of its own, or in a bundle.
+
+A bundle, `openaigym.trajectories.<infix>.h5`, holds trajectories of one monitor in one
+HDF5 file: a group `episode000027` has what the file
+`openaigym.trajectory.<infix>.episode000027.h5` would have at its root. A trajectory is
+called by the path of that file wherever it lies; `is_finished` and `file_of` say where.
+
+Which episodes a bundle holds stands before its HDF5 part, in what HDF5 calls the user
+block, as ranges of their numbers::
+
+    {"format": "mjrec trajectories", "version": 1, "episodes": [[0, 23], [25, 25]]}
+
+So a directory is listed without the HDF5 library.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+from ..errors import UnreadableFile
+from ..json_text import dumps
+from .json_fields import field, integer, json_object, list_of, unreadable
+from .monitor_directory import (
+    Infix,
+    bundle_name,
+    episode_of,
+    infix_of,
+    is_bundle,
+    iter_monitor_files,
+    trajectory_prefix,
+)
+from .regular_files import open_regular, regular_path
+from .trajectory import check_version
+
+FINISHED = ".h5"
+
+_FORMAT = "mjrec trajectories"
+_VERSION = 1
+_MOST_EPISODES = 1_000_000
+# HDF5 looks for its own beginning at 0, 512, 1024, 2048 ...
+_SMALLEST_INDEX = 512
+_LONGEST_INDEX = 1 << 26
+_LONGEST_RANGE = 44
+
+
+def is_finished(path: Path) -> bool:
+    """Tell whether a trajectory is there, by the path of its own file."""
+    return path.is_file() or _is_bundled(path)
+
+
+def file_of(path: Path) -> Path:
+    """Return the file that holds a trajectory; its own one where none does."""
+    if not path.is_file() and _is_bundled(path):
+        return bundle_of(path)
+    return path
+
+
+def bundle_of(path: Path) -> Path:
+    """Return the path of the bundle that a trajectory may lie in."""
+    return path.with_name(bundle_name(infix_of(path.name) or ""))
+
+
+def group_of(path: Path) -> str:
+    """Return the name of a trajectory's group in its bundle."""
+    return f"episode{episode_of(path.name):06d}"
+
+
+def finished_trajectories(directory: Path) -> Iterator[Path]:
+    """Yield the paths of the own files of all finished trajectories, sorted."""
+    found: set[Path] = set()
+    for path in iter_monitor_files(directory):
+        if is_bundle(path.name):
+            found.update(trajectories_in(path))
+        elif path.suffix == FINISHED:
+            found.add(path)
+    yield from sorted(found)
+
+
+def trajectories_in(bundle: Path) -> list[Path]:
+    """Return the paths of the own files of the trajectories in a bundle.
+
+    One that cannot be read has none: opening it says why.
+    """
+    infix = Infix.parse(infix_of(bundle.name) or "")
+    if infix is None:
+        return []
+    return [
+        bundle.with_name(f"{trajectory_prefix(infix, number)}{FINISHED}")
+        for number in sorted(_episodes_in(bundle))
+    ]
+
+
+def index_size(count: int) -> int:
+    """Return how many bytes before the HDF5 part the index of `count` episodes gets."""
+    size = _SMALLEST_INDEX
+    while size < _SMALLEST_INDEX // 4 + _LONGEST_RANGE * count:
+        size *= 2
+    return size
+
+
+def index_of(episodes: Iterable[int]) -> bytes:
+    """Return what a bundle's file begins with."""
+    ranges: list[list[int]] = []
+    for number in sorted(episodes):
+        if ranges and ranges[-1][1] == number - 1:
+            ranges[-1][1] = number
+        else:
+            ranges.append([number, number])
+    index = {"format": _FORMAT, "version": _VERSION, "episodes": ranges}
+    return dumps(index).encode() + b"\n"
+
+
+def _is_bundled(path: Path) -> bool:
+    number = episode_of(path.name)
+    return (
+        path.suffix == FINISHED
+        and number is not None
+        and number in _episodes_in(bundle_of(path))
+    )
+
+
+def _episodes_in(bundle: Path) -> frozenset[int]:
+    # Most directories have none.
+    if not bundle.is_file():
+        return frozenset()
+    try:
+        with unreadable(bundle):
+            status = regular_path(bundle).stat()
+            version = status.st_ino, status.st_size, status.st_mtime_ns
+            return _read_index(bundle, version)
+    except UnreadableFile:
+        return frozenset()
+
+
+# Each trajectory is looked for by itself.
+@functools.lru_cache(maxsize=64)
+def _read_index(bundle: Path, version: tuple[int, ...]) -> frozenset[int]:
+    del version
+    with open_regular(bundle) as file:
+        index = json_object(file.readline(_LONGEST_INDEX))
+    if index.get("format") != _FORMAT:
+        raise ValueError("it is no bundle of trajectories")
+    check_version(field(index, "version", integer))
+    numbers: set[int] = set()
+    following = 0
+    for first, last in field(index, "episodes", list_of(list_of(integer))):
+        if not following <= first <= last:
+            raise ValueError("its episodes are not in order")
+        if last - first >= _MOST_EPISODES - len(numbers):
+            raise ValueError(f"it has more than {_MOST_EPISODES} episodes")
+        numbers.update(range(first, last + 1))
+        following = last + 1
+    return frozenset(numbers)
