@@ -24,7 +24,6 @@ from benchmarks import (
 )
 from benchmarks.children import ChildFailed, call
 from benchmarks.results import Reference, Result, at_least, at_most
-from benchmarks.rounds import take_turns
 from benchmarks.tables import table_of
 from rich.console import Console
 
@@ -71,22 +70,6 @@ def test_what_was_not_measured_keeps_and_breaks_nothing():
     assert missing.is_kept is None
     assert json.dumps(missing.as_json(), allow_nan=False)
     assert "moviepy is not installed" in shown([missing])
-
-
-def test_each_variant_has_each_place_in_the_order():
-    """Rounds begin with another one each."""
-    order = []
-
-    def ran(name):
-        def run():
-            order.append(name)
-            return len(order)
-
-        return run
-
-    samples = take_turns({n: ran(n) for n in "abc"}, rounds=3, say=silently)
-    assert "".join(order) == "abcbcacab"
-    assert samples == {"a": [1, 6, 8], "b": [2, 4, 9], "c": [3, 5, 7]}
 
 
 def test_failing_child_says_what_it_printed():

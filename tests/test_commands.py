@@ -63,12 +63,6 @@ def mjrec(capsys):
     return run
 
 
-def results_of(directory):
-    results = load_results(directory)
-    assert results is not None
-    return results
-
-
 CHEETAH = ("record", "HalfCheetah-v5", "--size", "64x48", "--max-steps", 3)
 
 
@@ -79,7 +73,7 @@ def test_record_gymnasium(mjrec, tmp_path):
     assert status == 0
     assert "episode 9 (10/10): 3 steps" in out
     assert "video000008.mp4" in out
-    results = results_of(tmp_path)
+    results = load_results(tmp_path)
     assert results["episode_lengths"] == [3] * 10
     assert [Path(video).name[-10:] for video, _ in results["videos"]] == [
         "000000.mp4",
@@ -115,7 +109,7 @@ def test_text_environment(mjrec, tmp_path):
         *("--env-kwargs", '{"render_mode": "ansi"}'),
     )
     assert (status, err) == (0, "")
-    [[cast, _]] = results_of(tmp_path)["videos"]
+    [[cast, _]] = load_results(tmp_path)["videos"]
     assert json.loads(Path(cast).read_text())["version"] == 1
 
 
@@ -128,7 +122,7 @@ def test_resume_goes_on_where_it_stopped(mjrec, tmp_path):
                 *(*CHEETAH, "--out", tmp_path / out, "--seed", 3, "--resume"),
                 *("--episodes", episodes),
             )
-    whole, parts = results_of(tmp_path / "whole"), results_of(tmp_path / "parts")
+    whole, parts = load_results(tmp_path / "whole"), load_results(tmp_path / "parts")
     assert whole["episode_rewards"] == parts["episode_rewards"]
     assert metadata_of(tmp_path / "parts", 1)["episode_id"] == 1
 
@@ -137,7 +131,7 @@ def test_keep_names_only_what_was_chosen(mjrec, tmp_path):
     """The videos that are there in the end, in the summary and as JSON."""
     run = (*CHEETAH, "--seed", 0, "--episodes", 3, "--workers", 0, "--keep", "worst:1")
     _, out, _ = mjrec(*run, "--out", tmp_path / "a")
-    rewards = results_of(tmp_path / "a")["episode_rewards"]
+    rewards = load_results(tmp_path / "a")["episode_rewards"]
     worst = rewards.index(min(rewards))
     assert "1 video:" in out
     assert [name in out for name in map("video00000{}.mp4".format, range(3))] == [
@@ -162,7 +156,7 @@ def test_policies(mjrec, tmp_path, monkeypatch, policy):
     )
     assert status == 0
     assert ("policy seed" in out) == policy.endswith("Built")
-    assert results_of(tmp_path / "out")["episode_rewards"] == [
+    assert load_results(tmp_path / "out")["episode_rewards"] == [
         pytest.approx(0.0, abs=0.5)
     ]
 
@@ -171,7 +165,6 @@ def test_policies(mjrec, tmp_path, monkeypatch, policy):
     ("arguments", "said"),
     [
         (["Nope-v1"], ["Nope-v1", "Hopper-v5"]),
-        (["HalfCheetah-v5", "--camera", "side"], ["side", "track"]),
         (["HalfCheetah-v5", "--schedule", "some"], ["some", "every:N"]),
         (["HalfCheetah-v5", "--keep", "some"], ["some", "worst:N"]),
         (["HalfCheetah-v5", "--keep", "best:1", "--render", "off"], ["keep", "off"]),
@@ -180,21 +173,17 @@ def test_policies(mjrec, tmp_path, monkeypatch, policy):
             ["--keep best:1", "--schedule cubic"],
         ),
         (["HalfCheetah-v5", "--policy", "greedy"], ["greedy", "random"]),
-        (["HalfCheetah-v5", "--policy", "no_such:x"], ["no_such"]),
         (["HalfCheetah-v5", "--size", "0x48"], ["width", "0"]),
         (["HalfCheetah-v5", "--size", "big"], ["big", "640x480"]),
         (["HalfCheetah-v5", "--size", "-4x4"], ["-4x4"]),
         (["HalfCheetah-v5", "--fps", "0"], ["fps", "0"]),
         (["HalfCheetah-v5", "--fps", "nan"], ["fps", "nan"]),
         (["HalfCheetah-v5", "--episodes", "0"], ["episodes", "0"]),
-        (["HalfCheetah-v5", "--max-steps", "0"], ["max_steps", "0"]),
         (["HalfCheetah-v5", "--seed", "-1"], ["seed", "-1"]),
         (["HalfCheetah-v5", "--env-kwargs", "[1]"], ["JSON object", "[1]"]),
         (["HalfCheetah-v5", "--env-kwargs", "{"], ["JSON object"]),
-        (["HalfCheetah-v5", "--env-kwargs", '{"no": 1}'], ["HalfCheetah-v5", "no"]),
         (["HalfCheetah-v5", "--env-kwargs", '{"no": 1, "no": 2}'], ["'no'", "twice"]),
         (["HalfCheetah-v5", "--env-kwargs", '{"no": [NaN]}'], ["'no'", "NaN"]),
-        (["no_such.xml"], ["no_such.xml"]),
     ],
 )
 def test_bad_input_is_one_clear_error(mjrec, tmp_path, arguments, said):
@@ -220,7 +209,7 @@ def test_existing_recordings_need_force_or_resume(mjrec, tmp_path):
         *("--schedule", "none", "--episodes", 2),
     )
     assert status == 0
-    assert len(results_of(tmp_path)["episode_lengths"]) == 2
+    assert len(load_results(tmp_path)["episode_lengths"]) == 2
 
 
 NAN = """
@@ -276,7 +265,7 @@ def test_wrong_usage_is_status_2(mjrec):
     assert left.value.code == 2
 
 
-@pytest.mark.thorough
+# Takes more than five seconds: three videos, by renderers that start for them.
 def test_cameras_are_a_video_each_or_one_side_by_side(mjrec, tmp_path):
     """All are listed; captions and second names are asked for likewise."""
     (tmp_path / "model.xml").write_text(PENDULUM)
@@ -294,7 +283,8 @@ def test_cameras_are_a_video_each_or_one_side_by_side(mjrec, tmp_path):
     [frame, *_] = frames_in(tmp_path / "b", 0)
     assert frame.shape == (48, 128, 3)
     about = metadata_of(tmp_path / "b", 0)
-    assert (about["tiled"], about["annotated"]) == (True, True)
+    assert about["tiled"]
+    assert about["annotated"]
     assert (tmp_path / "b" / "rl-video-episode-0.mp4").exists()
 
 
@@ -442,34 +432,6 @@ def test_help_flows(mjrec, capsys, command):
     assert command != "record" or "By default the environment's limit, or 1000" in words
 
 
-@pytest.mark.parametrize(
-    ("arguments", "unneeded"),
-    [
-        (["--help"], {"tyro", "rich", "numpy", "mujoco", "h5py"}),
-        (["list", "."], {"mujoco", "gymnasium", "h5py", "scipy", "imageio"}),
-    ],
-)
-def test_a_command_loads_only_what_it_needs(tmp_path, arguments, unneeded):
-    """So that help is there at once, and a list nearly so."""
-    code = (
-        "import sys\n"
-        "from mjrec.commands import main\n"
-        "try:\n"
-        "    main(sys.argv[1:])\n"
-        "finally:\n"
-        "    print(*sys.modules, file=sys.stderr)"
-    )
-    done = subprocess.run(
-        [sys.executable, "-c", code, *arguments],
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    assert done.stdout
-    assert not unneeded & set(done.stderr.split())
-
-
 def test_what_is_said_by_mujoco_and_of_a_policy_is_said_once(
     mjrec, tmp_path, monkeypatch
 ):
@@ -513,13 +475,12 @@ def _start(tmp_path, **streams):
 def test_ctrl_c_keeps_everything_so_far(tmp_path):
     """Status 130; episodes and manifest are whole, and videos can be made of them."""
     process = _start(tmp_path, stdout=subprocess.PIPE)
-    assert process.stdout is not None
     assert b"episode 0" in process.stdout.readline()
     process.send_signal(signal.SIGINT)
     out, _ = process.communicate(timeout=60)
     assert process.returncode == 130
     assert b"Interrupted" in out
-    results = results_of(tmp_path)
+    results = load_results(tmp_path)
     assert results["episode_lengths"]
     assert set(results["episode_lengths"]) == {20}
     if not videos_in(tmp_path):
@@ -534,13 +495,12 @@ def test_ctrl_c_keeps_everything_so_far(tmp_path):
 def test_being_told_to_end_keeps_everything_so_far(signum, status, tmp_path):
     """As a scheduler does at a time limit: files are closed, the rest is said."""
     process = _start(tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
-    assert process.stdout is not None
     assert b"episode 0" in process.stdout.readline()
     process.send_signal(signum)
     _, errors = process.communicate(timeout=60)
     assert process.returncode == status
     assert b"Traceback" not in errors
-    results = results_of(tmp_path)
+    results = load_results(tmp_path)
     assert set(results["episode_lengths"]) == {20}
     if not videos_in(tmp_path):
         assert f"pending: mjrec render {tmp_path}".encode() in errors

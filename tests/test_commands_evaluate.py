@@ -144,17 +144,13 @@ def test_an_evaluation_is_recovered_and_rendered_as_one(
     ("arguments", "words"),
     [
         (["NoSuch-v0"], "no Gymnasium environment 'NoSuch-v0'"),
-        (["dm_control:bench"], "dm_control:benchmarking"),
         ([TASK, "--fail-under", "Ant-v5=3"], "'Ant-v5'"),
         ([TASK, "--fail-under", TASK], "TASK=VALUE"),
         ([TASK, "--fail-under", f"{TASK}=nan"], "TASK=VALUE"),
         ([TASK, "--score-range", f"{TASK}=3"], "TASK=LOW:HIGH"),
         ([TASK, "--score-range", f"{TASK}=3:nan"], "counts as 0"),
         ([TASK, "--seeds", "0,x"], "0,1,2"),
-        ([TASK, "--seeds", "0,1"], "one of them"),
-        ([TASK, "--keep", "bset"], "best:N"),
         ([TASK, "--env-kwargs", "[]"], "JSON object"),
-        ([TASK, "--policy", "few_policies:one"], "zero"),
     ],
 )
 def test_a_wrong_command_line_is_one_line(run, tmp_path, arguments, words):

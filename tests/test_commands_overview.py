@@ -10,9 +10,10 @@ from pathlib import Path
 import pytest
 from trajectories_by_hand import write_log
 
+from evaluations import write_evaluation
 from mjrec.commands import COMMANDS, main
 from mjrec.commands.overview import EXAMPLES, GROUPS
-from report_recordings import entry, write_evaluation, write_journal
+from report_recordings import entry, write_journal
 
 
 def said(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[object, str]:
@@ -85,13 +86,13 @@ def test_alone_it_says_what_is_recorded_here(
         folder.mkdir(parents=True)
     write_journal(first, "0.7", "X-v0", [entry(0), entry(1, recording="deferred")])
     write_log(first, 1, steps=2)
-    write_evaluation(second, ["a/x", "b/y"])
+    write_evaluation(second, {"a/x": [[1.0, None]], "b/y": [[2.0, 3.0]]})
     status, text = said(capsys)
     assert status == 0
     lines = text.splitlines()
     assert lines[0].startswith("runs/first: 2 episodes, return ")
     assert lines[0].endswith("0 videos and 1 pending")
-    assert lines[1] == "second: evaluation of 2 tasks, 8 episodes, 2 failed"
+    assert lines[1] == "second: evaluation of 2 tasks, 4 episodes, 1 failed"
     assert "mjrec render runs/first" in text
     monkeypatch.chdir(first)
     assert said(capsys)[1].startswith(".: 2 episodes")

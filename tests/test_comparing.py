@@ -42,7 +42,6 @@ def test_figures_of_a_task_by_hand(tmp_path):
     assert (comparison.unit, task.episodes) == ("episodes", (4, 5))
     assert comparison.figures == {IMPROVEMENT: task.figures[IMPROVEMENT]}
     interval = task.figures["difference"].interval
-    assert interval is not None
     assert interval.low < 7 < interval.high
 
 
@@ -74,7 +73,6 @@ def test_trainings_are_compared_by_their_means(tmp_path):
     # What differs is the training: not the standard error of 250 episodes, 0.06.
     reach = 1.96 * math.hypot(x.std() / 5**0.5, y.std() / 4**0.5)
     interval = comparison.tasks[0].figures["difference"].interval
-    assert interval is not None
     assert interval.high - interval.low == pytest.approx(2 * reach, rel=0.15)
     # As rliable has it: scores are (trainings x tasks), a task is a stratum.
     expected = stats.trim_mean(np.repeat(x, 2) / 1000, 0.25)
@@ -123,7 +121,6 @@ def test_over_tasks(tmp_path):
     assert [each.figures[IMPROVEMENT].value for each in comparison.tasks] == [0.5, 1]
     overall = comparison.figures
     interval = overall[IMPROVEMENT].interval
-    assert interval is not None
     assert 0.5 <= interval.low < overall[IMPROVEMENT].value == 0.75 < interval.high <= 1
     assert comparison.scored == (WALK,)
     assert (overall["IQM A"].value, overall["IQM B"].value) == (0.25, 0.25)
@@ -160,10 +157,8 @@ def test_pairs_are_of_the_same_seed_and_number(tmp_path):
     assert task.pairs == 6
     assert paired.value == pytest.approx((1 + 2 + 1 + 1 + 1 + 2) / 6)
     # Of unpaired ones, nobody could say so much.
-    assert paired.interval is not None
     assert 1 <= paired.interval.low <= paired.interval.high <= 2
     unpaired = task.figures["difference"].interval
-    assert unpaired is not None
     assert unpaired.low < 0
     assert task.failed == (1, 1)
     assert "1 of 8 episodes of A failed" in comparison.cautions[0]

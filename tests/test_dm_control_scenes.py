@@ -14,10 +14,11 @@ pytest.importorskip("dm_control")
 
 from dm_control import suite
 from dm_control.mujoco import Physics
-from dm_control.suite.wrappers import pixels
+from dm_control.suite.wrappers import action_noise, pixels
 
 from mjrec.environments.dm_control_contexts import ContextsOnDemand
 from mjrec.environments.dm_control_scenes import dm_control_scenes
+from mjrec.environments.wrapping import around_dm_env
 
 pytestmark = pytest.mark.dm_control
 
@@ -32,13 +33,11 @@ def load(domain="cheetah", task="run", **kwargs):
 def begun(env, directory, **asked):
     """Return the facts of the scene of an episode that begins now."""
     scenes = dm_control_scenes(env, **asked)
-    assert scenes.states is not None
     scenes.states.open(directory)
     with scenes.states.resetting():
         env.reset()
     start = scenes.states.begin_episode()
     assert start.refusal is None
-    assert start.scene is not None
     scenes.states.finish()
     scenes.states.close()
     return dict(start.scene)
@@ -197,3 +196,19 @@ def test_contexts_that_are_there_are_left_alone():
         assert env.physics._contexts is own
     assert env.physics._contexts is own
     env.physics.free()
+
+
+def test_wrappers_that_change_something_are_named():
+    """Also what hides its environment; the least limit counts."""
+
+    class Opaque:
+        __slots__ = ()
+
+    env = suite.load("cheetah", "run", task_kwargs={"time_limit": 0.5})
+    assert around_dm_env(env) == {"wrappers": [], "max_episode_steps": 50}
+    assert around_dm_env(action_noise.Wrapper(env)) == {
+        "wrappers": ["dm_control.suite.wrappers.action_noise.Wrapper"],
+        "max_episode_steps": 50,
+    }
+    [name] = around_dm_env(Opaque())["wrappers"]
+    assert name.endswith("Opaque")

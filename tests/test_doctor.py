@@ -146,7 +146,6 @@ def report_of(**changed):
 def shown(report):
     console = Console(width=80, file=io.StringIO(), highlight=False)
     show_report(report, console)
-    assert isinstance(console.file, io.StringIO)
     return console.file.getvalue()
 
 

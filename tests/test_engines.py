@@ -8,7 +8,6 @@ import contextlib
 import functools
 import os
 import signal
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
@@ -30,8 +29,6 @@ from mjrec.engines.local import LocalEngine
 from mjrec.engines.ray import RayEngine
 from mjrec.engines.slurm import SlurmEngine
 from mjrec.errors import Error, InvalidArgument
-
-Begin = Callable[..., Run]
 
 pytestmark = [
     # Ray's own connections and pipes, of which it says so when they are collected.
@@ -104,7 +101,6 @@ def test_jobs_get_settings_and_arguments(begin):
         submit(run, "0", do="echo", text="ß\n")
         seen = []
         for outcome in run.results():
-            assert outcome is not None
             seen.append(outcome.key)
             if len(seen) < 4:
                 submit(run, str(len(seen)), do="echo")
@@ -173,7 +169,7 @@ def test_a_job_whose_child_dies_is_done_again(begin, tmp_path, caplog):
         value=None,
         failure=(
             "Its worker died, which was try 3 of 3: it was killed by SIGKILL. "
-            "The end of what it said: SIGKILL is near"
+            "Its last output: SIGKILL is near"
         ),
         tries=3,
     )
@@ -213,7 +209,7 @@ def test_children_that_die_as_they_begin(begin):
         with pytest.raises(
             Error,
             match=r"No worker can begin. The last one ended with status 3. "
-            r"The end of what it said: a library is missing",
+            r"Its last output: a library is missing",
         ):
             outcomes(run)
 

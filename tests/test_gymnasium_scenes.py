@@ -13,8 +13,10 @@ from gymnasium.envs.mujoco.half_cheetah_v5 import HalfCheetahEnv
 from gymnasium.envs.mujoco.mujoco_env import MujocoEnv
 from gymnasium.envs.mujoco.mujoco_rendering import MujocoRenderer
 
+import mjrec
 from mjrec.environments.gymnasium_scenes import gymnasium_scenes
 from mjrec.environments.viewer_scene import ViewerScene
+from mjrec.environments.wrapping import around_gymnasium
 from mjrec.errors import InvalidArgument, UnknownName
 
 WIREFRAME = int(mujoco.mjtRndFlag.mjRND_WIREFRAME)
@@ -83,7 +85,6 @@ def test_wrappers_that_show_what_is_inside_are_no_obstacle():
 def test_wrappers_that_draw_are_named(wrap, name):
     """Wherever they are in the chain; the class that overrides is what is named."""
     obstacle = gymnasium_scenes(wrap(make())).obstacle
-    assert obstacle is not None
     assert obstacle.startswith("the wrapper ")
     assert obstacle.endswith(f"{name} overrides render()")
 
@@ -137,7 +138,6 @@ def test_what_makes_the_environment_again():
     """Its id and arguments, as far as JSON can hold them."""
     env = make("Hopper-v5", healthy_z_range=(0.5, np.float32(2.5)))
     environment = gymnasium_scenes(env).environment
-    assert environment is not None
     assert (environment["framework"], environment["id"]) == ("gymnasium", "Hopper-v5")
     assert environment["kwargs"]["healthy_z_range"] == [0.5, 2.5]
     assert json.loads(json.dumps(environment)) == environment
@@ -226,3 +226,33 @@ def test_camera_and_size_are_checked_at_once():
         gymnasium_scenes(make("HalfCheetah-v5"), camera="tracking")
     with pytest.raises(InvalidArgument, match="height"):
         gymnasium_scenes(make(), height=0)
+
+
+@pytest.mark.parametrize("part", ["wrapper", "environment"])
+def test_an_environment_that_shows_another_is_drawn_live(part, tmp_path):
+    """Its pictures do not follow from its own states."""
+    options = {"render_mode": "rgb_array", "width": 48, "height": 32}
+    env, other = (gymnasium.make("HalfCheetah-v5", **options) for _ in range(2))
+    other.reset()
+    changed = env if part == "wrapper" else env.unwrapped
+    changed.render = (other if part == "wrapper" else other.unwrapped).render
+    monitor = mjrec.Monitor(env, tmp_path, lambda _: True, workers=0)
+    with monitor:
+        monitor.reset(seed=0)
+        monitor.step(np.zeros(6))
+        assert isinstance(monitor.video_recorder, mjrec.VideoRecorder)
+    other.close()
+
+
+def test_wrappers_that_change_something_are_named():
+    """Outermost first; what only looks on is not among them; the least limit counts."""
+    env = gymnasium.make("InvertedPendulum-v5", max_episode_steps=7)
+    for steps in (9, 5, 8):
+        env = wrappers.TimeLimit(env, steps)
+    assert around_gymnasium(env) == {"wrappers": [], "max_episode_steps": 5}
+    env = wrappers.RecordEpisodeStatistics(wrappers.ClipAction(env))
+    env = wrappers.TransformReward(env, abs)
+    assert around_gymnasium(env)["wrappers"] == [
+        "gymnasium.wrappers.transform_reward.TransformReward",
+        "gymnasium.wrappers.transform_action.ClipAction",
+    ]

@@ -27,6 +27,15 @@ CASES = [
         "assert gymnasium_scenes(gymnasium.make('CartPole-v1')).states is None",
         SIMULATORS,
     ),
+    # So that help is there at once, and a list nearly so.
+    (
+        "from mjrec.commands import main\nmain(['--help'])",
+        {*SIMULATORS, "tyro", "rich", "numpy", "h5py"},
+    ),
+    (
+        "from mjrec.commands import main\nmain(['list', '.'])",
+        {*SIMULATORS, "gymnasium", "h5py", "scipy", "imageio"},
+    ),
     # What hands out an evaluation; a policy's memory is the workers'.
     pytest.param(
         "import pathlib, test_evaluating\ntest_evaluating.run(pathlib.Path('e'))",
@@ -40,5 +49,8 @@ CASES = [
 def test_what_is_not_needed_is_not_loaded(code, unneeded, tmp_path, monkeypatch):
     """Each in a process of its own."""
     monkeypatch.chdir(tmp_path)
-    said = run_python("-c", f"{code}\nimport sys; print(*sys.modules)")
-    assert not unneeded & set(said.split())
+    begin = (
+        "import atexit, sys\natexit.register(lambda: print('loaded:', *sys.modules))"
+    )
+    said = run_python("-c", f"{begin}\n{code}")
+    assert not unneeded & set(said.rpartition("loaded:")[2].split())

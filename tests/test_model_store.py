@@ -284,7 +284,7 @@ def test_facts_cannot_name_a_file_elsewhere(directory, name):
     """Only a model's name, in the recording's directory, where it may be missing."""
     facts = stored(directory, sphere())
     (directory / facts["mjb"]).unlink()
-    with pytest.raises(UnreadableFile, match="belongs beside the recording"):
+    with pytest.raises(UnreadableFile, match="copy it from the recorded"):
         load_model(directory, facts)
     for kind in ("mjb", "xml"):
         with pytest.raises(UnreadableFile, match="which is no name"):

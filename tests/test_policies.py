@@ -2,7 +2,6 @@
 """Policies by their names, and the actions that they give."""
 
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -46,7 +45,6 @@ def write(tmp_path, monkeypatch):
         sys.modules.pop(name, None)
 
 
-Write = Callable[..., None]
 BOX = acting_in(spaces.Box(-1, 1, (2,), np.float32))
 
 

@@ -121,7 +121,7 @@ except GLError as error:
 """
     said = run_python("-c", script, str(tmp_path), **{MARK: str(tmp_path)})
     assert said.count("Ray finds none on this machine. They draw in software.") == 1
-    assert "refused: Workers are to get GPUs" in said
+    assert "refused: Workers should get GPUs" in said
     wait_until(lambda: not marked(tmp_path), seconds=10)
 
 
@@ -176,7 +176,7 @@ except Exception as error:
 @pytest.mark.parametrize(
     ("address", "kind", "said"),
     [
-        ("127.0.0.1:1", Error, "no Ray cluster to be had at 127.0.0.1:1"),
+        ("127.0.0.1:1", Error, "No Ray cluster answers at 127.0.0.1:1"),
         ("ray://127.0.0.1:10001", InvalidArgument, "--address auto"),
     ],
 )

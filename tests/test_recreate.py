@@ -173,7 +173,6 @@ def test_of_other_wrappers_there_are_stand_ins():
         truncated=np.zeros(2, bool),
     )
     env.reset(seed=1)
-    assert stand_in is not None
     stand_in.begin(recorded)
     assert [env.step("anything")[1] for _ in range(2)] == [rewards[0], 7.0]
     assert stand_in.differing == 1
@@ -217,7 +216,6 @@ def test_steps_from_recorded_states_are_the_recorded_steps(pendulum, tmp_path):
     with open_hdf5(next(tmp_path.glob("*.h5"))) as reader:
         states, actions = reader.read("state", 0, 4), reader.actions(0, 3)
         rewards = reader.rewards
-    assert actions is not None
     pendulum.environment.reset(seed=99)
     unknown = np.full_like(states.view(np.float64), np.nan).view(states.dtype)
     for number, action in enumerate(actions):

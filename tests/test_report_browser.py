@@ -297,7 +297,6 @@ def test_a_phone_shows_which_episodes_failed(browser, tmp_path):
         outcome = page.locator("#episodes-table tbody tr").first.locator(".bad")
         expect(outcome).to_have_text(f"failed: {reason.strip()}")
         box = outcome.bounding_box()
-        assert box is not None
         assert box["x"] + box["width"] <= 360
 
 

@@ -160,27 +160,33 @@ def test_a_report_replaces_a_report(recordings, tmp_path):
     assert sorted(p.name for p in tmp_path.iterdir()) == ["recordings", "report", "run"]
 
 
-@pytest.mark.parametrize("name", ["index.html", "videos/mine.mp4", "notes.txt"])
-def test_what_is_no_report_is_not_replaced(recordings, tmp_path, name):
-    """Neither another folder, nor a report that somebody has put something into."""
-    report = tmp_path / "report"
-    if name != "index.html":
-        write_report(recordings, report)
-    (report / name).parent.mkdir(exist_ok=True, parents=True)
-    (report / name).write_text("mine")
-    before = names(report)
-    with pytest.raises(InvalidArgument, match=re.escape(name)):
-        write_report(recordings, report)
-    assert names(report) == before
-    assert (report / name).read_text() == "mine"
-
-
-def test_recordings_are_never_replaced_by_their_report(recordings):
-    """Whoever names the same directory twice keeps it."""
-    before = names(recordings)
-    with pytest.raises(InvalidArgument, match="no report"):
-        write_report(recordings, recordings)
-    assert names(recordings) == before
+@pytest.mark.parametrize(
+    ("target", "mine", "options", "words"),
+    [
+        # Another folder, and a report that somebody has put something into.
+        ("other", "other/index.html", {}, "index.html"),
+        ("report", "report/videos/mine.mp4", {}, "videos/mine.mp4"),
+        ("report", "report/notes.txt", {}, "notes.txt"),
+        # Whoever names the same directory twice keeps it.
+        ("recordings", "recordings/notes.txt", {}, "no report"),
+        ("mine.html", "mine.html", {"single_file": True}, "is no report"),
+        ("mine.html", "mine.html", {}, "single_file"),
+        ("file", "file", {}, "is a file"),
+        ("file/report", "file", {}, "file"),
+    ],
+)
+def test_what_is_no_report_is_not_replaced(
+    recordings, tmp_path, target, mine, options, words
+):
+    """All stays as it was, and the error names what is in the way."""
+    write_report(recordings, tmp_path / "report")
+    (tmp_path / mine).parent.mkdir(exist_ok=True)
+    (tmp_path / mine).write_text("mine")
+    before = names(tmp_path)
+    with pytest.raises((InvalidArgument, DirectoryNotWritable), match=words):
+        write_report(recordings, tmp_path / target, **options)
+    assert names(tmp_path) == before
+    assert (tmp_path / mine).read_text() == "mine"
 
 
 def test_a_failed_report_leaves_what_was_there(recordings, tmp_path, monkeypatch):
@@ -222,7 +228,7 @@ def test_a_single_file_is_no_larger_than_allowed(recordings, tmp_path):
     assert len(re.findall("<img[^>]* src=.data:image/jpeg;base64,", text)) == 2
     assert len(re.findall("<a[^>]* href=.data:video/mp4;base64,", text)) == 1
     assert "1 of 2 videos are not embedded" in text
-    with pytest.raises(InvalidArgument, match="without any picture or video"):
+    with pytest.raises(InvalidArgument, match="without any image or video"):
         write_report(
             recordings,
             tmp_path / "tiny.html",
@@ -230,26 +236,6 @@ def test_a_single_file_is_no_larger_than_allowed(recordings, tmp_path):
             max_single_file_bytes=1000,
         )
     assert not (tmp_path / "tiny.html").exists()
-
-
-def test_a_page_that_is_somebody_elses_is_not_replaced(recordings, tmp_path):
-    """Nor does a report that is a folder end in .html."""
-    page = tmp_path / "mine.html"
-    page.write_text("mine")
-    with pytest.raises(InvalidArgument, match="is no report"):
-        write_report(recordings, page, single_file=True)
-    with pytest.raises(InvalidArgument, match="single_file"):
-        write_report(recordings, page)
-    assert page.read_text() == "mine"
-
-
-def test_where_nothing_can_be_written(recordings, tmp_path):
-    """The error names the place."""
-    (tmp_path / "file").write_text("")
-    with pytest.raises(DirectoryNotWritable, match="file"):
-        write_report(recordings, tmp_path / "file" / "report")
-    with pytest.raises(InvalidArgument, match="is a file"):
-        write_report(recordings, tmp_path / "file")
 
 
 def test_replays_stand_beside_the_videos(tmp_path):

@@ -51,7 +51,6 @@ def normal(count, center=500.0, *, seed=0):
 
 
 def ends(interval):
-    assert interval is not None
     return [interval.low, interval.high]
 
 
@@ -88,7 +87,6 @@ def test_intervals_across_tasks_are_rliables():
     better = average(improvement(x, y) for x, y in zip(X, Y, strict=True))
     assert ends(better.interval(USUAL)) == pytest.approx([0.2658, 0.4629], abs=0.004)
     band = performance_profile(X, TENTHS).ends(USUAL)
-    assert band is not None
     low = [1.0, 0.9, 0.7, 0.533, 0.367, 0.15, 0.05, 0, 0, 0, 0]
     high = [1.0, 1.0, 0.883, 0.767, 0.6, 0.35, 0.217, 0.1, 0.05, 0, 0]
     assert band[0] == pytest.approx(low, abs=0.018)

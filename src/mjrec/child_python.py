@@ -163,7 +163,7 @@ class Child:
             if size == after > before:
                 break
             after = size
-        return self._words_from(before) or "(it does not say)"
+        return self._words_from(before) or "(no output)"
 
     def last_words(self) -> str:
         """Return what became of it, and the end of what it printed."""
@@ -171,7 +171,7 @@ class Child:
         # What Python says of a crash ends with the names of dozens of modules.
         words = self.printed().partition("\nExtension modules:")[0].strip()
         end = words[-_END_OF_WORDS:] or "(nothing)"
-        return f"{how}. The end of what it said: {end}"
+        return f"{how}. Its last output: {end}"
 
     def printed(self) -> str:
         """Return the end of what it has printed."""
@@ -181,7 +181,7 @@ class Child:
         """Return in words its exit status, for which it is waited some seconds."""
         status = self._process.wait(_SECONDS_TO_END)
         if status is None:
-            return "lives, and is silent"
+            return "is alive but silent"
         if status >= 0:
             return f"ended with status {status}"
         try:

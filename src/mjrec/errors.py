@@ -1,39 +1,39 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What can go wrong, as one tree.
+"""All errors of mjrec, as a tree.
 
 ::
 
     Error (Exception)
-    ├── InvalidArgument (also ValueError)   a value that cannot be
+    ├── InvalidArgument (also ValueError)   a wrong value
     │   ├── UnknownName                     no such environment, camera, policy ...
-    │   └── InvalidFrame                    not a (height, width, 3) uint8 picture
+    │   └── InvalidFrame                    not a (height, width, 3) uint8 array
     ├── ExistingRecordings                  neither force nor resume was asked for
     ├── DirectoryInUse                      another live monitor writes there
-    ├── DirectoryNotWritable (also OSError) it cannot be made or written to
-    ├── FileNotWritten (also OSError)       a full disk, say
+    ├── DirectoryNotWritable (also OSError) cannot be created or written to
+    ├── FileNotWritten (also OSError)       such as a full disk
     ├── DifferentEnvironment                resume over another environment
-    ├── DifferentEvaluation                 resume of an evaluation that is another
-    ├── EnvironmentNotMade                  it is known, and making it failed
-    ├── NotPicklable (also TypeError)       a monitor, which belongs to a process
+    ├── DifferentEvaluation                 resume with other options
+    ├── EnvironmentNotMade                  making a known environment failed
+    ├── NotPicklable (also TypeError)       a monitor belongs to its process
     ├── NoPictures                          the environment cannot be drawn
-    ├── PicturesDiffer                      from its state it would look otherwise
+    ├── PicturesDiffer                      frames do not follow from the state
     ├── ResetNeeded                         step before reset or after the end
-    ├── ResetNotAllowed                     reset in mid-episode
+    ├── ResetNotAllowed                     reset in the middle of an episode
     ├── ClosedError                         used after close()
     ├── EncoderError                        ffmpeg failed or died
     │   └── FrameCountError                 the finished file lacks or doubles frames
-    ├── RenderError                         videos could not be made of their states
-    ├── BlankVideo                          strict=True, and nothing is to be seen
+    ├── RenderError                         videos could not be rendered
+    ├── BlankVideo                          strict=True: the video shows nothing
     ├── GLError                             no backend renders, or the wrong one
     ├── PolicyError                         a policy raised or gave a bad action
     ├── ArchiveError                        write_archive's checks
     ├── PackError                           a run cannot be packed as asked
-    │   ├── UnfinishedRecordings            something is to be rendered or recovered
-    │   ├── ArchiveTooLarge                 max_size, also with smaller videos
-    │   └── IdentityLeft                    anonymous=True, and somebody is named
+    │   ├── UnfinishedRecordings            render or recover first
+    │   ├── ArchiveTooLarge                 exceeds max_size
+    │   └── IdentityLeft                    anonymous=True: a name is left
     ├── UnreadableFile                      a damaged or foreign file
-    │   ├── UnreadableArchive               which `mjrec verify` was given
-    │   └── UntrustedModel                  a stranger's, and without its sources
+    │   ├── UnreadableArchive               given to `mjrec verify`
+    │   └── UntrustedModel                  a stranger's, without its sources
     └── MissingDependency (also ImportError)  an extra is not installed
 
 Every message says what was asked, what is there, and what to do.
@@ -171,18 +171,18 @@ class DifferentEnvironment(Error):
         self.recorded = recorded
         self.asked = asked
         super().__init__(
-            f"{directory} holds recordings of {recorded}, and this monitor is around "
-            f"{asked}. Results of two environments in one directory cannot be told "
-            "apart: use another directory."
+            f"{directory} holds recordings of {recorded}, but this monitor records "
+            f"{asked}. Use another directory: results of two environments cannot share "
+            "one."
         )
 
 
 class DifferentEvaluation(Error):
-    """`resume=True` of an evaluation that was begun in another way.
+    """`resume=True` of an evaluation that was started with other options.
 
     Attributes:
         directory: of the evaluation.
-        differences: what was begun and what is asked now, by what it is of.
+        differences: pairs of old and new value, by option.
     """
 
     def __init__(
@@ -195,17 +195,16 @@ class DifferentEvaluation(Error):
             for name, (begun, asked) in self.differences.items()
         )
         super().__init__(
-            f"The evaluation in {directory} was begun in another way: {listed}. Its "
-            "results and new ones do not belong together: ask for the same, or use "
-            "another directory."
+            f"The evaluation in {directory} was started with other options: {listed}. "
+            "Use the same options, or another directory."
         )
 
 
 class EnvironmentNotMade(Error):
-    """An environment that is known could not be made; the cause is kept.
+    """A known environment could not be made; the cause is kept.
 
     Attributes:
-        name: the environment asked for.
+        name: the environment's name.
     """
 
     def __init__(self, name: str, reason: object, *, hint: str = "") -> None:
@@ -215,11 +214,11 @@ class EnvironmentNotMade(Error):
 
 
 class NotPicklable(Error, TypeError):
-    """A monitor was to be sent to another process, or copied."""
+    """A monitor cannot be sent to another process or copied."""
 
 
 class NoPictures(Error):
-    """Videos were asked for of an environment that gives no pictures."""
+    """Videos are wanted, but the environment gives no frames."""
 
 
 class PicturesDiffer(Error):
@@ -243,17 +242,17 @@ class RenderError(Error):
         reasons = "; ".join(f"{listed}: {why}" for why, listed in names.items())
         super().__init__(
             f"{len(self.failures)} of the videos in {directory} could not be rendered: "
-            f"{reasons} Their states are kept; to try again: mjrec render {directory}"
+            f"{reasons} Their states are kept. To try again: mjrec render {directory}"
         )
 
 
 class BlankVideo(Error):
-    """With `strict=True`: a video is whole, and shows nothing.
+    """With `strict=True`: a complete video shows nothing.
 
     Attributes:
-        path: the video; it is kept, and so is its metadata, which says the same.
-        frame_count: how many frames it has.
-        suspicion: what is wrong with it.
+        path: the video; it is kept, with its metadata.
+        frame_count: number of frames.
+        suspicion: what is wrong.
     """
 
     def __init__(self, path: Path, *, frame_count: int, suspicion: str) -> None:
@@ -261,9 +260,9 @@ class BlankVideo(Error):
         self.frame_count = frame_count
         self.suspicion = suspicion
         super().__init__(
-            f"{path} shows nothing: {suspicion}. The file is kept. Look at the lights "
-            "and the camera of the model, and at what `mjrec doctor` says of OpenGL; "
-            "without strict (--strict) this is a warning."
+            f"{path} shows nothing: {suspicion}. The file is kept. Check the model's "
+            "lights and camera, and OpenGL with `mjrec doctor`. Without strict "
+            "(--strict) this is a warning."
         )
 
 
@@ -272,7 +271,7 @@ class ResetNeeded(Error):
 
 
 class ResetNotAllowed(Error):
-    """`reset` in mid-episode, without `allow_early_reset=True`."""
+    """`reset` in the middle of an episode, without `allow_early_reset=True`."""
 
 
 class ClosedError(Error):
@@ -283,9 +282,9 @@ class EncoderError(Error):
     """ffmpeg failed or died.
 
     Attributes:
-        command: the argument list it was started with.
+        command: its arguments.
         returncode: its exit status; negative is the signal that killed it.
-        stderr: the end of what it said.
+        stderr: the end of its output.
     """
 
     def __init__(
@@ -297,20 +296,20 @@ class EncoderError(Error):
         said = stderr.strip() or "(nothing)"
         super().__init__(
             f"{what} ffmpeg's exit status: {returncode}. It was started as: "
-            f"{' '.join(self.command)}. The end of what it said: {said}"
+            f"{' '.join(self.command)}. Its last output: {said}"
         )
 
 
 class FrameCountError(EncoderError):
-    """The finished video does not hold exactly the frames that were written."""
+    """The finished video does not hold the frames that were written."""
 
 
 class GLError(Error):
-    """No OpenGL backend renders here, or another one is in use already."""
+    """No OpenGL backend renders here, or another one is already in use."""
 
 
 class PolicyError(Error):
-    """A policy cannot be built, raised, or gave something that is no action."""
+    """A policy cannot be built, raised, or gave an invalid action."""
 
 
 class ArchiveError(Error):
@@ -322,11 +321,11 @@ class PackError(Error):
 
 
 class UnfinishedRecordings(PackError):
-    """Something of the recordings is still to be done.
+    """Recordings are not finished.
 
     Attributes:
         directory: where the recordings are.
-        names: the base names of what is not finished.
+        names: base names of unfinished files.
     """
 
     def __init__(self, directory: Path, names: Sequence[str], *, advice: str) -> None:
@@ -339,12 +338,12 @@ class UnfinishedRecordings(PackError):
 
 
 class ArchiveTooLarge(PackError):
-    """A packed run would be larger than allowed, also with smaller videos.
+    """A packed run would exceed the limit, even with smaller videos.
 
     Attributes:
-        size: what the smallest archive that was tried has at least, in bytes.
-        limit: the most that was allowed.
-        largest: the names and sizes of the largest files in it.
+        size: least size of the smallest archive that was tried, in bytes.
+        limit: the limit in bytes.
+        largest: names and sizes of its largest files.
     """
 
     def __init__(
@@ -363,10 +362,10 @@ class ArchiveTooLarge(PackError):
 
 
 class IdentityLeft(PackError):
-    """With `anonymous=True`: something that names somebody is still in the archive.
+    """With `anonymous=True`: the archive would still name a person or machine.
 
     Attributes:
-        found: the files, each with what was found in it.
+        found: files, each with what was found in it.
     """
 
     def __init__(self, found: Sequence[tuple[str, str]]) -> None:
@@ -376,13 +375,13 @@ class IdentityLeft(PackError):
         )
         super().__init__(
             f"The packed run would not be anonymous, so it was not written: {listed}. "
-            "Record again without these (a uid, a camera's or a body's name, "
-            "a title), or leave out the episodes that have them."
+            "Record again without these names (uid, camera, body, title), or leave out "
+            "the episodes that have them."
         )
 
 
 class UnreadableFile(Error):
-    """A file that is damaged, or not what its name says.
+    """A file is damaged, or not what its name says.
 
     Attributes:
         path: the file.
@@ -390,10 +389,7 @@ class UnreadableFile(Error):
     """
 
     _message = "Cannot read {path}: {reason}."
-    _advice = (
-        " The other files of its directory are as good as before; to read them, move "
-        "this one away."
-    )
+    _advice = " To read the other files of its directory, move this one away."
 
     def __init__(self, path: Path, reason: object) -> None:
         self.path = path
@@ -404,21 +400,21 @@ class UnreadableFile(Error):
 
 
 class UnreadableArchive(UnreadableFile):
-    """What was given to be verified is no packed run, or is damaged."""
+    """The file to verify is no packed run, or is damaged."""
 
     _message = "Cannot verify {path}: {reason}."
     _advice = (
-        " It may not have come whole, or was packed anew by another program: ask for "
-        "the file that `mjrec pack` made again."
+        " It may be incomplete, or was packed again by another program: ask for the "
+        "file that `mjrec pack` wrote."
     )
 
 
 class UntrustedModel(UnreadableFile):
-    """A compiled model that a stranger may have written, which is not loaded.
+    """A compiled model that a stranger may have written is not loaded.
 
     Attributes:
         path: of the model.
-        reason: why nothing else can be used instead, and how to say that it is trusted.
+        reason: why its sources cannot be used, and how to trust it.
     """
 
     _message = "The model {path} is not loaded: {reason}."
@@ -426,7 +422,7 @@ class UntrustedModel(UnreadableFile):
 
 
 class MissingDependency(Error, ImportError):
-    """Something optional is needed and not installed."""
+    """An optional package is needed and not installed."""
 
     def __init__(self, package: str, *, purpose: str, install: str) -> None:
         self.package = package

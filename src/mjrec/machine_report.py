@@ -63,10 +63,10 @@ class Package:
 
     Attributes:
         name: its name.
-        version: None where it is not installed.
-        works: whether its simplest task can be made; None where that was not tried.
+        version: None if it is not installed.
+        works: whether its simplest task can be made. None if this was not tried.
         cause: why it does not work.
-        fix: what to do about it, or how to install it.
+        fix: what to do, or how to install it.
     """
 
     name: str
@@ -78,14 +78,14 @@ class Package:
 
 @dataclass(frozen=True)
 class Ffmpeg:
-    """The ffmpeg that videos are written with.
+    """The ffmpeg that writes videos.
 
     Attributes:
-        path: where it is; None where there is none.
-        version: its first line about itself.
-        encodes: whether it made H.264 out of a picture just now.
+        path: None if there is none.
+        version: the first line of its output.
+        encodes: whether it just encoded a frame as H.264.
         cause: why it did not.
-        fix: what to do about it.
+        fix: what to do.
     """
 
     path: str | None
@@ -102,8 +102,8 @@ class Cpus:
     Attributes:
         usable: how many this process can keep busy.
         present: how many the machine has.
-        allowed: how many the process may run on (its affinity).
-        quota: how many the cgroup grants; None where nothing limits them.
+        allowed: how many the process may run on (affinity).
+        quota: the cgroup's limit. None if there is none.
     """
 
     usable: int
@@ -114,23 +114,21 @@ class Cpus:
 
 @dataclass(frozen=True)
 class MachineReport:
-    """What `mjrec doctor` shows.
+    """What `mjrec doctor` found.
 
     Attributes:
-        can_render: whether a recording that starts now gets pictures.
-        backend: the backend that `use_gl` would choose; None where it would raise.
-        reason: where that choice comes from, or the error.
-        backends: each backend, tried.
-        problems: what is wrong with the environment variables or odd about the
-            choice, though mjrec may get along with it.
-        gpu_device_files: the GPUs that the kernel shows.
+        can_render: whether a recording that starts now gets frames.
+        backend: the backend that `use_gl` would choose. None if it would raise.
+        reason: why this backend, or the error.
+        backends: the result of each backend's test.
+        problems: odd settings that stop nothing.
+        gpu_device_files: GPUs that the kernel shows.
         ffmpeg: the encoder.
-        packages: what is installed.
-        extras: what is installed for optional parts, and engines; Slurm among them, and
-            the driver of a GPU.
+        packages: Python packages that recording uses.
+        extras: optional packages, engines, and the GPU's driver.
         cpus: the CPUs.
         python: the interpreter's version.
-        platform: the operating system and the processor.
+        platform: operating system and processor.
     """
 
     can_render: bool

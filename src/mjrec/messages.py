@@ -98,7 +98,7 @@ def carried(error: BaseException) -> dict[str, Any]:
         told = "".join(traceback.format_exception(error)).strip()
         return {
             "type": "Error",
-            "message": f"A worker failed in a way that nobody foresaw.\n{told}",
+            "message": f"A worker failed with an unexpected error.\n{told}",
         }
     # One that a module made of its own is known by the nearest that everybody knows.
     kinds = (kind.__name__ for kind in type(error).__mro__)

@@ -20,9 +20,9 @@ _CAP = 1000
 
 
 def capped_cubic_video_schedule(episode_id: int) -> bool:
-    """Tell whether an episode is a perfect cube below 1000 or a multiple of 1000.
+    """Return whether an episode is a cube below 1000 or a multiple of 1000.
 
-    A negative number is never recorded.
+    Negative numbers are never recorded.
 
     Examples:
         >>> [n for n in range(3001) if capped_cubic_video_schedule(n)]

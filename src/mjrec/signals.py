@@ -18,11 +18,11 @@ _SIGNALS = (signal.SIGTERM, signal.SIGHUP)
 
 
 class Terminated(SystemExit):
-    """A signal has asked the process to end.
+    """A signal asked the process to end.
 
-    Like Ctrl-C it leaves `with` blocks and runs `finally` clauses; nobody who catches
-    `Exception` catches it. Where nobody does, the exit status is 128 and the signal's
-    number, as shells say it.
+    Like KeyboardInterrupt it leaves `with` blocks, runs `finally` clauses, and is not
+    caught by `except Exception`. If it is not caught, the exit status is 128 plus the
+    signal's number.
 
     Attributes:
         signal: its number.
@@ -37,14 +37,14 @@ class Terminated(SystemExit):
 
 
 def exit_on_signals() -> None:
-    """Let SIGTERM and SIGHUP end this process the way that Ctrl-C does.
+    """Let SIGTERM and SIGHUP end this process like Ctrl-C.
 
-    By default they end it at once: what was recorded is there up to the last moment,
-    and `mjrec recover` puts it in order. After this call they raise `Terminated` in
-    the main thread instead, so that monitors close their files: nothing is rendered
-    any more, and one line says what is pending. The command line does it by itself.
+    By default these signals kill the process, and `mjrec recover` finishes its files.
+    After this call they raise `Terminated` in the main thread, so monitors close their
+    files. Pending videos are not rendered; one line says how many there are. The
+    command line calls it.
 
-    A signal that is ignored (`nohup`), or that has a handler already, stays as it is.
+    Signals that are ignored (`nohup`) or that have a handler are left alone.
 
     Raises:
         Error: not called in the main thread, where Python handles signals.

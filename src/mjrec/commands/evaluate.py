@@ -175,8 +175,8 @@ def evaluate(
         print_lines(
             console,
             [
-                f"Interrupted. What was finished is in {out}: mjrec evaluate "
-                f"--resume {out} goes on, and repeats none of it."
+                f"Interrupted. Finished episodes are in {out}. To continue: mjrec "
+                f"evaluate --resume {out}"
             ],
         )
         return _INTERRUPTED
@@ -222,8 +222,7 @@ def _tasks_and_directory(
         return tasks[:-1], Path(tasks[-1])
     if out is None:
         raise InvalidArgument(
-            "Say where the results go, --out DIR, or which evaluation goes on, "
-            "--resume DIR."
+            "Give --out DIR for a new evaluation, or --resume DIR to continue one."
         )
     return tasks, out
 
@@ -374,8 +373,8 @@ def _failure_lines(evaluation: Evaluation) -> Iterator[str]:
             yield f"  and {len(reasons) - _SHOWN} more reasons, in results.csv"
     if not_finite := evaluation.not_finite:
         yield (
-            f"{counted(len(not_finite), 'return')} NaN or infinite, which is no "
-            f"success (--allow-nan): {and_more([*map(_name, not_finite)])}"
+            f"{counted(len(not_finite), 'return')} NaN or infinite (--allow-nan "
+            f"accepts them): {and_more([*map(_name, not_finite)])}"
         )
 
 

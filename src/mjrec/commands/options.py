@@ -105,13 +105,12 @@ class EngineOptions:
         options = _options_of(self.engine_option)
         if self.engine is None and self.address is not None:
             raise InvalidArgument(
-                f"--address {self.address} is that of a Ray cluster: use it with "
-                "--engine ray."
+                f"--address {self.address} needs a Ray cluster: add --engine ray."
             )
         if self.engine is None and options:
             raise InvalidArgument(
-                f"--engine-option {next(iter(options))} is of an engine: say which, "
-                "such as --engine slurm."
+                f"--engine-option {next(iter(options))} needs an engine, such as "
+                "--engine slurm."
             )
         if self.engine is None and self.gpus is None and not self.require_gpu:
             return None

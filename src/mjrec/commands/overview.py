@@ -14,13 +14,7 @@ if TYPE_CHECKING:
 # Each command, in the group in which people look for it.
 GROUPS = {
     "Record and render": (
-        "record",
-        "render",
-        "list",
-        "view",
-        "replay",
-        "strip",
-        "recover",
+        *("record", "render", "list", "strip", "replay", "view", "recover"),
     ),
     "Evaluate": ("evaluate", "compare", "report"),
     "Share": ("pack", "verify"),

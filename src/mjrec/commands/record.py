@@ -148,8 +148,8 @@ def record(
         print_lines(console, _summary(session, recorded, interrupted))
         if not_finite:
             what = counted(len(not_finite), "return")
-            why = f"which is no success (--allow-nan): episode {not_finite[0]}"
-            print_lines(console, [f"{what} NaN or infinite, {why}"])
+            where = f"(--allow-nan accepts them): episode {not_finite[0]}"
+            print_lines(console, [f"{what} NaN or infinite {where}"])
     if interrupted:
         return _INTERRUPTED
     return _FAILED if not_finite and not allow_nan else 0

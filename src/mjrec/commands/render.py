@@ -102,8 +102,8 @@ def render(
     )
     if pending and (variant != Variant() or out is not None):
         raise InvalidArgument(
-            "--pending renders videos as they were to be. To render an episode another "
-            "way, leave it out."
+            "--pending renders videos as planned. To render an episode in another way, "
+            "leave it out."
         )
     places, number = _places(target, episode)
     if out is not None and len(places) > 1:
@@ -135,8 +135,8 @@ def render(
     if nothing and (episode is not None or not target.is_dir()):
         what = target.name if episode is None else f"episode {episode}"
         raise InvalidArgument(
-            f"No video of {what} is pending. To render it again, say what is to be "
-            "other (--camera, --size, --max-fps, --quality, --fps, --annotate) or "
+            f"No video of {what} is pending. To render it once more, say what should "
+            "change (--camera, --size, --max-fps, --quality, --fps, --annotate) or "
             "where to write it (--out)."
         )
     if as_json:
@@ -158,7 +158,7 @@ def _places(target: Path, episode: int | None) -> tuple[list[Path], int | None]:
         found = list(_trajectories(target, episode))
         if not found:
             raise InvalidArgument(
-                f"No episode {episode} is recorded in {target}. To see which are: "
+                f"No episode {episode} is recorded in {target}. To list the episodes: "
                 f"mjrec list {target}"
             )
         return found, None
@@ -196,7 +196,7 @@ def _collect(
 def _summary(report: RenderedVideos, is_interrupted: bool) -> Iterator[str]:
     shown = report.directory.absolute()
     if is_interrupted:
-        yield "Interrupted. What is not done stays as it was."
+        yield "Interrupted. Videos that are not finished stay pending."
     elif report.is_empty:
         yield f"Nothing is pending in {shown}."
     if report.videos:
@@ -204,9 +204,9 @@ def _summary(report: RenderedVideos, is_interrupted: bool) -> Iterator[str]:
         yield f"  {shown}"
     if report.elsewhere:
         what = counted(len(report.elsewhere), "video")
-        yield f"{what} left to another process, which is rendering now."
+        yield f"{what} left to another process that is rendering."
     yield from _reasons("could not be rendered:", report.failures)
-    yield from _reasons("rendered, with nothing to be seen:", report.blank)
+    yield from _reasons("rendered, showing nothing:", report.blank)
 
 
 def _reasons(what: str, failures: Mapping[str, str]) -> Iterator[str]:

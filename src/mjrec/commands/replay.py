@@ -10,8 +10,6 @@ from typing import Annotated
 import tyro
 
 from ..simulation.trajectories import load_trajectory
-from ..viewing.episodes import trajectory_in
-from ..viewing.replay import write_replay
 from .options import AsJson
 from .terminal import print_json
 
@@ -26,22 +24,24 @@ def replay(
     trust_models: bool = False,
     as_json: AsJson = False,
 ) -> int:
-    """Write one HTML file that shows a recorded episode in 3D, without a network.
+    """Show an episode in 3D, in one HTML file that needs no network.
 
-    It plays all recorded states, from any side and from the model's cameras, with the
-    reward and the return of each. It is a view of the recorded states and no evidence
-    of its own.
+    The page plays all recorded states from any side and from the model's cameras, with
+    the reward and return of each. It is a view, not evidence.
 
     Args:
-        target: a trajectory (openaigym.trajectory.*.h5), or a monitor directory.
-        episode: of a directory: its number; the last one that is recorded, if it is not
-            given.
-        max_fps: the most states per second of simulated time; all, if it is not given.
-        out: the page to write; a file that is there is replaced.
-        trust_models: load compiled models also where another user, or another machine,
-            has written them. A crafted one can do anything to whoever loads it.
+        target: a trajectory (openaigym.trajectory.*.h5) or a monitor directory.
+        episode: of a directory: number of the episode. By default the last one.
+        max_fps: most states per second of simulated time. By default all.
+        out: the page to write. An existing file is replaced.
+        trust_models: load compiled models that another user or machine wrote. A crafted
+            model can run any code, so use it only if you trust the author.
         as_json: print one JSON object at the end.
     """
+    # Not at the top: help is there without the extra.
+    from ..viewing.episodes import trajectory_in
+    from ..viewing.replay import write_replay
+
     path = trajectory_in(target, episode)
     trajectory = load_trajectory(path, trust_models=trust_models)
     made = write_replay(trajectory, out, max_fps=max_fps)

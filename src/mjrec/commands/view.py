@@ -9,8 +9,6 @@ from typing import Annotated
 
 import tyro
 
-from ..viewing.live import LiveView, be_nice
-
 
 def view(
     directory: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="DIR")],
@@ -19,18 +17,21 @@ def view(
     port: int = 0,
     trust_models: bool = False,
 ) -> int:
-    """Show a run in a browser while it goes on: newest states in 3D, returns, episodes.
+    """Show a run in a browser while it goes on: latest states in 3D, returns, episodes.
 
-    Prints an address of this machine, with a token that is needed to see anything, and
-    serves it until Ctrl-C. It only reads, at a low priority; the run does not wait for
-    it. On another machine, forward the port: ssh -L PORT:127.0.0.1:PORT HOST.
+    Prints an address on this machine, with a token that the browser needs, and serves
+    it until Ctrl-C. It only reads, at low priority, and never blocks the run. From
+    another machine, forward the port: ssh -L PORT:127.0.0.1:PORT HOST.
 
     Args:
         directory: a monitor directory.
-        port: to listen at; one that is free, if it is not given.
-        trust_models: load compiled models also where another user, or another machine,
-            has written them. A crafted one can do anything to whoever loads it.
+        port: port to listen on. By default a free one.
+        trust_models: load compiled models that another user or machine wrote. A crafted
+            model can run any code, so use it only if you trust the author.
     """
+    # Not at the top: help is there without the extra.
+    from ..viewing.live import LiveView, be_nice
+
     with LiveView(directory, port=port, trust_models=trust_models) as live:
         be_nice()
         sys.stdout.write(f"{live.url}\nCtrl-C ends it.\n")

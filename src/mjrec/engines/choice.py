@@ -36,13 +36,13 @@ def given_engine(engine: Executor | str | None, workers: int | None) -> Executor
         return engine_from(engine, workers=workers)
     if not isinstance(engine, Executor):
         raise InvalidArgument(
-            "engine is an executor of concurrent.futures, such as mjrec.LocalEngine(), "
-            f"or the name of one of ours, got {engine!r}."
+            "engine must be a concurrent.futures.Executor, such as "
+            f"mjrec.LocalEngine(), or a name such as 'ray', got {engine!r}."
         )
     if workers is not None:
         raise InvalidArgument(
-            f"workers={workers} and engine={engine!r} were given, and an engine has "
-            "workers of its own: say there how many."
+            f"workers={workers} and engine={engine!r} were given, but an engine has "
+            "its own workers: give their number to the engine."
         )
     return engine
 
@@ -77,15 +77,15 @@ def engine_from(
     if name.startswith(_DASK):
         if workers is not None or address is not None or gpus or options:
             raise InvalidArgument(
-                f"The workers of {name} are those that the Dask cluster has: start "
-                "them there, as many and with what they are to have."
+                f"The workers of {name} are those that the Dask cluster has. Choose "
+                "their number and resources when you start them."
             )
         return _dask(name.removeprefix(_DASK))
     if name not in ENGINES[:-1]:
         raise UnknownName("engine", name, ENGINES)
     if address is not None and name != "ray":
         raise InvalidArgument(
-            f"The address {address} would be a Ray cluster's, and the engine is {name}."
+            f"The address {address} is for a Ray cluster, but the engine is {name}."
         )
     if options and name != "slurm":
         raise InvalidArgument(
@@ -116,8 +116,8 @@ def _dask(address: str) -> Executor:
         client = distributed.Client(address, set_as_default=False)
     except (OSError, ValueError) as error:
         raise Error(
-            f"There is no Dask scheduler to be had at {address}. `dask scheduler` "
-            f"starts one, and says its address. Dask says: {error}"
+            f"No Dask scheduler answers at {address}. `dask scheduler` starts one and "
+            f"prints its address. Dask's error: {error}"
         ) from error
     # Each job is done, though another one looks the same.
     executor: Executor = client.get_executor(pure=False)

@@ -31,18 +31,18 @@ class GpuShare:
         number = isinstance(self.each, int | float) and not isinstance(self.each, bool)
         if not (number and math.isfinite(self.each) and self.each >= 0):
             raise InvalidArgument(
-                "gpus is how many GPUs each worker gets, such as 1, or 0.25 where four "
-                f"are to share one, got {self.each!r}."
+                "gpus is the number of GPUs per worker, such as 1, or 0.25 if four "
+                f"share one, got {self.each!r}."
             )
         if self.each > 1 and self.each != int(self.each):
             raise InvalidArgument(
-                "A worker gets a part of one GPU or several whole ones: gpus cannot be "
+                "A worker gets part of one GPU or several whole ones: gpus cannot be "
                 f"{self.each:g}."
             )
         if self.required and not self.each:
             raise InvalidArgument(
-                "A GPU is required (require_gpu, --require-gpu) and none is asked for: "
-                "say how much of one each worker gets, such as gpus=0.25 (--gpus 0.25)."
+                "A GPU is required (require_gpu, --require-gpu): say how much of one "
+                "each worker gets, such as gpus=0.25 (--gpus 0.25)."
             )
 
     @property

@@ -19,18 +19,18 @@ from .gpu_shares import GpuShare, check_worker_count
 
 
 class LocalEngine(Executor):
-    """Runs jobs in processes of this machine: threads, each with a child at work.
+    """Runs jobs in processes of this machine: a thread per worker, each with a child.
 
     Args:
-        workers: how many at most; None is one for each CPU that may be used.
-        gpus: how much of a GPU each worker gets: with 0.25 four share one. They are
-            given those that `CUDA_VISIBLE_DEVICES` names, else all of the machine.
-        require_gpu: a worker that renders in software though it was given a GPU is an
-            error, and not only a warning.
+        workers: how many at most. None is one per usable CPU.
+        gpus: part of a GPU for each worker; with 0.25 four share one. Workers get the
+            GPUs in `CUDA_VISIBLE_DEVICES`, else all of the machine.
+        require_gpu: a worker that was given a GPU but renders in software is an error,
+            not only a warning.
 
     Raises:
-        InvalidArgument: `workers` is not a whole number of at least 1, or `gpus` is no
-            share of GPUs.
+        InvalidArgument: `workers` is not a whole number of at least 1, or `gpus` is not
+            a valid share.
     """
 
     def __init__(
@@ -76,7 +76,7 @@ class LocalEngine(Executor):
         return future
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        """Take no more calls, and let the threads end. Idempotent."""
+        """Take no more calls and let the threads end. Idempotent."""
         del wait, cancel_futures
         self._end()
 

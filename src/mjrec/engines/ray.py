@@ -39,18 +39,18 @@ class RayEngine(Executor):
     """Runs jobs on a Ray cluster.
 
     Args:
-        workers: how many at once at most; None is as many as the cluster has room for,
-            also when it grows.
-        address: of the cluster; None is the one that `RAY_ADDRESS` names, else a Ray
-            that is started on this machine and ends with the engine. Where this process
-            is connected to Ray already, that is used, and left as it is.
-        gpus: how much of a GPU each worker gets: with 0.25 four share one.
-        require_gpu: a worker that renders in software though it was given a GPU is an
-            error, and not only a warning.
+        workers: how many at once. None is as many as the cluster has room for, also
+            while it grows.
+        address: of the cluster. None is `RAY_ADDRESS`, else a Ray is started on this
+            machine and ends with the engine. An existing connection of this process is
+            used and left open.
+        gpus: part of a GPU for each worker; with 0.25 four share one.
+        require_gpu: a worker that was given a GPU but renders in software is an error,
+            not only a warning.
 
     Raises:
-        InvalidArgument: `workers` is not a whole number of at least 1, or `gpus` is no
-            share of GPUs.
+        InvalidArgument: `workers` is not a whole number of at least 1, or `gpus` is not
+            a valid share.
         MissingDependency: Ray is not installed.
     """
 
@@ -111,9 +111,9 @@ class RayEngine(Executor):
             # No worker shall wait for ever for a GPU that there is not.
             has_gpus = self._ray.cluster_resources().get("GPU")
             if is_started and self.share.asked_for and not has_gpus:
-                lack = "Workers are to get GPUs, and Ray finds none on this machine."
+                lack = "Workers should get GPUs, but Ray finds none on this machine."
                 if self.share.required:
-                    raise GLError(f"{lack} `nvidia-smi -L` lists those that there are.")
+                    raise GLError(f"{lack} `nvidia-smi -L` lists GPUs.")
                 logger.warning("%s They draw in software.", lack)
                 self.share = GpuShare()
         self._task = self._ray.remote(
@@ -186,8 +186,8 @@ def _connect(ray: Any, address: str | None, cpus: int | None) -> bool:
     address = address or os.environ.get("RAY_ADDRESS") or "local"
     if address.startswith("ray://"):
         raise InvalidArgument(
-            f"{address} is an address for Ray's client, with which workers cannot be "
-            "watched. Start mjrec on a machine of the cluster, with --address auto."
+            f"{address} is an address for Ray's client, which cannot watch workers. "
+            "Start mjrec on a machine of the cluster, with --address auto."
         )
     try:
         with _signals_as_they_are():
@@ -206,9 +206,9 @@ def _connect(ray: Any, address: str | None, cpus: int | None) -> bool:
             why = f"Ray could not be started on this machine: {told}"
         else:
             why = (
-                f"There is no Ray cluster to be had at {address}. It must be running "
-                "(ray status), be reached from here, and have the same versions of Ray "
-                f"and Python. Ray says: {told}"
+                f"No Ray cluster answers at {address}. It must be running (ray "
+                "status), be reachable from here, and have the same versions of Ray "
+                f"and Python. Ray's error: {told}"
             )
         raise Error(why) from error
 

@@ -79,33 +79,32 @@ class SlurmEngine(Executor):
     """Runs jobs in Slurm jobs.
 
     Args:
-        workers: how many at most, in all Slurm jobs together; None is 4, and one for
-            each CPU where `cluster` is `"local"`.
-        cluster: None is the Slurm cluster that this machine belongs to; `"local"` is
-            this machine, with processes in place of Slurm jobs, to try it out.
-        gpus: how much of a GPU each worker gets: with 0.25 four share one.
-        require_gpu: a worker that renders in software though it was given a GPU is an
-            error, and not only a warning.
-        cpus_per_worker: how many CPUs each worker gets.
-        workers_per_job: how many workers a Slurm job holds, on one machine; None is as
-            many as share a GPU, else one.
-        partition: in which Slurm jobs run; None is the cluster's default, for this and
-            what follows.
-        account: which they are charged to.
-        qos: their quality of service.
-        constraint: features that their nodes have.
-        time_min: their time limit in minutes. One that comes to it is put back into
-            Slurm's queue and goes on where it was. The longest job has to fit.
-        notice_s: so many seconds before its time limit a Slurm job ends. None is 120,
-            or a quarter of a short limit.
+        workers: how many at most, in all Slurm jobs together. None is 4, or one per CPU
+            with `cluster="local"`.
+        cluster: None is this machine's Slurm cluster; `"local"` uses processes of this
+            machine instead of Slurm jobs, to try it out.
+        gpus: part of a GPU for each worker; with 0.25 four share one.
+        require_gpu: a worker that was given a GPU but renders in software is an error,
+            not only a warning.
+        cpus_per_worker: CPUs for each worker.
+        workers_per_job: workers in one Slurm job, on one machine. None is as many as
+            share a GPU, else one.
+        partition: for the Slurm jobs. None is the cluster's default, here and below.
+        account: charged for the jobs.
+        qos: quality of service.
+        constraint: features that nodes must have.
+        time_min: time limit in minutes. A job that reaches it goes back into the queue
+            and continues. The longest single job must fit.
+        notice_s: a Slurm job stops this many seconds before its limit. None is 120, or
+            a quarter of a short limit.
         mem_gb: memory of each worker, in gigabytes.
-        setup: lines of shell that run in a Slurm job before anything else.
-        sbatch: any other options of `sbatch`, by name, without their dashes.
+        setup: shell lines that run first in a Slurm job.
+        sbatch: other options of `sbatch`, by name, without dashes.
 
     Raises:
-        InvalidArgument: one of them cannot be.
+        InvalidArgument: an argument has a wrong value.
         MissingDependency: submitit is not installed.
-        Error: this machine has no commands of Slurm's.
+        Error: this machine has no Slurm commands.
     """
 
     def __init__(
@@ -189,10 +188,10 @@ class SlurmEngine(Executor):
     def submit(
         self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any
     ) -> Future[Any]:
-        """Do a job of a `jobs.Run` in some Slurm job.
+        """Run a job of a `jobs.Run` in some Slurm job.
 
         Raises:
-            ClosedError: it was shut down.
+            ClosedError: the engine was shut down.
             InvalidArgument: it is another function.
         """
         if self._is_shut_down:

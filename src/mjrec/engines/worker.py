@@ -168,7 +168,7 @@ class _JobChild(Child):
                 file.write(limit[2])
         self._listener.join(_SECONDS_BETWEEN_LOOKS)
         said = self._said.strip() or "(nothing)"
-        died = f"{how}. The end of what it said: {said}"
+        died = f"{how}. Its last output: {said}"
         return {"died": died, "begun": self._is_ready, "log": log}
 
     def end(self) -> None:

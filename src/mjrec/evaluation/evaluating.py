@@ -287,16 +287,16 @@ def _begun(directory: Path, *, resume: bool, force: bool) -> EvaluationPlan | No
         raise InvalidArgument(f"{directory} is a file: an evaluation is a directory.")
     if there:
         raise InvalidArgument(
-            f"{directory} holds an evaluation already. To go on with it, or to ask for "
-            "more seeds or episodes: resume=True (--resume). To delete it: force=True "
-            "(--force). For another one, use a directory of its own."
+            f"{directory} already holds an evaluation. To continue it, or to add seeds "
+            "or episodes: resume=True (--resume). To delete it: force=True (--force). "
+            "For another one, use another directory."
         )
     names = {*names_in(directory)} - {_LOCK_NAME, WORK_FOLDER}
     if names:
         raise InvalidArgument(
-            f"{directory} holds something that is no evaluation ({min(names)} "
-            f"{'and others' if len(names) > 1 else 'only'}). An evaluation needs a "
-            "directory of its own, which is empty or new."
+            f"{directory} holds files that are no evaluation ({min(names)} "
+            f"{'and others' if len(names) > 1 else 'only'}). An evaluation needs an "
+            "empty or new directory."
         )
     return None
 
@@ -319,8 +319,8 @@ def _options(begun: EvaluationPlan | None, **given: Any) -> dict[str, Any]:
 def _policy_as_begun(begun: EvaluationPlan) -> str:
     if begun.is_object:
         raise PolicyError(
-            f"The evaluation was begun with an object, {begun.policy}, as its policy: "
-            "give it again, policy=..., to go on."
+            f"The policy of this evaluation is an object, {begun.policy}: give it "
+            "again (policy=...) to continue."
         )
     return begun.policy
 

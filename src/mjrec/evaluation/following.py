@@ -196,7 +196,7 @@ def run_chunks(run: Run, chunks: Sequence[ChunkRun], tell: _Tell) -> EvaluationP
                     "there: all machines must see the directory under the same name."
                 )
                 logger.warning("%s", said)
-                each.reason = said.partition(" The end of what it said")[0]
+                each.reason = said.partition(" Its last output")[0]
         now = time.monotonic()
         if now >= counts_from or not by_key:
             for each in chunks:

@@ -82,20 +82,19 @@ class Verdict(enum.StrEnum):
 
 @dataclass(frozen=True, kw_only=True)
 class Finding:
-    """One item, or several alike, compared with what was made again.
+    """One compared item, or several alike.
 
     Attributes:
-        topic: the line of the one screen that it belongs to.
+        topic: its line on the screen.
         item: "episode 27 of 0.4711", a file's name below `data/`, or "" for the whole.
         outcome: how it compares.
-        reason: a clause. Of DIFFERENT: where, what the archive has, what was made
-            again. Of BELIEVED: why it was not made again.
-        excuse: the name of the excuse that allows it; None where none was needed, or
-            none applies.
+        reason: a clause. DIFFERENT: where, the archive's value, the recreated value.
+            BELIEVED: why it was not recreated.
+        excuse: name of the excuse that allows it. None if none was needed or applies.
         count: how many `unit` it stands for.
         unit: what is counted: "episode", "step", "frame", "video", "file".
         figures: numbers by name, for JSON: `maximum`, `tolerance`, `psnr` ...
-        is_headline: it stands beside the verdict: gaps, episodes that are the same.
+        is_headline: shown beside the verdict: gaps, identical episodes.
     """
 
     topic: Topic
@@ -164,12 +163,12 @@ class Verification:
 
     Attributes:
         path: as given.
-        level: how deep it went.
-        findings: in the order in which they were made.
+        level: as given.
+        findings: in the order of the comparison.
         excuses: those that were claimed.
-        inputs: inputs that are not the default and were used, by their names.
-        facts: what it was made with: versions, machine, the archive's sha256, sample
-            and its seed, the trusted environments.
+        inputs: inputs that are not default, by name.
+        facts: versions, machine, the archive's sha256, sample and its seed, trusted
+            environments.
     """
 
     path: Path

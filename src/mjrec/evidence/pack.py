@@ -71,13 +71,13 @@ def pack(
     max_size: int | str | None = None,
     on_progress: Callable[[Progress], object] = lambda _: None,
 ) -> Path:
-    """Pack a monitor directory into one file that a stranger can verify.
+    """Pack a monitor directory into one file that others can verify.
 
-    It is a zip file with one folder, which is called as the file: a BagIt bag with
-    sha512 checksums, whose payload is an RO-Crate with the monitor directory's files,
+    The zip file contains one folder with the file's name: a BagIt bag with sha512
+    checksums, whose payload is an RO-Crate with the monitor directory,
     `environment.json`, the statistics as CSV, a README and `CITATION.cff`. The same
-    recordings, statements and versions give the same bytes. Nothing in the directory
-    changes, and where anything fails there is no archive.
+    recordings, options and versions give the same bytes. The directory does not change,
+    and if anything fails there is no archive.
 
     ::
 
@@ -85,38 +85,38 @@ def pack(
         mjrec.verify("run.zip")
 
     Args:
-        directory: the monitor directory, or one that holds some, such as an
-            evaluation's. Its monitors are closed, and its videos rendered.
-        path: the archive; its name ends in `.zip`, and nothing of that name exists.
-        title: of the run; what was recorded, if None.
-        authors: each "Name", "Name <address>" or "Name <ORCID>", in their order.
-        license: the SPDX identifier of the licence, such as "CC-BY-4.0", or its URL.
-        episodes: the numbers of those whose videos and recorded states are packed;
-            all, if None, as always of several directories. Statistics, actions and
-            seeds are of all in any case, and the archive says that a choice was made.
-        anonymous: whether everything is taken out that names a user, a machine or an
-            author; for blind reviews.
-        max_size: the most bytes of the archive, as a number or as `"50M"` (50 million).
-            If it would be larger, the videos are drawn again from the recorded states
-            at 3/4, 1/2, 3/8 and 1/4 of width and height, which the archive says.
-        on_progress: told how far that drawing is.
+        directory: the monitor directory, or a folder of several, such as an
+            evaluation's; with closed monitors and rendered videos.
+        path: the archive, a new file that ends in `.zip`.
+        title: of the run. None is what was recorded.
+        authors: each "Name", "Name <address>" or "Name <ORCID>".
+        license: SPDX identifier of the licence, such as "CC-BY-4.0", or its URL.
+        episodes: numbers of the episodes whose videos and states are packed. None is
+            all, as always of several directories. Statistics, actions and seeds of all
+            are packed in any case, and the archive says that a choice was made.
+        anonymous: remove everything that names a user, a machine or an author, for
+            blind review.
+        max_size: size limit in bytes, a number or `"50M"` (50 million). A larger
+            archive gets smaller videos, drawn from the states at 3/4, 1/2, 3/8 or 1/4
+            of width and height, and says so.
+        on_progress: called with the progress of that drawing.
 
     Returns:
         The path of the archive.
 
     Raises:
         MissingDependency: the extra `evidence` is not installed.
-        InvalidArgument: a value that cannot be, no monitor directory, or a file that
-            is there already.
+        InvalidArgument: an argument has a wrong value, `directory` is no monitor
+            directory, or `path` exists.
         UnknownName: there is no such episode.
         DirectoryInUse: a monitor is open, or a process renders.
         UnfinishedRecordings: videos are pending, or a monitor was killed.
-        ArchiveTooLarge: `max_size` cannot be kept.
-        IdentityLeft: `anonymous`, and a name could not be taken out.
-        PackError: a file is missing, or cannot be packed; or there are more files than
-            `verify` takes.
+        ArchiveTooLarge: `max_size` is too small.
+        IdentityLeft: `anonymous`, but a name could not be removed.
+        PackError: a file is missing or cannot be packed, or there are more files than
+            `verify` accepts.
         UnreadableFile: a file is damaged.
-        FileNotWritten, DirectoryNotWritable: there is no room, or no permission.
+        FileNotWritten, DirectoryNotWritable: the disk is full or read-only.
     """
     target, source = _checked_paths(Path(path), Path(directory))
     if authors is not None and not isinstance(authors, str):

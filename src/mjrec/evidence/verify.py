@@ -71,40 +71,39 @@ def verify(
     report: str | os.PathLike[str] | None = None,
     on_progress: Callable[[VerificationProgress], object] | None = None,
 ) -> Verification:
-    """Make a packed run again, and say how it compares with what it is said to be.
+    """Run a packed run again, and compare the result with the archive.
 
-    What is verified may be anybody's. It is read, made again and compared in three
-    processes, each with limits of memory and time, without network and home, that see
-    no more than they need: the second sees the inputs only (environment, seeds,
-    actions, options). No code that the archive names is run, but for the environments
-    whose ids are in `trust`.
+    The archive may come from a stranger. Three processes read it, run it and compare,
+    each with limits on memory and time, without network or home directory, and each
+    sees only what it needs: the second gets the inputs only (environment, seeds,
+    actions, options). No code that the archive names is run, except environments in
+    `trust`.
 
     Args:
-        path: what `mjrec pack` has made; or that, unpacked; or a monitor directory, or
-            one that holds some, such as an evaluation's, of
-            which nothing can say whether files are missing.
-        level: where to stop: `"files"` (the bag holds what it says), `"stats"`
-            (rewards, ends, statistics and the selection of episodes are made again),
-            `"physics"` (and all states) or `"pixels"` (and all frames and files).
-        sample: how many frames of each video are drawn; None is all of them.
-        seed: of the random choice of these; None is one that cannot be foreseen.
-        trust: ids of environments that may be made though they are in no registry
-            that mjrec trusts: this runs code that you have installed.
-        allow: excuses that are taken, by name and value: `"gl=NVIDIA H100"`.
-        report: where to write a page about it, HTML in one file.
-        on_progress: told how far it is.
+        path: an archive of `mjrec pack`, an unpacked one, or a monitor directory
+            or a folder of several (for which missing files cannot be found).
+        level: where to stop: `"files"` (the bag holds what it lists), `"stats"`
+            (rewards, ends, statistics and selection of episodes), `"physics"` (also all
+            states) or `"pixels"` (also all frames and files).
+        sample: how many frames of each video to check. None is all.
+        seed: for the choice of these frames. None is random.
+        trust: ids of environments that may be made although they are in no trusted
+            registry. This runs code that you have installed.
+        allow: excuses to accept, by name and value: `"gl=NVIDIA H100"`.
+        report: path of an HTML page to write.
+        on_progress: called with the progress.
 
     Returns:
-        The verdict, PASS, PARTLY or FAIL, and all that was found. Nothing that differs
-        raises.
+        The verdict, PASS, PARTLY or FAIL, with all findings. A difference does not
+            raise.
 
     Raises:
-        UnreadableArchive: there is no such file, or it is damaged, or made to do harm.
-        InvalidArgument: there is no such level, `sample` is not 1 or more, or what is
-            to be allowed is no excuse.
+        UnreadableArchive: the file is missing, damaged or hostile.
+        InvalidArgument: `level` is unknown, `sample` is below 1, or `allow` names no
+            excuse.
         MissingDependency: a report needs the extra `evidence`.
-        DirectoryNotWritable: the report cannot be written there.
-        Error: there is too little room for what is packed.
+        DirectoryNotWritable: the report cannot be written.
+        Error: there is not enough room to unpack.
     """
     deepest = _level(level)
     asked = {

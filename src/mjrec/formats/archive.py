@@ -43,19 +43,19 @@ def write_archive(
     archive_file: IO[bytes],
     env_id: str | None = None,
 ) -> None:
-    """Write an archive of videos with their metadata.
+    """Write gym's archive of videos with their metadata.
 
-    Everything is checked and read before the first byte goes into `archive_file`.
+    Everything is checked and read before the first byte is written.
 
     Args:
-        videos: pairs of a video's path and its metadata's path, as in
-            `load_results(...)["videos"]`; at most 100, in names that all differ.
-        archive_file: a file open for writing bytes. It is not closed.
-        env_id: what the videos show; the messages begin with it.
+        videos: pairs of video path and metadata path, as in
+            `load_results(...)["videos"]`; at most 100, with different names.
+        archive_file: a binary file open for writing. It is not closed.
+        env_id: the environment, for error messages.
 
     Raises:
-        ArchiveError: a file is missing, no regular file, has a name that does not
-            belong into an archive, or cannot be read. Nothing was written.
+        ArchiveError: a file is missing, unreadable, no regular file, or has a name that
+            is not allowed. Nothing was written.
     """
     pairs = [(Path(video), Path(metadata)) for video, metadata in videos]
     for reason in _objections(pairs):

@@ -25,7 +25,7 @@ from .bundle import FINISHED
 from .journal import JournalWriter
 from .monitor_directory import Infix, log_name
 from .row_log import TAIL_BYTES, RowLog
-from .spans import LOOKS, remove_if_done, remove_log
+from .spans import LOOKS, Recording, remove_log
 from .trajectory import (
     FORMAT_VERSION,
     FRAME,
@@ -114,13 +114,12 @@ class SpanLogs:
             line = _begin(log, name, facts, said)
             self._journal.note("begin", line, later=False)
         except FileNotWritten:
-            if not log.begun:
+            if not log.recordings:
                 self._log = None
                 log.remove()
             raise
         log.is_alone = alone
-        log.begun += 1
-        return SpanWriter(log, name)
+        return SpanWriter(log, name, facts)
 
     def close(self) -> None:
         """Write what the log lacks, and close it. Idempotent.
@@ -190,7 +189,7 @@ class OpenLog:
         bodies: for each slot all words behind its head.
         is_alone: it is one recording's only, and ends with it.
         look_size: the bytes of all changes of the model so far.
-        begun: how many recordings it has.
+        recordings: all that were begun.
     """
 
     def __init__(
@@ -204,7 +203,9 @@ class OpenLog:
     ) -> None:
         self.path, self.number, self.journal = path, number, journal
         self.is_alone = False
-        self.look_size = self.begun = 0
+        self.look_size = 0
+        # Few: to read them all in the journal would take time and memory.
+        self.recordings: list[Recording] = []
         self._dtype = dtype
         self._looks: int | None = None
         self.rows = RowLog(path, dtype.itemsize // 8, tail_bytes=tail_bytes)
@@ -218,9 +219,10 @@ class OpenLog:
 
     def suits(self, dtype: np.dtype[Any]) -> bool:
         """Tell whether a recording with such rows can go on in this log."""
-        is_short = self.rows.size + self.look_size < _LONG and self.begun < _MANY
+        size = self.rows.size + self.look_size
+        is_short = size < _LONG and len(self.recordings) < _MANY
         is_free = self.rows.is_there and not self.is_alone
-        return is_short and is_free and (self._dtype is dtype or self._dtype == dtype)
+        return is_short and is_free and self._dtype == dtype
 
     def add_change(self, change: ModelChange) -> None:
         """Add a change of the model that holds from the next row on.
@@ -259,10 +261,9 @@ class OpenLog:
             raise
         self.rows.close()
         self.release()
-        if not self.is_alone:
+        if not any(recording.is_in_flight for recording in self.recordings):
             # Else the finisher does it.
-            with contextlib.suppress(DirectoryNotWritable):
-                remove_if_done(self.path)
+            self.remove()
 
     def remove(self) -> None:
         """Let go of the files, and remove them."""
@@ -285,6 +286,7 @@ class SpanWriter:
     Args:
         log: where its rows go.
         name: of its file, without suffix.
+        facts: what is known of it.
 
     Attributes:
         log: as given.
@@ -293,11 +295,15 @@ class SpanWriter:
         last_frame: the step of the last one; -1 before.
     """
 
-    def __init__(self, log: OpenLog, name: str) -> None:
+    def __init__(self, log: OpenLog, name: str, facts: Mapping[str, Any]) -> None:
         self.log = log
+        self._name = name
+        own = {key: facts[key] for key in ("kept", "video") if key in facts}
+        row, look = log.rows.count, log.look_size
+        self._recording = Recording(name, log.path, {}, own, row=row, look=look)
+        log.recordings.append(self._recording)
         self.steps = self.frame_count = 0
         self.last_frame = -1
-        self._name = name
 
     def make_room(self) -> int:
         """Return the slot that the next row is to be filled in.
@@ -363,7 +369,11 @@ class SpanWriter:
         Raises:
             FileNotWritten: the disk is full; it is said before the next line.
         """
-        said = {"name": self._name, "row": self.log.rows.count, "facts": dict(facts)}
+        said = {
+            "name": self._name,
+            "row": self.log.rows.count,
+            "facts": dict(facts),
+        }
         self.log.journal.note("end", said)
         if self.log.is_alone:
             self.log.close()
@@ -377,4 +387,5 @@ class SpanWriter:
         if self.log.is_alone:
             # First of all: the disk may be full.
             self.log.remove()
+        self._recording.is_dropped = True
         self.log.journal.note("drop", self._name)

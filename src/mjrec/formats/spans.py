@@ -228,10 +228,16 @@ class _Spans:
         return self.journal.with_name(log_name(infix or "", _count(number)))
 
 
+class _Known(threading.local):
+    """What this thread has read: a lock could be held when the process is forked."""
+
+    def __init__(self) -> None:
+        self.spans: dict[Path, _Spans] = {}
+
+
 # A journal only grows, and each recording is looked for by itself.
-_known: dict[Path, _Spans] = {}
+_known = _Known()
 _MOST_KNOWN = 64
-_lock = threading.Lock()
 
 
 def _read(journal: Path) -> _Spans:
@@ -240,20 +246,22 @@ def _read(journal: Path) -> _Spans:
     Raises:
         UnreadableFile: it cannot be read.
     """
-    with _lock, contextlib.ExitStack() as opened:
-        spans = _known.pop(journal, None) or _Spans(journal)
-        with unreadable(journal):
-            try:
-                file = opened.enter_context(open_regular(journal))
-            except FileNotFoundError:
-                return _Spans(journal)
+    known = _known.spans
+    # What is interrupted is read anew.
+    spans = known.pop(journal, None) or _Spans(journal)
+    with unreadable(journal):
+        try:
+            file = open_regular(journal)
+        except (FileNotFoundError, NotADirectoryError):
+            return _Spans(journal)
+        with file:
             if not spans.goes_on_in(file):
                 spans = _Spans(journal)
             spans.read_on(file)
-        while len(_known) >= _MOST_KNOWN:
-            del _known[next(iter(_known))]
-        _known[journal] = spans
-        return spans
+    while len(known) >= _MOST_KNOWN:
+        del known[next(iter(known))]
+    known[journal] = spans
+    return spans
 
 
 def _journal_of(path: Path) -> Path:

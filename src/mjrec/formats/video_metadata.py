@@ -30,6 +30,27 @@ _CUT = " [...] "
 _PART = re.compile(r"[A-Za-z0-9_%-]{1,200}", re.ASCII)
 
 
+# What a recording says of its episode, and metadata too.
+_OF_EPISODE = ("episode_id", "type", "env_id", "seed", "options", "versions")
+
+
+def recording_facts(facts: Mapping[str, Any], *, recording: str) -> dict[str, Any]:
+    """Return what metadata says of the recording that a video shows.
+
+    Args:
+        facts: of the recording, as far as they are known: of a clip its first part's.
+        recording: when the frames are drawn, "live" or "deferred".
+    """
+    video = facts.get("video") or {}
+    further = {"recording_reason": video.get("reason")} if recording == "live" else {}
+    further["selection"] = video.get("selection")
+    return {
+        **{key: facts[key] for key in _OF_EPISODE if key in facts},
+        "recording": recording,
+        **{key: value for key, value in further.items() if value is not None},
+    }
+
+
 class StepRuns:
     """The step of every frame, as runs, so that memory does not grow with frames.
 

@@ -51,42 +51,40 @@ class VideoWriter:
             for frame in frames:
                 video.write(frame)
 
-    The default is H.264 High in yuv420p with bt709 colours, which every browser plays.
-    The same frames give the same file, byte for byte, on any CPU, with the same
-    ffmpeg.
+    By default H.264 High, yuv420p, bt709, which every browser plays. The same frames
+    give the same file, byte for byte, on any CPU, with the same ffmpeg.
 
     An existing file is replaced when the new one is complete. Without a frame there is
-    no file and no error. Leaving `with` through an exception finishes the file with
-    the frames written so far; only where the encoder itself failed is there none. One
-    thread at a time may use a writer.
+    no file and no error. An exception that leaves `with` finishes the file with the
+    frames so far, unless the encoder failed. Use a writer on one thread at a time.
 
     Args:
-        path: the file; `.mp4`, `.mov`, `.mkv`, `.webm` or `.avi`.
-        fps: frames per second. A fraction is exact in the file; a float is the
-            simplest fraction that is equal to within a millionth.
-        crf: from 0 (largest) to 51 (worst); 18 if None, which few can tell from the
-            original. Below 1, x264 is lossless but for the conversion of colours, and
-            the profile is one that browsers do not play.
-        codec: ffmpeg's name of an encoder; libx264 if None. The lossless ones of RGB
-            (`ffv1` and `libx264rgb` in `.mkv`, for example) keep every pixel.
-        frame_hashes: whether to write, beside the video and under its name with
-            `.framehash` for extension, the sha256 of each frame as it was given.
-        encoder_arguments: further output arguments for ffmpeg, placed behind ours.
+        path: the file: `.mp4`, `.mov`, `.mkv`, `.webm` or `.avi`.
+        fps: frames per second. A fraction is exact in the file; a float becomes the
+            simplest fraction within a millionth.
+        crf: from 0 (largest) to 51 (worst). None is 18, which looks like the original.
+            Below 1, x264 is lossless except for colour conversion, and browsers do not
+            play it.
+        codec: ffmpeg's name of an encoder. None is libx264. Lossless RGB encoders
+            (`ffv1` and `libx264rgb` in `.mkv`) keep every pixel.
+        frame_hashes: also write the sha256 of each frame, to a `.framehash` file with
+            the video's name.
+        encoder_arguments: further output arguments for ffmpeg.
 
     Attributes:
         path: the file.
         fps: as a `Fraction`.
-        frame_count: how many frames were written so far.
-        closed: whether the file is finished or given up.
-        result: what was written, once closed; None without frames.
-        temporary: the name of the file until it is complete.
-        temporary_hashes: likewise of the `.framehash`, if there is to be one.
+        frame_count: frames written so far.
+        closed: whether the file is finished or abandoned.
+        result: what was written, once closed. None without frames.
+        temporary: name of the file until it is complete.
+        temporary_hashes: likewise for the `.framehash`, if there is one.
 
     Raises:
-        InvalidArgument: an argument cannot be.
+        InvalidArgument: an argument has a wrong value.
         UnknownName: ffmpeg has no such encoder.
-        DirectoryNotWritable: the file's directory is missing or cannot be written to.
-        EncoderError: ffmpeg cannot encode with this codec, crf, rate and kind of file.
+        DirectoryNotWritable: the directory is missing or not writable.
+        EncoderError: ffmpeg cannot encode with this combination of options.
         MissingDependency: there is no ffmpeg.
     """
 
@@ -121,13 +119,12 @@ class VideoWriter:
         self.closed = False
 
     def write(self, frame: Frame) -> None:
-        """Add a frame, a `(height, width, 3) uint8` array; the first fixes the size.
+        """Add a `(height, width, 3) uint8` frame; the first one fixes the size.
 
-        The frame is copied: the caller may reuse its memory at once. Waits while the
-        encoder is behind.
+        The frame is copied. Waits while the encoder is behind.
 
         Raises:
-            InvalidFrame: it is no such array; the writer stays usable.
+            InvalidFrame: it is no such array. The writer stays usable.
             ClosedError: after `close` or `abort`, or in a forked process.
             EncoderError: ffmpeg failed or died. Nothing is left of the video.
         """
@@ -187,10 +184,10 @@ class VideoWriter:
         )
 
     def close(self) -> None:
-        """Finish the file: encode what waits, count the frames again, give the name.
+        """Finish the file: encode the rest, count the frames, and give it its name.
 
-        Idempotent. After Ctrl-C has interrupted it no more frames are taken, and
-        another call goes on.
+        Idempotent. After Ctrl-C interrupted it, no more frames are taken, and another
+        call continues.
 
         Raises:
             EncoderError: ffmpeg failed or died. Nothing is left of the video.
@@ -207,19 +204,13 @@ class VideoWriter:
         self.closed = True
 
     def abort(self) -> None:
-        """Stop at once and leave nothing; an older file of that name stays.
-
-        Idempotent.
-        """
+        """Stop at once and leave no new file; an older one stays. Idempotent."""
         if not self.closed and self._encoding is not None and not self._was_forked():
             self._encoding.abort()
         self.closed = True
 
     def leave(self) -> None:
-        """Take no more frames; the encoder finishes the unfinished file by itself.
-
-        Never waits. Idempotent.
-        """
+        """Take no more frames and let the encoder finish alone. Idempotent."""
         if not self.closed and self._encoding is not None and not self._was_forked():
             self._encoding.leave()
         self.closed = True
@@ -278,35 +269,35 @@ def save_video(
     step_starting_index: int = 0,
     **kwargs: Any,
 ) -> None:
-    """Write videos of one episode's frames, as Gymnasium's function of that name does.
+    """Write videos of one episode's frames, like Gymnasium's `save_video`.
 
     `<prefix>-episode-<episode_index>.mp4` holds the episode, if `episode_trigger` says
-    yes; `<prefix>-step-<n>.mp4` begins with the frame of step n, for each n for which
-    `step_trigger` says yes. The first frame is the reset's and belongs to no step; the
-    second is that of step `step_starting_index`. Every frame is in the file.
+    so. `<prefix>-step-<n>.mp4` starts with the frame of step n, if `step_trigger` says
+    so. The first frame belongs to the reset, the second to step `step_starting_index`.
+    Every frame is in the file.
 
-    `frames` may be any iterable. Where only the episode trigger is used it is streamed,
-    read no further than `video_length`, and not at all when no video is due; with a
-    step trigger, whose videos may overlap, all frames are held in memory. An existing
-    video is replaced when the new one is complete. No frames, no file. If `frames`
-    raises, the frames before that are kept.
+    `frames` can be any iterable. With an episode trigger it is streamed, up to
+    `video_length`, and not read if no video is due. With a step trigger, whose videos
+    can overlap, all frames are in memory. An existing video is replaced when the new
+    one is complete. Without frames there is no file. If `frames` raises, the frames so
+    far are kept.
 
     Args:
         frames: `(height, width, 3) uint8` arrays.
-        video_folder: the directory; made if need be.
-        episode_trigger: from an episode's number to whether it gets a video. If both
-            triggers are None: the cubes 0, 1, 8, 27 ... 729 and every 1000th.
-        step_trigger: from a step's number to whether a video begins there.
-        video_length: the most frames of a video; all that follow if None.
-        name_prefix: begins the files' names.
+        video_folder: the directory; created if needed.
+        episode_trigger: maps an episode number to whether it gets a video. If both
+            triggers are None: 0, 1, 8, 27 ... 729 and every 1000th.
+        step_trigger: maps a step number to whether a video starts there.
+        video_length: most frames of a video. None is all that follow.
+        name_prefix: start of the file names.
         episode_index: the episode's number.
         step_starting_index: the number of the episode's first step.
-        **kwargs: `fps`, which is required, and the other options of `VideoWriter`.
+        **kwargs: `fps`, which is required, and other options of `VideoWriter`.
 
     Raises:
-        InvalidArgument: `fps` is missing, an option is unknown, or a value cannot be.
-        DirectoryNotWritable: `video_folder` cannot be made or written to.
-        InvalidFrame: what is no picture.
+        InvalidArgument: `fps` is missing, an option is unknown, or a value is wrong.
+        DirectoryNotWritable: `video_folder` cannot be created or written to.
+        InvalidFrame: a frame has a wrong shape or type.
         EncoderError: as `VideoWriter.write` and `close`.
     """
     _check_options(kwargs, video_length)

@@ -47,25 +47,24 @@ class Choice:
 def use_gl(backend: str | None = None) -> str:
     """Choose the OpenGL backend of this process and return its name.
 
-    The choice is `backend`, else what the environment variable `MUJOCO_GL` names, else
-    the first of EGL, OSMesa and GLFW that renders. However it came about, it is tried
-    before it is taken: a child process draws a picture and looks at it, which takes
-    about a second, once in a process. So the answer is always a backend that renders,
-    and one that was asked for and does not is an error here, with its cause and fix,
-    not a puzzle later. Who wants nothing tried sets `MUJOCO_GL` and does not call this.
+    The choice is `backend`, else the environment variable `MUJOCO_GL`, else the first
+    of EGL, OSMesa and GLFW that renders. A child process draws a test frame with it
+    first, which takes about a second, once per process. So the result is a backend that
+    works, and one that does not is an error with its cause and fix. To skip the test,
+    set `MUJOCO_GL` and do not call this function.
 
-    Afterwards `MUJOCO_GL` and `PYOPENGL_PLATFORM` say the same; if anything fails, both
-    are as they were. Call it before anything imports mujoco, dm_control or OpenGL; if
-    mujoco is imported already, only the backend that it took can be chosen.
+    It sets `MUJOCO_GL` and `PYOPENGL_PLATFORM`; after an error both are unchanged. Call
+    it before anything imports mujoco, dm_control or OpenGL. If mujoco is already
+    imported, only the backend that it uses can be chosen.
 
     Args:
-        backend: `"egl"`, `"osmesa"` or `"glfw"`, in any case; None lets mjrec choose.
+        backend: `"egl"`, `"osmesa"` or `"glfw"`, in any case. None lets mjrec choose.
 
     Raises:
-        UnknownName: there is no such backend, or `MUJOCO_GL` names none that is.
-        GLError: `MUJOCO_GL` turns rendering off, or mujoco, dm_control or PyOpenGL was
-            imported with another backend, or the backend asked for does not render
-            here, or none does. The message has the cause and the fix of each.
+        UnknownName: there is no backend of this name, or of `MUJOCO_GL`'s.
+        GLError: `MUJOCO_GL` turns rendering off; mujoco, dm_control or PyOpenGL was
+            imported with another backend; or no backend, or not this one, renders. The
+            message has the cause and fix of each.
     """
     choice = choose(backend)
     _log(choice)

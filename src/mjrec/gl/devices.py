@@ -36,29 +36,27 @@ _DOCTOR = "`mjrec doctor` shows EGL's devices; `nvidia-smi -L` shows the GPUs."
 def render_on_given_gpu(
     gpu: str | None = None, *, required: bool = False
 ) -> EglDevice | None:
-    """Let this process, and its children, render on the GPU that it was given.
+    """Let this process and its children render on the GPU that they were given.
 
-    Afterwards `MUJOCO_EGL_DEVICE_ID` names EGL's device of that GPU, and `MUJOCO_GL`
-    is `egl`, unless it turns rendering off: then that holds for this process, and
-    whoever draws later takes the device. Where the GPU cannot be drawn on, no variable
-    changes, and what is wrong is logged as one warning. Takes a second or two, in child
-    processes. Call it before anything imports mujoco, dm_control or OpenGL.
+    Sets `MUJOCO_EGL_DEVICE_ID` to the EGL device of that GPU, and `MUJOCO_GL` to `egl`
+    unless it turns rendering off in this process. If the GPU cannot be used, nothing is
+    set and one warning says why. Takes a second or two, in child processes. Call it
+    before anything imports mujoco, dm_control or OpenGL.
 
     Args:
         gpu: one entry as in `CUDA_VISIBLE_DEVICES`: a number ("3"), or the UUID of a
-            GPU ("GPU-1a2b...") or of a part of one ("MIG-..."). None is the first
-            entry of that variable, where it is set, else CUDA's first GPU.
-        required: whether it is an error if that GPU cannot be drawn on.
+            GPU ("GPU-1a2b...") or of a part of one ("MIG-..."). None is the first entry
+            of that variable, else CUDA's first GPU.
+        required: raise an error if the GPU cannot be used.
 
     Returns:
-        EGL's device that draws; None where it is not the given GPU, or EGL cannot tell.
+        The EGL device. None if it is not the given GPU, or EGL cannot tell.
 
     Raises:
-        InvalidArgument: `gpu` is no entry, or several.
-        UnknownName: `MUJOCO_GL` names no backend that there is.
-        GLError: mujoco, dm_control or PyOpenGL was imported with another backend, or
-            one of them has begun to draw; or, if it is required, the GPU cannot be
-            drawn on.
+        InvalidArgument: `gpu` is not exactly one entry.
+        UnknownName: `MUJOCO_GL` names an unknown backend.
+        GLError: mujoco, dm_control or PyOpenGL was imported with another backend or has
+            drawn already; or the GPU is required and cannot be used.
     """
     entry = _entry(gpu)
     _refuse_latecomers()
@@ -179,15 +177,15 @@ def _found(gpu: str, environ: Mapping[str, str]) -> tuple[EglDevice, int]:
     """
     if not gpu:
         raise GLError(
-            "This process was given no GPU for rendering: CUDA_VISIBLE_DEVICES names "
-            "none. Ask whoever starts it for one."
+            "This process was given no GPU for rendering: CUDA_VISIBLE_DEVICES is "
+            "empty. Ask your scheduler for one."
         )
     asked = f"GPU {gpu} was given for rendering"
     backend = None if rendering_is_off(environ) else backend_in_environment(environ)
     if backend not in (None, "egl"):
         raise GLError(
-            f"{asked}, and MUJOCO_GL={backend} cannot be told on which GPU to render: "
-            "unset MUJOCO_GL, or set it to egl."
+            f"{asked}, but MUJOCO_GL={backend} cannot choose a GPU: unset MUJOCO_GL, "
+            "or set it to egl."
         )
     device, alone = _device(gpu, environ)
     if device is None:

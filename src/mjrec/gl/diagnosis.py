@@ -25,8 +25,8 @@ class Diagnosis:
 
     Attributes:
         cause: what is wrong, in a sentence or two.
-        fix: what to do, or nothing where that is not known. Commands stand on lines
-            of their own, indented by two.
+        fix: what to do; empty if unknown. Commands are on lines of their own, indented
+            by two spaces.
     """
 
     cause: str
@@ -39,12 +39,12 @@ def diagnose(
     backend: str | None = None,
     environ: Mapping[str, str] | None = None,
 ) -> Diagnosis | None:
-    """Return the cause and the fix of a failure, or None if it is not a known one.
+    """Return the cause and fix of an OpenGL failure, or None if it is unknown.
 
     Args:
-        text: the exception's text or all that a process printed.
-        backend: the backend that was tried, where that is known.
-        environ: the environment variables at that time; this process's, if None.
+        text: the exception's text, or everything that a process printed.
+        backend: the backend in use, if known.
+        environ: the environment variables at that time. None is this process's.
     """
     environ = os.environ if environ is None else environ
     wanted = backend or environ.get("MUJOCO_GL", "").strip().lower()

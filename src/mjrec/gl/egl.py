@@ -27,14 +27,14 @@ class EglDevice:
     """One of EGL's devices.
 
     Attributes:
-        index: its place in EGL's list, which is what `MUJOCO_EGL_DEVICE_ID` means to
-            mujoco 3 (and to mujoco 4 where no device has a CUDA number).
-        device_file: for example `/dev/dri/renderD128`; empty where EGL does not tell.
-        cuda_id: CUDA's number of the same device; None where it has none, or where
+        index: position in EGL's list, as in `MUJOCO_EGL_DEVICE_ID` for MuJoCo 3 (and
+            for MuJoCo 4 if no device has a CUDA number).
+        device_file: such as `/dev/dri/renderD128`; empty if unknown.
+        cuda_id: CUDA's number of the device. None if it has none, or if
             `CUDA_VISIBLE_DEVICES` hides it.
         software: whether it is the CPU.
         in_use: whether the current context draws on it.
-        uuid: of the GPU, as `nvidia-smi -L` shows it; empty where EGL does not tell.
+        uuid: of the GPU, as in `nvidia-smi -L`; empty if unknown.
     """
 
     index: int

@@ -26,20 +26,20 @@ _SOFTWARE = re.compile(r"llvmpipe|softpipe|swrast|SwiftShader|software", re.IGNO
 
 @dataclass(frozen=True)
 class Probe:
-    """What came of trying a backend.
+    """The result of a test with one backend.
 
     Attributes:
         backend: its name.
-        renders: whether a picture of several colours came out as it should.
-        gl_renderer: what draws, in OpenGL's words; empty where unknown.
-        gl_vendor: whose it is.
+        renders: whether a frame of several colours was correct.
+        gl_renderer: what draws, as OpenGL names it; empty if unknown.
+        gl_vendor: its vendor.
         gl_version: OpenGL's version, with the driver's.
-        frames_per_second: 480x480 pictures of a small scene with MuJoCo's default
-            quality, read back; None where it was not measured.
-        devices: EGL's devices, where it tells; also if none of them renders.
+        frames_per_second: of a small scene, 480x480, at MuJoCo's default quality. None
+            if it was not measured.
+        devices: EGL's devices, if known; also if none renders.
         cause: why it does not render.
-        fix: what to do about it; empty where that is not known.
-        output: the end of what the child process said, if it does not render.
+        fix: what to do; empty if unknown.
+        output: the end of the child process's output, if it does not render.
     """
 
     backend: str

@@ -155,7 +155,7 @@ class MonitorBase:
 
 
 class EnvironmentMonitor(MonitorBase):
-    """The part of one environment's monitor that does not depend on the framework."""
+    """What all monitors of one environment have."""
 
     _recorder: Recorder
     # Closed with the monitor; empty where its user closes it.
@@ -199,22 +199,21 @@ class EnvironmentMonitor(MonitorBase):
         return list(self._recorder.stats_recorder.episode_lengths)
 
     def model_changed(self) -> None:
-        """Say that a texture, a height field or a mesh was changed in mid-episode.
+        """Report that a texture, height field or mesh changed during an episode.
 
-        All else that a picture depends on is noticed by itself, and at every reset
-        everything is. The next recorded frame shows the change; what only the physics
-        depend on (masses, damping) is then in the trajectory too, for replays.
+        All other changes that a frame shows are found without this, and at a reset all
+        are. The next recorded frame shows the change. Physical constants (masses,
+        damping) then go into the trajectory too, for replays.
         """
         self._recorder.model_changed()
 
     def forget_pictures(self) -> None:
-        """Let the next episode look as if it were the environment's first.
+        """Make the next episode look as in a fresh environment.
 
-        Gymnasium places its free camera at the first picture, and infinite planes and
-        tracking cameras go by the picture before: an episode looks other as the tenth
-        than as the first. After this call, between two episodes, the next is shown as
-        by an environment that has just been made. Where pictures are drawn live it
-        changes nothing.
+        Gymnasium places its free camera at the first frame; infinite planes and
+        tracking cameras depend on the frame before. So an episode can look different as
+        the tenth than as the first. Call this between two episodes. It has no effect on
+        live frames.
         """
         self._recorder.forget_pictures()
 

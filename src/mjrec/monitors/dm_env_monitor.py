@@ -28,19 +28,18 @@ _NO_PHYSICS = (
 
 
 class DmEnvMonitor(EnvironmentMonitor, dm_env.Environment):  # type: ignore[misc]  # untyped
-    """Records a dm_env environment; `mjrec.Monitor` makes one and says how.
+    """Records a dm_env environment; made by `mjrec.Monitor`, which has the options.
 
-    It keeps dm_env's contract: `reset` at any time; `step` before the first reset, or
-    after the last time step of an episode, ignores its action and begins an episode,
-    and is recorded as its reset. What else the environment has (`physics`, `task`,
-    `control_timestep` ...) is here too.
+    It follows dm_env's contract: `reset` is allowed at any time; `step` before the
+    first reset or after the last time step ignores its action, starts an episode, and
+    is recorded as its reset. Other attributes of the environment (`physics`, `task`,
+    `control_timestep` ...) are available here too.
 
-    After `close` nothing is recorded: calls go straight to the environment, which is
-    closed.
+    After `close`, calls go straight to the closed environment, and nothing is recorded.
 
     Attributes:
-        seed: what the journal and the metadata say of the next episode's seed.
-            dm_env's `reset` takes none, so say here what you seeded it with.
+        seed: the next episode's seed, for journal and metadata. dm_env's `reset` takes
+            none, so set it if you seed the environment in your own way.
     """
 
     allows_early_reset = True
@@ -84,7 +83,8 @@ class DmEnvMonitor(EnvironmentMonitor, dm_env.Environment):  # type: ignore[misc
         """Reset the environment and begin an episode.
 
         Raises:
-            ResetNotAllowed: in mid-episode, with `allow_early_reset=False`.
+            ResetNotAllowed: in the middle of an episode, with
+                `allow_early_reset=False`.
         """
         if self._recorder.closed:
             return self._env.reset()

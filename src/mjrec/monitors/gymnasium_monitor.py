@@ -27,16 +27,15 @@ _Step = tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]
 
 
 class GymnasiumMonitor(EnvironmentMonitor, gymnasium.Wrapper[Any, Any, Any, Any]):
-    """Records a Gymnasium environment; `mjrec.Monitor` makes one and says how.
+    """Records a Gymnasium environment; made by `mjrec.Monitor`, which has the options.
 
-    An episode is over when it is terminated or truncated. A reset in mid-episode is
-    an error, unless early resets are allowed; a step before the first reset or after
-    the end of an episode is one too. A reset before any step keeps the episode's
-    number and replaces its picture. Below Gymnasium's `Autoreset` wrapper's step after
-    the end, which is a reset, begins the next episode.
+    An episode ends when it is terminated or truncated. A reset in the middle of an
+    episode is an error unless early resets are allowed; so is a step before the first
+    reset or after the end. A reset before any step keeps the episode's number and
+    replaces its first frame. Inside Gymnasium's `Autoreset` wrapper, the step after the
+    end is a reset and starts the next episode.
 
-    After `close` nothing is recorded: calls go straight to the environment, which is
-    closed.
+    After `close`, calls go straight to the closed environment, and nothing is recorded.
     """
 
     allows_early_reset = False
@@ -92,7 +91,8 @@ class GymnasiumMonitor(EnvironmentMonitor, gymnasium.Wrapper[Any, Any, Any, Any]
         """Reset the environment and begin an episode.
 
         Raises:
-            ResetNotAllowed: in mid-episode, unless early resets are allowed.
+            ResetNotAllowed: in the middle of an episode, unless early resets are
+                allowed.
         """
         if self._recorder.closed:
             return self.env.reset(seed=seed, options=options)

@@ -59,139 +59,121 @@ def Monitor(  # noqa: N802  named as the class that it was in gym
     policy_file: str | os.PathLike[str] | None = None,
     env_id: str | None = None,
 ) -> GymnasiumMonitor | VectorMonitor | DmEnvMonitor:
-    """Record what happens to an environment into a monitor directory.
+    """Record an environment into a monitor directory.
 
-    Use what this returns instead of `env`, and close it, best with `with`::
+    Use the monitor instead of `env`, and close it, best with `with`::
 
         with mjrec.Monitor(env, "recordings/run1") as env:
             observation, info = env.reset(seed=0)
 
-    Where the pictures of a MuJoCo environment follow from its state, the state is
-    recorded, and processes of their own draw the pictures beside the simulation:
-    stepping is hardly slowed down, and any recorded episode can be rendered again
-    (`mjrec.render`). They are byte for byte those of `env.render()` at that moment.
-    Other environments are drawn while they step, through their own `render()`.
+    If the frames of a MuJoCo environment follow from its state, `step` only saves the
+    state, and worker processes draw the frames: byte for byte those of `env.render()`
+    at that moment. Any recorded episode can be rendered again (`mjrec.render`). Other
+    environments are drawn in `step`, through their own `render()`.
 
     Args:
-        env: a Gymnasium environment, a vector environment, whose sub-environments are
-            each recorded (`VectorMonitor` says how), or a dm_env
-            environment such as `dm_control.suite.load(...)`. Where pictures are drawn
-            live it must be made with `render_mode="rgb_array"` (or `"rgb_array_list"`,
-            `"ansi"`); deferred rendering needs no `render_mode`, and no OpenGL in this
-            process.
-        directory: where the recordings go. It is made where it is missing.
-        video_callable: which episodes get a video: a function from the episode's
-            number, from 0, to a bool; None for `capped_cubic_video_schedule`; False
-            for none.
-        force: delete the monitor files that are in the directory. It wins over
-            `resume`.
-        resume: add to the recordings that are there. What killed monitors have left
-            is put in order first, as `mjrec.recover` does. Episodes are numbered on
-            from the highest number of the monitors that closed or died (with `uid`:
-            of those with this `uid`). Monitors that share a directory at the same
-            time each need it; they number independently. `"join"` looks at no other
-            monitor's files, so that it takes as long among thousands as among none:
-            nothing is put in order, episodes are numbered from 0, and that the others
-            are of the same environment is for the caller to know.
-        write_upon_reset: write statistics and manifest at every reset, not only at
-            the end. The journal, with a line for each completed episode, is written
-            as the episodes end in any case.
-        uid: stands in the file names instead of the process id.
-        mode: "training" or "evaluation": the type of the episodes.
-        fps: the rate written into the videos. None is real time: one frame for each
-            step, as long as the simulated time of the step.
-        camera: a name or number, or an `mujoco.MjvCamera`, of a MuJoCo environment;
-            None is what the environment itself shows. A list of them gives a video
-            each: `....video000027.mp4` of the first, `....video000027.<camera>.mp4`
-            of the others. What is drawn live comes from the environment's own
-            `render()`: with `render="live"`, another camera or size than that gives is
-            an error.
-        width: of the videos, in pixels; None is the environment's own.
+        env: a Gymnasium environment, a vector environment (see `VectorMonitor`), or a
+            dm_env environment such as `dm_control.suite.load(...)`. Live recording
+            needs `render_mode="rgb_array"` (or `"rgb_array_list"`, `"ansi"`); deferred
+            rendering needs no `render_mode`, and no OpenGL in this process.
+        directory: the monitor directory. It is created if needed.
+        video_callable: maps an episode number, from 0, to whether it gets a video. None
+            is `capped_cubic_video_schedule`, False is no videos.
+        force: delete the monitor files in the directory first. Overrides `resume`.
+        resume: add to existing recordings. Recovers killed monitors first, as
+            `mjrec.recover` does. Episode numbers continue from the highest number of
+            closed or dead monitors (with `uid`: of this `uid`). Monitors that share a
+            directory at the same time all need it, and number independently. `"join"`
+            reads no other monitor's files, so it is as fast among thousands: it
+            recovers nothing, numbers from 0, and does not check that environments are
+            the same.
+        write_upon_reset: write statistics and manifest at every reset, not only at the
+            end. The journal always gets a line when an episode ends.
+        uid: used in file names instead of the process id.
+        mode: "training" or "evaluation", the type of the episodes.
+        fps: frame rate of the video files. None is real time: one frame per step.
+        camera: a camera's name or number, or an `mujoco.MjvCamera`. None is what the
+            environment shows. A list makes a video per camera: `....video000027.mp4`
+            for the first, `....video000027.<camera>.mp4` for the others. Live frames
+            come from the environment's `render()`, so with `render="live"` another
+            camera or size is an error.
+        width: of the videos, in pixels. None is the environment's own.
         height: likewise.
-        max_fps: the most frames per second of simulated time: steps 0, n, 2n ... with
-            the smallest whole n that fits, and the last. None is every step.
-        quality: "full", the model's own settings, or "draft", without multisampling
-            and with a small shadow map: several times faster, for a quick look.
-            Deferred rendering only; what is drawn live is as the environment draws it.
-        render: "deferred" (states now, pictures later), "live" (pictures in `step`),
-            "off" (statistics and trajectories only), or None: deferred where the
-            pictures are known to follow from the states, else live. The log and the
-            metadata say which, and why.
-        workers: how many processes draw deferred pictures; None is one for each CPU
-            that may be used, shared by all monitors of a directory; 0 draws nothing
-            now and leaves the videos pending: `mjrec render DIR` makes them.
-        trajectory_callable: which episodes keep their trajectory: a function from the
-            episode's number to a bool, True for all, False for none (that of a video
-            is then removed once the video is there). None is all episodes of type
-            evaluation, and of the others those with a video.
-        observations: whether trajectories hold observations too.
-        allow_early_reset: whether a reset in mid-episode is allowed; the episode is
-            then no part of the statistics, and its video is marked incomplete. None
-            is what the framework has: no for Gymnasium, yes for its vector environments
-            and for dm_env.
-        on_error: "raise", or "warn": where something cannot be recorded (a full disk,
-            a dead encoder, a video that cannot be rendered) the simulation goes on,
-            the log says so once, and the manifest lists under `mjrec.faults` which
-            episodes lack what. What the environment itself raises is raised in any
-            case, and so is wrong use, a step before the first reset for instance, and
-            a `close()` that can write no results.
-        strict: whether a video that shows nothing (all frames black, of one colour
-            each, or all the same) is an error, `BlankVideo` as its episode ends or, of
-            a deferred one, `RenderError` in `close`. The video is kept in any case, its
-            metadata has `suspect_black` or `suspect_constant`, and the log a warning.
-        keep: which episodes get a video, decided when they have ended, instead of
-            `video_callable`: "best:3" or "worst:3" (by return), "failures" or
-            "failures:20" (the first 20), "median", or a function from the finished
-            episodes (`mjrec.trackers.FinishedEpisode`) to the numbers of those to
-            keep. A failure is what `info["is_success"]` or `info["success"]` of the
-            last step denies; where there is neither, what was terminated. Every
-            episode is recorded, and what is not chosen is deleted, at once where the
-            rule allows; with "median" and a function all states stay on disk until
-            `close`. Episodes that are not completed are never chosen. Trajectories
-            that are kept in any case (type evaluation, `trajectory_callable`) stay
-            without their video. Manifest and metadata name the rule, and whether it
-            was applied: of a killed run the candidates are pending. Where the function
-            raises, or names no finished episodes, `close` says so and keeps all.
-        step_trigger: which steps begin a video, instead of `video_callable`: a
-            function from the number of steps taken so far to a bool, asked before
-            each step. The first picture is that before the step.
-        video_length: steps of a video after its first picture; it goes on across
-            resets. None is until the end of the episode. Where pictures are deferred,
-            so are these; the states that they are drawn from are then removed.
-        name_prefix: finished videos have Gymnasium's names besides,
-            `<name_prefix>-episode-27.mp4` or `<name_prefix>-step-1000.mp4`: links to
-            the same files.
-        episode_info: whether the last step of an episode has `info["episode"]`, a
-            dictionary of return "r", length "l" and seconds "t", as Gymnasium's
-            RecordEpisodeStatistics gives it. A key that is there stays as it is.
-            Gymnasium environments only.
-        annotate: whether episode, step, simulated time and return are written on the
-            pictures. They are then not those of `env.render()` any more.
-        tiled: one video of all `camera`s side by side, instead of one for each. Of a
+        max_fps: most frames per second of simulated time: steps 0, n, 2n ... and the
+            last. None is every step.
+        quality: "full", the model's own settings; or "draft", several times faster,
+            without multisampling and with small shadow maps. Deferred rendering only.
+        render: "deferred" (states now, frames later), "live" (frames in `step`), "off"
+            (statistics and trajectories only), or None: deferred if the frames are
+            known to follow from the states, else live. Log and metadata say which, and
+            why.
+        workers: processes that draw deferred frames. None is one per usable CPU, shared
+            by all monitors of a directory. 0 draws nothing now and leaves the videos
+            pending: `mjrec render DIR` draws them.
+        trajectory_callable: maps an episode number to whether its trajectory is kept.
+            True is all; False is none, and a video's trajectory is removed once the
+            video exists. None is all evaluation episodes and those with a video.
+        observations: record observations in trajectories too.
+        allow_early_reset: allow resets in the middle of an episode. A cut episode is
+            not in the statistics, and its video is marked incomplete. None is the
+            framework's rule: no for Gymnasium, yes for its vector environments and for
+            dm_env.
+        on_error: "raise"; or "warn": if something cannot be recorded (full disk, dead
+            encoder, failed video), the simulation continues, the log says so once, and
+            `mjrec.faults` in the manifest lists what is missing. Errors of the
+            environment, wrong use, and a `close()` that cannot write results always
+            raise.
+        strict: a video that shows nothing (black, one colour, no movement) is an error:
+            `BlankVideo` at the end of its episode, or for a deferred one `RenderError`
+            in `close`. The video is always kept; its metadata has `suspect_black` or
+            `suspect_constant`, and the log a warning.
+        keep: choose the videos after episodes have ended, instead of `video_callable`:
+            "best:3" or "worst:3" (by return), "failures" or "failures:20" (the first
+            20), "median", or a function from the finished episodes
+            (`mjrec.trackers.FinishedEpisode`) to the numbers to keep. A failure has
+            `info["is_success"]` or `info["success"]` false in its last step; without
+            either, it terminated. Other episodes are deleted as soon as the rule
+            allows; "median" and functions keep all states on disk until `close`.
+            Incomplete episodes are never chosen. Trajectories kept for another reason
+            stay, without their video. Manifest and metadata name the rule. After a
+            kill, all candidates are pending. If the function raises or names unknown
+            episodes, `close` says so and keeps all.
+        step_trigger: maps the number of steps so far to whether a clip starts, before
+            each step; instead of `video_callable`. Its first frame is the one before
+            the step.
+        video_length: steps of a clip after its first frame, across resets. None is
+            until the end of the episode.
+        name_prefix: also link finished videos under Gymnasium's names:
+            `<name_prefix>-episode-27.mp4` or `<name_prefix>-step-1000.mp4`.
+        episode_info: add `info["episode"]` to the last step of an episode: return "r",
+            length "l" and seconds "t", as Gymnasium's RecordEpisodeStatistics does. An
+            existing key stays. Gymnasium environments only.
+        annotate: write episode, step, simulated time and return on the frames. They
+            then differ from those of `env.render()`.
+        tiled: one video with all cameras side by side, instead of one per camera. For a
             vector environment: also a video of all sub-environments side by side.
         trackers: are notified of finished episodes and videos, see `mjrec.trackers`.
-        policy_file: the file in which the policy is, such as a checkpoint. Its sha256
-            goes into the manifest, for packing the recording as evidence.
-        env_id: the environment's name in the recordings. None is the name in its
-            spec; dm_env environments have none, so theirs is worth giving, as
-            `dm_control/<domain>-<task>`.
+        policy_file: the policy's file, such as a checkpoint. Its sha256 goes into the
+            manifest, as evidence.
+        env_id: the environment's name in the recordings. None is the name in its spec.
+            dm_env environments have none, so give theirs: `dm_control/<domain>-<task>`.
 
     Returns:
         A `GymnasiumMonitor`, a `VectorMonitor` or a `DmEnvMonitor`.
 
     Raises:
-        InvalidArgument: `env` is none of these, or an argument cannot be.
-        NoPictures: videos were asked for of an environment that gives no pictures.
-        MissingDependency: `annotate`, and there is no Pillow.
-        PicturesDiffer: `render="deferred"`, and what the environment shows cannot be
-            made from its state; the message names what stands in the way.
+        InvalidArgument: `env` is none of these, or an argument has a wrong value.
+        NoPictures: videos are wanted, but the environment gives no frames.
+        MissingDependency: `annotate` without Pillow.
+        PicturesDiffer: `render="deferred"`, but the frames do not follow from the
+            state; the message names the reason.
         ExistingRecordings: the directory holds recordings, and neither `force` nor
             `resume` was given.
-        DirectoryInUse: `force`, and another monitor is recording there.
+        DirectoryInUse: `force`, but another monitor is recording there.
         DifferentEnvironment: `resume` over recordings of another environment.
-        DirectoryNotWritable: the directory cannot be made or written to.
+        DirectoryNotWritable: the directory cannot be created or written to.
 
-    When it raises, `env` is as it was, and no file is left.
+    If it raises, `env` is unchanged and no file is left.
     """
     # First of all: the arguments by their names, before there are others.
     options = dict(locals())

@@ -48,38 +48,36 @@ _TAILS = 4 << 20
 
 
 class VectorMonitor(MonitorBase, gymnasium.vector.VectorWrapper):
-    """Records a Gymnasium vector environment; `mjrec.Monitor` makes one and says how.
+    """Records a Gymnasium vector environment; made by `mjrec.Monitor`.
 
-    Every sub-environment has a monitor of its own, with its own infix, statistics,
-    schedule, numbering and manifest, all in one directory.
+    Each sub-environment has its own monitor, with its own infix, statistics, schedule,
+    numbering and manifest, all in one directory.
 
-    Where the sub-environments are objects in this process (`SyncVectorEnv`, also
-    below vector wrappers), each is recorded as an environment of its own: every frame
-    of every episode in every autoreset mode, rendered from states where that can be.
-    Rewards and actions are those of the sub-environment, not of vector wrappers.
+    Sub-environments that are objects in this process (`SyncVectorEnv`, also inside
+    vector wrappers) are recorded like single environments: every frame of every episode
+    in every autoreset mode, rendered from states where possible. Rewards and actions
+    are the sub-environment's, not those of vector wrappers.
 
-    All others (`AsyncVectorEnv`, environments that are vectorised by themselves) are
-    recorded by what goes into them and comes out: pictures are drawn live, through
-    `render()`, and trajectories hold no states. Where such an environment resets
-    itself in the step that ends an episode (SAME_STEP), its last frame is not seen from
-    outside: the metadata says `final_frame: missing`. With a Monitor inside the
-    environment functions, instead of this one, all is as for one environment.
+    Others (`AsyncVectorEnv`, vectorised simulators) are recorded from outside: frames
+    are drawn live, through `render()`, and trajectories have no states. If such an
+    environment resets itself in the step that ends an episode (SAME_STEP), the last
+    frame is missing, and the metadata says `final_frame: missing`. To avoid this, put a
+    Monitor inside the environment functions.
 
-    A reset in mid-episode is allowed unless `allow_early_reset=False`: sub-environments
-    end their episodes at different times. What it cuts off is no part of the
-    statistics.
+    A reset in the middle of an episode is allowed unless `allow_early_reset=False`,
+    because sub-environments end their episodes at different times. Cut episodes are not
+    in the statistics.
 
-    With `tiled=True` there is also a video of all sub-environments side by side,
-    `....video000027.tiled.mp4`, for each episode of the first that its schedule
-    chooses. It is drawn live, and so needs `render_mode="rgb_array"`; it is among the
-    videos of the first. In the SAME_STEP mode its last frame shows the first
-    sub-environment after the reset, and its metadata says `final_frame: missing`.
+    `tiled=True` adds a video of all sub-environments side by side,
+    `....video000027.tiled.mp4`, for the scheduled episodes of the first. It is drawn
+    live and needs `render_mode="rgb_array"`. In the SAME_STEP mode its last frame shows
+    the first sub-environment after the reset, and its metadata says `final_frame:
+    missing`.
 
-    After `close` nothing is recorded: calls go straight to the environment, which is
-    closed.
+    After `close`, calls go straight to the closed environment, and nothing is recorded.
 
     Attributes:
-        monitors: the monitors of the sub-environments, in their order.
+        monitors: the monitors of the sub-environments, in order.
     """
 
     allows_early_reset = True
@@ -174,11 +172,11 @@ class VectorMonitor(MonitorBase, gymnasium.vector.VectorWrapper):
         seed: int | list[int | None] | None = None,
         options: dict[str, Any] | None = None,
     ) -> tuple[Any, dict[str, Any]]:
-        """Reset the environment, or what its options choose of it.
+        """Reset the environment, or the sub-environments that `options` select.
 
         Raises:
-            ResetNotAllowed: in mid-episode, with `allow_early_reset=False`. Nothing has
-                been reset then.
+            ResetNotAllowed: in the middle of an episode, with
+                `allow_early_reset=False`. Nothing was reset.
         """
         if self._is_closed:
             return self._env_reset(seed, options)
@@ -197,11 +195,11 @@ class VectorMonitor(MonitorBase, gymnasium.vector.VectorWrapper):
         return result
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
-        """Step the environment and record what happened.
+        """Step the environment and record the result.
 
         Raises:
-            ResetNeeded: before the first reset, or of sub-environments whose episodes
-                are over, where nothing resets them by itself.
+            ResetNeeded: before the first reset, or if a sub-environment's episode is
+                over and nothing resets it.
         """
         if self._is_closed:
             return self.env.step(actions)

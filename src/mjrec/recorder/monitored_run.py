@@ -17,6 +17,7 @@ from ..errors import FileNotWritten
 from ..formats.journal import JournalEntry, JournalWriter
 from ..formats.monitor_directory import journal_name
 from ..formats.span_writer import SpanLogs
+from ..formats.video_metadata import recording_facts
 from ..machine import machine_fingerprint
 from ..provenance import look_around, versions
 from ..results.run import Run
@@ -370,14 +371,11 @@ class MonitoredRun:
     def live_facts(self) -> dict[str, Any]:
         """Return what the metadata of a live video says of the running episode."""
         known = self.recording_facts(None)
-        keys = ("episode_id", "type", "env_id", "seed", "options")
-        reason = self.env.rendering.reason
-        return {
-            **{key: known[key] for key in (*keys, "versions", "machine")},
-            "recording": LIVE,
-            **({} if reason is None else {"recording_reason": reason}),
-            **({"selection": self.selection} if self.selection else {}),
-        }
+        video: dict[str, Any] = {"reason": self.env.rendering.reason}
+        if self.selection:
+            video["selection"] = self.selection
+        said = recording_facts({**known, "video": video}, recording=LIVE)
+        return {**said, "machine": known["machine"]}
 
 
 def _policy_facts(options: RecorderOptions) -> dict[str, Any]:

@@ -18,34 +18,32 @@ _TYPES = ("t", "e")
 
 
 class StatsRecorder:
-    """Counts the steps and adds up the rewards of episodes, with gym's interface.
+    """Counts steps and sums rewards of episodes, with gym's interface.
 
     Call `before_reset`, reset the environment, call `after_reset`; for every step call
     `before_step`, step the environment, call `after_step`. Only complete episodes are
-    part of the statistics.
+    in the statistics.
 
     Args:
-        directory: where the statistics file goes. It must exist when `flush` or
-            `close` is called.
+        directory: of the statistics file. It must exist at `flush` or `close`.
         file_prefix: the file is `<file_prefix>.stats.json`.
-        autoreset: the environment begins a new episode by itself, in the step that
-            ends the last one.
+        autoreset: the environment starts a new episode in the step that ends the last.
         env_id: the environment's name, for messages.
-        allow_early_reset: a reset in mid-episode drops the episode instead of raising
-            `ResetNotAllowed`.
+        allow_early_reset: a reset in the middle of an episode drops it instead of
+            raising `ResetNotAllowed`.
 
     Attributes:
-        initial_reset_timestamp: wall-clock time, in seconds since the epoch, just
-            before the first reset; None before it.
-        timestamps: the wall-clock time at the end of each complete episode.
+        initial_reset_timestamp: wall-clock seconds since the epoch, just before the
+            first reset. None before it.
+        timestamps: wall-clock time at the end of each complete episode.
         episode_lengths: steps of each complete episode.
-        episode_rewards: the sum of rewards of each complete episode, added up in
-            float64 in the order of the steps.
+        episode_rewards: sum of rewards of each complete episode, in float64, in step
+            order.
         episode_types: "t" (training) or "e" (evaluation) of each complete episode.
-        steps: steps of the running episode; None before the first reset.
-        rewards: the sum of its rewards; None before the first reset.
-        done: whether it is over; None before the first reset.
-        total_steps: all steps, those of incomplete episodes too.
+        steps: steps of the running episode. None before the first reset.
+        rewards: its sum of rewards. None before the first reset.
+        done: whether it is over. None before the first reset.
+        total_steps: all steps, including incomplete episodes.
         closed: whether `close` was called.
         path: the statistics file.
     """
@@ -144,7 +142,7 @@ class StatsRecorder:
         return bool(done)
 
     def count(self, reward: float, done: bool) -> None:
-        """Count a step, as `after_step` does; nothing begins another episode."""
+        """Count a step like `after_step`, but never start another episode."""
         assert self.steps is not None  # before_step has seen to it
         assert self.rewards is not None
         self.rewards += reward

@@ -31,10 +31,10 @@ class Run:
 
     Attributes:
         directory: the monitor directory, absolute.
-        infix: what the names of its files have in the middle.
+        infix: the middle part of its file names.
         env_id: the environment's name.
-        env_index: which sub-environment of a vector environment it is, from 0; None
-            for an environment of its own.
+        env_index: index of a sub-environment in a vector environment. None for a single
+            environment.
     """
 
     directory: Path
@@ -53,14 +53,14 @@ class FinishedEpisode:
         reward: sum of the rewards.
         type: `"t"` for training, `"e"` for evaluation.
         terminated: the task ended it.
-        truncated: a limit from outside the task ended it.
-        success: what the environment says of it, `info["is_success"]` or
-            `info["success"]` of the last step; None where it says nothing.
+        truncated: a limit outside the task ended it.
+        success: `info["is_success"]` or `info["success"]` of the last step. None
+            without either.
         seed: as given to `reset`.
         options: as given to `reset`.
         start_time: wall clock just before the reset, in seconds since the epoch.
         end_time: wall clock after the last step.
-        total_steps: the steps of the run so far, those of unfinished episodes too.
+        total_steps: steps of the run so far, including unfinished episodes.
     """
 
     episode_id: int
@@ -79,16 +79,15 @@ class FinishedEpisode:
 
 @dataclass(frozen=True, kw_only=True)
 class FinishedVideo:
-    """A video that is there, whole.
+    """A finished video.
 
     Attributes:
         path: the file.
-        metadata_path: all about it, JSON.
-        episode_id: of its episode, or of the one in which it begins.
-        view: what it shows where there are several of an episode, as the names of the
-            files say it: a further camera, or `tiled` for all sub-environments; empty
-            for the first camera.
-        episode: its episode; None where that is not over or was not completed.
+        metadata_path: its metadata, JSON.
+        episode_id: of its episode, or of the one in which it starts.
+        view: as in the file name: the name of a further camera, or `tiled`; empty for
+            the first camera.
+        episode: its episode. None if that is not over or was not completed.
     """
 
     path: Path
@@ -99,29 +98,29 @@ class FinishedVideo:
 
 
 class Tracker:
-    """Follows what a monitor records; `mjrec.Monitor(..., trackers=...)` takes them.
+    """Follows what a monitor records; for `mjrec.Monitor(..., trackers=...)`.
 
-    To be subclassed; each method does nothing. One tracker may serve several runs at
-    the same time, those of a vector environment for instance: each call says which.
-    What a method raises is logged and noted in the manifest, the run is ended for that
-    tracker, which is notified no more, and the recording goes on.
+    Subclass it and override methods; each does nothing by default. One tracker can
+    serve several runs at once, such as those of a vector environment: each call names
+    its run. If a method raises, the error is logged and noted in the manifest, the
+    tracker gets no more calls for that run, and the recording continues.
     """
 
     def begin(self, run: Run) -> None:
-        """Take note of a run that begins."""
+        """Called when a run begins."""
 
     def episode(self, run: Run, episode: FinishedEpisode) -> None:
-        """Take note of an episode that has just ended."""
+        """Called when an episode has ended."""
 
     def video(self, run: Run, video: FinishedVideo) -> None:
-        """Take note of a video that is finished.
+        """Called when a video is finished.
 
-        Deferred videos finish beside the simulation and are reported when the next
-        episode ends, or in `close`.
+        Deferred videos finish beside the simulation and are reported at the end of the
+        next episode, or in `close`.
         """
 
     def end(self, run: Run) -> None:
-        """Take note of the end of a run; nothing more of it is reported."""
+        """Called at the end of a run, as its last call."""
 
 
 class Trackers:

@@ -49,51 +49,49 @@ def can_give_pictures(source: object) -> bool:
 
 
 class VideoRecorder:
-    """Records what `env.render()` gives, one frame for each `capture_frame`.
+    """Records `env.render()`, one frame per `capture_frame`, with gym's interface.
 
-    Images become an mp4 (`VideoWriter` says which), text becomes an asciicast of
-    version 1 (`.json`). The rate is real time: the simulated time between the first
-    two captures where `env` is a MuJoCo environment, else what `env` declares. `close`
-    finishes the file and writes `<path without extension>.meta.json`. Until then a
-    hidden note beside the unfinished mp4 says what it is, for `mjrec.recover`.
+    Images become an mp4 (see `VideoWriter`), text an asciicast version 1 (`.json`). The
+    rate is real time: the simulated time between the first two captures of a MuJoCo
+    environment, else the rate that `env` declares. `close` finishes the file and writes
+    `<path without extension>.meta.json`. Until then a hidden note describes the
+    unfinished mp4 for `mjrec.recover`.
 
-    A frame that is none (None, or another size or type than the first) stops the
-    video: what came before it stays as a playable file, `broken` is set, and one
-    warning and the metadata say so.
+    A bad frame (None, or another size or type than the first) ends the video: the
+    frames so far stay as a playable file, `broken` is set, and a warning and the
+    metadata say so.
 
     Args:
-        env: has `render_mode` and `render()`. With a render mode that gives no
-            pictures the recorder is not enabled and does nothing.
-        path: the video, ending in `.mp4`, or `.json` for text. A file in a new
-            temporary directory without `path` and `base_path`.
-        metadata: goes first into the metadata file. It is copied.
+        env: has `render_mode` and `render()`. If its render mode gives no frames, the
+            recorder is not enabled and does nothing.
+        path: the video, ending in `.mp4`, or `.json` for text. Without `path` and
+            `base_path`, a file in a new temporary directory.
+        metadata: first entries of the metadata file. It is copied.
         enabled: False makes a recorder that does nothing.
         base_path: the path without extension, instead of `path`.
         fps: frames per second of the file, instead of real time.
-        max_fps: the most frames per second that are wanted: of the pictures of
-            `rgb_array` every n-th is taken, with the smallest n that fits, and the
-            last, see `capture_last`. Of the other render modes every one is.
+        max_fps: most frames per second. Of `rgb_array` frames every n-th is taken, and
+            the last, see `capture_last`. Other render modes keep all.
         frame_hashes: also write the `.framehash` of an image video.
-        clock: returns the simulated time in seconds, or None where there is none.
-        declared: returns the rate to take where there is no simulated time.
-        facts: returns more for the metadata, once there is a frame.
-        strict: whether images that show nothing (all black, of one colour each, or all
-            the same) are an error of `close`; else they are a warning.
-        caption: returns what is written on the images of this moment; None where
-            nothing is.
+        clock: returns the simulated time in seconds, or None without one.
+        declared: returns the rate to use without simulated time.
+        facts: returns more metadata, once there is a frame.
+        strict: images that show nothing (black, one colour, no movement) make `close`
+            raise; else they are a warning.
+        caption: returns the text to write on the current frame, or None.
 
     Raises:
-        MissingDependency: there is no Pillow to write captions with.
+        MissingDependency: captions need Pillow.
         InvalidArgument: both `path` and `base_path` are given, or the extension is
-            another.
+            wrong.
 
     Attributes:
-        path: the video; None when not enabled.
-        metadata_path: the metadata file; None when not enabled.
-        metadata: what the metadata file will hold, as far as it is known.
+        path: the video. None if not enabled.
+        metadata_path: the metadata file. None if not enabled.
+        metadata: the content of the metadata file so far.
         enabled: whether it records.
-        broken: a bad frame, or an encoder that failed, ended the video early.
-        finished: the video is there, under its name and whole; known after `close`.
+        broken: a bad frame or a failed encoder ended the video early.
+        finished: the video is complete under its name; known after `close`.
         closed: whether `close` or `discard` was called.
     """
 
@@ -178,11 +176,11 @@ class VideoRecorder:
     def capture_frame(self) -> None:
         """Record what `env.render()` gives now.
 
-        Nothing happens when the recorder is not functional or is closed. What
-        `env.render()` raises is raised.
+        Does nothing if the recorder is not functional or is closed. Exceptions of
+        `env.render()` pass.
 
         Raises:
-            EncoderError: ffmpeg failed; the recorder is broken from then on.
+            EncoderError: ffmpeg failed; the recorder is then broken.
         """
         if not self.functional or self.closed:
             return
@@ -195,10 +193,10 @@ class VideoRecorder:
             self._capture(step)
 
     def capture_last(self) -> None:
-        """Record the picture of the last step, if `max_fps` has left it out.
+        """Record the frame of the last step, if `max_fps` left it out.
 
-        To be called at the end of an episode, before the environment goes on. Raises
-        what `capture_frame` raises.
+        Call it at the end of an episode, before the environment continues. Raises what
+        `capture_frame` raises.
         """
         step = self._captures - 1
         if self.functional and not self.closed and step > self._last_taken >= 0:
@@ -220,12 +218,12 @@ class VideoRecorder:
     def close(self) -> None:
         """Finish the video and write its metadata. A second call does nothing.
 
-        Without a frame there is no video, and the metadata says `empty`. Where it is
-        interrupted (Ctrl-C), the next call finishes what is left.
+        Without a frame there is no video, and the metadata says `empty`. If Ctrl-C
+        interrupts it, the next call continues.
 
         Raises:
             EncoderError: ffmpeg failed; the metadata is written all the same.
-            BlankVideo: with `strict`; the video and its metadata are there.
+            BlankVideo: with `strict`; the video and its metadata exist.
         """
         if self.closed:
             return

@@ -24,6 +24,7 @@ from ..formats.video_metadata import (
     StepRuns,
     further_live_videos,
     metadata_path,
+    recording_facts,
     timing_facts,
     write_metadata,
 )
@@ -35,7 +36,6 @@ _CUT = {"complete": False, "reason": KILLED}
 _BROKEN = (
     "the recording process was killed, and its encoder before it had finished the file"
 )
-_SAID_BY_TRAJECTORY = ("type", "env_id", "seed", "options", "versions")
 
 
 def finish_video(path: Path, known: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
@@ -160,8 +160,7 @@ def finish_text(
         said = {
             "episode_id": episode_of(path.name),
             "content_type": "video/vnd.openai.ansivid",
-            "recording": "live",
-            **{key: facts[key] for key in _SAID_BY_TRAJECTORY if key in facts},
+            **recording_facts(facts, recording="live"),
             **known,
             **timing_facts(StepRuns(range(len(frames))), fps=rate, timestep=None),
             "recovered": True,

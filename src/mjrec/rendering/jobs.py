@@ -180,15 +180,15 @@ class VideoJob:
 
 @dataclass(frozen=True, kw_only=True)
 class RenderedVideos:
-    """What became of the videos that were to be rendered, by the names of files.
+    """The results of a rendering, by file name.
 
     Attributes:
-        directory: where they are.
-        videos: those that were rendered, each with the number of its frames.
-        trajectories: of episodes without a video, which got their final form.
-        failures: why videos could not be rendered.
-        blank: what videos that were rendered do not show, where `strict` asked.
-        elsewhere: those that another process is rendering.
+        directory: where the videos are.
+        videos: number of frames of each rendered video.
+        trajectories: finished trajectories of episodes without a video.
+        failures: reasons of videos that could not be rendered.
+        blank: with `strict`: what is wrong with videos that show nothing.
+        elsewhere: videos that another process is rendering.
     """
 
     directory: Path

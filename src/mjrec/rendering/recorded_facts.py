@@ -162,7 +162,7 @@ def check_has_frames(reader: TrajectoryReader) -> None:
         "it ended before the first" if facts.get("scene") else "none were recorded"
     )
     raise NoPictures(
-        f"{reader.path} holds no snapshots to draw pictures from: {reason}. If it has "
+        f"{reader.path} holds no snapshots to draw frames from: {reason}. If it has "
         "states, mjrec.render_states can draw those."
     )
 

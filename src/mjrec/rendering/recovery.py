@@ -41,14 +41,14 @@ class RecoveredFile:
 
 @dataclass(frozen=True)
 class Recovery:
-    """What `recover` did. It is false where there was nothing to do.
+    """What `recover` did. It is false if there was nothing to do.
 
     Attributes:
         directory: the directory.
-        files: what was put in order.
-        failures: what could not be, and why. It stays as it was.
-        open_monitors: infixes of the monitors that are still recording, and whose
-            files were left alone.
+        files: files that were finished.
+        failures: files that could not be finished, with reasons. They are unchanged.
+        open_monitors: infixes of monitors that are still recording. Their files were
+            left alone.
     """
 
     directory: Path
@@ -81,31 +81,29 @@ def recover(
     timeout: float = _SECONDS,
     bundle: bool = False,
 ) -> Recovery:
-    """Put a directory in order whose monitors, or renderers, were killed.
+    """Finish what killed monitors or renderers left in a directory.
 
-    Videos that were recorded live get their names, and metadata that says
-    `complete: false` and `reason: "killed"`; logs become trajectories that say the
-    same; statistics and manifest are made of the journal; unfinished files that
-    no process will finish are removed. What was to be rendered stays pending: `mjrec
-    render DIR`. Files of monitors that are open, and of renderers at work, are left
-    alone. `docs/howto/recovery.md` has the details.
+    Live videos get their names and metadata with `complete: false` and `reason:
+    "killed"`; logs become trajectories that say the same; statistics and manifest are
+    written from the journal; unfinished files of dead processes are removed. Deferred
+    videos stay pending: `mjrec render DIR`. Files of open monitors and running
+    renderers are left alone. `docs/howto/recovery.md` has the details.
 
-    It may be killed at any moment and run again; run once more, it does nothing.
+    It can be killed at any moment and repeated. A second run does nothing.
 
     Args:
         directory: the monitor directory.
-        timeout: how many seconds to wait, in all, for encoders that have outlived the
-            process that recorded, and are finishing their files.
-        bundle: the trajectories that are made of a monitor's log lie in one file, as
-            those of an evaluation.
+        timeout: seconds to wait, in all, for encoders that are still finishing files of
+            a dead process.
+        bundle: put the trajectories made of a monitor's logs into one file, as an
+            evaluation does.
 
     Returns:
-        What was done. Where something could not be done, that is told there, and all
-        else was done.
+        What was done. If something failed, everything else was done.
 
     Raises:
         InvalidArgument: there is no such directory.
-        DirectoryNotWritable: it is read-only, and something is to be done.
+        DirectoryNotWritable: it is read-only, and there is something to do.
     """
     path = Path(directory).absolute()
     is_number = isinstance(timeout, numbers.Real) and not isinstance(timeout, bool)

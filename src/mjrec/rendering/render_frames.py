@@ -39,12 +39,12 @@ def render(
     quality: str | None = None,
     workers: int = 1,
 ) -> Iterator[Frame]:
-    """Return the pictures of a recorded episode, one after the other.
+    """Return the frames of a recorded episode, one after the other.
 
-    With every option None they are, byte for byte, what `env.render()` gave or would
-    have given (on the same driver). They are drawn in processes of their own, which
-    live until the iterator ends or is dropped; however long the episode is, only a few
-    pictures are in memory. The first is drawn before this returns.
+    By default they are, byte for byte, those that `env.render()` gave or would have
+    given on the same driver. Worker processes draw them until the iterator ends or is
+    dropped. Only a few frames are in memory at a time. The first is drawn before this
+    returns.
 
     ::
 
@@ -52,34 +52,33 @@ def render(
             ...
 
     Args:
-        trajectory: what `mjrec.load_trajectory` returned, or its path. With
-            `trust_models=True` there, the compiled model is loaded whoever wrote it.
-        camera: the name or number of one of the model's cameras, -1 for the free
-            camera in the place that the model gives it, an `mujoco.MjvCamera`, or a
-            mapping of its members; None is as recorded.
-        width: in pixels; None is as recorded.
-        height: in pixels; None is as recorded.
-        max_fps: draw pictures 0, n, 2n ... with the smallest n that gives no more than
-            so many per second of the simulation, and the last; None draws all that the
-            recording has.
-        quality: `"full"` or `"draft"` (no multisampling, a shadow map of at most
-            1024x1024); None is as recorded.
-        workers: how many processes draw. The pictures do not depend on it.
+        trajectory: from `mjrec.load_trajectory`, or its path. If it was loaded with
+            `trust_models=True`, its compiled model is loaded whoever wrote it.
+        camera: name or number of a model's camera, -1 for the free camera where the
+            model places it, an `mujoco.MjvCamera`, or a mapping of its members. None is
+            as recorded.
+        width: in pixels. None is as recorded.
+        height: in pixels. None is as recorded.
+        max_fps: draw only frames 0, n, 2n ... and the last, with at most this many per
+            second of simulated time. None draws all recorded frames.
+        quality: `"full"` or `"draft"` (no multisampling, shadow maps of at most
+            1024x1024). None is as recorded.
+        workers: number of worker processes. Frames do not depend on it.
 
     Returns:
-        New arrays of `(height, width, 3) uint8`, the top row first.
+        New arrays, `(height, width, 3) uint8`, top row first.
 
     Raises:
-        UnreadableFile: the trajectory or its model is missing, damaged, or made by a
+        UnreadableFile: the trajectory or its model is missing, damaged, or from a
             MuJoCo that this one cannot read.
-        UntrustedModel: its model was compiled by another user or on another machine,
-            and its sources are not there.
-        NoPictures: the trajectory has states and no snapshots.
-        UnknownName: its model has no camera of that name, or there is no such quality.
-        InvalidArgument: another value that cannot be, also a size that the driver
-            cannot draw.
+        UntrustedModel: another user or machine compiled the model, and its sources are
+            missing.
+        NoPictures: the trajectory has states but no snapshots.
+        UnknownName: there is no such camera or quality.
+        InvalidArgument: another argument has a wrong value, or the driver cannot draw
+            this size.
         GLError: no OpenGL backend works here.
-        Error: a worker died at a picture, and again at the second try.
+        Error: workers died twice at the same frame.
     """
     path = _path(trajectory)
     view = View(
@@ -109,12 +108,12 @@ def render_states(
     quality: str = "full",
     workers: int = 1,
 ) -> Iterator[Frame]:
-    """Return pictures of physics states, one after the other.
+    """Return frames of physics states, one after the other.
 
-    Each is what `mujoco.Renderer` shows of a new `MjData` after `mj_setState` of the
-    row and `mj_forward`. So states from anywhere can be drawn: `mujoco.rollout`, MJX,
-    Warp. They are drawn in processes of their own, as in `render`; until the iterator
-    ends or is dropped, model and states lie in a temporary directory.
+    Each frame is what `mujoco.Renderer` shows of a new `MjData` after `mj_setState` of
+    the row and `mj_forward`. So you can draw states from anywhere: `mujoco.rollout`,
+    MJX, Warp. Worker processes draw, as in `render`; until the iterator ends or is
+    dropped, model and states are in a temporary directory.
 
     ::
 
@@ -127,23 +126,23 @@ def render_states(
 
     Args:
         model: a `mujoco.MjModel`, or dm_control's wrapper of one.
-        states: `(n, size)`, one row for each picture.
-        spec: which components a row has: a combination of `mujoco.mjtState`. What it
-            leaves out is as in a new `MjData`.
+        states: `(n, size)`, a row per frame.
+        spec: the components of a row, a combination of `mujoco.mjtState`. Others are as
+            in a new `MjData`.
         height: in pixels.
         width: in pixels.
-        camera: the name or number of one of the model's cameras, -1 for the free
-            camera, an `mujoco.MjvCamera`, or a mapping of its members.
+        camera: name or number of a model's camera, -1 for the free camera, an
+            `mujoco.MjvCamera`, or a mapping of its members.
         quality: `"full"` or `"draft"`.
-        workers: how many processes draw.
+        workers: number of worker processes.
 
     Returns:
-        New arrays of `(height, width, 3) uint8`, the top row first.
+        New arrays, `(height, width, 3) uint8`, top row first.
 
     Raises:
-        InvalidArgument: the states have another shape; a size or a camera cannot be.
-        UnknownName: the model has no camera of that name, or there is no such quality.
-        FileNotWritten: the temporary directory has no room.
+        InvalidArgument: the states have a wrong shape, or a size or camera is wrong.
+        UnknownName: there is no such camera or quality.
+        FileNotWritten: the temporary directory is full.
         GLError, Error: as `render`.
     """
     # Here, because drawing recorded episodes needs no simulator in this process.

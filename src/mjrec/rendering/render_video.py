@@ -22,7 +22,12 @@ from ..errors import BlankVideo, EncoderError, NoPictures
 from ..formats.journal import KILLED
 from ..formats.monitor_directory import second_name_of
 from ..formats.second_names import give_second_names, take_second_names
-from ..formats.video_metadata import StepRuns, timing_facts, write_metadata
+from ..formats.video_metadata import (
+    StepRuns,
+    recording_facts,
+    timing_facts,
+    write_metadata,
+)
 from ..formats.video_sink import VideoSink
 from ..frames import Frame, grid_shape
 from ..machine import machine_fingerprint
@@ -219,12 +224,10 @@ def _fps(recorded: Recorded, chosen: ChosenFrames) -> Fraction:
 def _metadata(recorded: Recorded) -> dict[str, Any]:
     """Return what the metadata says of what was recorded."""
     first, last = recorded.facts[0], recorded.facts[-1]
-    keys = ("episode_id", "type", "env_id", "seed", "options", "versions")
     complete = bool(last.get("complete"))
     said = {
         "content_type": "video/mp4",
-        **{key: first.get(key) for key in keys},
-        "recording": "deferred",
+        **recording_facts(first, recording="deferred"),
         "rendered_with": dict(versions()),
         # Software rasterisers round as their CPU does.
         "machine": dict(machine_fingerprint()),
@@ -244,8 +247,6 @@ def _metadata(recorded: Recorded) -> dict[str, Any]:
         said["reason"] = last.get("reason", KILLED)
         if "exception" in last:
             said["exception"] = last["exception"]
-    if (selection := video_facts(first).get("selection")) is not None:
-        said["selection"] = selection
     if (broken := last.get("broken_reason")) is not None:
         said |= {"broken_reason": broken, "broken": True}
     return said

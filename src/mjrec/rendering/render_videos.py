@@ -56,51 +56,49 @@ def render_videos(
     engine: Executor | str | None = None,
     on_progress: _OnProgress | None = None,
 ) -> RenderedVideos:
-    """Render the pending videos of a directory, or recorded episodes again.
+    """Render the pending videos of a directory, or recorded episodes once more.
 
-    If nothing is to be other than recorded, the videos that are not there yet are
-    rendered, as they were to be; where none is pending, nothing is done. Several of
-    these calls, in any processes, share the work of a directory. Else (`camera`,
-    `height`, `width`, `max_fps`, `quality`, `fps`, `annotate`, `out`) recorded episodes
-    are rendered once more, into new files beside the originals, which nothing changes.
+    Without options, pending videos are rendered as planned. Several calls, in any
+    processes, share the work of a directory. With `camera`, `height`, `width`,
+    `max_fps`, `quality`, `fps`, `annotate` or `out`, recorded episodes are rendered
+    once more, into new files beside the originals.
 
-    A video that cannot be rendered stops no other; the result says why. Ctrl-C, or what
-    else is raised, leaves what is finished.
+    A failed video does not stop the others; the result has the reasons. Ctrl-C and
+    other exceptions keep what is finished.
 
     Args:
         target: a monitor directory; or a trajectory or video in one, for that episode
             only.
-        episode: its number; all recorded ones, if None.
-        camera: as of `mjrec.render`; as recorded, if None. So with all of these.
+        episode: number of the episode. None is all recorded ones.
+        camera: as in `mjrec.render`. None is as recorded, here and below.
         height: in pixels.
         width: likewise.
-        max_fps: the most frames per second of simulated time; every n-th recorded
-            frame is drawn, and the last.
+        max_fps: most frames per second of simulated time; every n-th recorded frame is
+            drawn, and the last.
         quality: `"full"` or `"draft"`.
-        fps: frames per second written into the file; selects nothing.
-        annotate: whether episode, step, time and return are written on the frames.
-        out: the file to write, for one episode; its ending says which kind.
-        workers: how many processes draw; one for each CPU that is free, if None. Where
-            `engine` is a name, how many it has.
-        strict: whether a video that shows nothing (black, of one colour, or without any
-            movement) is among the `blank`; it is kept.
-        trust_models: load compiled models also where another user, or another machine,
-            has written them. A crafted one can do anything to whoever loads it. Until
-            the end of the call this holds for the whole process.
-        engine: where it is done, instead of processes of this one: an engine, or
-            `"local"`, `"ray"` or `"slurm"`. Each video is drawn by one worker. All
-            workers see the directory under the same name.
-        on_progress: called with how far it is: after every frame, or with an engine
-            after every video.
+        fps: frames per second written into the file. It does not select frames.
+        annotate: write episode, step, time and return on the frames.
+        out: the file to write, for one episode. Its suffix chooses the format.
+        workers: number of worker processes. None is one per free CPU. If `engine` is a
+            name, the number of its workers.
+        strict: list videos that show nothing (black, one colour, no movement) in
+            `blank`. They are kept.
+        trust_models: load compiled models that another user or machine wrote. A crafted
+            model can run any code. Holds for the whole process during the call.
+        engine: where to render, instead of processes of this one: an executor, or
+            `"local"`, `"ray"` or `"slurm"`. One worker draws each video. All workers
+            see the directory under the same path.
+        on_progress: called with the progress after every frame, or with an engine after
+            every video.
 
     Returns:
-        What became of each.
+        The videos, and the reasons of failures.
 
     Raises:
-        InvalidArgument: there are no such recordings, or an argument cannot be.
-        MissingDependency: what the engine, or writing on frames, needs is not there.
+        InvalidArgument: there are no such recordings, or an argument has a wrong value.
+        MissingDependency: the engine's package, or Pillow for captions, is missing.
         UnreadableFile: a manifest is damaged.
-        Error: the engine cannot do any work.
+        Error: the engine cannot work.
     """
     variant = Variant(
         view=View(
@@ -168,8 +166,8 @@ def iter_rendered_videos(
         if not keys and not target.is_dir():
             raise InvalidArgument(
                 f"No video of {target.name} is pending: no recording has such a name. "
-                "To render it again, say what is to be other (camera, size, max_fps, "
-                "quality, fps, annotate) or where to write it (out, --out)."
+                "To render it once more, say what should change (camera, size, "
+                "max_fps, quality, fps, annotate) or where to write it (out, --out)."
             )
         results = finish(
             directory,
@@ -251,8 +249,7 @@ def _variant_jobs(
         names = [path.name for key in episodes for path in parts_of(directory, key)]
     if not names:
         raise InvalidArgument(
-            f"There are no recorded states of {target}, from which it could be "
-            "rendered again."
+            f"{target} has no recorded states, so it cannot be rendered again."
         )
     if out is not None:
         if len(names) > 1:

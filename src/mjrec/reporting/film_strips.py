@@ -63,19 +63,17 @@ def film_strip(
     width: int | None = None,
     quality: str | None = None,
 ) -> Frame:
-    """Return some pictures of an episode side by side on white, with their times.
+    """Return frames of an episode side by side on white, with their times.
 
-    They are evenly spread over the episode, the first and the last one included. Times
-    are simulated seconds since the reset where these are known, else the video's own.
+    They are evenly spread, first and last included. Times are simulated seconds since
+    the reset, if known, else the video's own.
 
     Args:
-        file: a trajectory (`.h5`), which is drawn again; or a video, which is
-            decoded.
-        frames: how many pictures.
-        columns: how many side by side; None is all of up to eight, else as many as make
-            equal rows.
+        file: a trajectory (`.h5`), which is rendered; or a video, which is decoded.
+        frames: how many frames.
+        columns: frames per row. None is up to eight, else equal rows.
         camera: of a trajectory, as in `mjrec.render`.
-        height: of each picture, likewise.
+        height: of each frame, likewise.
         width: likewise.
         quality: likewise.
 
@@ -83,10 +81,10 @@ def film_strip(
         `(height, width, 3) uint8`.
 
     Raises:
-        InvalidArgument: there are fewer pictures than that; or a camera, a size or a
-            quality was asked for of a video.
+        InvalidArgument: there are not enough frames; or a camera, size or quality was
+            given for a video.
         UnreadableFile: it is neither a video nor a trajectory, or is damaged.
-        MissingDependency: there is no Pillow.
+        MissingDependency: Pillow is not installed.
         EncoderError: the video cannot be decoded.
         NoPictures, UntrustedModel, GLError: as `mjrec.render`.
     """
@@ -188,8 +186,8 @@ def _spread(available: int, count: int, path: Path) -> list[int]:
     """
     if count > available:
         raise InvalidArgument(
-            f"{path} has {available} pictures, and {count} were asked for: ask for at "
-            f"most {available} (frames, --frames)."
+            f"{path} has only {available} frames, not {count}: ask for at most "
+            f"{available} (frames, --frames)."
         )
     return [int(index) for index in np.linspace(0, available - 1, count).round()]
 

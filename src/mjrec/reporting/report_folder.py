@@ -62,37 +62,35 @@ def write_report(
     verifications: Iterable[str | os.PathLike[str]] = (),
     on_progress: OnProgress | None = None,
 ) -> Path:
-    """Write a page that shows recordings, and return its path.
+    """Write a web page about recordings, and return its path.
 
-    It has a summary of each task, curves, a gallery of the videos, all episodes, and
-    how they came about. It works for evaluations and for any monitor directory, also
-    one that old gym wrote, on a machine without MuJoCo and OpenGL. A file that cannot
-    be read is named on the page, and the rest is shown.
+    It has a summary of each task, curves, videos, all episodes, and their provenance.
+    It works for evaluations and for any monitor directory, also of old gym, without
+    MuJoCo and OpenGL. An unreadable file is named on the page.
 
     Args:
-        directories: of evaluations, of monitors, or folders with such directories
-            directly in them; one, or several.
-        path: of the folder to write. A report that is there is replaced, another
-            folder that is not empty is not. With `single_file` it may end in `.html`
-            and is then the page itself.
-        title: of the page; what was recorded, if None.
-        single_file: put posters and videos into the page. Those that are too large
-            for `max_single_file_bytes` are left out, with a note: the posters come
-            first, then the videos in the order of the gallery.
-        max_single_file_bytes: the most bytes of the page with `single_file`.
-        replays: put a page in 3D beside the videos of the best, the median and the
-            worst episode, as `write_replay` makes it. It is loaded when it is opened.
-        verifications: files that `mjrec verify --json` has printed; a
-            `verification.json` in a directory is found by itself.
+        directories: evaluations, monitor directories, or folders that contain some; one
+            or several.
+        path: the folder to write. An existing report is replaced; another folder that
+            is not empty is left alone. With `single_file` it may end in `.html`, and is
+            then the page.
+        title: of the page. None is what was recorded.
+        single_file: put images and videos into the page: posters first, then videos in
+            order, up to `max_single_file_bytes`; the rest is named.
+        max_single_file_bytes: size limit of the page with `single_file`.
+        replays: put a 3D page (`write_replay`) beside the videos of the best, median
+            and worst episode. It is loaded when it is opened.
+        verifications: outputs of `mjrec verify --json`. A `verification.json` in a
+            directory is found by itself.
         on_progress: called with a `ReportProgress` for each poster and video.
 
     Raises:
-        InvalidArgument: a directory has no recordings; `path` is something else than
-            a report; the page alone is larger than `max_single_file_bytes`; or
-            replays are wanted in it.
-        UnreadableFile: one of `verifications`.
+        InvalidArgument: a directory has no recordings, `path` is not a report, the
+            page alone is larger than `max_single_file_bytes`, or `replays` are wanted
+            in it.
+        UnreadableFile: one of `verifications` cannot be read.
         MissingDependency: Jinja2 is not installed, or viser for replays.
-        FileNotWritten, DirectoryNotWritable: the disk is full, or read-only.
+        FileNotWritten, DirectoryNotWritable: the disk is full or read-only.
     """
     target = Path(os.path.realpath(path))
     is_page = target.suffix.lower() in _PAGE_ENDINGS
@@ -137,7 +135,7 @@ def _single_page(
             return page
         if room <= 0:
             raise InvalidArgument(
-                f"The page has {size} bytes without any picture or video, and "
+                f"The page has {size} bytes without any image or video, and "
                 f"max_single_file_bytes allows {most_bytes}. Allow more, or write a "
                 "folder."
             )
@@ -152,7 +150,7 @@ def _check_target(target: Path, *, is_page: bool) -> None:
     if is_page:
         if not _is_own_page(target):
             raise InvalidArgument(
-                f"{target} is there and is no report. It is not replaced: choose "
+                f"{target} exists and is no report, so it is not replaced: choose "
                 "another name, or remove it."
             )
         return
@@ -175,8 +173,9 @@ def _check_target(target: Path, *, is_page: bool) -> None:
     if foreign:
         more = f" and {len(foreign) - _SHOWN} more" if len(foreign) > _SHOWN else ""
         raise InvalidArgument(
-            f"{target} holds what is no report: {', '.join(foreign[:_SHOWN])}{more}. "
-            "It is not replaced: choose another folder, or move that away."
+            f"{target} holds files that are no report: "
+            f"{', '.join(foreign[:_SHOWN])}{more}. It is not replaced: choose another "
+            "folder, or move them away."
         )
 
 

@@ -19,32 +19,28 @@ from .monitor_files import MonitorFiles, monitors_of
 
 @dataclass(frozen=True, kw_only=True)
 class Episode:
-    """One completed episode.
-
-    Where gym's own files do not say something, it is None.
+    """One completed episode. What gym's files do not say is None.
 
     Attributes:
-        episode_id: its number in its monitor's run; in gym's files, which have no
-            numbers, its index among the completed episodes.
+        episode_id: its number in its monitor's run; in gym's files its index.
         length: number of steps.
         reward: sum of the rewards.
         type: `"t"` for training, `"e"` for evaluation.
         start_time: wall clock just before the reset.
-        end_time: when it ended. Wall clock, except in files of gym 0.21 and 0.22,
-            which wrote seconds since some moment of their own.
+        end_time: when it ended. Wall clock, except in files of gym 0.21 and 0.22.
         seed: as given to `reset`.
         options: as given to `reset`.
         terminated: the task ended the episode.
-        truncated: a limit from outside the task ended it.
-        monitor: the infix of its monitor's files.
-        video: its video, where there is one.
-        metadata: its video's metadata, where there is one.
-        trajectory: its recorded states, where there are some. The file may not be
-            there yet: `load_trajectory` reads what a log has of it so far.
-        pending: its video is promised and not there; `mjrec render` makes it.
-        success: what the environment said of it.
-        evaluation: of an evaluation's episode its `seed` and `episode` there, and
-            MuJoCo's `warnings`.
+        truncated: a limit outside the task ended it.
+        monitor: infix of its monitor's files.
+        video: its video, if there is one.
+        metadata: its video's metadata, if there is a video.
+        trajectory: its trajectory, if it has one. The file may not exist yet:
+            `load_trajectory` then reads the monitor's log.
+        pending: whether its video is still to be rendered (`mjrec render`).
+        success: as reported by the environment.
+        evaluation: in an evaluation, its `seed` and `episode` there, and MuJoCo's
+            `warnings`.
     """
 
     episode_id: int
@@ -82,25 +78,23 @@ class Episode:
 
 
 def iter_episodes(directory: str | os.PathLike[str]) -> Iterator[Episode]:
-    """Yield the completed episodes of a directory, monitor after monitor.
+    """Yield the completed episodes of a directory, monitor by monitor.
 
-    Monitors come in the order of their infix, the episodes of each in the order of
-    their ends. Monitors that never closed are included, with what their journal
-    holds. The episodes are read as they are asked for: a journal of any length needs
-    little memory.
+    Monitors are ordered by infix, their episodes by end. Monitors that never closed are
+    included, from their journals. Episodes are read one by one, so memory does not
+    grow.
 
-    Where a journal lacks episodes that the statistics file has, the episodes are the
-    statistics file's, and the journal adds what it says of each. What is damaged in a
-    journal is left out with a warning.
+    If a journal lacks episodes that the statistics file has, the latter is used, and
+    the journal adds what it knows. Damaged lines of a journal are left out with a
+    warning.
 
-    Gym's files do not say which video shows which episode where an environment was
-    reset twice in a row; such a monitor's episodes have None as their video. So do
-    episodes whose line of the journal is lost; their `episode_id` is the lowest that
-    they can have had.
+    gym's files do not say which video belongs to which episode if an environment was
+    reset twice in a row; these episodes have no video. Neither have episodes whose
+    journal line is lost; they get the lowest possible number.
 
     Raises:
-        UnreadableFile: there is no such directory (at once), or a file in it is
-            damaged and no other has the same episodes (when it is read).
+        UnreadableFile: there is no such directory (at once), or a file is damaged and
+            no other has the same episodes (when it is read).
     """
     directory = Path(directory)
     if not directory.is_dir():

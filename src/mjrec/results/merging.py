@@ -53,31 +53,29 @@ class MergedStats(NamedTuple):
 
 
 def load_results(directory: str | os.PathLike[str]) -> dict[str, Any] | None:
-    """Return the results of all monitors of a directory, merged.
+    """Return the merged results of all monitors of a directory.
 
     The dictionary has gym's keys: `manifests`, `env_info`, `data_sources`,
     `timestamps`, `episode_lengths`, `episode_rewards`, `episode_types`,
     `initial_reset_timestamps`, `initial_reset_timestamp` and `videos`. An item of
-    `data_sources` is an index into `manifests` and into `initial_reset_timestamps`.
-    `videos` holds pairs of the paths of a video and its metadata.
+    `data_sources` is an index into `manifests` and `initial_reset_timestamps`. `videos`
+    has pairs of video path and metadata path.
 
-    A monitor that never closed, because it was killed or is still open, counts with
-    the complete episodes of its journal, if they are more than those of its
-    statistics file; episodes are never taken from both. Where it left no manifest,
-    the path of its journal stands among `manifests`; its videos are those that are
-    there and not broken. What is damaged in a journal is left out with a warning.
+    A monitor that never closed (killed, or still open) counts with the episodes of its
+    journal, if these are more than in its statistics file. Without a manifest, the
+    journal's path is among `manifests`, and videos are those on disk and not broken.
+    Damaged lines of a journal are left out with a warning.
 
-    Monitors of several environments or versions are accepted with a warning that
-    shows the difference; `env_info` is then the newest's. Listed videos that are
-    gone are left out with a warning.
+    Monitors of different environments or versions give a warning, and `env_info` is the
+    newest one's. Missing videos are left out with a warning.
 
     Returns:
-        The results, or None, with an error in the log, where there is no such
-        directory, or neither a manifest nor a journal in it.
+        The results. None, with an error in the log, if there is no such directory or
+        neither a manifest nor a journal in it.
 
     Raises:
         UnreadableFile: a manifest or statistics file is missing or damaged, and there
-            is no journal to be read in its stead.
+            is no readable journal.
     """
     directory = Path(directory)
     if not directory.is_dir():
@@ -102,9 +100,7 @@ def load_results(directory: str | os.PathLike[str]) -> dict[str, Any] | None:
 
 
 def merge_stats_files(paths: Iterable[str | os.PathLike[str]]) -> MergedStats:
-    """Return the episodes of statistics files, in the order of their ends.
-
-    Episodes that ended at the same time stay in the order of their files.
+    """Return the episodes of statistics files, ordered by their ends.
 
     Raises:
         UnreadableFile: a file is missing or damaged.

@@ -159,12 +159,11 @@ def detect_training_manifests(
 ) -> list[str]:
     """Return the paths of the manifests in `directory`, sorted.
 
-    Unfinished manifests and files with names like a manifest's are left out. A
-    directory that is not there has none.
+    Unfinished files and similar names are left out. A missing directory has none.
 
     Args:
-        directory: where to look; not below it.
-        files: the names to choose from, instead of what the directory holds.
+        directory: where to look, not below it.
+        files: names to choose from, instead of the directory's.
     """
     directory = Path(directory)
     if files is None:
@@ -173,9 +172,9 @@ def detect_training_manifests(
 
 
 def detect_monitor_files(directory: str | os.PathLike[str]) -> list[str]:
-    """Return the paths of all files in `directory` that monitors finished, sorted.
+    """Return the paths of all finished monitor files in `directory`, sorted.
 
-    Files that only begin like one (`openaigym.notes.txt`) are left out.
+    Other files with a similar name (`openaigym.notes.txt`) are left out.
     """
     return [str(path) for path in iter_monitor_files(Path(directory))]
 
@@ -183,13 +182,11 @@ def detect_monitor_files(directory: str | os.PathLike[str]) -> list[str]:
 def clear_monitor_files(directory: str | os.PathLike[str]) -> None:
     """Remove the files of all monitors in `directory`, also unfinished ones.
 
-    Also the second names of videos (`rl-video-episode-27.mp4`), where they lead to one
-    of these files. Nothing else is removed: no directory, and no file that only begins
-    like a monitor's.
+    Also removes links to their videos (`rl-video-episode-27.mp4`), and nothing else: no
+    directory, and no other file with a similar name.
 
     Raises:
-        DirectoryInUse: a monitor that is still open writes there. Nothing was
-            removed.
+        DirectoryInUse: a monitor there is open. Nothing was removed.
     """
     paths = list(iter_monitor_files(Path(directory), hidden=True))
     for path in paths:

@@ -443,8 +443,8 @@ def _never() -> bool:
 
 def _differs(reason: str) -> PicturesDiffer:
     return PicturesDiffer(
-        f"The picture of this moment cannot be made from the recorded state: {reason}. "
-        'Record the environment\'s own pictures with render="live".'
+        f"This frame cannot be drawn from the recorded state: {reason}. Record live, "
+        'with render="live".'
     )
 
 

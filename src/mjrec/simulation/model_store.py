@@ -286,12 +286,12 @@ def _untrusted(compiled: Path, what_of_sources: str) -> UntrustedModel:
 def _not_loadable(directory: Path, facts: Mapping[str, Any]) -> UnreadableFile:
     name, version = facts.get("mjb") or facts.get("xml"), facts.get("mujoco")
     if name is None:
-        return UnreadableFile(directory, "the recording says nothing of its model")
+        return UnreadableFile(directory, "the recording does not name its model")
     if version == mujoco.__version__:
         return UnreadableFile(
             directory / name,
-            "the model of the recording is missing; it belongs beside the recording, "
-            "and whatever was copied without it needs it too",
+            "the model of the recording is missing; copy it from the recorded "
+            "directory",
         )
     source = facts.get("xml")
     return UnreadableFile(

@@ -81,9 +81,10 @@ def note_models(digests: Iterable[str]) -> None:
             reasons.append(f"{directory}: {error.strerror or error}")
     if new:
         _warn_once(
-            "The models of these recordings count as a stranger's, because no list of "
-            f"this user's models can be kept ({'; '.join(reasons)}). Where it is not "
-            f"known what they were made from, rendering will need {TRUST_VARIABLE}=1."
+            "The list of this user's models cannot be written "
+            f"({'; '.join(reasons)}), so the models of these recordings will not be "
+            f"trusted. If their sources are not stored, rendering needs "
+            f"{TRUST_VARIABLE}=1."
         )
 
 
@@ -191,9 +192,9 @@ def _listed() -> str:
                 continue
             except OSError as error:
                 _warn_once(
-                    f"The list of this user's models is not used: {error}. If nobody "
-                    "else has written there, mend that; else remove it: models that "
-                    "were stored before then count as a stranger's."
+                    f"The list of this user's models is not used: {error}. If no one "
+                    "else has written to it, correct that; else remove it. Models "
+                    "stored before are then no longer trusted."
                 )
     return content
 

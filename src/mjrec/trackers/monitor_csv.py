@@ -29,17 +29,16 @@ _ENDING = "monitor.csv"
 
 
 class MonitorCsvTracker(Tracker):
-    """Writes what `stable_baselines3.common.monitor.load_results` reads.
+    """Writes files for `stable_baselines3.common.monitor.load_results`.
 
-    Each run has a file of its own: every sub-environment, and every run that adds to
-    earlier recordings. `load_results` reads all files of a directory and puts the
-    episodes in the order of their ends. A file that is there is never written to.
-
-    A row is on disk as soon as its episode has ended, whole or not at all.
+    Each run has its own file: every sub-environment, and every run that adds to earlier
+    recordings. `load_results` reads all files of a directory and orders episodes by
+    their ends. An existing file is never changed. A row is on disk, whole, as soon as
+    its episode has ended.
 
     Args:
-        path: a directory that is there, or a file's name, to which `.monitor.csv` is
-            added unless it ends in `monitor.csv`, and a number where it is taken:
+        path: an existing directory, or a file name, to which `.monitor.csv` is added
+            unless it ends in `monitor.csv`, and a number if it exists:
             `logs/a.monitor.csv`, `logs/a.1.monitor.csv` ... None is the monitor
             directory. In a directory the name is
             `openaigym.results.<infix>.monitor.csv`.

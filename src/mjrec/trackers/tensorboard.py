@@ -33,23 +33,22 @@ _MANY_FRAMES = 10_000
 
 
 class TensorBoardTracker(Tracker):
-    """Writes event files that TensorBoard shows.
+    """Writes event files for TensorBoard.
 
-    Scalars, over the steps of the run: `training/return`, `training/length` and, where
-    the environment says it, `training/success`; those of evaluation episodes begin with
-    `evaluation/`. TensorBoard plays no videos (its issue 39): a finished mp4 file is
-    shown as a small animated GIF, `training/video` under Images, and its name under
-    Text. The GIF is made from the file, on a thread beside the simulation.
+    Scalars over the steps of the run: `training/return`, `training/length` and, if the
+    environment reports it, `training/success`; evaluation episodes use `evaluation/`.
+    TensorBoard cannot play videos (its issue 39), so each mp4 is shown as a small
+    animated GIF, `training/video` under Images, with its name under Text. A thread
+    makes the GIF from the file.
 
-    Each monitor, so each sub-environment too, is a run of its own in TensorBoard, in a
-    directory of its own: TensorBoard reads only one of several files that grow in one
+    Each monitor, so each sub-environment too, is a TensorBoard run in its own
+    directory, because TensorBoard reads only one of several growing files in a
     directory. Events are on disk at once.
 
     Args:
-        log_dir: above the runs' directories; None is `tensorboard` in the monitor
-            directory. A run is called `<infix>` there, and
-            `<monitor directory's name>.<infix>` in a `log_dir`; `.env<i>` follows for
-            a sub-environment.
+        log_dir: parent of the runs' directories. None is `tensorboard` in the monitor
+            directory. A run is named `<infix>` there, and `<monitor directory's
+            name>.<infix>` in a `log_dir`, followed by `.env<i>` for a sub-environment.
 
     Raises:
         MissingDependency: tensorboard is not installed.
@@ -79,11 +78,11 @@ class TensorBoardTracker(Tracker):
         self._runs[run].write_episode(episode)
 
     def video(self, run: Run, video: FinishedVideo) -> None:
-        """Write the video's name, and have its preview made.
+        """Write the video's name, and start making its preview.
 
         Raises:
             FileNotWritten: the disk is full.
-            EncoderError: ffmpeg failed at the preview of this video or an earlier one.
+            EncoderError: ffmpeg failed at the preview of this or an earlier video.
             UnreadableFile: the video's metadata is damaged.
         """
         self._runs[run].write_video(video)

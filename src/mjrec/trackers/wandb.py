@@ -18,27 +18,25 @@ class WandbTracker(Tracker):
     """Logs to a run of Weights & Biases.
 
     Over the steps of the run, `training/total_steps`: `training/return`,
-    `training/length` and, where the environment says it, `training/success`; those of
-    evaluation episodes begin with `evaluation/`, those of a sub-environment with
-    `training/env<i>/`. A finished mp4 file is uploaded as it is, as `training/video`,
-    over `training/video_total_steps`: a deferred video comes later than the episodes
-    that follow its own.
+    `training/length` and, if the environment reports it, `training/success`; evaluation
+    episodes use `evaluation/`, sub-environments `training/env<i>/`. Each mp4 is
+    uploaded as `training/video`, over `training/video_total_steps`, because a deferred
+    video comes later than the next episodes.
 
-    Nothing is logged at a step of W&B's own, which must never go back; each call takes
-    the next one. Code that logs to the same run with `step=` should say
-    `run.define_metric` instead too: W&B drops what comes with a lower step.
+    Each call takes W&B's next step. W&B drops data with a lower step, so code that logs
+    to the same run with `step=` should use `run.define_metric` instead.
 
     Args:
-        run: what `wandb.init` returned; it stays open. None is the one that is active
-            when the first monitor begins, if no other argument is given either; and
-            else a new one, which is finished when the last monitor has ended.
-        project: of the new run, as `wandb.init`.
-        mode: of the new run, as `wandb.init`: `"offline"`, for example.
-        **init: the other arguments of `wandb.init`.
+        run: from `wandb.init`; it stays open. None is the run that is active when the
+            first monitor begins, if there are no other arguments; else a new one, which
+            is finished with the last monitor.
+        project: of the new run, as in `wandb.init`.
+        mode: of the new run, as in `wandb.init`, such as `"offline"`.
+        **init: other arguments of `wandb.init`.
 
     Raises:
         MissingDependency: wandb is not installed.
-        InvalidArgument: a run is given, and how to make one too.
+        InvalidArgument: both a run and arguments for a new one are given.
     """
 
     def __init__(
@@ -70,7 +68,7 @@ class WandbTracker(Tracker):
         self._last_episodes: dict[Run, FinishedEpisode | None] = {}
 
     def begin(self, run: Run) -> None:
-        """Make the run of W&B, if need be."""
+        """Start W&B's run, if needed."""
         if self._service is None:
             self._open()
         self._last_episodes[run] = None
@@ -97,7 +95,7 @@ class WandbTracker(Tracker):
         self._log(group, {_VIDEO_STEPS: steps, name: picture})
 
     def end(self, run: Run) -> None:
-        """Finish the run of W&B, if it was made here and this was its last monitor."""
+        """Finish W&B's run, if it was started here and this was its last monitor."""
         del self._last_episodes[run]
         if self._last_episodes:
             return
