@@ -122,13 +122,14 @@ def look_for_contents(directory: Path, episodes: Iterable[int] | None) -> Conten
         UnreadableFile: a file is damaged, or a link that leads out of the directory.
     """
     places = recording_directories(directory)
+    for place in places:
+        _check_is_idle(place)
     if not any(map(any, map(iter_monitor_files, places))):
         raise InvalidArgument(
             f"{directory} holds no recordings that could be packed. "
             f"{where_recordings_are(directory)}"
         )
     for place in places:
-        _check_is_idle(place)
         _check_all_is_done(place)
     chosen = None
     if episodes is not None:

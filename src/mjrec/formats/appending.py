@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Files that grow by whole pieces, each with the operating system at once.
 
-A line of a journal or of a list of spans, a row of a table, a record of TensorBoard's:
+A line of a journal, a row of a table, a record of TensorBoard's:
 half a piece would be taken for another one, and hide what is behind it. What is added
 outlives the process that added it.
 """

@@ -60,7 +60,7 @@ def is_recorded(path: Path) -> bool:
     """Tell whether a trajectory is there in any form, by the path of its own file.
 
     Raises:
-        UnreadableFile: it may be in a list of spans that cannot be read.
+        UnreadableFile: the journal of its monitor cannot be read.
     """
     return is_finished(path) or find_recording(path) is not None
 
