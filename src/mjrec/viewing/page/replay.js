@@ -277,7 +277,8 @@
 
   let before = performance.now();
   function tick(now) {
-    const seconds = (now - before) / 1000;
+    // A machine that draws slowly plays slowly, and does not jump to the end.
+    const seconds = Math.min(0.25, (now - before) / 1000);
     before = now;
     if (playing) {
       clock += seconds * Number(element("replay-speed").value);
