@@ -57,6 +57,17 @@ def test_a_table_says_what_came_of_it(run, tmp_path):
     assert "2/2 episodes" in err
 
 
+def test_tasks_with_a_scale_are_summarized_together(run):
+    """What is left out is named, with the reason."""
+    double = "InvertedDoublePendulum-v5"
+    ranges = (f"{TASK}=0:10", "--score-range", f"{double}=0:100")
+    tasks = (TASK, double, "Hopper-v5", "--policy", "zero", "--keep", "none")
+    status, out, _ = run(*tasks, "--score-range", *ranges)
+    assert status == 0
+    assert "Over 2 tasks, as scores from 0 to 1: IQM" in out
+    assert "without Hopper-v5: it has no scale of its own" in out
+
+
 def test_json_is_one_object_and_nothing_else(run):
     """For programs; over tasks too."""
     status, out, err = run(

@@ -15,7 +15,7 @@ from engine_runs import run_python
 from parts import parametrize
 
 import mjrec
-from evaluations import write_recorded
+from evaluations import write_evaluation, write_recorded
 from mjrec.commands import main
 from mjrec.errors import InvalidArgument, UnreadableFile
 from mjrec.evaluation.evaluation import read_results
@@ -213,6 +213,14 @@ def test_an_evaluation_has_its_results(tmp_path):
         c.tasks[-1].summary.mean_interval for c in (contents, gather(tmp_path / "m"))
     ]
     assert beside[0] != beside[1]
+
+
+def test_intervals_made_in_another_way_are_told(tmp_path):
+    """One sentence about them is true of all but these."""
+    write_recorded(tmp_path / "a", ["a/x"])
+    write_evaluation(tmp_path / "b", {"b/y": [[1.0, 2.0]]}, monitor="0.batch")
+    [problem] = gather([tmp_path / "a", tmp_path / "b"]).problems
+    assert "b were made in another way: 10 resamples with seed 0, 0.95." in problem
 
 
 def test_videos_of_an_evaluation_know_their_episode(corridor, tmp_path):
