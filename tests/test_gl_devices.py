@@ -120,7 +120,7 @@ def test_what_is_no_entry_is_refused(gpu):
         ("None", {"CUDA_VISIBLE_DEVICES": ""}, "This process was given no GPU"),
         ("None", {"CUDA_VISIBLE_DEVICES": "-1"}, "This process was given no GPU"),
         # `MUJOCO_GL` stands, and what that means is said.
-        ("'0'", {"MUJOCO_GL": "osmesa"}, "GPU 0 was given for rendering, and MUJOCO"),
+        ("'0'", {"MUJOCO_GL": "osmesa"}, "GPU 0 was given for rendering, but MUJOCO"),
         pytest.param(
             *("'3'", {}, "GPU 3 was given for rendering, and EGL has only"),
             marks=needs_no_gpu,

@@ -181,7 +181,7 @@ WRONG = [
     ({"out": f"{VIDEO}.mp4"}, InvalidArgument, "name of a recorded video"),
     ({"engine": "spark"}, UnknownName, "slurm"),
     ({"engine": 3}, InvalidArgument, r"mjrec\.LocalEngine\(\)"),
-    ({"engine": LocalEngine(1), "workers": 2}, InvalidArgument, "of its own"),
+    ({"engine": LocalEngine(1), "workers": 2}, InvalidArgument, "its own workers"),
     ({"engine": "local", "workers": 0}, InvalidArgument, "workers"),
     ({"engine": "local", "out": f"{VIDEO}.mp4"}, InvalidArgument, "recorded video"),
 ]
