@@ -553,7 +553,7 @@ WRONG = [
     ({"workers": 0}, InvalidArgument, "workers"),
     ({"engine": "spark"}, UnknownName, "slurm"),
     ({"engine": 3, "workers": None}, InvalidArgument, "LocalEngine"),
-    ({"engine": mjrec.LocalEngine(1)}, InvalidArgument, "of its own"),
+    ({"engine": mjrec.LocalEngine(1)}, InvalidArgument, "its own workers"),
     ({"keep": "bset"}, UnknownName, "best:N"),
     ({"protocol": "seed"}, UnknownName, "suite"),
     ({"quality": "low"}, UnknownName, "draft"),
