@@ -1,6 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The states of a simulation, as a recorder asks for them."""
 
+import copy
+import dataclasses
+
 import mujoco
 import numpy as np
 import pytest
@@ -216,3 +219,50 @@ def test_a_field_that_is_forgotten_is_refused(simulation, monkeypatch):
     """The first frame is compared, whatever the reason for a difference is."""
     monkeypatch.setattr("mjrec.simulation.captured_arrays.ALWAYS", ("geom_xmat",))
     assert "the scene is another one" in (simulation.begin().refusal or "")
+
+
+def check_scenes_that_stay(simulation, frames):
+    """Compare scenes that stay, frame by frame: a live and a recorded one."""
+    view = view_from_facts(simulation.begin_scene())
+    own = simulation.view()
+    camera, option = copy.copy(own.camera), copy.copy(own.option)
+    live_view = dataclasses.replace(own, camera=camera, option=option)
+    live = mujoco.MjvScene(simulation.model, maxgeom=100)
+    model = copy.copy(simulation.model)
+    data = mujoco.MjData(model)
+    again = mujoco.MjvScene(model, maxgeom=100)
+    for _ in range(frames):
+        simulation.step(30)
+        changed = simulation.capture() or {}
+        update(live, simulation.model, simulation.data, live_view)
+        apply_fields(model, changed, camera=view.camera, option=view.option)
+        restore_snapshot(simulation.row, model, data)
+        update(again, model, data, view)
+        assert list(differences(live, again, view.option)) == []
+    left = [camera.pos.tolist() for camera in live.camera]
+    assert simulation.begin_scene()["previous_cameras"] == left
+
+
+def test_an_infinite_plane_remembers_the_camera_before(simulation):
+    """An episode says what the last frame before has left, until it is forgotten."""
+    simulation.compile(BALL, plane="0 0 1")
+    simulation.camera.type = int(mujoco.mjtCamera.mjCAMERA_FIXED)
+    simulation.camera.fixedcamid = 0
+    assert simulation.begin_scene()["previous_cameras"] is None
+    check_scenes_that_stay(simulation, 3)
+    simulation.states.forget_pictures()
+    assert simulation.begin_scene()["previous_cameras"] is None
+
+
+def track(simulation):
+    simulation.camera.type = int(mujoco.mjtCamera.mjCAMERA_TRACKING)
+    simulation.camera.trackbodyid = 1
+
+
+def test_a_camera_that_tracks_moves_from_frame_to_frame(simulation):
+    """Each frame moves it a fifth of the way; where to is part of the recording."""
+    track(simulation)
+    before = simulation.camera.lookat.copy()
+    check_scenes_that_stay(simulation, 4)
+    assert np.array_equal(simulation.camera.lookat, before), "the user's own stays"
+    assert simulation.begin_scene()["camera"]["lookat"] != before.tolist()

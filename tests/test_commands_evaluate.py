@@ -185,4 +185,4 @@ def test_ctrl_c_says_how_to_go_on(run, monkeypatch):
     monkeypatch.setattr("mjrec.commands.evaluate.evaluate_policy", interrupted)
     status, _, err = run(TASK, "--policy", "zero")
     assert status == 130
-    assert "mjrec evaluate --resume e goes on" in err
+    assert "To continue: mjrec evaluate --resume e" in err

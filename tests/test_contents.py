@@ -14,8 +14,9 @@ import pytest
 from full_disk import file_size_limit
 from packed_runs import the, unpacked
 from parts import parametrize
-from trajectories_by_hand import write_finished, write_log, write_pending_manifest
+from trajectories_by_hand import write_log
 
+import honest_runs
 import mjrec
 from mjrec.evidence.bag import make_bag
 from mjrec.evidence.size_limit import byte_count
@@ -68,9 +69,7 @@ def test_an_open_monitor_is_named(
 def test_pending_videos_are_to_be_rendered_first(tmp_path: Path, place: Path) -> None:
     """The message has the command."""
     runs = tmp_path / "runs"
-    runs.mkdir()
-    write_finished(runs)
-    write_pending_manifest(runs, 0)
+    honest_runs.pendulum(runs, episodes=1, workers=0)
     message = refusal(mjrec.UnfinishedRecordings, runs, place)
     assert "video000000.mp4" in message
     assert f"mjrec render {runs}" in message

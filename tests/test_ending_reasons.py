@@ -202,3 +202,49 @@ def test_a_signal_whose_exception_is_lost_comes_again(tmp_path):
         143,
     )
     assert "2 videos pending" in done.stderr
+
+
+@pytest.mark.usefixtures("default_signals")
+def test_the_end_of_an_episode_that_is_interrupted(tmp_path, monkeypatch):
+    """Ctrl-C while that is written down: recovery makes it, and the next, complete."""
+    env = gymnasium.make("InvertedPendulum-v5", max_episode_steps=3)
+    monitor = Monitor(env, tmp_path, lambda _: True, workers=0)
+    monitor.reset(seed=0)
+    steps(monitor, 2)
+    with monkeypatch.context() as patch:
+        patch.setattr(
+            "mjrec.recorder.states.StateRecorder.end",
+            lambda *_: signal.raise_signal(signal.SIGINT),
+        )
+        with pytest.raises(KeyboardInterrupt):
+            steps(monitor, 1)
+    monitor.reset(seed=0)
+    steps(monitor, 3)
+    monitor.close()
+    mjrec.recover(tmp_path)
+    paths = list(tmp_path.glob("*.h5"))
+    assert len(paths) == 2
+    for facts in (mjrec.load_trajectory(path).facts for path in paths):
+        ending = [facts[key] for key in ("complete", "truncated", "length")]
+        assert ending == [True, True, 3]
+    assert stats_of(tmp_path)["episode_lengths"] == [3, 3]
+
+
+def test_a_handlers_exception_between_a_step_and_its_row(tmp_path, monkeypatch):
+    """The step is not counted and has no row: it is that exception that ended it."""
+    env = gymnasium.make("InvertedPendulum-v5", max_episode_steps=1)
+    monitor = Monitor(env, tmp_path, lambda _: True, workers=0)
+    monitor.reset(seed=0)
+
+    def handler(*_, **__):
+        raise ArithmeticError("the handler's")
+
+    row = "mjrec.recorder.states.StateRecorder.step"
+    monkeypatch.setattr(row, handler)
+    with pytest.raises(ArithmeticError), monitor:
+        steps(monitor, 1)
+    [path] = in_flight(tmp_path)
+    facts = mjrec.load_trajectory(path).facts
+    assert (facts["complete"], facts["reason"]) == (False, "exception")
+    assert facts["exception"]["message"] == "the handler's"
+    assert stats_of(tmp_path)["episode_lengths"] == []

@@ -395,3 +395,21 @@ def test_a_kill_at_a_row_loses_that_row(moment, tmp_path):
     # The first step of all did not go the fast way.
     assert [len(each) for each in trajectories(tmp_path)] == [3, 3, 1]
     assert [each.complete for each in trajectories(tmp_path)] == [True, True, False]
+
+
+def test_a_monitor_may_be_closed_within_a_step(tmp_path):
+    """As by a signal's handler that only closes it: the step returns as ever."""
+
+    def close_at(reward):
+        if monitor.get_total_steps() == 3:
+            monitor.close()
+        return reward
+
+    monitor = monitored(Rewarding(make(), close_at), tmp_path)
+    begin(monitor)
+    go(monitor, 3)
+    assert is_fast(monitor)
+    [(observation, *_)] = go(monitor, 1)
+    assert observation.shape == (17,)
+    [trajectory] = trajectories(tmp_path)
+    assert len(trajectory) == 3

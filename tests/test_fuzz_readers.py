@@ -2,8 +2,7 @@
 """Whatever a file holds, reading it gives what it says or one error that names it.
 
 Hypothesis makes the files: sound ones, changed where their structure has joints, with
-checksums that are right again. It always makes the same ones. What could take the
-process with it is read in forks.
+checksums that are right again. It always makes the same ones.
 """
 
 import contextlib
@@ -15,10 +14,8 @@ import struct
 
 import numpy as np
 import pytest
-from hostile_reading import Inspector
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from sound_files import compiled, finished, source
 from trajectories_by_hand import INFIX, write_log
 from trajectory_contents import content_of
 
@@ -47,7 +44,6 @@ FEW = settings(
     max_examples=200,
     suppress_health_check=[HealthCheck.function_scoped_fixture],
 )
-FEWER = settings(FEW, max_examples=20)
 
 
 # --- JSON ----------------------------------------------------------------------------
@@ -312,44 +308,3 @@ def test_any_damaged_tail(tmp_path, sound_log, damage, written):
     files = {**sound_log, LOG: rows[: written * size], TAIL: tail}
     found = read_log(put_log(tmp_path, files))
     assert found is None or written <= len(found.states) <= 5
-
-
-# --- HDF5 and models, in forks -------------------------------------------------------
-
-
-@pytest.fixture(scope="module")
-def inspector():
-    with Inspector() as one:
-        yield one
-
-
-@pytest.fixture(scope="module")
-def sound(tmp_path_factory):
-    """A sound file of each kind, in a directory of its own."""
-    found = {}
-    for name, write in {"h5": finished, "zip": source, "mjb": compiled}.items():
-        directory = tmp_path_factory.mktemp(name) / "recordings"
-        directory.mkdir()
-        found[name] = write(directory)
-    return found
-
-
-def check(outcome, path):
-    assert outcome.kind in ("value", "refused"), outcome
-    assert outcome.kind == "value" or outcome.names == str(path), outcome
-
-
-@pytest.mark.parametrize(
-    ("kind", "reader"), [("h5", "trajectory"), ("zip", "source"), ("mjb", "model")]
-)
-@FEWER
-@given(damage=DAMAGE)
-def test_any_damaged_file(inspector, sound, kind, reader, damage):
-    """Of HDF5, of a model's sources, of a compiled model: no crash, no hang."""
-    path = sound[kind]
-    data = path.read_bytes()
-    try:
-        path.write_bytes(damaged(data, damage))
-        check(inspector.read(reader, path), path)
-    finally:
-        path.write_bytes(data)

@@ -3,8 +3,6 @@
 
 import copy
 import pickle
-import subprocess
-import sys
 import threading
 
 import gymnasium
@@ -18,21 +16,6 @@ WRITERS = 8
 EPISODES = 3
 STEPS = 4
 
-# Records as in a container: every process there has the same number. It begins when
-# the others do.
-PROGRAM = """
-import sys, gymnasium, mjrec
-env = gymnasium.make("InvertedPendulum-v5", width=32, height=32, max_episode_steps=4)
-print("ready", flush=True)
-sys.stdin.readline()
-with mjrec.Monitor(env, sys.argv[1], lambda _: True, resume=True, uid="7",
-                   workers=0) as env:
-    for seed in range(3):
-        env.reset(seed=seed)
-        for _ in range(4):
-            env.step(env.action_space.sample() * 0)
-"""
-
 
 def check(directory):
     """Check that there is everything of everyone, and nothing twice."""
@@ -43,33 +26,6 @@ def check(directory):
     assert results["episode_lengths"] == [STEPS] * (WRITERS * EPISODES)
     assert len(list(directory.glob("*.manifest.json"))) == WRITERS
     assert not list(directory.glob("*.part*"))
-
-
-@pytest.mark.thorough
-def test_eight_processes_with_the_same_number(tmp_path):
-    """As in eight containers: no file is overwritten, and all results are merged."""
-    command = [sys.executable, "-c", PROGRAM, str(tmp_path)]
-    processes = [
-        subprocess.Popen(
-            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
-        )
-        for _ in range(WRITERS)
-    ]
-    for process in processes:
-        assert process.stdout is not None
-        assert process.stdout.readline() == "ready\n"
-    for process in processes:
-        assert process.stdin is not None
-        process.stdin.write("\n")
-        process.stdin.flush()
-    for process in processes:
-        process.communicate(timeout=120)
-        assert process.returncode == 0
-    check(tmp_path)
-    trajectories = list(tmp_path.glob("*.h5"))
-    assert len(trajectories) == WRITERS * EPISODES
-    # Stored once, though all of them have it.
-    assert len(list(tmp_path.glob("*.mjb.gz"))) == 1
 
 
 def test_eight_threads(tmp_path, make_corridor):

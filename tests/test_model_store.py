@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Models are stored once, whole, and come back as they were; nothing else is read."""
 
+import gzip
 import hashlib
 import io
 import json
@@ -288,3 +289,13 @@ def test_facts_cannot_name_a_file_elsewhere(directory, name):
     for kind in ("mjb", "xml"):
         with pytest.raises(UnreadableFile, match="which is no name"):
             load_model(directory, {**facts, kind: name})
+
+
+def test_a_bomb_of_a_compiled_model_is_not_unpacked(directory):
+    """It is read up to the size that was recorded."""
+    facts = stored(directory, sphere())
+    (directory / facts["mjb"]).write_bytes(gzip.compress(bytes(1 << 20)))
+    with pytest.raises(UnreadableFile, match="it holds more, not the recorded"):
+        load_model(directory, facts)
+    with pytest.raises(UnreadableFile, match="recorded size is"):
+        load_model(directory, {**facts, "bytes": 1 << 50})

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 import subprocess
 import sys
@@ -107,9 +108,12 @@ def pages() -> Iterator[Any]:
     complaints: list[str] = []
     with sync_playwright() as playwright:
         found = shutil.which("chromium") or playwright.chromium.executable_path
-        browser = playwright.chromium.launch(executable_path=found, args=_OPTIONS)
+        browsers = []
 
         def opened(address: str) -> Page:
+            # One for each page: they draw without a GPU, and would wait for each other.
+            browser = playwright.chromium.launch(executable_path=found, args=_OPTIONS)
+            browsers.append(browser)
             page = browser.new_page(viewport=_SIZE)
             page.set_default_timeout(120_000)
             page.on("pageerror", lambda error: complaints.append(str(error)))
@@ -119,7 +123,8 @@ def pages() -> Iterator[Any]:
             return page
 
         yield opened
-        browser.close()
+        for browser in browsers:
+            browser.close()
     known = ("file:", "data:", "blob:", "http://127.0.0.1:")
     assert [each for each in complaints if not each.startswith(known)] == []
 
@@ -333,6 +338,34 @@ def test_the_page_holds_no_code_of_a_name(cheetah: Path, tmp_path: Path) -> None
     trajectory.facts = {**trajectory.facts, "env_id": "</script><script>alert(1)"}
     mjrec.write_replay(trajectory, tmp_path / "page.html")
     assert "<script>alert" not in (tmp_path / "page.html").read_text()
+
+
+def test_colours_change_when_the_model_does(tmp_path: Path) -> None:
+    """A geom has the colour that it had in each state; one that vanishes is hidden."""
+    env = gymnasium.make("Hopper-v5")
+    with mjrec.Monitor(env, tmp_path, workers=0, video_callable=lambda _: True) as run:
+        run.reset(seed=0)
+        for step in range(1, 5):
+            if step == 3:
+                env.unwrapped.model.geom_rgba[2] = (1, 0, 0, 1)
+                env.unwrapped.model.geom_rgba[3, 3] = 0
+            run.step(run.action_space.sample())
+    [path] = tmp_path.glob("*.h5")
+    page = tmp_path / "page.html"
+    mjrec.write_replay(mjrec.load_trajectory(path), page)
+    text = page.read_text().split('id="replay-data">')[1].split("</script>")[0]
+    colours = {each[1]: each for each in json.loads(text)["chunk"]["colours"]}
+    assert colours["/geom/2"] == [3, "/geom/2", [1, 0, 0, 1]]
+    assert colours["/geom/3"][0] == 3
+    assert colours["/geom/3"][2][3] == 0
+
+
+def test_states_that_are_no_numbers_are_left_out(cheetah: Path, tmp_path: Path) -> None:
+    """A state that was reset away, or has diverged, is not shown; the others are."""
+    trajectory = mjrec.load_trajectory(cheetah)
+    trajectory.states[-1] = np.nan
+    made = mjrec.write_replay(trajectory, tmp_path / "page.html")
+    assert made.states == _STEPS
 
 
 @pytest.mark.thorough

@@ -183,7 +183,7 @@ def test_how_many_workers():
         ({"time_min": 0}, "time_min must be"),
         ({"time_min": 1, "notice_s": 60}, "notice_s is less than"),
         ({"mem_gb": 0}, "mem_gb is more than 0"),
-        ({"gpus": -1}, "gpus is how many"),
+        ({"gpus": -1}, "gpus is the number"),
     ],
 )
 def test_what_cannot_be(options, said):

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from mjrec.formats.journal import JournalWriter
+from mjrec.formats.journal import JournalWriter, is_of_spans
 from mjrec.formats.manifest import Manifest, write_manifest
 from mjrec.formats.monitor_directory import (
     Infix,
@@ -191,9 +191,16 @@ def write_log(
 
 
 def write_finished(directory: Path, episode_id: int = 0, **rest: Any) -> Path:
-    """Write the finished trajectory of an episode, as this user's own."""
+    """Write the finished trajectory of an episode, and nothing else."""
     note_models([directory_digest(directory)])
-    return finish_trajectory(write_log(directory, episode_id, **rest))
+    path = finish_trajectory(write_log(directory, episode_id, **rest))
+    journal = directory / journal_name(rest.get("infix", INFIX))
+    is_needed = any(log_paths(directory)) or not all(
+        map(is_of_spans, journal.read_bytes().splitlines())
+    )
+    if not is_needed:
+        journal.unlink()
+    return path
 
 
 def write_pending_manifest(

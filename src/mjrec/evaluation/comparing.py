@@ -70,23 +70,22 @@ class TaskComparison:
 
 @dataclass(frozen=True, kw_only=True)
 class Comparison:
-    """B against A; what is in pairs is of A and of B.
+    """B against A. Pairs are of A and B.
 
     Attributes:
-        a: the directories of the one side.
-        b: the directories of the other.
-        unit: what the figures are of, and is resampled: `"episodes"` of one evaluation
-            on each side, or `"evaluations"`.
-        policies: what was evaluated.
-        cautions: what must be known before the figures are believed: that not all was
-            made under the same conditions, or that episodes failed.
-        remarks: in what else the two differ; their figures can be compared all the
-            same.
-        left_out: tasks that are not in all evaluations of the other.
-        tasks: those that are everywhere, in the order of A.
-        figures: by name, those of `OVERALL_FIGURES` that can be said: the probability
-            of improvement, averaged over tasks, and interquartile means of scores.
-        scored: the tasks whose scores these are: with the same scale everywhere.
+        a: directories of A.
+        b: directories of B.
+        unit: what is resampled: `"episodes"`, with one evaluation on each side, or
+            `"evaluations"`.
+        policies: the policies.
+        cautions: reasons not to trust the figures: different conditions, failed
+            episodes.
+        remarks: other differences, which do not matter for the figures.
+        left_out: tasks of one side that are not in all evaluations of the other.
+        tasks: common tasks, in the order of A.
+        figures: by name, of `OVERALL_FIGURES`: the probability of improvement, averaged
+            over tasks, and interquartile means of scores.
+        scored: tasks with these scores: those with the same scale everywhere.
         bootstrap: how intervals were made.
     """
 
@@ -111,24 +110,22 @@ def compare(
     resamples: int = 10_000,
     seed: int = 0,
 ) -> Comparison:
-    """Compare two evaluations, or two sets of them; every figure is of B against A.
+    """Compare two evaluations, or two sets of them: how much better is B than A?
 
-    Of one evaluation on each side, episodes are resampled: the figures are of these two
-    policies. Of several on a side (trainings of one method with different seeds), each
-    evaluation counts as its mean return, and these are resampled, for each task on its
-    own.
+    With one evaluation on each side, episodes are resampled: the figures are of these
+    two policies. With several (trainings of one method with different seeds), each
+    evaluation counts as its mean return, and these are resampled task by task.
 
     Args:
         a: the directory of an evaluation, or several.
         b: likewise.
-        confidence: the share of intervals that hold the true value.
-        resamples: of the bootstrap that intervals come from.
-        seed: of its generator.
+        confidence: confidence level of the intervals.
+        resamples: bootstrap resamples.
+        seed: seed of the bootstrap.
 
     Raises:
-        UnreadableFile: there is no finished evaluation in a directory, or it is
-            damaged.
-        InvalidArgument: no task is in all of them, or a directory is there twice.
+        UnreadableFile: a directory has no finished evaluation, or it is damaged.
+        InvalidArgument: no task is in all of them, or a directory is given twice.
     """
     how = Bootstrap(resamples=resamples, seed=seed, confidence=confidence)
     sides = of_a, of_b = _Side("A", a), _Side("B", b)

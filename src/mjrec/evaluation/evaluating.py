@@ -122,20 +122,19 @@ def evaluate(
     on_progress: _Tell | None = None,
     engine: Executor | str | None = None,
 ) -> Evaluation:
-    """Run N episodes of each task and seed, and write down their results.
+    """Run episodes of each task and seed, and write their results.
 
-    Every episode keeps its trajectory, so that any of them can be drawn later. An
-    episode in which the policy raises, or gives NaN or the wrong shape, or the
-    environment raises, has failed; the others go on. An episode whose worker dies is
-    begun again, and has failed when three workers have died of it.
+    Every episode keeps its trajectory, so each can be rendered later. An episode fails
+    if the policy or the environment raises, or if an action is NaN or misshaped; the
+    others continue. If its worker dies it is started again, and fails after three
+    deaths.
 
-    Each worker makes environment and policy once for each task, and resets them for
-    each episode. Only an environment that draws its model when it is made (`lqr` of
-    dm_control) is made anew for each seed, and one whose frames are drawn while it
-    runs for each episode.
+    A worker makes environment and policy once per task and resets them for each
+    episode. An environment that builds its model when it is made (dm_control's `lqr`)
+    is made per seed, one that is drawn live per episode.
 
-    Ctrl-C and other exceptions end the workers; what was finished stays, and the same
-    call with `resume=True` goes on.
+    Ctrl-C and other exceptions end the workers. Finished episodes stay, and the same
+    call with `resume=True` continues.
 
     Args:
         tasks: environments as in `mjrec record`, sets (`dm_control:benchmarking`,
@@ -143,57 +142,55 @@ def evaluate(
             `gymnasium:mujoco`), or patterns (`dm_control/walker-*`).
         policy: a text as in `mjrec record` (`random`, `zero`, `module:name`,
             `module:name()`); or a function of the observation, an object with
-            `predict`, or a class that is built with each environment, which is
+            `predict`, or a class that is built with each environment. Objects are
             pickled and sent to each worker.
         directory: of the evaluation; empty or new, unless `resume` or `force`.
-        episodes: how many of each task and seed; 10, if None.
-        seeds: of the runs.
-        num_seeds: how many, from 0 on, instead; 5 if neither is given.
-        workers: how many processes run, and later draw; one for each usable CPU, if
-            None. The results do not depend on it. Where `engine` is a name, how many
-            it has.
-        keep: which episodes of each task get a video: `best[:N]`, `median`,
-            `worst[:N]` and `failures[:N]`, separated by commas; or `cubic`, `all` or
-            `none`. See `evaluation.kept_episodes`. None is `"best,median,worst"`.
-        protocol: `"seeded"`, or None: episode i of seed s starts from
-            `SeedSequence([s, i])`. `"suite"`: each task and seed has one random stream,
-            seeded with s, that goes on from episode to episode.
-        resume: go on with the evaluation in the directory. What is not given is as it
-            was. Other tasks, more seeds and more episodes may be asked for (with the
-            protocol `"suite"` not episodes), everything else must be as it was, the
-            policy's code and weights too. What is done already is not repeated.
-        force: delete the evaluation that is in the directory.
-        max_steps: ends an episode as truncated; None is the environment's own limit,
-            and 1000 where it has none.
-        episode_timeout: an episode that takes more seconds has failed, and its worker
+        episodes: episodes per task and seed. None is 10.
+        seeds: the seeds.
+        num_seeds: number of seeds, from 0 on, instead of `seeds`. 5 without either.
+        workers: worker processes, which also render. None is one per usable CPU.
+            Results do not depend on it. If `engine` is a name, the number of its
+            workers.
+        keep: which episodes of each task get a video: `best[:N]`, `median`, `worst[:N]`
+            and `failures[:N]`, joined by commas; or `cubic`, `all` or `none`. None is
+            `"best,median,worst"`.
+        protocol: `"seeded"`, or None: episode i of seed s starts from `SeedSequence([s,
+            i])`. `"suite"`: each task and seed has one random stream, seeded with s.
+        resume: continue the evaluation in the directory and repeat nothing that is
+            finished. Arguments that are None stay as they were. You may add tasks,
+            seeds and (not with `"suite"`) episodes. Everything else must be equal, the
+            policy's code and weights too.
+        force: delete the evaluation in the directory first.
+        max_steps: truncate episodes after this many steps. None is the environment's
+            limit, or 1000.
+        episode_timeout: an episode that takes longer, in seconds, fails, and its worker
             is ended.
-        camera: of the videos; None is the model's tracking camera where there is one.
-        height: of the videos, in pixels; None is the environment's own.
+        camera: of the videos. None is the model's tracking camera, if it has one.
+        height: of the videos, in pixels. None is the environment's own.
         width: likewise.
-        max_fps: the most frames per second of simulated time; None is every step.
+        max_fps: most frames per second of simulated time. None is every step.
         quality: `"full"`, or None; or `"draft"`.
-        env_kwargs: more arguments for each environment.
-        policy_kwargs: more arguments for the policy.
-        score_ranges: the returns that count as 0 and as 1, by task, for what is said
-            over all tasks. Those of the dm_control suite have theirs.
-        confidence: the share of intervals that hold the true value.
-        on_progress: called several times a second with how far it is.
-        engine: where the work runs, instead of processes of this one: an executor, or
-            `"local"`, `"ray"` or `"slurm"`. Its workers draw the videos, too. All of
-            them see the directory under the same name. The results do not depend on it.
+        env_kwargs: arguments for each environment.
+        policy_kwargs: arguments for the policy.
+        score_ranges: by task, the returns that count as scores 0 and 1 across tasks.
+            dm_control tasks have their own.
+        confidence: confidence level of the intervals.
+        on_progress: called several times a second with the progress.
+        engine: where to run, instead of processes of this one: an executor, or
+            `"local"`, `"ray"` or `"slurm"`. Its workers also render. All of them see
+            the directory under the same path. Results do not depend on it.
 
     Returns:
-        The results, which stand in the directory too: `results.json`, `results.csv`
-        and `timing.csv`.
+        The results, which are also in the directory: `results.json`, `results.csv`,
+        `timing.csv`.
 
     Raises:
-        MissingDependency: the framework of a task, or what the engine needs, is not
-            installed.
-        DifferentEvaluation: what is resumed was begun in another way.
+        MissingDependency: a task's framework, or the engine's package, is missing.
+        DifferentEvaluation: `resume` with other options.
         DirectoryInUse: another evaluation writes into the directory.
         PolicyError: the policy cannot be built, or not be sent to other processes.
-        Error: an argument, a task or the policy cannot be. All of these are raised
-            before anything is run or written.
+        Error: an argument, a task or the policy is wrong. All of these are raised
+            before anything runs.
     """
     how = Bootstrap(confidence=confidence)
     given = given_engine(engine, workers)

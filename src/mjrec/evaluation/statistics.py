@@ -72,12 +72,12 @@ class Bootstrap:
     """How confidence intervals are made.
 
     Attributes:
-        resamples: how many.
-        seed: of the generator that draws them.
-        confidence: the share of the intervals that hold the true value.
+        resamples: number of resamples.
+        seed: of their generator.
+        confidence: confidence level.
 
     Raises:
-        InvalidArgument: there are no such intervals.
+        InvalidArgument: a value is out of range.
     """
 
     resamples: int = 10_000

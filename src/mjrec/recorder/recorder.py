@@ -512,6 +512,9 @@ class Recorder:
         if kept is not None:
             standing = kept.judge(recording.episode_id, episode)
         try:
+            # Without its model an episode that a kill leaves is worth nothing.
+            for states in self._states:
+                states.settle()
             # Before all that is drawn, so that no failing video can lose the episode.
             with failures:
                 self._journal_end(recording, facts, episode, standing)

@@ -213,6 +213,11 @@ class Capture:
         if self._stored is not None:
             self._stored.scene = None
 
+    def settle(self) -> None:
+        """Wait until every model is stored, or could not be: `finish` says so."""
+        if self._store is not None:
+            self._store.settle()
+
     def finish(self) -> None:
         """Wait until every model is stored.
 

@@ -118,14 +118,18 @@ class ModelStore:
         Raises:
             FileNotWritten: one could not be. It is tried again by the next call.
         """
-        if self._writer is not None:
-            self._writer.close()
-            self._writer = None
+        self.settle()
         failed, self._failed = self._failed, []
         for job, _ in failed:
             self._store(job)
         if self._failed:
             raise self._failed[0][1]
+
+    def settle(self) -> None:
+        """Wait until every model is stored, or could not be: `finish` says so."""
+        if self._writer is not None:
+            self._writer.close()
+            self._writer = None
 
     def leave(self) -> None:
         """Let what waits be stored in the background. Never blocks."""

@@ -35,21 +35,17 @@ def load_trajectory(
     """Return a recorded episode.
 
     Args:
-        path: of its `openaigym.trajectory.*.h5`. Of an evaluation's episode that file
-            is not there: it lies under this name in its monitor's bundle,
-            `openaigym.trajectories.*.h5`. Of an episode that is not over, or whose
-            process was killed, what its monitor's log has of it is returned.
-        trust_models: whether `model()`, and `mjrec.render` of what is returned, load
-            a compiled model that another user, or another machine, has written. A
-            crafted one can do anything to whoever loads it; so without this, such a
-            model is compiled from its sources, where they are there.
-            `MJREC_TRUST_MODELS=1` says the same for all.
+        path: of its `openaigym.trajectory.*.h5`. If the episode is not over, or its
+            process was killed, there is no such file yet, and its monitor's log is
+            read.
+        trust_models: let `model()` and `mjrec.render` load a compiled model that
+            another user or machine wrote. A crafted model can run any code; without
+            this, the model is compiled from its sources, if they exist.
+            `MJREC_TRUST_MODELS=1` does the same for all.
 
     Raises:
-        UnreadableFile: there is no such file, or it is damaged, of a newer format, or
-            a stranger's that does harm to the process that reads it.
-        InvalidArgument: it is a directory or a bundle; the trajectories in it are
-            named.
+        UnreadableFile: the file is missing, damaged, of a newer format, or hostile.
+        InvalidArgument: it is a directory; the message lists its trajectories.
     """
     path = Path(path)
     if path.is_symlink() and infix_of(path.name) is None:

@@ -253,10 +253,12 @@ def _plane(model: mujoco.MjModel, shape: Shape, texture: int | None) -> trimesh.
         return _coloured(mesh, shape)
     material = int(model.geom_matid[shape.object_id])
     repeat = model.mat_texrepeat[material].astype(float)
-    # Its texture repeats so often over the plane, or over each unit of length.
+    # Half of it is as long as half of the plane, or as a unit of length. It begins at
+    # the upper left corner; that of an infinite plane in the middle.
     per_length = is_infinite | bool(model.mat_texuniform[material])
-    scale = np.where(per_length, half, 1.0) * repeat
-    uv = 0.5 * corners * scale - 0.5
+    length = np.where(per_length, 1.0, half)
+    begin = np.where(is_infinite, 0.0, half * [-1, 1])
+    uv = 0.5 * repeat * (vertices[:, :2] - begin) * [1, -1] / length
     return _textured(mesh, uv, _image(model, texture), shape)
 
 

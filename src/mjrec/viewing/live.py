@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import html
 import json
 import os
 import secrets
@@ -180,10 +181,15 @@ class _Answers:
 
     def _page(self, asked: dict[str, str]) -> tuple[str, str]:
         paths = recorded_episodes(self._directory)
-        if not paths:
-            return "text/html", _WAITING
-        path = self._path(asked["episode"]) if "episode" in asked else paths[-1]
-        trajectory, stage = self._load(path)
+        path = self._path(asked["episode"]) if "episode" in asked else None
+        try:
+            if not paths:
+                raise InvalidArgument("No episode is recorded yet.")
+            path = path or paths[-1]
+            trajectory, stage = self._load(path)
+        except Error as error:
+            # An episode that has just begun has no state yet.
+            return "text/html", _WAITING.format(html.escape(str(error)))
         motion = stage.motion(trajectory, np.arange(1))
         live = {
             "live": True,
@@ -257,6 +263,6 @@ def _number(value: float) -> float | None:
 _WAITING = (
     '<!doctype html><html lang="en"><head><meta charset="utf-8">'
     '<meta http-equiv="refresh" content="2"><title>mjrec view</title></head><body>'
-    "<p>No episode is recorded yet. This page looks again every two seconds.</p>"
+    "<p>{} This page looks again every two seconds.</p>"
     "</body></html>"
 )

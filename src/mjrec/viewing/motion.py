@@ -280,9 +280,11 @@ class Stage:
         self, trajectory: Trajectory, step: int, index: int
     ) -> Iterator[tuple[int, str, list[float]]]:
         self._enter(trajectory, step)
-        for geom in self._drawn():
-            name = _name(geom)
-            if name in self._rgba and self._rgba[name] != (rgba := _rgba(geom)):
+        drawn = {_name(geom): _rgba(geom) for geom in self._drawn()}
+        for name, before in self._rgba.items():
+            # What is wholly transparent is not drawn.
+            rgba = drawn.get(name, (*before[:3], 0.0))
+            if rgba != before:
                 self._rgba[name] = rgba
                 yield index, name, list(rgba)
 

@@ -96,7 +96,10 @@ def write_replay(
 
 
 def shown_steps(trajectory: Trajectory, max_fps: float | None) -> NDArray[np.int64]:
-    """Return which states are shown: each n-th, and the last."""
+    """Return which states are shown: each n-th, and the last.
+
+    One that holds NaN is not: the environment had gone on, or the simulation diverged.
+    """
     count, time = len(trajectory.states), trajectory.time
     stride = 1
     if max_fps is not None and time is not None and count > 1:
@@ -104,8 +107,9 @@ def shown_steps(trajectory: Trajectory, max_fps: float | None) -> NDArray[np.int
         if timestep > 0:
             stride = stride_for(rate_from_timestep(timestep), max_fps)
     steps = np.arange(0, count, stride)
-    is_last_shown = len(steps) and steps[-1] == count - 1
-    return steps if is_last_shown else np.append(steps, count - 1)
+    if count and steps[-1] != count - 1:
+        steps = np.append(steps, count - 1)
+    return steps[np.isfinite(trajectory.states[steps]).all(axis=1)]
 
 
 def replay_page(
