@@ -38,7 +38,7 @@ class Settings:
     Attributes:
         rounds: of all variants.
         frames: of each variant in a round.
-        size: height and width of the pictures.
+        size: height and width of the frames.
     """
 
     rounds: int = 5
@@ -75,16 +75,16 @@ def measure(settings: Settings, say: Say) -> list[Result]:
 def write_video(
     frames: int, height: int, width: int, options: dict[str, Any]
 ) -> dict[str, float]:
-    """Write pictures to a file; return how fast that was and what came of it."""
-    pictures = moving_gradients(frames, height, width)
+    """Write frames to a file; return how fast that was and what came of it."""
+    gradients = moving_gradients(frames, height, width)
     with tempfile.TemporaryDirectory() as directory:
         # The first close of a process also reads the whole ffmpeg binary for its hash.
-        _write(pictures[:2], Path(directory) / "first.mkv", options)
-        return _write(pictures, Path(directory) / "second.mkv", options)
+        _write(gradients[:2], Path(directory) / "first.mkv", options)
+        return _write(gradients, Path(directory) / "second.mkv", options)
 
 
 def moving_gradients(count: int, height: int, width: int) -> Frame:
-    """Return pictures that move, with the noise that textures have."""
+    """Return frames that move, with the noise that textures have."""
     y, x = np.mgrid[0:height, 0:width]
     base = np.stack([x, y, (x + y) // 2], axis=-1) % 256
     noise = np.random.default_rng(0).integers(0, 8, base.shape)

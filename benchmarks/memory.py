@@ -31,7 +31,7 @@ class Settings:
         rounds: of all variants.
         short: the frames of the shorter episode.
         long: those of the longer one.
-        size: height and width of the pictures.
+        size: height and width of the frames.
         drawn_size: of those that workers draw. What they draw is not in the process
             that is measured, so it need not be large.
         recorders: who is measured, the bare environment among them; RecordVideo with

@@ -31,7 +31,7 @@ class Settings:
         environments: whose states are drawn.
         rounds: of all variants.
         frames: of each variant in a round.
-        size: height and width of the pictures.
+        size: height and width of the frames.
     """
 
     environments: tuple[str, ...] = ("HalfCheetah-v5", "Humanoid-v5")
@@ -134,12 +134,12 @@ def _camera(facts: Mapping[str, Any]) -> Any:
     return camera
 
 
-def _timed(pictures: Iterable[object], start: float) -> dict[str, float]:
-    """Return pictures per second after the first, and seconds from `start` to that."""
-    pictures = iter(pictures)
-    next(pictures)
+def _timed(frames: Iterable[object], start: float) -> dict[str, float]:
+    """Return frames per second after the first, and seconds from `start` to that."""
+    frames = iter(frames)
+    next(frames)
     first = time.perf_counter()
-    count = sum(1 for _ in pictures)
+    count = sum(1 for _ in frames)
     end = time.perf_counter()
     return {"rate": count / (end - first), "first": first - start}
 

@@ -23,7 +23,7 @@ class Promise:
     is_least: bool
 
     def is_kept_by(self, value: float) -> bool:
-        """Tell whether a number is on the right side."""
+        """Return whether a number is on the right side."""
         return value >= self.bound if self.is_least else value <= self.bound
 
     def __str__(self) -> str:

@@ -44,7 +44,7 @@ def reset(env: Any, seed: int) -> None:
 
 
 def is_over(result: Any) -> bool:
-    """Tell whether what a step returned ends an episode."""
+    """Return whether what a step returned ends an episode."""
     return bool(result[2] or result[3] if len(result) == 5 else result.last())
 
 

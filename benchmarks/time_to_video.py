@@ -63,7 +63,7 @@ class Settings:
     Attributes:
         rounds: of all variants of a case.
         steps: the lengths of the episodes.
-        size: height and width of the pictures.
+        size: height and width of the frames.
         workers: mjrec's processes that draw.
         cases: what is measured.
     """

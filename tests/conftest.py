@@ -58,7 +58,7 @@ def default_signals():
 
 
 def pytest_report_header():
-    """Say what the pictures come from."""
+    """Say what the frames come from."""
     return [f"MUJOCO_GL={os.environ['MUJOCO_GL']}", f"dm_control: {_HAS_DM_CONTROL}"]
 
 
@@ -135,7 +135,7 @@ def pendulums(tmp_path_factory):
 
 @pytest.fixture
 def corridor():
-    """An environment of three steps that draws 48x32 pictures."""
+    """An environment of three steps that draws 48x32 frames."""
     return Corridor()
 
 

@@ -40,7 +40,7 @@ def values(run):
 
 def wait_for(path, run):
     """Return the number of the process that has begun a job, which notes it there."""
-    for _ in run.results(patience_s=0.02):
+    for _ in run.results(timeout_s=0.02):
         if path.exists() and path.read_text():
             break
     return int(path.read_text().split()[-1])

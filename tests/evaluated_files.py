@@ -46,5 +46,5 @@ def datasets_in(path):
 
 
 def hashes_of(video):
-    """Return the hashes of a video's pictures, as its file has them."""
+    """Return the hashes of a video's frames, as its file has them."""
     return video.with_suffix(".framehash").read_text()

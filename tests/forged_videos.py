@@ -32,7 +32,7 @@ def say(path: Path, **changes: Any) -> None:
 
 
 def drawn(directory: Path, episode: int = 0) -> list[Any]:
-    """Return the pictures of an episode, drawn again."""
+    """Return the frames of an episode, drawn again."""
     [path] = directory.glob(f"*.episode{episode:06d}.h5")
     return list(mjrec.render(path))
 

@@ -90,7 +90,7 @@ def _bytes(value: Any) -> bytes:
 
 
 def _inside_png(where: str, content: bytes) -> Iterator[tuple[str, bytes]]:
-    """Yield the texts in a picture that are compressed."""
+    """Yield the texts in a frame that are compressed."""
     start = len(_PNG)
     while start < len(content):
         end = start + 12 + int.from_bytes(content[start : start + 4])

@@ -25,7 +25,7 @@ from mjrec.json_text import dumps
 def record_pendulum(
     directory: Path, episodes: int = 3, *, longest: int = 8, **options: Any
 ) -> None:
-    """Record short episodes with small pictures."""
+    """Record short episodes with small frames."""
     env = gymnasium.make(
         "InvertedPendulum-v5",
         render_mode="rgb_array",

@@ -7,7 +7,7 @@ import mjrec
 
 
 def is_fast(monitor):
-    """Tell whether the coming step may be recorded the fast way."""
+    """Return whether the coming step may be recorded the fast way."""
     return monitor._recorder.fast is not None
 
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A recorded episode that is small and has what makes pictures hard to draw again.
+"""A recorded episode that is small and has what makes frames hard to draw again.
 
-A camera rides over an infinite plane, which is drawn around the camera of the picture
+A camera rides over an infinite plane, which is drawn around the camera of the frame
 before; on the way the terrain, a texture and a colour change.
 """
 
@@ -50,7 +50,7 @@ PLAIN = """
 
 
 class Ride(NamedTuple):
-    """A recorded episode, and the pictures that were seen of it."""
+    """A recorded episode, and the frames that were seen of it."""
 
     path: Path
     frames: list[Any]
@@ -63,13 +63,13 @@ def start(xml=PLAIN):
 
 
 def move(model, data, number):
-    """Go on to a picture's place, unevenly."""
+    """Go on to a frame's place, unevenly."""
     data.qpos[0] = 3.1 * number + 2 * (number % 3)
     mujoco.mj_forward(model, data)
 
 
 def change(model, number):
-    """Change the model before a picture; return the names of what has changed."""
+    """Change the model before a frame; return the names of what has changed."""
     if number == 3:
         model.hfield_data[20:40] = 1
         return ["hfield_data"]
@@ -83,7 +83,7 @@ def change(model, number):
 
 
 def record(directory, *, camera="rider", fresh=False, facts=None):
-    """Record a ride as a log, with the pictures that a viewer had shown."""
+    """Record a ride as a log, with the frames that a viewer had shown."""
     model, data = start()
     option = mujoco.MjvOption()
     option.flags[mujoco.mjtVisFlag.mjVIS_INERTIA] = True
@@ -128,7 +128,7 @@ def record(directory, *, camera="rider", fresh=False, facts=None):
         for number in range(FRAMES):
             names = change(model, number)
             move(model, data, number)
-            # Pictures are of every second step.
+            # Frames are of every second step.
             for step in sorted({max(2 * number - 1, 0), 2 * number}):
                 add_row(span, step)
             if names:

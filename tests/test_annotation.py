@@ -34,13 +34,13 @@ def test_letters_stand_out(size, brightness):
     [{"episode_id": 28}, {"step": 121}, {"time": 2.45}, {"time": None}, {"reward": 1}],
 )
 def test_everything_is_said(other):
-    """Whatever of a caption is other, the picture is another one."""
+    """Whatever of a caption is other, the frame is another one."""
     frame = plain(240, 320)
     before = annotated(frame, CAPTION)
     assert (annotated(frame, replace(CAPTION, **other)) != before).any()
 
 
-def test_the_same_caption_gives_the_same_picture():
+def test_the_same_caption_gives_the_same_frame():
     """Also in another process."""
     program = (
         "import sys, numpy\n"

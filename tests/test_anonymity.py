@@ -49,10 +49,10 @@ from mjrec.evidence.statements import state
 from mjrec.formats.manifest import read_manifest
 for directory in map(pathlib.Path, sys.argv[1:]):
     manifests = map(read_manifest, directory.glob("*.manifest.json"))
-    surroundings = [manifest.mjrec["surroundings"] for manifest in manifests]
+    provenance = [manifest.mjrec["provenance"] for manifest in manifests]
     authors = ["Margherita Brunelli <m.brunelli@uni-pavia.example>"]
     stated = state(title=None, authors=authors, license=None)
-    identity = identity_of_user(surroundings, stated.authors)
+    identity = identity_of_user(provenance, stated.authors)
     make_anonymous(directory, identity=identity)
     for where, what in remaining_identity(directory, identity):
         print(where, what)
@@ -292,14 +292,14 @@ def test_placeholders_stand_for_what_was_there(anonymous: Path) -> None:
     assert kwargs["xml_file"] == "<path>/models/robot.xml"
     details = _read(next((anonymous / "pendulum").glob("*.manifest.json")))["mjrec"]
     assert "no key in <path>/wandb.key" in details["faults"][0]["reason"]
-    surroundings = details["surroundings"]
-    assert surroundings["command"] == [
+    provenance = details["provenance"]
+    assert provenance["command"] == [
         Path(sys.executable).name,
         "identity_recording.py",
         "runs",
     ]
-    assert surroundings["code"]["remote"] is None
-    assert surroundings["policy"]["file"] == "policy.pt"
+    assert provenance["code"]["remote"] is None
+    assert provenance["policy"]["file"] == "policy.pt"
 
 
 def test_the_model_compiles_to_the_same(recorded: Path, anonymous: Path) -> None:
@@ -310,7 +310,7 @@ def test_the_model_compiles_to_the_same(recorded: Path, anonymous: Path) -> None
         np.testing.assert_array_equal(getattr(old, name), getattr(new, name))
 
 
-def test_pictures_are_the_same(anonymous: Path) -> None:
+def test_frames_are_the_same(anonymous: Path) -> None:
     """What is rendered of the recording without its author has the recorded hashes."""
     [trajectory, _] = _trajectories(anonymous)
     [hashes] = (anonymous / "pendulum").glob("*.video000000.framehash")
@@ -366,14 +366,14 @@ def test_single_cards_are_not_named(tmp_path: Path) -> None:
     card = "GPU-8f1c2b0e-5d6a-4e3b-9c7d-112233445566"
     metadata = {
         "gl_device": {"index": 1, "file": "/dev/dri/renderD129", "uuid": card},
-        "surroundings": {"variables": {"CUDA_VISIBLE_DEVICES": f"{card},GPU-8f,2"}},
+        "provenance": {"variables": {"CUDA_VISIBLE_DEVICES": f"{card},GPU-8f,2"}},
     }
     path = tmp_path / "openaigym.video.0.1.video000000.meta.json"
     path.write_text(json.dumps(metadata))
     make_anonymous(tmp_path, identity=Identity())
     assert _read(path) == {
         "gl_device": {"index": 1},
-        "surroundings": {"variables": {"CUDA_VISIBLE_DEVICES": "<gpu>,<gpu>,2"}},
+        "provenance": {"variables": {"CUDA_VISIBLE_DEVICES": "<gpu>,<gpu>,2"}},
     }
 
 

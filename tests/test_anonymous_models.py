@@ -53,7 +53,7 @@ def test_licences_stay() -> None:
     assert _anonymous(b"<!-- (c) me@lab.example --><mujoco/>") == b"<mujoco/>"
 
 
-def test_pictures_lose_their_texts_and_no_pixel() -> None:
+def test_frames_lose_their_texts_and_no_pixel() -> None:
     """An editor writes its user's name into them."""
     file, texts = io.BytesIO(), PngImagePlugin.PngInfo()
     texts.add_text("Author", "mbrunelli", zip=True)

@@ -44,7 +44,7 @@ def test_each_model_is_read_here():
 
 
 def test_parts_are_what_the_script_writes():
-    """Pictures, mesh and skin can be made again from the committed script."""
+    """Frames, mesh and skin can be made again from the committed script."""
     spec = importlib.util.spec_from_file_location(
         "make_parts", ASSETS / "make_parts.py"
     )

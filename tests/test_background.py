@@ -89,7 +89,7 @@ def patched(tmp_path, monkeypatch, code):
 
 
 def is_finished(log):
-    """Tell whether it is there, and its rows are not."""
+    """Return whether it is there, and its rows are not."""
     return log.exists() and find_recording(log) is None
 
 
@@ -278,7 +278,7 @@ def test_one_that_hangs_is_ended(hangs, others, tmp_path, start, caplog, monkeyp
     pids = tmp_path / "pids"
     code = HANGING.format(pids=str(pids)) if hangs else SLOW
     patched(tmp_path, monkeypatch, code)
-    monkeypatch.setenv("MJREC_PATIENCE", "0.7")
+    monkeypatch.setenv("MJREC_TIMEOUT", "0.7")
     log = write_log(tmp_path, video=None)
     background = start(tmp_path, log)
     background.wait()

@@ -9,8 +9,8 @@ from mjrec.blank_frames import BlankFrames
 SIZE = (40, 56)
 
 
-def picture(value=0, *, pixel=None):
-    """Return a plain picture, with one pixel of another brightness if given."""
+def frame(value=0, *, pixel=None):
+    """Return a plain frame, with one pixel of another brightness if given."""
     frame = np.full((*SIZE, 3), value, np.uint8)
     if pixel is not None:
         # None that a coarse look would see.
@@ -33,16 +33,16 @@ CONSTANT = {"suspect_constant": True}
     ("frames", "facts"),
     [
         ([], {}),
-        ([picture()], BLACK),
-        ([picture(), picture()], BLACK),
-        ([picture(pixel=3), picture(4)], {"suspect_black": True}),
-        ([picture(90)], CONSTANT),
-        ([picture(90), picture(30)], CONSTANT),
-        ([picture(90), picture(90, pixel=91)], {}),
-        ([picture(90, pixel=0)], {}),
-        ([picture(90, pixel=0)] * 3, CONSTANT),
-        ([picture(90, pixel=0)] * 2 + [picture(90, pixel=1)], {}),
-        ([picture()] * 9 + [picture(pixel=255)], {}),
+        ([frame()], BLACK),
+        ([frame(), frame()], BLACK),
+        ([frame(pixel=3), frame(4)], {"suspect_black": True}),
+        ([frame(90)], CONSTANT),
+        ([frame(90), frame(30)], CONSTANT),
+        ([frame(90), frame(90, pixel=91)], {}),
+        ([frame(90, pixel=0)], {}),
+        ([frame(90, pixel=0)] * 3, CONSTANT),
+        ([frame(90, pixel=0)] * 2 + [frame(90, pixel=1)], {}),
+        ([frame()] * 9 + [frame(pixel=255)], {}),
     ],
 )
 def test_what_is_suspect(frames, facts):

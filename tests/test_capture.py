@@ -250,7 +250,7 @@ def test_an_infinite_plane_remembers_the_camera_before(simulation):
     simulation.camera.fixedcamid = 0
     assert simulation.begin_scene()["previous_cameras"] is None
     check_scenes_that_stay(simulation, 3)
-    simulation.states.forget_pictures()
+    simulation.states.forget_frames()
     assert simulation.begin_scene()["previous_cameras"] is None
 
 

@@ -76,7 +76,7 @@ def test_what_is_not_rendered_is_listed_with_its_reason(tmp_path, mjrec, painter
     assert "1 video rendered" in out
     assert "1 video left to another process" in out
     assert "3 videos could not be rendered:" in out
-    assert "nothing that pictures can be made of" in out
+    assert "nothing that frames can be made of" in out
     lock.release()
     status, out, _ = mjrec(tmp_path, "--json")
     assert status == 1

@@ -367,7 +367,7 @@ def test_some_frames_are_drawn_and_compared(packed: Path, given: Path) -> None:
 
 
 def test_an_undrawn_run_has_the_same_videos_to_draw(packed: Path, given: Path) -> None:
-    """Below the level of pictures a pending video stands for one that is there."""
+    """Below the level of frames a pending video stands for one that is there."""
     made = given
 
     def undraw(manifest: Any) -> None:

@@ -54,7 +54,7 @@ def seen(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
         place=folders["place"],
         readable=[folders["readable"]],
     ) as sandbox:
-        said = next(sandbox.said(60))
+        said = next(sandbox.answers(60))
         assert said is not None, sandbox.last_words()
         return {**said, "own": str(folders["place"])}
 
@@ -72,7 +72,7 @@ def test_a_confined_process_sees_what_it_is_given(seen: dict[str, Any]) -> None:
 
 
 def has_landlock() -> bool:
-    """Tell whether this kernel has it."""
+    """Return whether this kernel has it."""
     path = Path("/sys/kernel/security/lsm")
     return not path.exists() or "landlock" in path.read_text()
 

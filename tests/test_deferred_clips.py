@@ -39,7 +39,7 @@ class Blinking(gymnasium.Wrapper):
 
 
 def hopper(length=5, **made):
-    """Return a hopper whose episodes are short, and small pictures of it."""
+    """Return a hopper whose episodes are short, and small frames of it."""
     # So wide that a caption has room.
     size = {"width": 256, "height": 48}
     return Blinking(
@@ -91,7 +91,7 @@ def parts(directory):
 
 
 def hashes(directory):
-    """Return the hashes of the pictures of each video, by the end of its name."""
+    """Return the hashes of the frames of each video, by the end of its name."""
     return {
         path.name.partition(".video")[2].split(".video")[-1]: hashes_at(path)
         for path in sorted(directory.glob("*.framehash"))
@@ -131,7 +131,7 @@ def check_same(live, deferred):
 
 # Takes more than five seconds: the same run live and deferred.
 @parametrize("options", [{"annotate": True, "max_fps": 50}, {}])
-def test_pictures_are_those_that_were_drawn_live(options, tmp_path):
+def test_frames_are_those_that_were_drawn_live(options, tmp_path):
     """Byte for byte, across resets and from the midst of an episode."""
     clips = {"step_trigger": lambda step: step in (2, 20), "video_length": 13}
     for render in ("live", "deferred"):

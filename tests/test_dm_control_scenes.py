@@ -55,7 +55,7 @@ def test_shown_as_by_physics(tmp_path):
 
 
 def test_what_physics_cannot_draw_is_shown_as_it_is_live(tmp_path):
-    """Larger pictures than its buffer, and cameras of one's own."""
+    """Larger frames than its buffer, and cameras of one's own."""
     camera = mujoco.MjvCamera()
     for asked in ({"width": 4000}, {"camera": camera}):
         scene = begun(load(), tmp_path, **asked)
@@ -154,7 +154,7 @@ def test_terrain_is_made_without_gl():
     assert run.stdout.splitlines() == 2 * each
 
 
-def test_a_reset_that_draws_gets_its_pictures():
+def test_a_reset_that_draws_gets_its_frames():
     """Pixel observations are the same, and the contexts are real ones by then."""
     seen = []
     for recorded in (False, True):
@@ -188,7 +188,7 @@ def test_an_error_in_a_reset_leaves_the_physics_as_it_was():
 
 
 def test_contexts_that_are_there_are_left_alone():
-    """The user's own pictures need the terrain too."""
+    """The user's own frames need the terrain too."""
     env = load()
     env.physics.render(8, 8)
     own = env.physics._contexts

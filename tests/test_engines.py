@@ -119,7 +119,7 @@ def test_jobs_run_beside_each_other(begin, tmp_path):
     os.mkfifo(tmp_path / "pipe")
     with begin(2) as run:
         submit(run, "a", do="meet", pipe=str(tmp_path / "pipe"), mode="rb")
-        assert next(run.results(patience_s=1e-6)) is None
+        assert next(run.results(timeout_s=1e-6)) is None
         submit(run, "b", do="meet", pipe=str(tmp_path / "pipe"), mode="wb")
         assert len({value["pid"] for value in values(run)}) == 2
 
@@ -222,7 +222,7 @@ def test_children_that_cannot_begin_do_not_end_one_at_work(begin, tmp_path):
         submit(run, "a", do="hold", begun=begun, go=go)
         wait_for(tmp_path / "begun", run)
         submit(run, *"bcdefg", do="echo")
-        for _ in run.results(patience_s=0.02):
+        for _ in run.results(timeout_s=0.02):
             if len(list(tmp_path.glob("died-*"))) >= 6:
                 break
         (tmp_path / "go").touch()

@@ -43,7 +43,7 @@ def named(request, tmp_path, monkeypatch):
         pytest.importorskip("dm_control")
     monkeypatch.chdir(tmp_path)
     (tmp_path / "ball.xml").write_text(BALL)
-    return environment_from_name(request.param, EnvironmentOptions(pictures=False))
+    return environment_from_name(request.param, EnvironmentOptions(frames=False))
 
 
 def trajectory(named, seeds, *, steps=10):
@@ -70,7 +70,7 @@ def test_an_episode_depends_on_its_seeds_alone(named):
 
 def test_the_environments_seed_and_the_actions_seed_differ():
     """Each stream changes what it is for, and nothing else."""
-    named = environment_from_name("HalfCheetah-v5", EnvironmentOptions(pictures=False))
+    named = environment_from_name("HalfCheetah-v5", EnvironmentOptions(frames=False))
     seeds = EpisodeSeeds(environment=1, actions=2, policy=3)
     same_start = EpisodeSeeds(environment=1, actions=4, policy=3)
     begun = [named.begin_episode(named.environment, s) for s in (seeds, same_start)]
@@ -85,7 +85,7 @@ def test_the_environments_seed_and_the_actions_seed_differ():
 
 def test_a_stream_is_seeded_once():
     """As Gymnasium's users do: `reset(seed=...)`, then `reset()` and `reset()`."""
-    options = EnvironmentOptions(pictures=False)
+    options = EnvironmentOptions(frames=False)
     named = environment_from_name("InvertedPendulum-v5", options)
     theirs = gymnasium.make("InvertedPendulum-v5")
     expected = [theirs.reset(seed=4)[0], theirs.reset()[0]]
@@ -139,7 +139,7 @@ def test_a_file_is_named_by_its_path(tmp_path):
 
 def test_without_a_version_the_latest_is_meant():
     """As for gymnasium.make, without its warning."""
-    assert make("HalfCheetah", pictures=False).spec.id == "HalfCheetah-v5"
+    assert make("HalfCheetah", frames=False).spec.id == "HalfCheetah-v5"
 
 
 def test_a_module_that_registers_lies_in_the_working_directory(
@@ -230,7 +230,7 @@ def test_limits_of_other_environments(registered, env_id, asked, expected):
 @pytest.mark.parametrize(("own", "expected"), [(6, 6), (-1, 1000)])
 def test_gymnasiums_own_word_for_the_limit(own, expected):
     """`max_episode_steps` replaces the registered limit, and -1 is none."""
-    env = make("HalfCheetah-v5", pictures=False, kwargs={"max_episode_steps": own})
+    env = make("HalfCheetah-v5", frames=False, kwargs={"max_episode_steps": own})
     assert env.spec.max_episode_steps == expected
 
 
@@ -243,7 +243,7 @@ def test_the_render_mode_is_one_that_the_environment_has(registered, env_id, mod
 
 
 def test_text_that_is_asked_for_is_drawn():
-    """Though the environment has pictures, too."""
+    """Though the environment has frames, too."""
     env = make("FrozenLake-v1", kwargs={"render_mode": "ansi"})
     env.reset(seed=0)
     assert "FHFH" in str(env.render())
@@ -253,21 +253,21 @@ def test_text_that_is_asked_for_is_drawn():
 
 
 @pytest.mark.parametrize(("camera", "is_seen"), [(None, True), (-1, False)])
-def test_pictures_follow_the_robot_unless_asked_otherwise(camera, is_seen):
+def test_frames_follow_the_robot_unless_asked_otherwise(camera, is_seen):
     """Gymnasium 1.4's default camera stays where it is; -1 asks for that one."""
     env = make("HalfCheetah-v5", camera=camera, height=48, width=64)
     env.reset(seed=0)
-    # Where Gymnasium's free camera looks is settled at the first picture.
+    # Where Gymnasium's free camera looks is settled at the first frame.
     env.render()
     simulated = env.unwrapped
     # Thirty metres from where it began.
     simulated.data.qpos[0] = 30
     simulated.set_state(simulated.data.qpos, simulated.data.qvel)
-    picture = np.asarray(env.render()).astype(int)
+    frame = np.asarray(env.render()).astype(int)
     env.close()
-    assert picture.shape == (48, 64, 3)
+    assert frame.shape == (48, 64, 3)
     # The robot's colour; the ground is green and the sky is grey.
-    red, green, blue = (picture[..., channel] for channel in range(3))
+    red, green, blue = (frame[..., channel] for channel in range(3))
     assert (((red - blue > 60) & (red > green)).sum() > 15) == is_seen
 
 
@@ -338,9 +338,9 @@ WRONG = [
 
 def begin(name, **options):
     named = environment_from_name(name, EnvironmentOptions(**options))
-    # Some are made all the same, without pictures.
-    if named.no_pictures is not None:
-        raise named.no_pictures
+    # Some are made all the same, without frames.
+    if named.not_drawn is not None:
+        raise named.not_drawn
 
 
 @pytest.mark.parametrize(("name", "options", "kind", "words"), WRONG)

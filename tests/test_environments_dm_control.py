@@ -23,7 +23,7 @@ def test_a_task_is_made_with_its_own_limit():
     """All but lqr have one; max_steps lowers it; lqr gets 1000."""
 
     def limit(name, **options):
-        made = EnvironmentOptions(pictures=False, **options)
+        made = EnvironmentOptions(frames=False, **options)
         return environment_from_name(f"dm_control/{name}", made).step_limit
 
     assert limit("pendulum-swingup") == limit("lqr-lqr_2_1") == 1000
@@ -104,7 +104,7 @@ def test_the_view_follows_the_robot(name, camera):
 
 
 def test_a_camera_that_is_asked_for_is_checked():
-    """Before any episode begins; without pictures there is no view."""
+    """Before any episode begins; without frames there is no view."""
     named = environment_from_name(
         "dm_control/cheetah-run", EnvironmentOptions(camera="back")
     )
@@ -114,7 +114,7 @@ def test_a_camera_that_is_asked_for_is_checked():
             "dm_control/cheetah-run", EnvironmentOptions(camera="nose")
         )
     named = environment_from_name(
-        "dm_control/cheetah-run", EnvironmentOptions(pictures=False)
+        "dm_control/cheetah-run", EnvironmentOptions(frames=False)
     )
     assert named.view == {}
 
@@ -183,7 +183,7 @@ def test_a_stream_is_what_the_suites_users_have(task):
     """Seeded once when it is loaded, then reset and reset, as `suite.load` is used."""
     domain, _, name = task.partition("-")
     theirs = suite.load(domain, name, task_kwargs={"random": 7})
-    options = EnvironmentOptions(seed=7, pictures=False)
+    options = EnvironmentOptions(seed=7, frames=False)
     named = environment_from_name(f"dm_control/{task}", options)
     ours = named.environment
     for episode in range(3):
@@ -197,7 +197,7 @@ def test_a_stream_is_what_the_suites_users_have(task):
 
 def test_a_stream_of_another_seed_is_begun_anew():
     """What the environment was made with does not matter then, nor what it drew."""
-    options = EnvironmentOptions(seed=7, pictures=False)
+    options = EnvironmentOptions(seed=7, frames=False)
     name = "dm_control/pendulum-swingup"
     fresh, used = (environment_from_name(name, options) for _ in range(2))
     used.environment.reset()

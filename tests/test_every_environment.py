@@ -44,7 +44,7 @@ def record(name, directory, *, steps=3):
     return metadata
 
 
-def check_pictures(directory):
+def check_frames(directory):
     """Frames have content: neither black nor of one colour."""
     [path] = directory.glob("*.mp4")
     with av.open(str(path)) as container:
@@ -63,7 +63,7 @@ def test_all_of_gymnasiums_are_known():
 def test_gymnasium(env_id, tmp_path):
     """Recorded in real time, with something to see."""
     metadata = record(env_id, tmp_path)
-    check_pictures(tmp_path)
+    check_frames(tmp_path)
     env = gymnasium.make(env_id)
     assert Fraction(metadata["timestep"]) == Fraction(
         env.unwrapped.dt
@@ -84,7 +84,7 @@ def test_dm_control(name, tmp_path):
     from dm_control import suite
 
     metadata = record(name, tmp_path)
-    check_pictures(tmp_path)
+    check_frames(tmp_path)
     env = suite.load(*name.removeprefix("dm_control/").split("-"))
     assert Fraction(metadata["timestep"]) == Fraction(
         env.control_timestep()

@@ -72,7 +72,7 @@ def test_a_program_that_cannot_be_started_is_told_from_one_that_failed(
 @pytest.fixture
 def impatient(monkeypatch):
     """Let what makes no progress hang after a moment."""
-    monkeypatch.setenv("MJREC_PATIENCE", "0.3")
+    monkeypatch.setenv("MJREC_TIMEOUT", "0.3")
 
 
 def hang_at(tmp_path, monkeypatch, text):
@@ -118,7 +118,7 @@ def test_a_slow_process_does_not_hang(tmp_path, monkeypatch):
 
 
 def still_runs(*command):
-    """Tell whether it does so for another ten seconds, on a busy machine."""
+    """Return whether it does so for another ten seconds, on a busy machine."""
     wanted = "\0".join([*command, ""]).encode()
     end = time.monotonic() + 10
     while time.monotonic() < end:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Film strips show the right pictures with the right times."""
+"""Film strips show the right frames with the right times."""
 
 import json
 
@@ -49,7 +49,7 @@ def video(recorded):
 
 
 def cells(strip, rows, columns, size):
-    """Cut a strip's pictures out, by its margins of white."""
+    """Cut a strip's frames out, by its margins of white."""
     height, width = size
     gap = max(2, round(0.03 * min(size)))
     row_height = (strip.shape[0] - gap) // rows
@@ -65,7 +65,7 @@ def cells(strip, rows, columns, size):
 
 @pytest.fixture
 def labels(monkeypatch):
-    """What is written under the pictures."""
+    """What is written under the frames."""
     written = []
     labels_of = module._labels
 
@@ -79,28 +79,28 @@ def labels(monkeypatch):
 
 
 @pytest.mark.thorough
-def test_pictures_of_a_trajectory_are_those_rendered(trajectory, labels):
+def test_frames_of_a_trajectory_are_those_rendered(trajectory, labels):
     """Evenly spread, byte for byte, from any camera and of any size."""
     strip = film_strip(trajectory, frames=3)
     rendered = list(mjrec.render(trajectory))
     shown = cells(strip, 1, 3, (HEIGHT, WIDTH))
-    for picture, index in zip(shown, (0, 5, 10), strict=True):
-        np.testing.assert_array_equal(picture, rendered[index])
+    for frame, index in zip(shown, (0, 5, 10), strict=True):
+        np.testing.assert_array_equal(frame, rendered[index])
     assert labels == ["0.00 s", "0.25 s", "0.50 s"]
     other = {"height": 96, "width": 128, "camera": "track", "quality": "draft"}
     first, _ = cells(film_strip(trajectory, frames=2, **other), 1, 2, (96, 128))
     np.testing.assert_array_equal(first, next(mjrec.render(trajectory, **other)))
 
 
-def test_pictures_of_a_video_are_those_decoded(video, labels):
+def test_frames_of_a_video_are_those_decoded(video, labels):
     """Without the row that made its height even, and with simulated times."""
     strip = film_strip(video, frames=6, columns=3)
     decoded = frames_of(video)
     shown = cells(strip, 2, 3, (HEIGHT, WIDTH))
-    for picture, index in zip(shown, (0, 2, 4, 6, 8, 10), strict=True):
-        difference = picture.astype(int) - decoded[index][:HEIGHT]
+    for frame, index in zip(shown, (0, 2, 4, 6, 8, 10), strict=True):
+        difference = frame.astype(int) - decoded[index][:HEIGHT]
         assert np.abs(difference).max() <= 2
-    # What is no picture is white paper; letters stand in between.
+    # What is no frame is white paper; letters stand in between.
     assert (strip[:2] == 255).all()
     assert (strip[:, :2] == 255).all()
     assert strip[2 + HEIGHT : strip.shape[0] // 2, :, 0].min() < 64
@@ -121,7 +121,7 @@ def test_pictures_of_a_video_are_those_decoded(video, labels):
 def test_without_metadata_that_fit_a_video_has_its_own_times(
     video, tmp_path, text, labels
 ):
-    """They may be anybody's, and claim any number of pictures."""
+    """They may be anybody's, and claim any number of frames."""
     copy = tmp_path / "copy.mp4"
     copy.write_bytes(video.read_bytes())
     if text is not None:
@@ -172,7 +172,7 @@ def test_other_files(video, tmp_path):
 
 
 @pytest.mark.parametrize("ending", [".mp4", ".avi", ".mkv"])
-def test_each_picture_is_the_right_one(tmp_path, ending):
+def test_each_frame_is_the_right_one(tmp_path, ending):
     """Of each kind of video, at a rate whose times are no round numbers."""
     path = tmp_path / f"grey{ending}"
     with mjrec.VideoWriter(path, fps=30) as writer:
@@ -200,7 +200,7 @@ def test_a_strip_is_a_whole_png_for_print(video, tmp_path):
         np.testing.assert_array_equal(np.asarray(image), strip)
 
 
-def test_the_command_writes_a_picture_and_says_its_size(video, tmp_path, capsys):
+def test_the_command_writes_a_frame_and_says_its_size(video, tmp_path, capsys):
     """In as many columns as asked for; nothing where a video cannot show it."""
     out = tmp_path / "strip.png"
     with pytest.raises(InvalidArgument, match="trajectory"):

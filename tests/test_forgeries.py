@@ -899,12 +899,12 @@ FORGERIES = (
     Forgery("a return in the table", bag=edit_the_table, line="statistics.csv"),
     Forgery(
         "another graphics card in environment.json",
-        bag=edit_environment(pictures=[{"gl_renderer": "RTX 4090"}]),
+        bag=edit_environment(frames=[{"gl_renderer": "RTX 4090"}]),
         line="environment.json",
     ),
     Forgery(
         "another command in environment.json",
-        bag=edit_environment(surroundings={"command": ["honest.py"]}),
+        bag=edit_environment(provenance={"command": ["honest.py"]}),
         line="environment.json",
     ),
     Forgery(

@@ -32,7 +32,7 @@ def let_python_start_with(code, folder, monkeypatch):
 
 
 def test_egl_renders_and_says_with_what():
-    """A real picture, its speed, OpenGL's words and EGL's devices."""
+    """A real frame, its speed, OpenGL's words and EGL's devices."""
     answer = probe("egl", measure=True)
     assert answer.renders, f"{answer.cause}\n{answer.fix}\n{answer.output}"
     assert answer.gl_renderer
@@ -94,7 +94,7 @@ def test_variables_that_keep_a_backend_from_rendering(backend, variables, cause,
 
 
 def test_driver_that_draws_nothing():
-    """A context that can be made is not enough: the picture is looked at."""
+    """A context that can be made is not enough: the frame is looked at."""
     usual = probe("egl")
     if not usual.software:
         pytest.skip(f"only Mesa can be told to draw nothing, not {usual.gl_renderer}")
@@ -144,27 +144,27 @@ def test_software_on_a_machine_with_a_gpu_is_odd(tmp_path, monkeypatch):
     assert hardware.warning() == ""
 
 
-# --- What a picture must show -------------------------------------------------------
+# --- What a frame must show -------------------------------------------------------
 
 
 @pytest.mark.parametrize(
     ("spoil", "said"),
     [
-        (np.zeros_like, r"Every pixel of the picture is \(0, 0, 0\)"),
+        (np.zeros_like, r"Every pixel of the frame is \(0, 0, 0\)"),
         (lambda p: p[:, ::-1], "red on the left"),
         (lambda p: np.random.default_rng(0).integers(0, 255, p.shape), "on the left"),
     ],
     ids=["black", "mirrored", "noise"],
 )
-def test_a_bad_picture_is_found_out(spoil, said):
-    """A context that works and a picture that is wrong is a failure."""
-    picture = np.full((480, 480, 3), 60, np.uint8)
-    picture[250:350, 50:160] = (255, 0, 0)
-    picture[250:350, 320:430] = (0, 0, 255)
-    picture[125:210, 200:280] = (0, 255, 0)
-    gl_probe.check_picture(picture)
-    with pytest.raises(gl_probe.WrongPicture, match=said):
-        gl_probe.check_picture(spoil(picture))
+def test_a_bad_frame_is_found_out(spoil, said):
+    """A context that works and a frame that is wrong is a failure."""
+    frame = np.full((480, 480, 3), 60, np.uint8)
+    frame[250:350, 50:160] = (255, 0, 0)
+    frame[250:350, 320:430] = (0, 0, 255)
+    frame[125:210, 200:280] = (0, 255, 0)
+    gl_probe.check_frame(frame)
+    with pytest.raises(gl_probe.WrongFrame, match=said):
+        gl_probe.check_frame(spoil(frame))
 
 
 # --- Libraries that are not there ---------------------------------------------------

@@ -140,7 +140,7 @@ def test_gyms_questions_have_gyms_answers(corridor, tmp_path, play):
 
 
 def test_the_schedule_is_asked_once_for_each_number(corridor, tmp_path, play):
-    """A reset before any step keeps it and replaces the picture; truth counts."""
+    """A reset before any step keeps it and replaces the frame; truth counts."""
     asked = []
 
     def even(episode_id):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is known of Gymnasium environments: whose pictures follow from states."""
+"""What is known of Gymnasium environments: whose frames follow from states."""
 
 import functools
 import json
@@ -102,7 +102,7 @@ def test_a_patched_class_is_an_obstacle(monkeypatch):
 
 
 @pytest.mark.parametrize("mode", ["depth_array", "rgbd_tuple", "human"])
-def test_other_pictures_are_an_obstacle(mode):
+def test_other_frames_are_an_obstacle(mode):
     """Depths are not drawn from states, and a window is nothing to record."""
     env = HalfCheetahEnv(render_mode=mode)
     assert repr(mode) in str(gymnasium_scenes(env).obstacle)
@@ -158,7 +158,7 @@ def test_another_renderer_has_another_camera():
     env.reset(seed=1)
     scene = scene_of(env)
     view = scene()
-    scene.at_picture(lambda: None)
+    scene.at_frame(lambda: None)
     first = pose(view.camera)
     for _ in range(20):
         env.step(env.action_space.sample())
@@ -166,7 +166,7 @@ def test_another_renderer_has_another_camera():
     base.mujoco_renderer = MujocoRenderer(
         base.model, base.data, {"azimuth": 11.0}, 64, 48, visual_options={0: True}
     )
-    scene.at_picture(lambda: None)
+    scene.at_frame(lambda: None)
     assert view.camera.azimuth == 11
     assert view.camera.lookat.tolist() != first[3]
     assert view.option.flags[0] == 1
@@ -214,14 +214,14 @@ def test_camera_that_was_asked_for():
     view = scene()
     before = pose(view.camera)
     env.unwrapped.model.vis.global_.azimuth += 45
-    scene.at_picture(lambda: None)
+    scene.at_frame(lambda: None)
     assert pose(view.camera) != before
     camera = mujoco.MjvCamera()
     assert scene_of(env, camera=camera)().camera is camera
 
 
 def test_camera_and_size_are_checked_at_once():
-    """Not at the first picture."""
+    """Not at the first frame."""
     with pytest.raises(UnknownName, match="track"):
         gymnasium_scenes(make("HalfCheetah-v5"), camera="tracking")
     with pytest.raises(InvalidArgument, match="height"):
@@ -230,7 +230,7 @@ def test_camera_and_size_are_checked_at_once():
 
 @pytest.mark.parametrize("part", ["wrapper", "environment"])
 def test_an_environment_that_shows_another_is_drawn_live(part, tmp_path):
-    """Its pictures do not follow from its own states."""
+    """Its frames do not follow from its own states."""
     options = {"render_mode": "rgb_array", "width": 48, "height": 32}
     env, other = (gymnasium.make("HalfCheetah-v5", **options) for _ in range(2))
     other.reset()

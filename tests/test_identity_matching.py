@@ -146,6 +146,6 @@ def test_who_packs_is_known_from_the_system(
         {"code": {"root": "/\0", "remote": "::::"}, "variables": {"HOME": ["x"]}},
     ],
 )
-def test_surroundings_may_say_anything(hostile: dict[str, object]) -> None:
-    """What a file says of its surroundings raises nothing."""
+def test_provenance_may_say_anything(hostile: dict[str, object]) -> None:
+    """What a file says of its provenance raises nothing."""
     assert identity_of_user([hostile]).hosts

@@ -223,7 +223,7 @@ from mjrec.engines.local import LocalEngine
 begun = Path(sys.argv[1])
 run = Run(LocalEngine(1), Work(entry="odd_jobs:make"))
 run.submit("a", do="hold", begun=str(begun))
-for _ in run.results(patience_s=0.02):
+for _ in run.results(timeout_s=0.02):
     if begun.exists() and begun.read_text():
         break
 if sys.argv[2] == "killed":

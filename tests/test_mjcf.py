@@ -137,7 +137,7 @@ def test_what_is_no_control_is_refused(write, action):
 @pytest.mark.parametrize(("asked", "expected"), [(None, 1000), (7, 7)])
 def test_episodes_end_after_max_steps(write, asked, expected):
     """A model has no end of its own; its id in recordings is the file's name."""
-    env = make_mjcf(write(), EnvironmentOptions(max_steps=asked, pictures=False))
+    env = make_mjcf(write(), EnvironmentOptions(max_steps=asked, frames=False))
     env.reset()
     ends = [env.step(np.zeros(2))[2:4] for _ in range(expected)]
     assert ends == [(False, False)] * (expected - 1) + [(False, True)]
@@ -149,7 +149,7 @@ class Draws(MjcfEnvironment):
         return super().render()
 
 
-def test_pictures_follow_from_states(write):
+def test_frames_follow_from_states(write):
     """Wrapped or not, unless something overrides; cameras are checked at once."""
     path = write(cameras=FIXED)
     limited = gymnasium.wrappers.TimeLimit(MjcfEnvironment(path), 3)

@@ -343,14 +343,14 @@ def test_sources_show_what_the_environment_showed(
     directory, tmp_path, monkeypatch, make
 ):
     """With what was set by hand, and what composer has put together."""
-    env, picture, options = make()
+    env, frame, options = make()
     with mjrec.Monitor(env, directory, lambda _: True, workers=0, **options) as monitor:
         monitor.reset()
-        shown = [picture()]
+        shown = [frame()]
         for _ in range(2):
             space = getattr(env, "action_space", None) or env.action_spec()
             monitor.step(np.full(space.shape, 0.1))
-            shown.append(picture())
+            shown.append(frame())
         monitor.close(wait=False)
     become_another_user(monkeypatch, tmp_path)
     forbid_compiled_models(monkeypatch, directory)

@@ -163,7 +163,7 @@ def test_joining_looks_at_no_other_files(tmp_path):
     assert first_number(tmp_path, resume="join", env_id=ANOTHER) == 0
 
 
-def test_joining_leaves_dead_monitors_as_they_are(tmp_path, caplog):
+def test_joining_leaves_killed_monitors_as_they_are(tmp_path, caplog):
     """`resume=True` recovers them."""
     env_id = ENV_INFO["env_id"]
     dead = write_log(tmp_path, infix=Infix(0, "1"), ended=False, env_id=env_id)

@@ -276,15 +276,15 @@ def test_the_citation_is_valid(bag: Path) -> None:
 def test_the_environment_says_what_drew_and_encoded(
     recorded: Path, infix: str, bag: Path
 ) -> None:
-    """Beside what the recording says of its own surroundings."""
+    """Beside what the recording says of its own provenance."""
     content = json.loads((bag / "data/environment.json").read_text())
     said, metadata = content["recordings"][infix], metadata_of(recorded, 0)
     details = manifest_of(recorded)["mjrec"]
     assert said["env_id"] == "InvertedPendulum-v5"
     assert said["versions"] == details["versions"]
-    assert said["surroundings"] == details.get("surroundings")
-    [pictures], [encoder] = said["pictures"], said["encoders"]
-    assert pictures["gl_renderer"] == metadata["gl_renderer"]
+    assert said["provenance"] == details.get("provenance")
+    [frames], [encoder] = said["pictures"], said["encoders"]
+    assert frames["gl_renderer"] == metadata["gl_renderer"]
     assert encoder["ffmpeg_sha256"] == metadata["ffmpeg_sha256"]
     assert content["packed_with"]["mjrec"] == mjrec.__version__
 
@@ -473,7 +473,7 @@ def test_two_monitors_are_two_actions(recorded: Path, tmp_path: Path) -> None:
 
 
 def _record(directory: Path, episodes: int, size: tuple[int, int], **rest: Any) -> None:
-    """Record episodes of four steps with pictures of that height and width."""
+    """Record episodes of four steps with frames of that height and width."""
     env = gymnasium.make(
         "HalfCheetah-v5",
         render_mode="rgb_array",

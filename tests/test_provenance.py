@@ -33,9 +33,9 @@ def git(directory, *arguments):
     return done.stdout.strip()
 
 
-def surroundings_of(directory):
+def provenance_of(directory):
     [manifest] = directory.glob("*.manifest.json")
-    return json.loads(manifest.read_text())["mjrec"]["surroundings"]
+    return json.loads(manifest.read_text())["mjrec"]["provenance"]
 
 
 @pytest.fixture
@@ -53,7 +53,7 @@ def repository(tmp_path):
 def test_a_program_in_a_repository(repository):
     """Its command line, packages, variables, commit and policy are in the manifest."""
     subprocess.run([sys.executable, "train.py"], cwd=repository, check=True)
-    found = surroundings_of(repository / "out")
+    found = provenance_of(repository / "out")
     assert found["command"][1:] == ["train.py"]
     assert found["working_directory"] == str(repository)
     assert found["machine"] == dict(machine_fingerprint())

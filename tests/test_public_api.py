@@ -14,7 +14,7 @@ PACKAGE = Path(mjrec.__file__).parent
 ROWS = (
     {
         *("errors", "json_text", "rates", "frames", "schedules", "atomic_files"),
-        *("worker_thread", "gl", "machine", "blank_frames", "patience", "signals"),
+        *("worker_thread", "gl", "machine", "blank_frames", "timeouts", "signals"),
         *("annotation", "plain_text", "provenance"),
         *("child_python", "messages", "parent", "sandbox", "confined"),
     },

@@ -91,7 +91,7 @@ def test_a_node_that_dies_takes_no_job_with_it(cluster, work, tmp_path, caplog):
         for key in "abcd":
             said = {"begun": str(tmp_path / key), "go": str(tmp_path / "go")}
             submit(run, key, do="hold", **said)
-        for _ in run.results(patience_s=0.05):
+        for _ in run.results(timeout_s=0.05):
             if all(lines(tmp_path / key) for key in "abcd"):
                 break
         pids = [int(lines(tmp_path / key)[0]) for key in "abcd"]

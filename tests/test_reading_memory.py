@@ -33,7 +33,7 @@ def write_monitors(directory, said):
             stats=name,
             videos=(),
             env_info={"gym_version": "mjrec-1", "env_id": "Hopper-v5"},
-            mjrec={"surroundings": {"packages": said}},
+            mjrec={"provenance": {"packages": said}},
         )
         write_manifest(directory / manifest_name(infix), manifest)
     return directory

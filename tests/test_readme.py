@@ -85,14 +85,14 @@ def test_command_runs(line: str, checkout: Path) -> None:
 
 
 def test_readme_is_short() -> None:
-    """It is read in two minutes: at most 450 words, and one picture."""
+    """It is read in two minutes: at most 450 words, and one frame."""
     text = (ROOT / "README.md").read_text()
     assert len(text.split()) <= 450
     assert text.count("![") == 1
 
 
 def test_links_lead_somewhere() -> None:
-    """Pictures and pages of the README are there."""
+    """Frames and pages of the README are there."""
     targets = re.findall(r"\]\((?!https?:)([^)#]+)", (ROOT / "README.md").read_text())
     assert targets
     for target in targets:

@@ -187,10 +187,10 @@ def check_manifest(cut: Path) -> None:
     )
     details = manifest["mjrec"]
     assert details.pop("versions")["mjrec"] == mjrec.__version__
-    [provenance] = events_of(cut, "surroundings")
+    [provenance] = events_of(cut, "provenance")
     assert provenance["packages"]
     assert details == {
-        "surroundings": provenance,
+        "provenance": provenance,
         "format_version": 1,
         "schedule": {"name": "always", "recorded": [0, 1, 2]},
         "first_episode_id": 0,
@@ -457,7 +457,7 @@ def test_a_log_of_unknown_rows_stays_and_is_reported(tmp_path: Path) -> None:
 # --- others --------------------------------------------------------------------------
 
 
-def test_only_the_dead_monitors_files_are_touched(
+def test_only_the_killed_monitors_files_are_touched(
     cut: Path, corridor: Any, play: Callable[..., None]
 ) -> None:
     """A living one in the same directory goes on as if nothing had been."""

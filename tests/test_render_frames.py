@@ -134,7 +134,7 @@ def test_what_is_no_recording(tmp_path):
         (0, 1, []),
     ],
 )
-def test_pictures_are_chosen_by_rate(count, max_fps, chosen):
+def test_frames_are_chosen_by_rate(count, max_fps, chosen):
     """Every n-th of those that were recorded, and the last."""
     facts = {"rate": "20", "stride": 2}
     assert chosen_frames(count, facts, max_fps).indices == chosen
@@ -154,10 +154,10 @@ def test_states_are_drawn_as_mujoco_would(temporary):
     before = model.vis.global_.offwidth
 
     for workers in (1, 3):
-        pictures = mjrec.render_states(
+        frames = mjrec.render_states(
             model, states, SPEC, camera="rider", workers=workers, **SIZE
         )
-        assert np.array_equal(list(pictures), shown)
+        assert np.array_equal(list(frames), shown)
     assert model.vis.global_.offwidth == before
     assert list(temporary.iterdir()) == []
 
@@ -166,10 +166,10 @@ def test_states_are_drawn_as_mujoco_would(temporary):
 def test_states_that_are_left_early_leave_no_files(temporary):
     """Nor do they at interpreter exit."""
     model, _ = start()
-    pictures = mjrec.render_states(model, np.zeros((50, 3)), SPEC, **SIZE)
-    next(pictures)
+    frames = mjrec.render_states(model, np.zeros((50, 3)), SPEC, **SIZE)
+    next(frames)
     assert len(list(temporary.iterdir())) == 1
-    del pictures
+    del frames
     gc.collect()
     assert list(temporary.iterdir()) == []
 

@@ -118,7 +118,7 @@ def test_an_encoder_that_hangs_leaves_the_video_pending(
     instead, two, tmp_path, monkeypatch
 ):
     """Whether it takes nothing or does not end; the other video is rendered."""
-    monkeypatch.setenv("MJREC_PATIENCE", "2")
+    monkeypatch.setenv("MJREC_TIMEOUT", "2")
     use_encoder(tmp_path, monkeypatch, of="video000000", instead=instead)
     # More than a pipe takes.
     began = time.monotonic()

@@ -168,7 +168,7 @@ def test_a_camera_that_follows_does_not_depend_on_the_order(ride, one, three):
     np.testing.assert_array_equal(drawn, [frames[number] for number in order])
 
 
-def test_the_plane_depends_on_the_picture_before(ride, one, tmp_path):
+def test_the_plane_depends_on_the_frame_before(ride, one, tmp_path):
     """Or the tests above would show nothing of it; fresh scenes do not depend."""
     fresh = record(tmp_path, fresh=True)
     assert not np.array_equal(fresh.frames[4], ride.frames[4])
@@ -201,11 +201,11 @@ def be_impatient(monkeypatch):
         stacks = Child.stacks
 
         def prolong_and_ask(child):
-            pool._patience.seconds = 120
+            pool._timeout.seconds = 120
             return stacks(child)
 
         monkeypatch.setattr(Child, "stacks", prolong_and_ask)
-        pool._patience.seconds = 0.5
+        pool._timeout.seconds = 0.5
 
     return shorten
 
@@ -279,7 +279,7 @@ def test_forgotten_workers_end(ride):
     assert new == []
 
 
-def test_ctrl_c_while_a_picture_is_drawn(ride, one):
+def test_ctrl_c_while_a_frame_is_drawn(ride, one):
     """It reaches only the parent; another worker draws for the next call."""
     list(one.frames(ride.path, [0]))
     [pid] = pids(one)

@@ -148,7 +148,7 @@ def test_videos_play(usual):
 
 @parametrize("single_file", [False, True])
 def test_a_recordings_report_plays(page, tmp_path, make_corridor, play, single_file):
-    """From the monitor's files to the picture in the browser."""
+    """From the monitor's files to the frame in the browser."""
     directory = tmp_path / "recordings #1"
     with mjrec.Monitor(make_corridor(length=20), directory) as monitor:
         play(monitor, 3, seed=0)
@@ -161,7 +161,7 @@ def test_a_recordings_report_plays(page, tmp_path, make_corridor, play, single_f
     page.get_by_role("button", name="Play").first.click()
     player = page.locator("video").first
     page.wait_for_function("() => document.querySelector('video').currentTime > 0.1")
-    # The environment's own rate is 10, and the first picture is the reset's.
+    # The environment's own rate is 10, and the first frame is the reset's.
     assert player.evaluate("v => v.duration") == pytest.approx(2.1, abs=0.1)
     assert player.evaluate("v => v.poster") != ""
 
@@ -301,7 +301,7 @@ def test_a_phone_shows_which_episodes_failed(browser, tmp_path):
 
 
 @pytest.mark.thorough
-def test_paper_has_the_whole_summary_pictures_and_no_buttons(browser, videos):
+def test_paper_has_the_whole_summary_frames_and_no_buttons(browser, videos):
     """On A4 with margins of a centimetre."""
     known = {"success_known": 50, "success_rate": 0.5, "warnings": {"BADQACC": 12}}
     made = usual_report()
@@ -313,10 +313,10 @@ def test_paper_has_the_whole_summary_pictures_and_no_buttons(browser, videos):
         assert page.evaluate("document.scrollingElement.scrollWidth") <= 718
         expect(page.locator("#gallery-filter")).to_be_hidden()
         expect(page.locator("nav")).to_be_hidden()
-        picture = page.locator(".play").first
-        expect(picture).to_be_visible()
+        frame = page.locator(".play").first
+        expect(frame).to_be_visible()
         signs = "['::before', '::after'].map(p => getComputedStyle(e, p).display)"
-        assert picture.evaluate(f"e => {signs}") == ["none", "none"]
+        assert frame.evaluate(f"e => {signs}") == ["none", "none"]
 
 
 def test_what_a_stranger_wrote_stays_text(page, videos):

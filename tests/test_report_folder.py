@@ -119,7 +119,7 @@ def test_a_video_that_is_none_is_named_and_the_rest_is_there(recordings, tmp_pat
     assert "posters/0000-unknown-corridor.jpg" not in names(page.parent)
     assert "posters/0001-unknown-corridor.jpg" in names(page.parent)
     text = page.read_text()
-    assert "There is no picture of a video" in text
+    assert "There is no frame of a video" in text
     assert "not the file that its metadata describe" in text
     assert sha256(first) in text
     second.write_text("<html><script>alert(1)</script></html>")

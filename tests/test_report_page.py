@@ -143,7 +143,7 @@ def test_a_card_says_what_a_video_shows():
 
 
 def test_a_video_that_is_no_part_of_the_report_has_no_player():
-    """But its picture, its notes, and the command that renders it."""
+    """But its frame, its notes, and the command that renders it."""
     page = page_of(with_videos(video(file="", notes=["It is too large."])))
     elements = Elements(page)
     assert elements.players() == []

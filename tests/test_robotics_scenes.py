@@ -9,8 +9,8 @@ from robots import robots_that_reset
 
 from mjrec.environments.gymnasium_scenes import (
     drawn_part,
+    frame_moment,
     gymnasium_scenes,
-    picture_moment,
 )
 
 pytest.importorskip("gymnasium_robotics")
@@ -74,7 +74,7 @@ def test_goal_is_shown_and_nothing_is_changed(mode):
     """In the moment the marker is at the goal; afterwards all is bit for bit as was."""
     env = make("FetchPickAndPlace-v4", render_mode=mode)
     base = env.unwrapped
-    moment = picture_moment(base)
+    moment = frame_moment(base)
     site = mujoco.mj_name2id(base.model, int(mujoco.mjtObj.mjOBJ_SITE), "target0")
     before, seen = everything(env), []
     moment(lambda: seen.append(base.data.site_xpos[site].copy()))
@@ -89,7 +89,7 @@ def test_goal_is_shown_and_nothing_is_changed(mode):
 def test_an_error_in_the_moment_leaves_all_as_it_was():
     """A full disk, for example."""
     env = make("HandReach-v3")
-    moment = picture_moment(env.unwrapped)
+    moment = frame_moment(env.unwrapped)
     before = everything(env)
 
     def fail():
@@ -111,8 +111,8 @@ def test_a_render_that_is_not_known_is_not_called():
             raise AssertionError("called")
 
     env = Robot()
-    assert picture_moment(env) is None
+    assert frame_moment(env) is None
     # Nor where drawing changes nothing: nothing has to be put back.
     maze = gymnasium.make("PointMaze_UMaze-v3")
-    assert picture_moment(drawn_part(maze.unwrapped)) is None
+    assert frame_moment(drawn_part(maze.unwrapped)) is None
     assert "Robot overrides render()" in str(gymnasium_scenes(env).obstacle)

@@ -55,7 +55,7 @@ def workers():
 
 
 def check_frames(directory, live, workers, *, is_seen_to_move=True):
-    """Check that the frames of a recording are the pictures of their moments."""
+    """Check that the frames of a recording are the frames of their moments."""
     paths = {*directory.glob("*.h5"), *in_flight(directory)}
     for episode, frames in enumerate(live):
         [path] = [p for p in paths if p.name.endswith(f".episode{episode:06d}.h5")]
@@ -73,22 +73,22 @@ def monitored(env, directory, **options):
     return mjrec.Monitor(env, directory, lambda _: True, **deferred, **options)
 
 
-def record(env, directory, picture=None, *, each_step=lambda _: None, **options):
-    """Record two episodes, and return the pictures of every moment."""
+def record(env, directory, frame=None, *, each_step=lambda _: None, **options):
+    """Record two episodes, and return the frames of every moment."""
     # MuJoCo frees what an environment has drawn with in whatever OpenGL context is
-    # current: one that an earlier test has left is not to go between two pictures.
+    # current: one that an earlier test has left is not to go between two frames.
     gc.collect()
     random = np.random.RandomState(1)
     live = []
     with monitored(env, directory, **options) as monitor:
-        picture = picture or monitor.render
+        frame = frame or monitor.render
         for seed in SEEDS:
             monitor.reset(**({"seed": seed} if hasattr(env, "unwrapped") else {}))
-            frames = [picture()]
+            frames = [frame()]
             for step in range(STEPS):
                 each_step(step)
                 outcome = monitor.step(_action(env, random))
-                frames.append(picture())
+                frames.append(frame())
                 # A dm_env's discount is 1 while the episode goes on.
                 if hasattr(env, "action_space") and any(outcome[2:4]):
                     break
@@ -108,7 +108,7 @@ def _action(env, random):
 
 
 def draw_quickly(model):
-    """Make a model whose pictures cost a software renderer little."""
+    """Make a model whose frames cost a software renderer little."""
     model.vis.quality.shadowsize = 256
     model.vis.quality.offsamples = 0
 
@@ -131,7 +131,7 @@ def test_quality_that_the_model_asks_for(workers, tmp_path):
 
 @every("env_id", GYMNASIUM, "HalfCheetah-v5")
 def test_gymnasium(env_id, workers, tmp_path):
-    """The default camera, which the first picture settles."""
+    """The default camera, which the first frame settles."""
     check_frames(tmp_path, record(make(env_id), tmp_path), workers)
 
 
@@ -179,11 +179,11 @@ def test_robotics(env_id, workers, tmp_path):
 
 
 def record_dm(env, directory, camera):
-    def picture():
+    def frame():
         return env.physics.render(**SIZE, camera_id=-1 if camera is None else camera)
 
     view = {"camera": camera, **SIZE}
-    return record(env, directory, picture, env_id="dm_control/any", **view)
+    return record(env, directory, frame, env_id="dm_control/any", **view)
 
 
 @pytest.mark.dm_control
@@ -277,7 +277,7 @@ ENDLESS = """
 
 
 def test_own_model_over_an_infinite_plane(workers, tmp_path):
-    """It is drawn around the camera of the picture before; and a tendon is taut."""
+    """It is drawn around the camera of the frame before; and a tendon is taut."""
     path = tmp_path / "endless.xml"
     path.write_text(ENDLESS)
     options = EnvironmentOptions(**SIZE, max_steps=STEPS)

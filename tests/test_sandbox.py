@@ -47,7 +47,7 @@ def command_of(pid: int) -> str:
 def test_a_death_is_told_with_its_last_words(tmp_path: Path) -> None:
     """Of a request that it does not understand, it dies."""
     with Sandbox(_COMPILER, {}, place=tmp_path) as sandbox:
-        assert list(sandbox.said(60)) == []
+        assert list(sandbox.answers(60)) == []
         said = sandbox.last_words()
     assert said.startswith("ended with status 1")
     assert "KeyError: 'task'" in said

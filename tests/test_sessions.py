@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Sessions whose pictures are drawn later, by others, or not at all."""
+"""Sessions whose frames are drawn later, by others, or not at all."""
 
 import contextlib
 import importlib.util
@@ -72,7 +72,7 @@ def test_what_is_not_drawn_here_looks_for_no_gl(options, tmp_path):
 @pytest.mark.parametrize("render", [None, "live"])
 @pytest.mark.usefixtures("no_gl")
 def test_without_gl_the_way_out_is_named(tmp_path, render):
-    """Where the pictures could be drawn elsewhere; nothing is written."""
+    """Where the frames could be drawn elsewhere; nothing is written."""
     options = {"render": render} if render else {}
     with pytest.raises(GLError, match="Nothing renders here") as raised:
         list(record_session(session(tmp_path / "out", **options)))
@@ -111,7 +111,7 @@ def test_record_says_which_videos_are_pending(tmp_path, capsys):
 )
 @pytest.mark.parametrize("options", [{}, {"keep": "best:1"}])
 def test_what_cannot_be_drawn_is_recorded_without_videos(options, tmp_path, caplog):
-    """CartPole needs pygame: one line says so, unless pictures were asked for."""
+    """CartPole needs pygame: one line says so, unless frames were asked for."""
     asked = replace(
         session(tmp_path, name="CartPole", episodes=2, **options),
         made=EnvironmentOptions(max_steps=2),

@@ -120,7 +120,7 @@ work = odd_work(shared=place / "shared", left=str(place / "left"))
 with Run(SlurmEngine(2, cluster="local"), work) as run:
     submit(run, "a", do="hold", begun=str(place / "begun"))
     submit(run, *map(str, range(20)), do="echo")
-    for outcome in run.results(patience_s=0.05):
+    for outcome in run.results(timeout_s=0.05):
         print(outcome.key if outcome else None, flush=True)
 """
 

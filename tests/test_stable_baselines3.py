@@ -42,7 +42,7 @@ torch.set_num_threads(1)
 
 
 def make_env(directory, *, steps=20, **options):
-    """Return a monitored pendulum; its pictures are drawn later."""
+    """Return a monitored pendulum; its frames are drawn later."""
     env = gymnasium.make("InvertedPendulum-v5", max_episode_steps=steps)
     return mjrec.Monitor(
         env, directory, width=48, height=32, render="deferred", **options

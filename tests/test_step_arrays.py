@@ -26,7 +26,7 @@ from mjrec.recorder.step_arrays import action_array, step_array
     ],
 )
 def test_a_kind_keeps_every_value(example: Any, kind: Any) -> None:
-    """Floats are float64 and integers int64; pictures stay as they are."""
+    """Floats are float64 and integers int64; frames stay as they are."""
     array = step_array(example)
     assert array is not None
     assert array.kind == kind

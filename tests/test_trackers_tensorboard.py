@@ -29,7 +29,7 @@ def read(directory):
     return events
 
 
-def picture(gif, index):
+def frame(gif, index):
     with Image.open(io.BytesIO(gif)) as image:
         image.seek(index)
         return image.convert("RGB")
@@ -75,7 +75,7 @@ def test_video_is_played_as_a_gif_of_the_file(finished):
         assert opened.info["loop"] == 0
     # The bar grows by four pixels a step.
     for step in (0, 5, 10):
-        shown = picture(gif, step)
+        shown = frame(gif, step)
         inside, outside = (4 * step + 1, 16), (min(4 * step + 7, 47), 16)
         assert shown.getpixel(inside)[0] > 150
         assert shown.getpixel(outside)[0] < 60

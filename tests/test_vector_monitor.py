@@ -300,7 +300,7 @@ def test_a_masked_reset_leaves_the_others_alone(tmp_path):
     assert shown(path_of(env.monitors[1], 0, "mp4"), step=16) == [0, 1, 2, 3]
 
 
-def test_pictures_must_be_one_for_each(tmp_path):
+def test_frames_must_be_one_for_each(tmp_path):
     """Said at the first reset."""
     vector = VectorCorridor()
     vector.render = lambda: (np.zeros((8, 8, 3), np.uint8),)

@@ -40,7 +40,7 @@ def corridors(make_corridor):
 
 
 def tiles_at(path, *, step):
-    """Return the position that each tile of a 2x2 grid of 32x64 pictures shows."""
+    """Return the position that each tile of a 2x2 grid of 32x64 frames shows."""
     shown = []
     for frame in frames_of(path):
         assert frame.shape == (64, 128, 3)
@@ -113,7 +113,7 @@ def test_a_video_that_is_cut_off_says_so(corridors, tmp_path, how):
 
 
 def drawn_by(env):
-    """Return its picture; Gymnasium draws into whichever context is current."""
+    """Return its frame; Gymnasium draws into whichever context is current."""
     env.unwrapped.mujoco_renderer.viewer.make_context_current()
     return env.render()
 
@@ -137,7 +137,7 @@ def test_pixels_are_those_of_each_environment(tmp_path):
     assert hashes_at(path)[1:] == expected
 
 
-def test_a_bad_picture_can_be_tolerated(tmp_path, caplog):
+def test_a_bad_frame_can_be_tolerated(tmp_path, caplog):
     """Sizes that differ are an error, or with `on_error="warn"` no tiled video."""
     vector = VectorCorridor(heights=(32, 48))
     with (

@@ -35,7 +35,7 @@ BITS = 8
 
 
 def numbered(number, *, height=16, width=128):
-    """Return a picture that shows its number, as black and white bars."""
+    """Return a frame that shows its number, as black and white bars."""
     bits = [255 * (number >> bit & 1) for bit in range(BITS)]
     row = np.repeat(np.array(bits, np.uint8), width // BITS)
     return np.broadcast_to(row[None, :, None], (height, len(row), 3)).copy()
@@ -48,13 +48,13 @@ def number_of(frame):
 
 
 def scene(number, *, height=96, width=128):
-    """Return a picture with gradients, an edge and noise, which moves."""
+    """Return a frame with gradients, an edge and noise, which moves."""
     y, x = np.mgrid[0:height, 0:width]
     planes = [2 * x + 3 * number, 2 * y + number, x + y + 5 * number]
-    picture = np.stack(planes, axis=-1) % 256
-    picture[10:30, 5 * number % width :] = (200, 30, 60)
-    noise = np.random.default_rng(number).integers(0, 40, picture.shape)
-    return np.clip(picture + noise - 20, 0, 255).astype(np.uint8)
+    frame = np.stack(planes, axis=-1) % 256
+    frame[10:30, 5 * number % width :] = (200, 30, 60)
+    noise = np.random.default_rng(number).integers(0, 40, frame.shape)
+    return np.clip(frame + noise - 20, 0, 255).astype(np.uint8)
 
 
 def record(path, frames, **options):

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Directories with trajectories in them, written without a simulation.
 
-Frame k of one is a grey picture of brightness `grey(k)`, which `Painter` draws from
+Frame k of one is a grey frame of brightness `grey(k)`, which `Painter` draws from
 its snapshots, with a white pixel in a corner.
 """
 
@@ -88,10 +88,10 @@ class Painter:
         for index, brightness in enumerate(shown):
             self.breaks_at(trajectory, view, index)
             brighter = 0 if view.camera is None else 5
-            picture = np.full((*self.size, 3), brightness | brighter, np.uint8)
+            frame = np.full((*self.size, 3), brightness | brighter, np.uint8)
             if not self.plain:
-                picture[-1, -1] = 255
-            yield picture
+                frame[-1, -1] = 255
+            yield frame
 
     def start(self) -> None: ...
 

@@ -23,7 +23,7 @@ DISABLED = AutoresetMode.DISABLED
 class VectorCorridor(gymnasium.vector.VectorEnv[Any, Any, Any]):
     """Several corridors in one object, each of its own length; draws all of them.
 
-    The picture of a corridor is 16 pixels wide for each step that was taken.
+    The frame of a corridor is 16 pixels wide for each step that was taken.
     """
 
     def __init__(
@@ -74,7 +74,7 @@ class VectorCorridor(gymnasium.vector.VectorEnv[Any, Any, Any]):
     def render(self):
         self.rendered += 1
         return tuple(
-            _picture(position, height)
+            _frame(position, height)
             for position, height in zip(self.positions, self.heights, strict=True)
         )
 
@@ -85,7 +85,7 @@ class VectorCorridor(gymnasium.vector.VectorEnv[Any, Any, Any]):
         return self.positions[:, None].astype(float)
 
 
-def _picture(position, height):
+def _frame(position, height):
     frame = np.zeros((height, 64, 3), np.uint8)
     frame[:, : 16 * position + 16] = (200, 40, 10)
     return frame

@@ -43,7 +43,7 @@ class Caption:
     Attributes:
         episode_id: the episode's number.
         step: how many steps were made before the frame.
-        time: simulated seconds since the reset; None where nobody knows.
+        time: simulated seconds since the reset; None where unknown.
         reward: the sum of the rewards so far.
     """
 
@@ -56,7 +56,7 @@ class Caption:
 def annotated(frame: Frame, caption: Caption) -> Frame:
     """Return a frame with a caption on its top.
 
-    The same frame and caption give the same picture, byte for byte, with the same
+    The same frame and caption give the same frame, byte for byte, with the same
     Pillow. Letters grow with the frame. In a small one they are abbreviated, stand in
     several lines, or say less; in one of a few pixels there are none.
 
@@ -162,7 +162,7 @@ _ARRANGEMENTS = (
 
 @functools.lru_cache(maxsize=256)
 def _layout(height: int, width: int, lengths: tuple[int, ...]) -> _Layout | None:
-    """Return where items of so many characters stand; None where nothing fits.
+    """Return where items of these lengths stand; None where nothing fits.
 
     Args:
         height: of the frame.

@@ -2,7 +2,7 @@
 """Files that appear whole or not at all.
 
 A file is written under a temporary name in its own directory and then renamed, so
-that nobody ever sees half of it under its final name. The temporary name begins with
+that half of it never has its final name. The temporary name begins with
 a dot and ends in `.part`: `.<name>.<8 hex digits>.part`.
 """
 
@@ -20,8 +20,8 @@ from .errors import FileNotWritten
 def temporary_path(path: Path) -> Path:
     """Return a new name for an unfinished `path`, in the same directory.
 
-    It is hidden by one dot, also where `path` is hidden itself: by that dot whoever
-    puts a directory in order knows the file.
+    It is hidden by one dot, also where `path` is hidden itself: by that dot a program
+    that puts a directory in order knows the file.
     """
     name = path.name.removeprefix(".")
     return path.with_name(f".{name}.{secrets.token_hex(4)}.part")

@@ -18,14 +18,14 @@ from .frames import Frame
 
 logger = logging.getLogger(__name__)
 
-# Of 255, the brightest that nobody can tell from black.
+# Of 255, the brightest that looks black.
 _BLACK = 4
-# Every so many-th pixel of every so many-th row is looked at first.
+# Every n-th pixel of every n-th row is looked at first.
 _STEP = 16
 
 
 class BlankFrames:
-    """Is told the frames of a video, and knows at the end whether they show anything.
+    """Takes the frames of a video and says at the end whether they show anything.
 
     As soon as one frame has two colours and one differs from the first, nothing more is
     looked at. Only frames that could be blank are looked at as a whole.
@@ -73,7 +73,7 @@ class BlankFrames:
             return f"{frames} black"
         if "plain" in self._suspects:
             return f"{frames} of a single colour"
-        return f"{frames} the same picture"
+        return f"{frames} the same frame"
 
     def judge(self, video: Path, *, strict: bool) -> None:
         """Warn of a finished video that shows nothing, or raise.

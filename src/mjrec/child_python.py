@@ -31,7 +31,7 @@ from .messages import (
     packed,
     received,
 )
-from .patience import Patience
+from .timeouts import Timeout
 
 # What users may have without privileges: one frame of 480x480, and more.
 _PIPE_BYTES = 1 << 20
@@ -139,9 +139,9 @@ class Child:
 
     def messages(self, seconds: float) -> Iterator[dict[str, Any] | None]:
         """Yield its messages until it ends; None once it was silent for so long."""
-        patience = Patience(seconds)
-        while not patience.is_over:
-            if not patience.wait(lambda slice_: wait_for_news([self], slice_)):
+        timeout = Timeout(seconds)
+        while not timeout.is_over:
+            if not timeout.wait(lambda slice_: wait_for_news([self], slice_)):
                 continue
             try:
                 while (message := self.receive()) is not None:
@@ -166,7 +166,7 @@ class Child:
         return self._words_from(before) or "(no output)"
 
     def last_words(self) -> str:
-        """Return what became of it, and the end of what it printed."""
+        """Return how it ended, and the end of its output."""
         how = self.how_it_ended()
         # What Python says of a crash ends with the names of dozens of modules.
         words = self.printed().partition("\nExtension modules:")[0].strip()
@@ -244,8 +244,8 @@ class Child:
 
     def _words_from(self, begin: int) -> str:
         # Not by seeking: the position is the child's too.
-        said = os.pread(self.words.fileno(), _MOST_WORDS_READ, begin)
-        return said.decode(errors="replace").strip()
+        output = os.pread(self.words.fileno(), _MOST_WORDS_READ, begin)
+        return output.decode(errors="replace").strip()
 
 
 def wait_for_news(children: Iterable[Child], seconds: float) -> list[Child]:

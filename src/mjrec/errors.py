@@ -107,7 +107,7 @@ class UnknownName(InvalidArgument):
 
 
 class InvalidFrame(InvalidArgument):
-    """A picture that is not a `(height, width, 3) uint8` array."""
+    """A frame that is not a `(height, width, 3) uint8` array."""
 
 
 class ExistingRecordings(Error):
@@ -293,10 +293,10 @@ class EncoderError(Error):
         self.command = list(command)
         self.returncode = returncode
         self.stderr = stderr
-        said = stderr.strip() or "(nothing)"
+        output = stderr.strip() or "(nothing)"
         super().__init__(
             f"{what} ffmpeg's exit status: {returncode}. It was started as: "
-            f"{' '.join(self.command)}. Its last output: {said}"
+            f"{' '.join(self.command)}. Its last output: {output}"
         )
 
 

@@ -22,7 +22,7 @@ _MAX_SIDE = 16384
 
 
 def check_frame(frame: object, *, size: tuple[int, int] | None = None) -> Frame:
-    """Return `frame` if it is a picture.
+    """Return `frame` if it is a frame.
 
     Args:
         frame: what an environment gave.
@@ -52,7 +52,7 @@ def check_frame(frame: object, *, size: tuple[int, int] | None = None) -> Frame:
 
 
 def check_quality(quality: object) -> str:
-    """Return `quality` if pictures can be drawn so: "full" or "draft".
+    """Return `quality` if frames can be drawn so: "full" or "draft".
 
     Raises:
         UnknownName: it is something else.
@@ -63,7 +63,7 @@ def check_quality(quality: object) -> str:
 
 
 def check_size(height: int, width: int) -> tuple[int, int]:
-    """Return `(height, width)` if a picture can have that size, in pixels.
+    """Return `(height, width)` if a frame can have that size, in pixels.
 
     Raises:
         InvalidArgument: one is not a whole number from 1 to 16384.
@@ -91,7 +91,7 @@ def pad_to_even(frame: Frame) -> Frame:
 
 
 def grid_shape(count: int) -> tuple[int, int]:
-    """Return the rows and columns of the grid of so many pictures.
+    """Return the rows and columns of the grid of N frames.
 
     It is as square as can be, and rather wide than high.
 
@@ -103,7 +103,7 @@ def grid_shape(count: int) -> tuple[int, int]:
 
 
 def grid_frame(frames: Sequence[Frame]) -> Frame:
-    """Return pictures of one size as one picture, row by row.
+    """Return frames of one size as one frame, row by row.
 
     What is left of the last row is black.
 
@@ -120,7 +120,7 @@ def grid_frame(frames: Sequence[Frame]) -> Frame:
     if len(sizes) != 1:
         shown = ", ".join(f"{shape[1]}x{shape[0]}" for shape in sorted(sizes)) or "none"
         raise InvalidArgument(
-            "Pictures side by side in one video must be of one size, got "
+            "Frames side by side in one video must be of one size, got "
             f"{shown}. Give all the same height and width, or make a video of each."
         )
     [(height, width, channels)] = sizes

@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-# Whatever can be read can also be written again, compared and shown, all of which
+# Everything that can be read can also be written, compared and shown, which all
 # Python does recursively.
 _DEEPEST = 100
 
@@ -94,7 +94,7 @@ def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def has_nan(value: object) -> bool:
-    """Tell whether NaN, which comes back as `null`, is anywhere in a value of JSON."""
+    """Return whether NaN, which comes back as `null`, is anywhere in a JSON value."""
     match value:
         case float():
             return math.isnan(value)
@@ -106,7 +106,7 @@ def has_nan(value: object) -> bool:
 
 
 def _is_plain(value: object, room: int = _DEEPEST) -> bool:
-    """Tell whether all keys are texts, and nothing is nested too deeply."""
+    """Return whether all keys are texts, and nothing is nested too deeply."""
     if isinstance(value, dict):
         if not {str}.issuperset(map(type, value)):
             return False

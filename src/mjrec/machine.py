@@ -49,7 +49,7 @@ def cgroup_cpu_quota(
         root: where the cgroup file system is mounted.
         own: the file that names the groups of this process.
     """
-    # Inside a container the path may be the host's, of which nothing is mounted; the
+    # Inside a container the path may be the host's, which is not mounted; the
     # root then is the container's own group.
     groups = [line.split("::", 1) for line in _lines(own)]
     quotas = [
@@ -119,12 +119,12 @@ def _lines(path: Path) -> list[str]:
 
 @functools.cache
 def _cpuinfo() -> Mapping[str, str]:
-    said: dict[str, str] = {}
+    fields: dict[str, str] = {}
     for line in _lines(_CPUINFO):
         name, colon, value = line.partition(":")
         if colon:
-            said.setdefault(name.strip(), value.strip())
-    return MappingProxyType(said)
+            fields.setdefault(name.strip(), value.strip())
+    return MappingProxyType(fields)
 
 
 def check_workers(workers: int | None) -> int | None:

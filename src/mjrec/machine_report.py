@@ -203,7 +203,7 @@ def _problems(chosen: str | None, probes: dict[str, Probe]) -> Iterator[Diagnosi
         )
     if not named and not probes["glfw"].renders:
         yield Diagnosis(
-            "MUJOCO_GL is not set. mjrec gets along without; other programs choose "
+            "MUJOCO_GL is not set. mjrec works without it; other programs choose "
             "GLFW then, which does not render here.",
             f"For other programs:\n  export MUJOCO_GL={chosen}",
         )
@@ -212,7 +212,7 @@ def _problems(chosen: str | None, probes: dict[str, Probe]) -> Iterator[Diagnosi
 
 
 def examine_ffmpeg() -> Ffmpeg:
-    """Find ffmpeg and encode a picture as a recording does."""
+    """Find ffmpeg and encode a frame as a recording does."""
     path, version = None, ""
     try:
         path = ffmpeg_executable()
@@ -220,8 +220,8 @@ def examine_ffmpeg() -> Ffmpeg:
         settings = encoder_settings(codec=None, crf=None, muxer=MUXERS[".mp4"])
         try_encoding(settings, _TRIAL_FPS)
     except Error as error:
-        said = error.stderr.split("\n") if isinstance(error, EncoderError) else []
-        cause = next(filter(None, map(str.strip, reversed(said))), str(error))
+        output = error.stderr.split("\n") if isinstance(error, EncoderError) else []
+        cause = next(filter(None, map(str.strip, reversed(output))), str(error))
         fix = (
             "Install the one that comes with imageio-ffmpeg, or name another:\n"
             "  python -m pip install --force-reinstall imageio-ffmpeg\n"
@@ -251,7 +251,7 @@ def examine_package(name: str, program: str, install: str) -> Package:
         return Package(name, version, works=True)
     known = diagnose(failure, environ=_WITHOUT_GL)
     found = known or Diagnosis(
-        failure.strip().splitlines()[-1], f"Install it anew:\n  {install}"
+        failure.strip().splitlines()[-1], f"Reinstall it:\n  {install}"
     )
     return Package(name, version, works=False, cause=found.cause, fix=found.fix)
 
@@ -284,13 +284,13 @@ def _slurm() -> Package:
 
 def _gpu() -> Package:
     try:
-        said = _NVIDIA_VERSION.read_text(errors="replace")
+        output = _NVIDIA_VERSION.read_text(errors="replace")
     except OSError:
         if gpu_device_files():
             return Package("GPU", "there is one, without NVIDIA's driver")
         fix = "No device file in /dev: videos are drawn on the CPU."
         return Package("GPU", None, fix=fix)
-    return Package("GPU", said.partition("\n")[0].strip())
+    return Package("GPU", output.partition("\n")[0].strip())
 
 
 # Whether a package works is another question than whether it can draw.
@@ -312,5 +312,5 @@ def _run_in_child(program: str) -> str | None:
         return f"It did not end within {_PROGRAM_TIMEOUT} seconds."
     if done.returncode == 0:
         return None
-    said = done.stderr.decode(errors="replace").strip()
-    return said or f"It ended with status {done.returncode}."
+    output = done.stderr.decode(errors="replace").strip()
+    return output or f"It ended with status {done.returncode}."

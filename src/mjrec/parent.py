@@ -66,7 +66,7 @@ class Parent:
 
         Args:
             at_end: called there when it has ended; ends this process. At once, if None:
-                what is done here is of use to nobody else.
+                the work here has no other use.
         """
         self._listens = True
         threading.Thread(

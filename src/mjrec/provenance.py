@@ -35,7 +35,7 @@ from .parent import Parent
 
 logger = logging.getLogger(__name__)
 
-# What changes pictures, the last bits of numbers, or which library is loaded.
+# What changes frames, the last bits of numbers, or which library is loaded.
 _VARIABLES = frozenset(
     {
         *("CUDA_VISIBLE_DEVICES", "DISPLAY", "GLIBC_TUNABLES", "LD_LIBRARY_PATH"),
@@ -56,7 +56,7 @@ _SECONDS_AT_THE_END = 2.0
 
 
 def is_of_drawing(variable: str) -> bool:
-    """Tell whether frames, or the last bits of numbers, may depend on a variable."""
+    """Return whether frames, or the last bits of numbers, may depend on a variable."""
     return variable in _VARIABLES or variable.startswith(_PREFIXES)
 
 
@@ -200,9 +200,9 @@ def installed_packages() -> dict[str, Any]:
             Child(__name__, environ=os.environ) as child,
         ):
             child.send(places=places)
-            for said in child.messages(_SECONDS_FOR_PACKAGES):
-                if said is not None:
-                    return said
+            for answer in child.messages(_SECONDS_FOR_PACKAGES):
+                if answer is not None:
+                    return answer
             logger.debug("Packages are looked for here: it %s", child.last_words())
     return _packages_in(places)
 
@@ -225,8 +225,8 @@ def _name_and_version(
 ) -> tuple[str | None, str | None]:
     """Return what a package says first: parsing all that it says takes milliseconds."""
     text = distribution.read_text("METADATA") or distribution.read_text("PKG-INFO")
-    said = dict(_NAME_OR_VERSION.findall((text or "").partition("\n\n")[0]))
-    return said.get("Name"), said.get("Version")
+    answer = dict(_NAME_OR_VERSION.findall((text or "").partition("\n\n")[0]))
+    return answer.get("Name"), answer.get("Version")
 
 
 def _record_sha256(distribution: importlib.metadata.Distribution) -> str | None:

@@ -30,7 +30,7 @@ logger = logging.getLogger(__name__)
 
 _GIB = 1 << 30
 # Of each process that takes part. What is mapped and never touched counts for the
-# address space only, and OpenGL's drivers map a lot. Drawing 1280x720 pictures with
+# address space only, and OpenGL's drivers map a lot. Drawing 1280x720 frames with
 # llvmpipe takes 0.35 GiB of the one and 0.9 GiB of the other (measured).
 LIMITS: Final[Mapping[str, int]] = {
     "RLIMIT_DATA": 8 * _GIB,
@@ -107,9 +107,9 @@ class Sandbox(Child):
             ) from error
         self.send(request=_plain(request), limits=dict(limits))
 
-    def said(self, patience_s: float) -> Iterator[Mapping[str, Any] | None]:
+    def answers(self, timeout_s: float) -> Iterator[Mapping[str, Any] | None]:
         """Yield what it says until it ends; None once it was silent for so long."""
-        for message in self.messages(patience_s):
+        for message in self.messages(timeout_s):
             if message is None:
                 logger.warning("A process with limits hangs: %s", self.stacks())
             yield message
@@ -122,7 +122,7 @@ class Sandbox(Child):
 
 
 def is_inside() -> bool:
-    """Tell whether this process runs in a sandbox already."""
+    """Return whether this process runs in a sandbox already."""
     return _INSIDE_VARIABLE in os.environ
 
 
@@ -141,12 +141,12 @@ def enter() -> tuple[Any, Callable[..., None]]:
         resource.setrlimit(kind, (allowed, allowed))
     # With those of its group.
     parent.listen(lambda: os.killpg(0, signal.SIGKILL))
-    return told["request"], lambda **said: parent.send(**_plain(said))
+    return told["request"], lambda **answers: parent.send(**_plain(answers))
 
 
 def _is_kept(name: str) -> bool:
     return is_of_drawing(name) or name.startswith(("LC_", "PYTHON", "__GLX_", "VK_"))
 
 
-def _plain(said: Mapping[str, Any]) -> Any:
-    return json.loads(json_text.dumps(said))
+def _plain(answers: Mapping[str, Any]) -> Any:
+    return json.loads(json_text.dumps(answers))

@@ -78,7 +78,7 @@ def check_takes_one(function: Callable[..., Any], name: str, what: str) -> None:
     try:
         signature = inspect.signature(function)
     except ValueError:
-        # Of what is written in C nobody may know.
+        # A function in C may have no signature.
         return
     try:
         signature.bind(None)
@@ -116,9 +116,9 @@ def schedule_from_text(text: str) -> Schedule:
     }
     if text in named:
         return named[text]
-    kind, _, said = text.partition(":")
+    kind, _, listed = text.partition(":")
     try:
-        numbers = sorted({int(number) for number in said.split(",")})
+        numbers = sorted({int(number) for number in listed.split(",")})
     except ValueError:
         numbers = []
     if kind == "at" and numbers and numbers[0] >= 0:

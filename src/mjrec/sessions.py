@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A recording session: so many episodes of a named environment, under a policy.
+"""A recording session: N episodes of a named environment under a policy.
 
 This is what `mjrec record` does. Episode i of a session with the seed S starts from
 `SeedSequence([S, i])` (`environments.episode_seeds` has the recipe), so any episode
@@ -51,7 +51,7 @@ class Session:
         schedule: which episodes get a video: `cubic`, `all`, `none`, `every:N` or
             `at:0,5,9`; None is `cubic`, unless `monitor` has a `keep`.
         further_cameras: of more videos of the same episodes.
-        made: how the environment is made; the session sets `pictures` and `seed`.
+        made: how the environment is made; the session sets `frames` and `seed`.
         monitor: how it is recorded; the session sets which episodes, and the policy's
             file.
     """
@@ -114,13 +114,13 @@ def record_session(
         schedule = schedule_from_text(session.schedule or "cubic")
     with contextlib.ExitStack() as stack:
         drawn = schedule is not disable_videos and options.render != OFF
-        named = _environment(session, pictures=drawn)
+        named = _environment(session, frames=drawn)
         closing = stack.enter_context(contextlib.ExitStack())
         closing.callback(named.environment.close)
-        if named.no_pictures is not None:
+        if named.not_drawn is not None:
             if options.render in (LIVE, DEFERRED):
-                raise named.no_pictures
-            logger.warning("No videos, only statistics. %s", named.no_pictures)
+                raise named.not_drawn
+            logger.warning("No videos, only statistics. %s", named.not_drawn)
             schedule, options = disable_videos, replace(options, keep=None)
         policy = load_policy(session.policy, named.environment, session.policy_kwargs)
         view = dict(named.view)
@@ -204,11 +204,11 @@ def _check(session: Session) -> None:
     episode_seeds(session.seed, 0)
 
 
-def _environment(session: Session, *, pictures: bool) -> NamedEnvironment:
+def _environment(session: Session, *, frames: bool) -> NamedEnvironment:
     render, workers = session.monitor.render, session.monitor.workers
     no_gl = None
     # Does this process draw, or one that it starts?
-    if pictures and (render == LIVE or (render is None and workers != 0)):
+    if frames and (render == LIVE or (render is None and workers != 0)):
         # A text environment, or one that draws by itself, needs no OpenGL, and only the
         # environment tells which it is.
         try:
@@ -220,12 +220,12 @@ def _environment(session: Session, *, pictures: bool) -> NamedEnvironment:
 
     log_mujoco_warnings()
     named = environment_from_name(
-        session.environment, replace(session.made, pictures=pictures, seed=session.seed)
+        session.environment, replace(session.made, frames=frames, seed=session.seed)
     )
     if no_gl is None or simulation_in(named.environment) is None:
         return named
     with contextlib.closing(named.environment):
-        if render == LIVE or not named.has_deferrable_pictures():
+        if render == LIVE or not named.can_be_deferred():
             raise no_gl
         raise GLError(
             f"{no_gl}\nRecording itself needs no OpenGL: with --workers 0 (workers=0) "

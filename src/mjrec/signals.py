@@ -90,7 +90,7 @@ def _deadly() -> list[signal.Signals]:
 def received() -> Terminated | None:
     """Return what the first signal raised; None where there was none.
 
-    At exit the interpreter does not tell of a `SystemExit` that nobody has caught.
+    At exit the interpreter does not report an uncaught `SystemExit`.
     """
     return _received[0] if _received else None
 

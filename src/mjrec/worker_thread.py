@@ -144,7 +144,7 @@ class WorkerThread(Generic[T]):
                 self._consume(item[0])
             if self._finish is not None and not self._aborted:
                 self._finish()
-        # Whatever it is, it belongs to the caller; nobody looks at this thread.
+        # Every error belongs to the caller; this thread has no reader.
         except BaseException as error:
             with self._lock:
                 self._error = error

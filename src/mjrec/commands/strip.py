@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`mjrec strip`: some pictures of an episode side by side, for a paper."""
+"""`mjrec strip`: some frames of an episode side by side, for a paper."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def strip(
         as_json: print one JSON object at the end.
     """
     height, width = size_of(size)
-    picture = film_strip(
+    frame = film_strip(
         file,
         frames=frames,
         columns=columns,
@@ -51,8 +51,8 @@ def strip(
         width=width,
         quality=quality,
     )
-    write_film_strip(out, picture)
-    shown = {"strip": str(out), "width": picture.shape[1], "height": picture.shape[0]}
+    write_film_strip(out, frame)
+    shown = {"strip": str(out), "width": frame.shape[1], "height": frame.shape[0]}
     if as_json:
         print_json(shown)
     else:

@@ -49,8 +49,8 @@ def show_verification(
         console.print(f"  {drawn}")
     _list(console, "Asked for", summary.inputs(verification), most)
     if verbose:
-        said = [_finding(each) for each in verification.findings]
-        _list(console, "Findings", said, None)
+        rows = [_finding(each) for each in verification.findings]
+        _list(console, "Findings", rows, None)
         facts = (f"{key}: {value}" for key, value in verification.facts.items())
         _list(console, "Made with", facts, None)
 
@@ -74,9 +74,9 @@ def _finding(finding: Finding) -> str:
 
 
 def _list(
-    console: rich.console.Console, title: str, said: Iterable[str], most: int | None
+    console: rich.console.Console, title: str, rows: Iterable[str], most: int | None
 ) -> None:
-    texts = list(said)
+    texts = list(rows)
     if not texts:
         return
     if title:

@@ -154,15 +154,13 @@ class Run:
         """
         self._hand_out(_Task(key, arguments))
 
-    def results(
-        self, *, patience_s: float | None = None
-    ) -> Iterator[JobOutcome | None]:
+    def results(self, *, timeout_s: float | None = None) -> Iterator[JobOutcome | None]:
         """Yield outcomes as they come, until there is no job left.
 
         A job whose child dies is done again behind the others, `TRIES` times in all.
 
         Args:
-            patience_s: None is yielded whenever nothing has come for so long; never,
+            timeout_s: None is yielded whenever nothing has come for so long; never,
                 if it is None.
 
         Raises:
@@ -173,7 +171,7 @@ class Run:
             if not self._tasks:
                 self._hand_out_parked()
             try:
-                future = self._done.get(timeout=patience_s)
+                future = self._done.get(timeout=timeout_s)
             except queue.Empty:
                 yield None
                 continue
@@ -222,25 +220,25 @@ class Run:
         """Return the outcome of a job; None where it is to be done again."""
         task = self._tasks.pop(future)
         try:
-            said = future.result()
+            answer = future.result()
         except CancelledError:
-            said = {"died": "was cancelled by its executor", "begun": True}
+            answer = {"died": "was cancelled by its executor", "begun": True}
         except Error:
             raise
         except Exception as error:
             # The executor's own: a worker of it is gone.
             why = f"{type(error).__name__}: {error}".splitlines()
             how = f"is gone: {why[0]} {why[-1] if why[1:] else ''}"
-            said = {"died": how, "begun": True}
-        self._log(said.get("log", ()))
-        if "error" in said:
-            raise unpacked(said["error"])
-        if "died" in said:
-            return self._bury(task, said["died"], has_begun=said["begun"])
+            answer = {"died": how, "begun": True}
+        self._log(answer.get("log", ()))
+        if "error" in answer:
+            raise unpacked(answer["error"])
+        if "died" in answer:
+            return self._bury(task, answer["died"], has_begun=answer["begun"])
         return JobOutcome(
             key=task.key,
-            value=said.get("value"),
-            failure=said.get("failure"),
+            value=answer.get("value"),
+            failure=answer.get("failure"),
             tries=task.deaths + 1,
         )
 

@@ -8,7 +8,7 @@ done, and what an array has left undone is submitted once more. In that folder::
     slurm/outcomes/17.json   what `worker.do_job` returned of job 17
     slurm/logs/              what the Slurm jobs print, and submitit's own files
 
-`submitit` writes the scripts and submits them. What became of a Slurm job is asked of
+`submitit` writes the scripts and submits them. The state of a Slurm job is asked of
 `squeue`, which every cluster has; submitit asks `sacct`, which needs a database that
 not every cluster keeps, and only every ten minutes.
 """
@@ -44,7 +44,7 @@ from .worker import do_job, end_idle_children
 
 logger = logging.getLogger(__name__)
 
-# What a cluster would grant is not known before; four are what nobody minds.
+# What a cluster would grant is not known before; four are always granted.
 DEFAULT_WORKERS = 4
 
 _CLUSTERS = ("slurm", "local")
@@ -285,8 +285,8 @@ class SlurmEngine(Executor):
             with _as_from_outside():
                 jobs = executor.map_array(do, each)
         except (OSError, RuntimeError, subprocess.SubprocessError) as error:
-            said = " ".join(str(error).split())
-            raise Error(f"No job could be submitted: {said}") from error
+            answer = " ".join(str(error).split())
+            raise Error(f"No job could be submitted: {answer}") from error
         self._waiting = [task for task in self._waiting if task.place != place]
         for job, share in zip(jobs, shares, strict=True):
             self._elements[job.job_id] = share
@@ -302,7 +302,7 @@ class SlurmEngine(Executor):
                         _resolve(task, json.loads(done[str(task.number)].read_bytes()))
 
     def _ask(self) -> None:
-        """See what became of Slurm jobs."""
+        """Ask for the states of Slurm jobs."""
         now = time.monotonic()
         is_local = self._cluster == "local"
         if not is_local and now - self._last_asked < _SECONDS_BETWEEN_QUESTIONS:
@@ -379,11 +379,11 @@ class ArrayElement:
             path = self.place / "outcomes" / f"{number}.json"
             if path.exists() or _is_ending.is_set():
                 return
-            said = do_job(run, jobs[number])
+            answer = do_job(run, jobs[number])
             # A child that was told to end with this process is no job's fault.
-            if "died" not in said or not _is_ending.wait(_SECONDS_BETWEEN_LOOKS):
+            if "died" not in answer or not _is_ending.wait(_SECONDS_BETWEEN_LOOKS):
                 with contextlib.suppress(Error):
-                    write_text(path, json.dumps(said))
+                    write_text(path, json.dumps(answer))
 
         with LocalEngine(self.workers, gpus=self.share.each) as engine:
             for future in [engine.submit(do, number) for number in jobs]:
@@ -438,17 +438,17 @@ def slurm_options(texts: Mapping[str, str]) -> dict[str, Any]:
 _ELSEWHERE = ("workers", "gpus", "require_gpu", "sbatch")
 
 
-def _resolve(task: _Task, said: Any) -> None:
+def _resolve(task: _Task, answer: Any) -> None:
     if not task.future.done() and task.future.set_running_or_notify_cancel():
-        task.future.set_result(said)
+        task.future.set_result(answer)
 
 
 def _end_of_log(place: Path, job: str) -> str:
-    said = b""
+    answer = b""
     for path in (place / "logs").glob(f"{job}_*log.err"):
         with contextlib.suppress(OSError):
-            said = path.read_bytes()[-_END_OF_LOG:]
-    return said.decode(errors="replace").strip() or "(nothing)"
+            answer = path.read_bytes()[-_END_OF_LOG:]
+    return answer.decode(errors="replace").strip() or "(nothing)"
 
 
 def _submitit(cluster: str) -> ModuleType:

@@ -167,8 +167,8 @@ class _JobChild(Child):
             with Path(limit[1]).open("a") as file:
                 file.write(limit[2])
         self._listener.join(_SECONDS_BETWEEN_LOOKS)
-        said = self._said.strip() or "(nothing)"
-        died = f"{how}. Its last output: {said}"
+        output = self._said.strip() or "(nothing)"
+        died = f"{how}. Its last output: {output}"
         return {"died": died, "begun": self._is_ready, "log": log}
 
     def end(self) -> None:

@@ -36,7 +36,7 @@ def tasks_of(domain: str) -> Sequence[str]:
 def make_dm_control(domain: str, task: str, options: EnvironmentOptions) -> Any:
     """Return a task of the suite.
 
-    Camera and size are not the environment's but of each picture: whoever draws it
+    Camera and size are not the environment's but of each frame: whoever draws it
     gives them. Episodes end after `max_steps`, or after 1000 steps where the task has
     no time limit.
 
@@ -108,7 +108,7 @@ class DmControlEnvironment(NamedEnvironment):
     def __init__(self, name: DmControlName, options: EnvironmentOptions) -> None:
         environment = make_dm_control(name.domain, name.task, options)
         view: dict[str, Any] = {}
-        if options.pictures:
+        if options.frames:
             camera = options.camera
             if camera is None:
                 camera = default_camera(environment.physics.model)
@@ -134,7 +134,7 @@ class DmControlEnvironment(NamedEnvironment):
 
         dm_env's `reset` takes no seed. dm_control's tasks draw all their random numbers
         from one `RandomState`, which is seeded in place, because what else holds it
-        must see the same. A monitor is told the seed, for its metadata.
+        must see the same. A monitor gets the seed for its metadata.
 
         An environment that was made with this seed and never reset is as
         `suite.load(..., task_kwargs={"random": seed})` made it: what it drew then stays
@@ -160,7 +160,7 @@ class DmControlEnvironment(NamedEnvironment):
         )
 
     def scenes(self) -> Scenes:
-        """Return what is known of its pictures and its states."""
+        """Return what is known of its frames and its states."""
         return dm_control_scenes(self.environment)
 
     def _generator(self) -> Any:
@@ -168,7 +168,7 @@ class DmControlEnvironment(NamedEnvironment):
 
 
 def _is_fresh(generator: Any, seed: Any) -> bool:
-    """Tell whether a generator, made with a seed, has drawn nothing."""
+    """Return whether a generator, made with a seed, has drawn nothing."""
     states = (each.get_state() for each in (generator, np.random.RandomState(seed)))
     return all(map(np.array_equal, *states))
 

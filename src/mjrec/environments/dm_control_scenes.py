@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The states of a dm_control environment, and the pictures that follow from them."""
+"""The states of a dm_control environment, and the frames that follow from them."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from ..simulation.view import (
 )
 from .dm_control_contexts import ContextsOnDemand
 from .scenes import (
-    NoPictureSource,
+    NoFrameSource,
     Scenes,
     class_name,
     generator_state,
@@ -47,13 +47,13 @@ MADE_WITH = "_mjrec_made_with"
 # Asked at every captured step. It is dm_control's own, which belongs to one model.
 _DATA = attrgetter("physics.data")
 
-# Of pictures that `physics.render()` does not draw.
+# Of frames that `physics.render()` does not draw.
 _MAX_GEOM = 10000
 
 
 _NOT_BY_PHYSICS = (
-    "physics.render() draws no picture from an MjvCamera, nor one that is larger than "
-    "the model's offscreen buffer; such pictures are drawn from recorded states and "
+    "physics.render() draws no frame from an MjvCamera, nor one that is larger than "
+    "the model's offscreen buffer; such frames are drawn from recorded states and "
     "never live. Leave render= out"
 )
 
@@ -79,14 +79,14 @@ def dm_control_scenes(
         width: in pixels; None is 320, likewise.
         env_id: `dm_control/<domain>-<task>`, of a task of the suite.
 
-    The pictures are those of `physics.render()`, or where that draws no such picture
+    The frames are those of `physics.render()`, or where that draws no such frame
     (see `_drawn_by_physics`) those of the same scene.
 
     Raises:
         UnknownName: the model has no such camera.
         InvalidArgument: a camera number, or a size, that cannot be.
     """
-    height, width = _picture_size(height, width)
+    height, width = _frame_size(height, width)
     by_physics = _drawn_by_physics(env.physics, camera, height, width)
     scene = _PhysicsScene(
         env,
@@ -98,7 +98,7 @@ def dm_control_scenes(
         states=Capture(
             lambda: (raw_model(env.physics.model), raw_data(env.physics.data)),
             view=scene,
-            at_picture=scene.at_picture,
+            at_frame=scene.at_frame,
             resetting=ContextsOnDemand(env).resetting,
             authored=lambda: _authored(env),
             is_unmoved=scene.is_unmoved,
@@ -109,14 +109,14 @@ def dm_control_scenes(
     )
 
 
-def dm_control_pictures(
+def dm_control_frames(
     env: Any,
     *,
     camera: Any = None,
     height: int | None = None,
     width: int | None = None,
-) -> PhysicsPictures | NoPictureSource:
-    """Return the source of a dm_control environment's pictures.
+) -> PhysicsFrames | NoFrameSource:
+    """Return the source of a dm_control environment's frames.
 
     Args:
         env: an environment with dm_control's `physics`.
@@ -124,20 +124,20 @@ def dm_control_pictures(
         height: in pixels; None is 240, dm_control's default.
         width: in pixels; None is 320, likewise.
 
-    The pictures are those of `physics.render()`. What that cannot draw is not drawn
-    live: a picture larger than the model's offscreen buffer, and one from an
+    The frames are those of `physics.render()`. What that cannot draw is not drawn
+    live: a frame larger than the model's offscreen buffer, and one from an
     `MjvCamera`.
 
     Raises:
         UnknownName: the model has no such camera.
         InvalidArgument: a number or a size that cannot be.
     """
-    height, width = _picture_size(height, width)
+    height, width = _frame_size(height, width)
     if camera is not None:
         resolve_camera(raw_model(env.physics.model), camera)
     if not _drawn_by_physics(env.physics, camera, height, width):
-        return NoPictureSource(_NOT_BY_PHYSICS)
-    return PhysicsPictures(env, camera=camera, height=height, width=width)
+        return NoFrameSource(_NOT_BY_PHYSICS)
+    return PhysicsFrames(env, camera=camera, height=height, width=width)
 
 
 def generator_of(env: Any) -> Any:
@@ -150,8 +150,8 @@ def generator_of(env: Any) -> Any:
     return None
 
 
-class PhysicsPictures:
-    """The pictures that `physics.render()` gives.
+class PhysicsFrames:
+    """The frames that `physics.render()` gives.
 
     Args:
         env: the environment; its physics may be another one at each call.
@@ -169,13 +169,13 @@ class PhysicsPictures:
         self._width = width
 
     def render(self) -> Any:
-        """Return the picture of this moment, `(height, width, 3) uint8`."""
+        """Return the frame of this moment, `(height, width, 3) uint8`."""
         return self._env.physics.render(
             height=self._height, width=self._width, camera_id=self._camera
         )
 
     def facts(self) -> dict[str, Any]:
-        """Return what the metadata of a video says about its pictures."""
+        """Return what the metadata of a video says about its frames."""
         physics = self._env.physics
         facts: dict[str, Any] = {
             "pictures": "env.render",
@@ -194,7 +194,7 @@ class _PhysicsScene:
         env: the environment; its physics may be another one at each call.
         camera: a name or number, or an `MjvCamera`.
         size: `(height, width)` in pixels.
-        by_physics: whether it is `physics.render()` that draws such pictures.
+        by_physics: whether it is `physics.render()` that draws such frames.
     """
 
     def __init__(
@@ -212,7 +212,7 @@ class _PhysicsScene:
         self._start(env.physics.model)
 
     def __call__(self) -> SceneView:
-        """Return what is shown from here on; `at_picture` keeps it up to date."""
+        """Return what is shown from here on; `at_frame` keeps it up to date."""
         model = self._env.physics.model
         if raw_model(model) is not self._model:
             self._start(model)
@@ -220,8 +220,8 @@ class _PhysicsScene:
         self._is_placed = False
         return self._view
 
-    def at_picture(self, capture: Callable[[], None]) -> None:
-        """Call `capture` with the view as a picture of this moment has it."""
+    def at_frame(self, capture: Callable[[], None]) -> None:
+        """Call `capture` with the view as a frame of this moment has it."""
         if self._camera == FREE_CAMERA:
             # It moves with the model's fields.
             place_free_camera(self._model, self._view.camera)
@@ -229,7 +229,7 @@ class _PhysicsScene:
         capture()
 
     def is_unmoved(self) -> bool:
-        """Tell, in a moment, that nothing is other than at the picture before.
+        """Return quickly whether nothing is other than at the frame before.
 
         But for what is in model, camera and option: it is the same simulation as when
         it was asked what is shown.
@@ -251,7 +251,7 @@ class _PhysicsScene:
         )
 
 
-def _picture_size(height: int | None, width: int | None) -> tuple[int, int]:
+def _frame_size(height: int | None, width: int | None) -> tuple[int, int]:
     """Return `(height, width)` with dm_control's default for what is None.
 
     Raises:
@@ -263,7 +263,7 @@ def _picture_size(height: int | None, width: int | None) -> tuple[int, int]:
 
 
 def _drawn_by_physics(physics: Any, camera: Any, height: int, width: int) -> bool:
-    """Tell whether `physics.render()` draws such pictures."""
+    """Return whether `physics.render()` draws such frames."""
     buffer = physics.model.vis.global_
     named = camera is None or isinstance(camera, str | int)
     return bool(named and height <= buffer.offheight and width <= buffer.offwidth)

@@ -26,7 +26,7 @@ def environment_from_name(
 ) -> NamedEnvironment:
     """Return the environment that `name` means.
 
-    Where it cannot be drawn it is made without pictures, and says why.
+    Where it cannot be drawn it is made without frames, and says why.
 
     Args:
         name: see `parse_environment_name`.
@@ -58,11 +58,11 @@ def _gymnasium(env_id: str, options: EnvironmentOptions) -> NamedEnvironment:
     try:
         return GymnasiumEnvironment(make_gymnasium(env_id, options))
     except (NoPictures, MissingDependency) as error:
-        if not options.pictures or "render_mode" in options.kwargs:
+        if not options.frames or "render_mode" in options.kwargs:
             raise
-        without = replace(options, pictures=False)
+        without = replace(options, frames=False)
         environment = make_gymnasium(env_id, without)
-        return GymnasiumEnvironment(environment, no_pictures=error)
+        return GymnasiumEnvironment(environment, not_drawn=error)
 
 
 def _dm_control(name: DmControlName, options: EnvironmentOptions) -> NamedEnvironment:

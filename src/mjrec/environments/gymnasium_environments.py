@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Gymnasium environments by their ids, with the pictures that were asked for."""
+"""Gymnasium environments by their ids, with the frames that were asked for."""
 
 from __future__ import annotations
 
@@ -47,10 +47,10 @@ _VIEW_ARGUMENTS = ("camera_name", "camera_id", "default_camera_config")
 def make_gymnasium(env_id: str, options: EnvironmentOptions) -> gymnasium.Env[Any, Any]:
     """Return what `gymnasium.make` makes of an id, ready to be recorded.
 
-    With pictures the render mode is `rgb_array`, or `ansi` where the environment has
+    With frames the render mode is `rgb_array`, or `ansi` where the environment has
     only text. A MuJoCo environment shows its model's tracking camera where there is
     one and nothing else was asked for, because the default camera of Gymnasium 1.4
-    stays where it is and the robot leaves the picture. The environment's own time
+    stays where it is and the robot leaves the frame. The environment's own time
     limit is lowered to `max_steps`, or is 1000 steps where it has none.
 
     Args:
@@ -76,14 +76,14 @@ class GymnasiumEnvironment(NamedEnvironment):
 
     Args:
         environment: as `make_gymnasium` made it, or an MJCF file's.
-        no_pictures: why it was made without pictures though they were asked for.
+        not_drawn: why it was made without frames though they were asked for.
     """
 
     def __init__(
         self,
         environment: gymnasium.Env[Any, Any],
         *,
-        no_pictures: Error | None = None,
+        not_drawn: Error | None = None,
     ) -> None:
         # Environments that are made from names always have one, and a limit.
         spec: Any = environment.spec
@@ -91,7 +91,7 @@ class GymnasiumEnvironment(NamedEnvironment):
             environment,
             env_id=spec.id,
             step_limit=spec.max_episode_steps,
-            no_pictures=no_pictures,
+            not_drawn=not_drawn,
         )
 
     def begin(self, around: Any, seeds: EpisodeSeeds, seed: int | None) -> Any:
@@ -104,7 +104,7 @@ class GymnasiumEnvironment(NamedEnvironment):
         return Step(*around.step(action)[:4])
 
     def scenes(self) -> Scenes:
-        """Return what is known of its pictures and its states."""
+        """Return what is known of its frames and its states."""
         return gymnasium_scenes(self.environment)
 
 
@@ -113,7 +113,7 @@ def _make_known(
 ) -> gymnasium.Env[Any, Any]:
     kwargs = dict(options.kwargs)
     kwargs["max_episode_steps"] = options.limit(_own_limit(spec, kwargs))
-    if not options.pictures:
+    if not options.frames:
         return _make(spec, kwargs)
     kwargs["render_mode"] = _render_mode(spec, kwargs)
     return _make_drawn(spec, kwargs, options)
@@ -210,23 +210,23 @@ def _render_mode(spec: registration.EnvSpec, kwargs: Mapping[str, Any]) -> str:
     if "render_mode" in kwargs:
         mode = kwargs["render_mode"]
         if mode in (None, "human"):
-            raise _no_pictures(spec.id, f"render_mode={mode!r} was asked for")
-        # Gymnasium itself collects the pictures of `rgb_array` into `rgb_array_list`.
+            raise _not_drawn(spec.id, f"render_mode={mode!r} was asked for")
+        # Gymnasium itself collects the frames of `rgb_array` into `rgb_array_list`.
         if modes is not None and str(mode).removesuffix("_list") not in modes:
             raise UnknownName(f"render mode of {spec.id}", mode, modes)
     else:
-        # What says nothing is asked for pictures.
+        # What says nothing is asked for frames.
         there = _PREFERRED_MODES if modes is None else modes
         mode = next((each for each in _PREFERRED_MODES if each in there), None)
         if mode is None:
-            raise _no_pictures(spec.id, f"its render modes are {modes}")
+            raise _not_drawn(spec.id, f"its render modes are {modes}")
     family = str(getattr(creator, "__module__", "")).rpartition(".")[0]
     if family in _PYGAME_EXTRAS and str(mode).startswith("rgb_array"):
         _check_pygame(spec.id, _PYGAME_EXTRAS[family], has_text="ansi" in (modes or ()))
     return str(mode)
 
 
-def _no_pictures(env_id: str, why: str) -> NoPictures:
+def _not_drawn(env_id: str, why: str) -> NoPictures:
     return NoPictures(
         f"There is nothing to record of {env_id}: {why}, and a video needs "
         '"rgb_array", a text recording "ansi". Record it without videos (schedule '
@@ -235,7 +235,7 @@ def _no_pictures(env_id: str, why: str) -> NoPictures:
 
 
 def _check_pygame(env_id: str, extra: str, *, has_text: bool) -> None:
-    """Say before the first episode what would fail at its first picture."""
+    """Say before the first episode what would fail at its first frame."""
     if importlib.util.find_spec("pygame") is None:
         text_instead = ' (or record its text: --env-kwargs \'{"render_mode": "ansi"}\')'
         raise MissingDependency(
@@ -251,7 +251,7 @@ def _make_drawn(
     env = _make_sized(spec, kwargs, options.size)
     try:
         if env.render_mode is None:
-            raise _no_pictures(spec.id, "it took no render mode")
+            raise _not_drawn(spec.id, "it took no render mode")
         _choose_camera(env, spec.id, kwargs, options.camera)
     except BaseException:
         env.close()
@@ -265,7 +265,7 @@ def _make_sized(
     for name in size:
         if name in kwargs:
             raise InvalidArgument(
-                f"The {name} of the pictures is given twice: as {size[name]} and "
+                f"The {name} of the frames is given twice: as {size[name]} and "
                 f"among the environment's own arguments as {kwargs[name]!r}."
             )
     try:
@@ -275,7 +275,7 @@ def _make_sized(
         if not any(text in str(error.__cause__) for text in unknown):
             raise
         raise InvalidArgument(
-            f"{spec.id} takes no size: its pictures have the size that it chooses. "
+            f"{spec.id} takes no size: its frames have the size that it chooses. "
             "Only MuJoCo environments can be given one."
         ) from error.__cause__
 
@@ -288,7 +288,7 @@ def _choose_camera(
 ) -> None:
     """Let a MuJoCo environment show the camera that was asked for, or one that tracks.
 
-    Its renderer is told: Gymnasium-Robotics' environments take no camera themselves.
+    Set on its renderer: Gymnasium-Robotics' environments take no camera themselves.
     """
     chosen = [name for name in _VIEW_ARGUMENTS if name in kwargs]
     if asked is None and chosen:

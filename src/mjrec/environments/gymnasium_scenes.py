@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The states of a Gymnasium environment, and whether its pictures follow from them."""
+"""The states of a Gymnasium environment, and whether its frames follow from them."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ _DELEGATING = (
 _ROBOT_ENV = "gymnasium_robotics.envs.robot_env"
 
 # Wrappers whose `render` gives what it gets. RecordVideo's does so for single
-# pictures; array conversion changes what holds the numbers, not the numbers.
+# frames; array conversion changes what holds the numbers, not the numbers.
 _PASSING_ON = (
     ("gymnasium.core", "Wrapper.render"),
     ("gymnasium.wrappers.common", "OrderEnforcing.render"),
@@ -79,8 +79,8 @@ def gymnasium_scenes(
         height: in pixels; None is the environment's own.
         width: likewise.
 
-    With none of the three the pictures are those of `env.render()`, and what overrides
-    `render` is an obstacle. With one of them the pictures are of the scene, and
+    With none of the three the frames are those of `env.render()`, and what overrides
+    `render` is an obstacle. With one of them the frames are of the scene, and
     nothing that a wrapper draws on top is in them, live or later.
 
     Raises:
@@ -122,7 +122,7 @@ def set_own_camera(env: gymnasium.Env[Any, Any], camera: int | str) -> None:
 
 
 def has_own_scenes(base: Any) -> bool:
-    """Tell whether an environment is one of ours, which knows itself."""
+    """Return whether an environment is one of ours, which knows itself."""
     return hasattr(type(base), "mjrec_scenes")
 
 
@@ -181,7 +181,7 @@ def _wrong_mode(mode: str | None) -> str | None:
     if mode in (None, "rgb_array"):
         return None
     return (
-        f"its render_mode is {mode!r}, and only the pictures of 'rgb_array' follow "
+        f"its render_mode is {mode!r}, and only the frames of 'rgb_array' follow "
         "from states"
     )
 
@@ -206,36 +206,36 @@ def _states(simulated: Any, view: dict[str, Any]) -> Capture:
         lambda: (simulated.model, simulated.data),
         view=scene,
         forget=scene.forget,
-        at_picture=_at_picture(simulated, scene),
+        at_frame=_at_frame(simulated, scene),
         authored=lambda: _authored(simulated),
         obstacle=(lambda: None) if own_view else scene.obstacle,
-        is_unmoved=None if picture_moment(simulated) else scene.is_unmoved,
+        is_unmoved=None if frame_moment(simulated) else scene.is_unmoved,
     )
 
 
-def _at_picture(
+def _at_frame(
     simulated: Any, scene: ViewerScene
 ) -> Callable[[Callable[[], None]], None]:
-    moment = picture_moment(simulated)
+    moment = frame_moment(simulated)
     if moment is None:
-        return scene.at_picture
-    return lambda capture: moment(lambda: scene.at_picture(capture))
+        return scene.at_frame
+    return lambda capture: moment(lambda: scene.at_frame(capture))
 
 
 def _is_robot(drawn: Any) -> bool:
-    """Tell whether an environment shows itself as Gymnasium-Robotics' robots do."""
+    """Return whether an environment shows itself as Gymnasium-Robotics' robots do."""
     render = getattr(type(drawn), "render", None)
     return is_defined_by(render, _ROBOT_ENV, "MujocoRobotEnv.render")
 
 
-def picture_moment(drawn: Any) -> Callable[[Callable[[], None]], None] | None:
+def frame_moment(drawn: Any) -> Callable[[Callable[[], None]], None] | None:
     """Return what makes the moment at which an environment draws itself.
 
     Fetch's and the hand's environments move their goal's markers, and call
-    `mj_forward`, in each `render`; so a picture changes what happens afterwards. What
+    `mj_forward`, in each `render`; so a frame changes what happens afterwards. What
     is returned calls `render` with something else in the place of what draws, and puts
-    the simulation back afterwards: the picture is the one that `render` gives, and the
-    episode is the one that nobody looked at.
+    the simulation back afterwards: the frame is the one that `render` gives, and the
+    episode is the one without rendering.
 
     Args:
         drawn: an environment without its wrappers.
@@ -254,14 +254,14 @@ def picture_moment(drawn: Any) -> Callable[[Callable[[], None]], None] | None:
 
     simulation = PreservedState()
 
-    def at_picture(capture: Callable[[], None]) -> None:
+    def at_frame(capture: Callable[[], None]) -> None:
         with (
             simulation.around(drawn.model, drawn.data),
             _drawing_instead(drawn.mujoco_renderer, capture),
         ):
             drawn.render()
 
-    return at_picture
+    return at_frame
 
 
 @contextlib.contextmanager

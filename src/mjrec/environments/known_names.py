@@ -40,10 +40,10 @@ def suite_tasks(tag: str) -> tuple[str, ...]:
             mujoco.
         EnvironmentNotMade: importing it failed otherwise.
     """
-    said = _ask(_SUITE, tag)
-    if "names" in said:
-        return tuple(said["names"])
-    raise dm_control_failure(f"dm_control:{tag}", _as_raised(said))
+    answer = _ask(_SUITE, tag)
+    if "names" in answer:
+        return tuple(answer["names"])
+    raise dm_control_failure(f"dm_control:{tag}", _as_raised(answer))
 
 
 def gymnasium_ids(module: str | None = None) -> tuple[str, ...]:
@@ -55,12 +55,12 @@ def gymnasium_ids(module: str | None = None) -> tuple[str, ...]:
     Raises:
         EnvironmentNotMade: the module cannot be imported.
     """
-    said = _ask(_GYMNASIUM, module or "")
-    if "names" in said:
-        return tuple(said["names"])
+    answer = _ask(_GYMNASIUM, module or "")
+    if "names" in answer:
+        return tuple(answer["names"])
     raise EnvironmentNotMade(
         f"{module}:" if module else "the list of Gymnasium's environments",
-        f"importing gave {said.get('kind')}: {said.get('text')}",
+        f"importing gave {answer.get('kind')}: {answer.get('text')}",
         hint="It must be installed, or lie in the working directory.",
     )
 
@@ -116,17 +116,17 @@ def _ask(*arguments: str) -> dict[str, Any]:
     # Names need no OpenGL; without a display, GLFW would complain.
     environ = {**os.environ, "MUJOCO_GL": "disabled"}
     with Child(__name__, *arguments, environ=environ) as child:
-        for said in child.messages(_TIMEOUT_S):
-            if said is not None:
-                return said
+        for answer in child.messages(_TIMEOUT_S):
+            if answer is not None:
+                return answer
         return {"kind": "its process", "text": child.last_words()}
 
 
-def _as_raised(said: dict[str, Any]) -> Exception:
+def _as_raised(answer: dict[str, Any]) -> Exception:
     """Return an error like the one that the process met."""
-    text = str(said.get("text"))
-    if said.get("kind") == ModuleNotFoundError.__name__:
-        return ModuleNotFoundError(text, name=said.get("name"))
+    text = str(answer.get("text"))
+    if answer.get("kind") == ModuleNotFoundError.__name__:
+        return ModuleNotFoundError(text, name=answer.get("name"))
     return ImportError(text)
 
 

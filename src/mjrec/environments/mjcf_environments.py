@@ -50,7 +50,7 @@ def make_mjcf(
         )
     environment = MjcfEnvironment(
         path,
-        render_mode="rgb_array" if options.pictures else None,
+        render_mode="rgb_array" if options.frames else None,
         camera=options.camera,
         model=model,
         **options.size,
@@ -67,7 +67,7 @@ class MjcfEnvironment(gymnasium.Env[NDArray[np.float64], NDArray[np.float64]]):
     advances the simulation to the next sixtieth of a second, see `MjcfSimulation`.
     Every reset is the model's initial state, whatever the seed: nothing here is random.
     Rewards are 0. An episode is terminated only where the simulation becomes unstable;
-    `info["unstable"]` then says why, and the last picture and observation are those
+    `info["unstable"]` then says why, and the last frame and observation are those
     before it happened.
 
     `metadata["render_fps"]` is the frame rate, 60 unless the timestep is longer than
@@ -78,10 +78,10 @@ class MjcfEnvironment(gymnasium.Env[NDArray[np.float64], NDArray[np.float64]]):
 
     Args:
         path: of the MJCF file.
-        render_mode: `"rgb_array"`, or None for no pictures and no OpenGL.
+        render_mode: `"rgb_array"`, or None for no frames and no OpenGL.
         camera: a name or number; None is the camera that tracks the robot, else the
             first, else the free one.
-        height: of the pictures, in pixels.
+        height: of the frames, in pixels.
         width: likewise.
         model: where the file was compiled already.
 
@@ -93,7 +93,7 @@ class MjcfEnvironment(gymnasium.Env[NDArray[np.float64], NDArray[np.float64]]):
     Attributes:
         path: of the MJCF file.
         camera: that is shown.
-        height: of the pictures, in pixels.
+        height: of the frames, in pixels.
         width: likewise.
     """
 
@@ -154,7 +154,7 @@ class MjcfEnvironment(gymnasium.Env[NDArray[np.float64], NDArray[np.float64]]):
         return self.simulation.state(), 0.0, trouble is not None, False, info
 
     def render(self) -> Frame:
-        """Return the picture of this moment, `(height, width, 3) uint8`.
+        """Return the frame of this moment, `(height, width, 3) uint8`.
 
         Raises:
             NoPictures: the render mode is None.
@@ -173,8 +173,8 @@ class MjcfEnvironment(gymnasium.Env[NDArray[np.float64], NDArray[np.float64]]):
             )
         return self._renderer.render(self.simulation.data)
 
-    def picture_facts(self) -> dict[str, Any]:
-        """Return what the metadata of a video says about the pictures."""
+    def frame_facts(self) -> dict[str, Any]:
+        """Return what the metadata of a video says about the frames."""
         facts = {"camera": camera_label(self.simulation.model, self.camera)}
         if self._renderer is None:
             return facts
@@ -183,7 +183,7 @@ class MjcfEnvironment(gymnasium.Env[NDArray[np.float64], NDArray[np.float64]]):
     def mjrec_scenes(
         self, *, camera: Any, height: int | None, width: int | None
     ) -> Scenes:
-        """Return how its states are recorded, from which its pictures always follow."""
+        """Return how its states are recorded, from which its frames always follow."""
         simulation = self.simulation
         scene = ViewerScene(
             simulation,
@@ -201,7 +201,7 @@ class MjcfEnvironment(gymnasium.Env[NDArray[np.float64], NDArray[np.float64]]):
                 lambda: (simulation.model, simulation.data),
                 view=scene,
                 forget=scene.forget,
-                at_picture=scene.at_picture,
+                at_frame=scene.at_frame,
                 authored=lambda: authored_from_file(self.path),
             ),
             obstacle=obstacle,
@@ -246,7 +246,7 @@ def _plain(rate: Fraction) -> int | float:
 def _spec(path: Path) -> EnvSpec:
     """Return what names the environment in recordings: `mjcf/<file name>`.
 
-    It is not registered: nobody makes an environment from a name in a recording.
+    It is not registered: no environment is made from a name in a recording.
     """
     # What Gymnasium's syntax of ids lacks.
     name = re.sub(r"[^\w.-]", "_", path.stem)

@@ -25,11 +25,11 @@ class EnvironmentOptions:
     Attributes:
         camera: a camera's name or number; None is the model's tracking camera where
             there is one.
-        height: of the pictures, in pixels; None is the environment's own.
+        height: of the frames, in pixels; None is the environment's own.
         width: likewise.
         max_steps: ends an episode as truncated. Where the environment has a limit of
             its own, the smaller one wins; where it has none, None is 1000.
-        pictures: whether the environment will be drawn.
+        frames: whether the environment will be drawn.
         seed: of the run, for what an environment draws once, when it is made.
         kwargs: more arguments, in the form that the kind of environment takes.
 
@@ -41,7 +41,7 @@ class EnvironmentOptions:
     height: int | None = None
     width: int | None = None
     max_steps: int | None = None
-    pictures: bool = True
+    frames: bool = True
     seed: int = 0
     kwargs: Mapping[str, Any] = field(default_factory=dict)
 
@@ -86,12 +86,12 @@ class Step(NamedTuple):
 
 
 def is_terminated(timestep: Any) -> bool:
-    """Tell whether the task itself ended the episode: LAST with a discount of 0."""
+    """Return whether the task itself ended the episode: LAST with a discount of 0."""
     return bool(timestep.last() and not timestep.discount)
 
 
 def is_truncated(timestep: Any) -> bool:
-    """Tell whether a limit from outside ended the episode.
+    """Return whether a limit from outside ended the episode.
 
     That is LAST with another discount than 0: rewards would have followed.
     """
@@ -109,7 +109,7 @@ class NamedEnvironment(abc.ABC):
         step_limit: after how many steps its episodes end.
         view: `camera`, `height` and `width` as far as the monitor is to be given them;
             empty where the environment itself shows what was asked for.
-        no_pictures: why it cannot be drawn though pictures were asked for.
+        not_drawn: why it cannot be drawn though frames were asked for.
     """
 
     def __init__(
@@ -119,13 +119,13 @@ class NamedEnvironment(abc.ABC):
         env_id: str,
         step_limit: int,
         view: Mapping[str, Any] | None = None,
-        no_pictures: Error | None = None,
+        not_drawn: Error | None = None,
     ) -> None:
         self.environment = environment
         self.env_id = env_id
         self.step_limit = step_limit
         self.view = view or {}
-        self.no_pictures = no_pictures
+        self.not_drawn = not_drawn
 
     @property
     def draws_when_made(self) -> bool:
@@ -152,9 +152,9 @@ class NamedEnvironment(abc.ABC):
 
     @abc.abstractmethod
     def scenes(self) -> Scenes:
-        """Return what is known of its pictures and its states."""
+        """Return what is known of its frames and its states."""
 
-    def has_deferrable_pictures(self) -> bool:
-        """Tell whether what it shows can be drawn from its states."""
+    def can_be_deferred(self) -> bool:
+        """Return whether what it shows can be drawn from its states."""
         scenes = self.scenes()
         return scenes.states is not None and scenes.obstacle is None

@@ -115,7 +115,7 @@ class _ForeignPolicy(Policy):
 class _Predictor:
     """Calls `predict` as Stable-Baselines3 defines it, for one environment.
 
-    Recurrent policies get back the state that they returned, and are told which
+    Recurrent policies get back the state that they returned, and learn which
     observation is the first of its episode; an argument that a `predict` does not take
     is left out.
     """

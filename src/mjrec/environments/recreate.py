@@ -51,7 +51,7 @@ _FILES = re.compile(r"(xml|model|mesh|asset|file|path|texture)", re.IGNORECASE)
 _RENDER_MODES = (None, "rgb_array", "rgb_array_list", "ansi", "depth_array")
 _MOST_VALUES = 10_000
 _LARGEST = 1e9
-# Of a count of anything that takes memory or time: pictures, frames skipped, stacks.
+# Of a count of anything that takes memory or time: frames, frames skipped, stacks.
 # A suite task's `random` is a seed.
 _LARGEST_COUNT = 10_000
 
@@ -167,7 +167,7 @@ class Recreated:
             enter_state(simulated.model, simulated.data, parts, row)
 
     def turns_by_rk4(self) -> bool:
-        """Tell whether MuJoCo 4 steps its model otherwise than MuJoCo 3, on purpose."""
+        """Return whether MuJoCo 4 steps its model unlike MuJoCo 3, on purpose."""
         from ..simulation.states import turns_by_rk4  # It loads MuJoCo.
 
         simulated = simulation_below(self.environment)
@@ -180,7 +180,7 @@ class Recreated:
 
 
 def recreate(
-    said: Mapping[str, Any],
+    recorded: Mapping[str, Any],
     *,
     own_camera: int | str | None = None,
     trust: frozenset[str] = frozenset(),
@@ -189,7 +189,7 @@ def recreate(
     """Return the environment of a recording.
 
     Args:
-        said: `framework`, `id`, `kwargs`, `wrappers` and so on, of the journal.
+        recorded: `framework`, `id`, `kwargs`, `wrappers` and so on, of the journal.
         own_camera: that the environment showed by itself, where that was set after it
             was made.
         trust: further ids that the reader has named, `Id` or `module:Id`. The module
@@ -199,20 +199,22 @@ def recreate(
     Raises:
         NotRecreated: the rule of trust forbids it, or it cannot be made here.
     """
-    env_id, kwargs = said.get("id"), said.get("kwargs")
-    limit = said.get("max_episode_steps")
+    env_id, kwargs = recorded.get("id"), recorded.get("kwargs")
+    limit = recorded.get("max_episode_steps")
     if not isinstance(env_id, str) or not (
         limit is None or (type(limit) is int and 0 < limit <= _LARGEST)
     ):
-        raise NotRecreated(f"what it says of its environment cannot be: {said!r:.200}")
+        raise NotRecreated(
+            f"what it says of its environment cannot be: {recorded!r:.200}"
+        )
     if not isinstance(kwargs, Mapping | None):
         raise NotRecreated(f"its arguments cannot be {kwargs!r:.100}")
-    match said.get("framework"):
+    match recorded.get("framework"):
         case "gymnasium":
             env = _gymnasium(env_id, kwargs, limit, trust)
         case "dm_control":
-            if said.get("wrappers"):
-                raise _wrappers_refused(said["wrappers"])
+            if recorded.get("wrappers"):
+                raise _wrappers_refused(recorded["wrappers"])
             return _dm_control(env_id, kwargs, limit)
         case "mjcf" if mjcf is not None:
             env = _mjcf(*mjcf, kwargs or {}, limit)
@@ -221,7 +223,7 @@ def recreate(
     with _failures(env_id):
         if own_camera is not None:
             set_own_camera(env, own_camera)
-        return _wrapped(env, said)
+        return _wrapped(env, recorded)
 
 
 def checked_options(options: Any) -> dict[str, Any] | None:
@@ -275,10 +277,10 @@ def _gymnasium(
         )
 
 
-def _wrapped(env: gymnasium.Env[Any, Any], said: Mapping[str, Any]) -> Recreated:
+def _wrapped(env: gymnasium.Env[Any, Any], recorded: Mapping[str, Any]) -> Recreated:
     """Return an environment in the wrappers of a recording, or in stand-ins."""
-    names = [str(name) for name in said.get("wrappers") or ()]
-    arguments = said.get("wrapper_arguments") or [None] * len(names)
+    names = [str(name) for name in recorded.get("wrappers") or ()]
+    arguments = recorded.get("wrapper_arguments") or [None] * len(names)
     if len(arguments) != len(names):
         raise _wrappers_refused(names)
     kinds = [_known_wrapper(*each) for each in zip(names, arguments, strict=True)]
@@ -353,12 +355,12 @@ def _dm_control(
 
 
 def _are_plain(arguments: Mapping[str, Any]) -> bool:
-    """Tell whether all arguments are plain values within bounds, and name no file."""
+    """Return whether all arguments are plain values within bounds, and name no file."""
     return all(_is_plain_item(*item) for item in arguments.items())
 
 
 def _is_plain_item(name: Any, value: Any) -> bool:
-    """Tell whether an argument is a plain value within bounds, and names no file."""
+    """Return whether an argument is a plain value within bounds, and names no file."""
     if not isinstance(name, str) or _FILES.search(name):
         return False
     if name != "random" and isinstance(value, int) and abs(value) > _LARGEST_COUNT:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a monitor needs to know of an environment to record its states and pictures."""
+"""What a monitor needs to know of an environment to record its states and frames."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _MOST_CHARACTERS = 400
 
 @dataclass(frozen=True, kw_only=True)
 class Scenes:
-    """How an environment's states are recorded, and whether pictures follow from them.
+    """How an environment's states are recorded, and whether frames follow from them.
 
     Attributes:
         states: takes them down; None where no MuJoCo simulation can be seen.
@@ -49,8 +49,8 @@ class Scenes:
     random_state: Callable[[], Any] = lambda: None
 
 
-class NoPictureSource:
-    """Stands for the pictures of an environment that cannot be drawn live.
+class NoFrameSource:
+    """Stands for the frames of an environment that cannot be drawn live.
 
     Args:
         missing: what the environment lacks, and what to do about it.
@@ -62,7 +62,7 @@ class NoPictureSource:
         self.missing = missing
 
     def render(self) -> None:
-        """Return None: there is no picture."""
+        """Return None: there is no frame."""
 
     def facts(self) -> dict[str, Any]:
         """Return nothing: there is no video."""
@@ -87,7 +87,7 @@ def new_warnings(before: Mapping[str, int], after: Mapping[str, int]) -> dict[st
 
 
 def is_defined_by(function: object, module: str, qualified_name: str) -> bool:
-    """Tell whether a function is the one that a module's own source defines.
+    """Return whether a function is the one that a module's own source defines.
 
     What was put in its place (a function of that name from elsewhere, also under a
     decorator that copies names) is not.
@@ -107,7 +107,7 @@ def is_defined_by(function: object, module: str, qualified_name: str) -> bool:
 
 
 def has_own_method(instance: Any, name: str) -> bool:
-    """Tell whether an object has a method itself that its class has otherwise.
+    """Return whether an object has a method itself that its class has otherwise.
 
     Asks not for `__dict__`: an object that was asked for it once finds each of its
     attributes several times as slowly ever after (CPython 3.11 and 3.12), which adds
@@ -181,14 +181,14 @@ def shown_arguments(kwargs: Any) -> str:
     """
     if not isinstance(kwargs, Mapping):
         return ""
-    said = ", ".join(
+    shown = ", ".join(
         f"{name}={value!r:.100}"
         for name, value in kwargs.items()
         if name not in VIEW_ARGUMENTS
     )
-    if len(said) > _MOST_CHARACTERS:
-        return f"{said[:_MOST_CHARACTERS]} ..."
-    return said
+    if len(shown) > _MOST_CHARACTERS:
+        return f"{shown[:_MOST_CHARACTERS]} ..."
+    return shown
 
 
 def _lists(value: Any) -> Any:

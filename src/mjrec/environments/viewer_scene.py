@@ -43,7 +43,7 @@ class ViewerScene:
 
     Where the environment has a viewer for `rgb_array`, that is the viewer's own camera
     and options, whatever the user makes of them. Until then it is what a viewer made
-    at the first picture would show, for as long as the environment keeps its renderer.
+    at the first frame would show, for as long as the environment keeps its renderer.
 
     Args:
         simulated: has MuJoCo's `model` and `data` and, if it is one of Gymnasium's
@@ -75,7 +75,7 @@ class ViewerScene:
         self._start()
 
     def __call__(self) -> SceneView:
-        """Return what is shown from here on; `at_picture` keeps it up to date."""
+        """Return what is shown from here on; `at_frame` keeps it up to date."""
         self._update()
         self._data = self._simulated.data
         self._note_unmoved()
@@ -89,22 +89,22 @@ class ViewerScene:
             label=self._label(),
         )
 
-    def at_picture(self, capture: Callable[[], None]) -> None:
-        """Call `capture` with the view as a picture of this moment has it."""
+    def at_frame(self, capture: Callable[[], None]) -> None:
+        """Call `capture` with the view as a frame of this moment has it."""
         self._update()
         self._is_settled = True
         self._note_unmoved()
         capture()
 
     def forget(self) -> None:
-        """Go by the next picture as if it were the first.
+        """Go by the next frame as if it were the first.
 
         A viewer that the environment has already stays as it is.
         """
         self._start()
 
     def is_unmoved(self) -> bool:
-        """Tell, in a moment, that nothing is other than at the picture before.
+        """Return quickly whether nothing is other than at the frame before.
 
         As far as that is sure without a closer look, and as far as it does not follow
         from what is in model, camera and option: it is the same simulation as when it
@@ -117,7 +117,7 @@ class ViewerScene:
         )
 
     def obstacle(self) -> str | None:
-        """Return why the viewer's picture of this moment would show something else."""
+        """Return why the viewer's frame of this moment would show something else."""
         renderer, viewer = self._renderer, self._viewer()
         if renderer is not None and renderer.model is not self._simulated.model:
             return "the renderer draws another model than the environment simulates"
@@ -207,7 +207,7 @@ def _addition(viewer: Any, new_flags: bytes) -> str | None:
     if viewer._markers:
         return "markers were added to the viewer"
     if viewer._overlays:
-        return "text was laid over the viewer's pictures"
+        return "text was laid over the viewer's frames"
     if viewer.pert.select or viewer.pert.active:
         return "a body is selected in the viewer"
     if viewer.scn.flags.tobytes() != new_flags:

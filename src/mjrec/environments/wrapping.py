@@ -2,7 +2,7 @@
 """What stands between a monitor and the environment that it records.
 
 An action that was recorded above a wrapper need not be what the environment got, so
-whoever makes the environment again must know of wrappers.
+recreating the environment takes its wrappers.
 """
 
 from __future__ import annotations

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Evaluating policies: so many episodes of so many tasks, and what comes of them."""
+"""Evaluating policies: episodes of many tasks, and their statistics."""

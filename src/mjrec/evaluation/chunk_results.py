@@ -117,9 +117,9 @@ def _read(path: Path, task: str, found: ChunkResults) -> None:
 
 
 def _completed(
-    entry: JournalEntry, said: Mapping[str, Any], task: str, monitor: str
+    entry: JournalEntry, recorded: Mapping[str, Any], task: str, monitor: str
 ) -> EpisodeResult:
-    seed, episode = _unit(said)
+    seed, episode = _unit(recorded)
     return EpisodeResult(
         task=task,
         seed=seed,
@@ -129,7 +129,7 @@ def _completed(
         terminated=entry.terminated,
         truncated=entry.truncated,
         success=entry.success,
-        warnings=field_of(said, "warnings", mapping, default={}),
+        warnings=field_of(recorded, "warnings", mapping, default={}),
         monitor=monitor,
         episode_id=entry.episode_id,
         start_time=entry.start_time,
@@ -137,24 +137,24 @@ def _completed(
     )
 
 
-def _failed(said: Mapping[str, Any], task: str, monitor: str) -> EpisodeResult:
-    seed, episode = _unit(said)
-    episode_id = field_of(said, "episode_id", optional(integer))
+def _failed(recorded: Mapping[str, Any], task: str, monitor: str) -> EpisodeResult:
+    seed, episode = _unit(recorded)
+    episode_id = field_of(recorded, "episode_id", optional(integer))
     return EpisodeResult(
         task=task,
         seed=seed,
         episode=episode,
         total_reward=None,
-        length=field_of(said, "length", integer),
+        length=field_of(recorded, "length", integer),
         terminated=None,
         truncated=None,
-        failure=field_of(said, "failure", text),
+        failure=field_of(recorded, "failure", text),
         monitor=None if episode_id is None else monitor,
         episode_id=episode_id,
-        start_time=field_of(said, "start_time", optional(number)),
-        seconds=field_of(said, "seconds", optional(number)),
+        start_time=field_of(recorded, "start_time", optional(number)),
+        seconds=field_of(recorded, "seconds", optional(number)),
     )
 
 
-def _unit(said: Mapping[str, Any]) -> Unit:
-    return field_of(said, "seed", integer), field_of(said, "episode", integer)
+def _unit(recorded: Mapping[str, Any]) -> Unit:
+    return field_of(recorded, "seed", integer), field_of(recorded, "episode", integer)

@@ -79,7 +79,7 @@ _WORKER = "mjrec.evaluation.worker:EvaluationWorker"
 _LOCK_NAME = ".mjrec.evaluation.lock"
 
 # Sums in another order are other numbers, and how many threads a library takes depends
-# on the machine; and so many processes keep all CPUs busy.
+# on the machine; and this many processes keep all CPUs busy.
 _ONE_THREAD_EACH = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 _GL = "MUJOCO_GL"

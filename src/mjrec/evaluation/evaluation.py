@@ -168,7 +168,7 @@ class Evaluation:
 
 
 def is_evaluation(directory: Path) -> bool:
-    """Tell whether a directory is that of an evaluation, finished or not."""
+    """Return whether a directory is that of an evaluation, finished or not."""
     return any((directory / name).is_file() for name in (PLAN_NAME, RESULTS_NAME))
 
 

@@ -135,7 +135,7 @@ def check_tasks(
             run.submit(f"{number}", kind="check", task=name)
     velocities: dict[str, int] = {}
     for outcome in run.results():
-        # Without patience there is always one.
+        # Without timeout there is always one.
         assert outcome is not None
         said = outcome.value or {}
         name = [*unknown][int(outcome.key) % len(unknown)]
@@ -179,7 +179,7 @@ def run_chunks(run: Run, chunks: Sequence[ChunkRun], tell: _Tell) -> EvaluationP
             by_key[_submit(run, each)] = each
     counts_from = 0.0
     progress = _progress(chunks)
-    for outcome in run.results(patience_s=_SECONDS_BETWEEN_REPORTS):
+    for outcome in run.results(timeout_s=_SECONDS_BETWEEN_REPORTS):
         if outcome is not None:
             each = by_key.pop(outcome.key)
             each.known = read_chunk(each.folder, each.task.name)

@@ -189,5 +189,5 @@ def _cubic(results: Sequence[EpisodeResult]) -> list[Chosen]:
 
 
 def _is_shown(result: EpisodeResult) -> bool:
-    """Tell whether there is something of an episode to be seen."""
+    """Return whether there is something of an episode to be seen."""
     return result.monitor is not None and result.length > 0

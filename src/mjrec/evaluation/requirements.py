@@ -52,14 +52,16 @@ class Requirement:
         Raises:
             UnknownName: the task is not compared.
         """
-        said = {each.task: each.figures for each in comparison.tasks}
+        figures_of = {each.task: each.figures for each in comparison.tasks}
         if self.task is not None:
-            if self.task not in said:
-                raise UnknownName("task in this comparison", self.task, list(said))
-            said = {self.task: said[self.task]}
+            if self.task not in figures_of:
+                raise UnknownName(
+                    "task in this comparison", self.task, list(figures_of)
+                )
+            figures_of = {self.task: figures_of[self.task]}
         elif self.figure in OVERALL_FIGURES:
-            said = {"all tasks": comparison.figures}
-        for whose, figures in said.items():
+            figures_of = {"all tasks": comparison.figures}
+        for whose, figures in figures_of.items():
             value = self._value(figures.get(self.figure))
             what = " ".join(filter(None, [self.figure, self.end]))
             if value is None:

@@ -99,7 +99,7 @@ class Evaluator:
         return not keep_rule(self._plan.keep).keeps_none
 
     def fits(self, task: str, seed: int, *, continues: bool) -> bool:
-        """Tell whether environment and policy of before are those of an episode.
+        """Return whether environment and policy of before are those of an episode.
 
         Args:
             task: its environment's name.
@@ -167,7 +167,7 @@ class Evaluator:
             height=plan.height,
             width=plan.width,
             max_steps=plan.max_steps,
-            pictures=self.draws,
+            frames=self.draws,
             seed=seed,
             kwargs=plan.env_kwargs,
         )
@@ -178,9 +178,9 @@ class Evaluator:
         except BaseException:
             named.environment.close()
             raise
-        can_be_drawn = self.draws and named.no_pictures is None
+        can_be_drawn = self.draws and named.not_drawn is None
         if self.draws and not can_be_drawn:
-            logger.warning("%s: no videos, only results. %s", task, named.no_pictures)
+            logger.warning("%s: no videos, only results. %s", task, named.not_drawn)
         return Acting(task, seed, named, policy, can_be_drawn and choice.mode == LIVE)
 
     def _make_policy(self, environment: Any) -> Policy:
@@ -268,7 +268,7 @@ class _ChunkRun:
         """
         monitor = self._monitored(unit, continues=continues)
         # What was shown before it does not count: other chunks have other episodes.
-        monitor.forget_pictures()
+        monitor.forget_frames()
         episode_id, start = monitor.episode_id, time.time()
         seed, number = unit
         monitor.recorder.note_event("begun", {"seed": seed, "episode": number})

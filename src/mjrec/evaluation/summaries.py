@@ -156,7 +156,7 @@ def summarize_task(
         task: its name.
         total_rewards: the returns.
         runs: how many seeds, or monitors, the episodes are of.
-        lengths: in steps; nothing where nobody wrote them down.
+        lengths: in steps; empty where they were not recorded.
         terminated: truth values; nothing likewise.
         truncated: likewise.
         success: 1 and 0, NaN where the environment said nothing; nothing likewise.
@@ -217,7 +217,7 @@ def summarize_results(
 def default_score_range(
     task: str, step_limit: int | None = None
 ) -> tuple[float, float] | None:
-    """Return the returns that count as 0 and as 1, or None where nobody can say.
+    """Return the returns that count as 0 and as 1; None where they are unknown.
 
     The tasks of the dm_control suite reward every step with 0 to 1 and have 1000 steps
     (arXiv 1801.00690), all but `lqr`, whose rewards have no bound.
@@ -312,13 +312,13 @@ def _figures(returns: FloatArray, how: Bootstrap) -> dict[str, Any]:
 
 
 def _successes(success: npt.ArrayLike, failed: int, how: Bootstrap) -> dict[str, Any]:
-    said = np.asarray(success, dtype=np.float64)
-    said = said[~np.isnan(said)]
-    if not len(said):
+    known_successes = np.asarray(success, dtype=np.float64)
+    known_successes = known_successes[~np.isnan(known_successes)]
+    if not len(known_successes):
         return {}
     # Who fails to complete an episode does not succeed in it.
-    known = len(said) + failed
-    successes = int(np.count_nonzero(said))
+    known = len(known_successes) + failed
+    successes = int(np.count_nonzero(known_successes))
     return {
         "success_known": known,
         "success_rate": successes / known,

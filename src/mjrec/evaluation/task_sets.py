@@ -87,7 +87,7 @@ def _named(text: str) -> Sequence[str]:
 
 
 def _is_set(text: str) -> bool:
-    """Tell whether it can only have been meant as a set."""
+    """Return whether it can only have been meant as a set."""
     framework, colon, name = text.partition(":")
     if not colon or _WILD.search(name):
         return False

@@ -6,7 +6,7 @@ Of a staged monitor directory, whose files are copies or links:
 - the texts in JSON (manifests, metadata, statistics, journals, text recordings), in
   trajectories' facts and in Stable-Baselines3's CSV have placeholders: `<home>`,
   `<path>`, `<user>`, `<host>`;
-- of the surroundings of a recording, the command line keeps only names of files, the
+- of the provenance of a recording, the command line keeps only names of files, the
   code neither its commit nor where it is, and variables no directories;
 - of the device that drew a video its number is left, and where UUIDs of GPUs stood is
   `<gpu>`: each names a single card;
@@ -197,14 +197,14 @@ def _csv_lines(data: bytes, texts: _Texts) -> Iterator[bytes]:
 
 def _general(key: str, value: Any) -> Any:
     """Return what may be said under a key of JSON in any recording."""
-    if key == "surroundings" and isinstance(value, dict):
-        return {k: _general_surrounding(k, item) for k, item in value.items()}
+    if key == "provenance" and isinstance(value, dict):
+        return {k: _general_provenance(k, item) for k, item in value.items()}
     if key == "gl_device" and isinstance(value, dict):
         return {k: v for k, v in value.items() if k not in ("uuid", "file")}
     return value
 
 
-def _general_surrounding(key: str, value: Any) -> Any:
+def _general_provenance(key: str, value: Any) -> Any:
     match key, value:
         case "working_directory", _:
             return "<path>"

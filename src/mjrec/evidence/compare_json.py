@@ -100,7 +100,7 @@ KEYS: Final[Mapping[str, Rule]] = {
     "gl_device": _STATEMENT,
     **dict.fromkeys(("ffmpeg_sha256",), _FFMPEG),
     **dict.fromkeys(("start_time", "end_time", "timestamps"), _OF_FILES),
-    **dict.fromkeys(("initial_reset_timestamp", "surroundings"), _OF_FILES),
+    **dict.fromkeys(("initial_reset_timestamp", "provenance"), _OF_FILES),
     "machine": Rule(Topic.PHYSICS, Aspect.CLAIM, "machine"),
     "model": _MODEL,
 }

@@ -23,8 +23,7 @@ from ..formats.regular_files import open_regular, read_regular
 from .decoded_video import DecodedVideo
 from .differences import Aspect, Difference, Same, short, unlike
 from .findings import Topic
-from .mp4_boxes import Box, read_boxes, shown_times
-from .picture_similarity import (
+from .frame_similarity import (
     OTHER_CPU,
     OTHER_ENCODER,
     Planes,
@@ -33,6 +32,7 @@ from .picture_similarity import (
     planes_of,
     similarity,
 )
+from .mp4_boxes import Box, read_boxes, shown_times
 
 # What another encoder, or other frames, change in a file that shows the same.
 _ENCODED: Final = frozenset(

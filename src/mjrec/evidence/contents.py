@@ -74,7 +74,7 @@ class Contents:
         manifests: by name, those that are packed with other content.
         bundled: trajectories that get a file of their own, by the name of that.
         without_states: trajectories that are packed without states and snapshots.
-        surroundings: what the manifests say of where their recordings were made.
+        provenance: what the manifests say of where their recordings were made.
     """
 
     directory: Path
@@ -83,10 +83,10 @@ class Contents:
     manifests: dict[str, Manifest] = field(default_factory=dict)
     bundled: dict[str, Path] = field(default_factory=dict)
     without_states: dict[str, Path] = field(default_factory=dict)
-    surroundings: list[Mapping[str, Any]] = field(default_factory=list)
+    provenance: list[Mapping[str, Any]] = field(default_factory=list)
 
     def is_chosen(self, name: str) -> bool:
-        """Tell whether a file is of an episode that was chosen."""
+        """Return whether a file is of an episode that was chosen."""
         return self.packed_episodes is None or episode_of(name) in self.packed_episodes
 
     def add(self, path: Path, *, of: str | None = None) -> None:
@@ -172,7 +172,7 @@ def _check_is_idle(directory: Path) -> None:
             what = (
                 "a monitor that is still open writes there"
                 if path.name == f".{FILE_PREFIX}.{infix_of(path.name)}.lock"
-                else "somebody renders there"
+                else "another process renders there"
             )
             raise DirectoryInUse(
                 f"Cannot pack {directory}: {what} (it holds {path.name}). Close the "
@@ -193,7 +193,7 @@ def _check_all_is_done(directory: Path) -> None:
     if strays:
         raise UnfinishedRecordings(directory, strays, advice=_STRAY)
     pending = [
-        key.told_name
+        key.shown_name
         for key in recordings(directory)
         if look_at(directory, key) is not None
     ]
@@ -253,9 +253,9 @@ def _add_monitor(contents: Contents, path: Path, files: list[Path]) -> None:
 
 def _add_manifest(contents: Contents, path: Path, manifest: Manifest) -> None:
     details = manifest.mjrec
-    surroundings = (details or {}).get("surroundings")
-    if isinstance(surroundings, Mapping):
-        contents.surroundings.append(surroundings)
+    provenance = (details or {}).get("provenance")
+    if isinstance(provenance, Mapping):
+        contents.provenance.append(provenance)
     if contents.packed_episodes is None:
         contents.add(path)
         return

@@ -18,7 +18,7 @@ import numpy as np
 from ..errors import UnreadableFile
 from ..formats.ffmpeg import FfmpegProcess, as_file, every_frame_arguments
 from ..formats.regular_files import regular_path
-from .picture_similarity import Planes
+from .frame_similarity import Planes
 
 _READ_SIZE: Final = 1 << 20
 _LONGEST_HEADER: Final = 1024
@@ -115,7 +115,7 @@ class DecodedVideo:
         self.header = line.decode("ascii", "backslashreplace")
 
     def _take(self, size: int) -> bytes:
-        """Return so many bytes; fewer at the end."""
+        """Return this many bytes; fewer at the end."""
         parts, missing = [self._rest[:size]], size - len(self._rest[:size])
         self._rest = self._rest[size:]
         while missing:

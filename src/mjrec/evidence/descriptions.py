@@ -132,7 +132,7 @@ def _environment(run: PackedRun, packed_with: Mapping[str, str]) -> dict[str, An
 
     Returns:
         `recordings`: for each monitor, by its infix, `env_id`, `versions`,
-        `surroundings` (null where the recording says nothing of them), and `pictures`
+        `provenance` (null where the recording says nothing of them), and `frames`
         and `encoders`, each different one that made a video of it. `packed_with`: the
         versions of what has made this archive, and the options of packing.
     """
@@ -143,7 +143,7 @@ def _environment(run: PackedRun, packed_with: Mapping[str, str]) -> dict[str, An
 
 
 def _made_with(session: Session) -> dict[str, Any]:
-    pictures = ("gl_vendor", "gl_renderer", "gl_version", "rendered_with")
+    frames = ("gl_vendor", "gl_renderer", "gl_version", "rendered_with")
     encoders = [
         {
             "version": facts["encoder_version"].get("version")
@@ -156,8 +156,8 @@ def _made_with(session: Session) -> dict[str, Any]:
     return {
         "env_id": session.env_id,
         "versions": dict(session.versions),
-        "surroundings": session.surroundings or None,
-        "pictures": session.different(*pictures),
+        "provenance": session.provenance or None,
+        "pictures": session.different(*frames),
         # Which also differ by their command lines.
         "encoders": [one for n, one in enumerate(encoders) if one not in encoders[:n]],
     }
@@ -203,7 +203,7 @@ def _rendered(
         ) from error
     templates = jinja2.Environment(
         loader=jinja2.PackageLoader("mjrec.evidence"),
-        # What recordings say of their surroundings may lack anything.
+        # What recordings say of their provenance may lack anything.
         undefined=jinja2.ChainableUndefined,
         finalize=finalize,
         trim_blocks=True,
@@ -327,7 +327,7 @@ def _environment_id(session: Session) -> str:
 
 
 def _policy_id(session: Session) -> str | None:
-    policy = session.surroundings.get("policy")
+    policy = session.provenance.get("policy")
     digest = policy.get("sha256") if isinstance(policy, Mapping) else None
     return f"#policy-{_uuid('policy', str(digest))}" if digest else None
 

@@ -44,7 +44,7 @@ class Aspect(enum.Enum):
     DERIVED = "derived"
     SOLVER = "solver"
     MODEL = "model"
-    PICTURE = "picture"
+    PICTURE = "frame"
     HASH = "hash"
     ENCODED = "encoded"
     STORED = "stored"

@@ -19,8 +19,7 @@ from typing import Final, TypeAlias
 from ..errors import InvalidArgument
 from .differences import Aspect, Difference, Place, Same
 from .findings import Excuse, ExcuseKind, Finding, Outcome, Topic
-from .notes import Note
-from .picture_similarity import (
+from .frame_similarity import (
     OTHER_BUILD,
     OTHER_CPU,
     OTHER_ENCODER,
@@ -28,6 +27,7 @@ from .picture_similarity import (
     Limits,
     Similarity,
 )
+from .notes import Note
 
 _Allowed: TypeAlias = Mapping[Aspect, float | Limits]
 
@@ -261,7 +261,7 @@ def with_allowed(excuses: Iterable[Excuse], allow: Iterable[str]) -> tuple[Excus
 
 
 class Trial:
-    """Tries excuses: is told of all that is equal and all that differs.
+    """Tries excuses against all that is equal and all that differs.
 
     Args:
         excuses: that are claimed.

@@ -220,7 +220,7 @@ class Verification:
 
 
 def _is_proof(finding: Finding) -> bool:
-    """Tell whether something that the environment or the renderer gives came out."""
+    """Return whether something that the environment or the renderer gives came out."""
     return finding.topic in _MADE and finding.outcome in (
         Outcome.MADE_AGAIN,
         Outcome.WITHIN_TOLERANCE,

@@ -110,7 +110,7 @@ class Identity:
 
 
 def identity_of_user(
-    surroundings: Iterable[Mapping[str, Any]] = (), authors: Iterable[Author] = ()
+    provenance: Iterable[Mapping[str, Any]] = (), authors: Iterable[Author] = ()
 ) -> Identity:
     """Return what names the user of this process, its machine, and who recorded.
 
@@ -118,7 +118,7 @@ def identity_of_user(
     directory and in the recorded repositories; no name server.
 
     Args:
-        surroundings: what the manifests say of where their recordings were made, which
+        provenance: what the manifests say of where their recordings were made, which
             may have been another machine and another user.
         authors: as they were stated.
     """
@@ -126,8 +126,8 @@ def identity_of_user(
     _add_system(identity)
     _add_variables(identity, os.environ)
     directories = [_working_directory()]
-    for said in surroundings:
-        _add_surroundings(identity, said)
+    for said in provenance:
+        _add_provenance(identity, said)
         root = facts_in(said.get("code")).get("root")
         directories += [root, said.get("working_directory")]
     for directory in dict.fromkeys(filter(_is_directory, directories)):
@@ -169,7 +169,7 @@ def _add_variables(identity: Identity, variables: Mapping[str, Any]) -> None:
             identity.add(kind, variables.get(name))
 
 
-def _add_surroundings(identity: Identity, said: Mapping[str, Any]) -> None:
+def _add_provenance(identity: Identity, said: Mapping[str, Any]) -> None:
     variables, code = facts_in(said.get("variables")), facts_in(said.get("code"))
     _add_variables(identity, variables)
     identity.add("directories", said.get("working_directory"))

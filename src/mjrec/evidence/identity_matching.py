@@ -198,7 +198,7 @@ def _short_parts(identity: Identity) -> Iterator[tuple[str, str]]:
 
 
 def _is_distinctive(name: str, length: int) -> bool:
-    """Tell whether a name of at least `length` is no ordinary word, and no number."""
+    """Return whether a name of at least `length` is no ordinary word, and no number."""
     has_letters = any(character.isalpha() for character in name)
     return len(name) >= length and has_letters and name.lower() not in _ORDINARY_WORDS
 

@@ -127,8 +127,8 @@ class RecordingInputs:
         evaluation_keep: what the choice among all recordings of an evaluation said.
         monitor_csv_start: the time in Stable-Baselines3's file, a statement; None where
             that was not asked for.
-        surroundings: the provenance, a statement; None where it was not known.
-        surroundings_after: how many lines the journal had before it, after its first.
+        provenance: the provenance, a statement; None where it was not known.
+        provenance_after: how many lines the journal had before it, after its first.
         was_killed: another process has put the recording in order.
         has_sources: it had stored what its models were made from, when it was killed.
         is_closed: it was closed by its monitor.
@@ -147,8 +147,8 @@ class RecordingInputs:
     episodes: Sequence[EpisodeInputs] = ()
     evaluation_keep: Mapping[str, Any] | None = None
     monitor_csv_start: float | None = None
-    surroundings: Mapping[str, Any] | None = None
-    surroundings_after: int = 0
+    provenance: Mapping[str, Any] | None = None
+    provenance_after: int = 0
     was_killed: bool = False
     has_sources: bool = False
     is_closed: bool = False

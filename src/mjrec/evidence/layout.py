@@ -54,6 +54,6 @@ SAMPLED: Final = "sampled"
 
 # In the key `mjrec` of a packed manifest: the episodes that were chosen for packing.
 PACKED_EPISODES: Final = "packed_episodes"
-# In the facts of a packed trajectory of another episode, of which actions, rewards and
+# In the facts of a packed trajectory of another episode, whose actions, rewards and
 # seeds are packed: its states and snapshots were left out.
 STATES_LEFT_OUT: Final = "states_left_out"

@@ -177,7 +177,7 @@ class _Playing:
         recorder = self._monitor.recorder
         for episode in self._recording.episodes:
             if episode.evaluation is not None:
-                self._monitor.forget_pictures()
+                self._monitor.forget_frames()
                 recorder.note_event("begun", dict(episode.evaluation))
                 recorder.evaluation_facts = functools.partial(
                     self._evaluation_facts, episode.evaluation

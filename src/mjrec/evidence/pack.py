@@ -134,7 +134,7 @@ def pack(
     )
     identity = None
     if anonymous:
-        identity = identity_of_user(contents.surroundings, statements.authors)
+        identity = identity_of_user(contents.provenance, statements.authors)
     with _folder_beside(target) as folder:
         try:
             bag = _bag(contents, folder, options, identity, on_progress)

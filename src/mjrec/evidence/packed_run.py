@@ -83,14 +83,14 @@ class Session:
         infix: of its files.
         env_id: what was recorded.
         versions: of Python and the packages that recorded, by their names.
-        surroundings: what it was recorded with; empty where nothing says it.
+        provenance: what it was recorded with; empty where nothing says it.
         rule: the name of the rule by which the recorded episodes were chosen.
         was_killed: whether its process was, and what it left was recovered.
         files: the names of its files.
         models: the names of the models among what its trajectories refer to.
         videos: the name of each video that the manifest lists, and its metadata.
         made_with: the arguments that its environments were made with, each set once,
-            as text; "" is one that had none, or of which nothing is known.
+            as text; "" is one that had none, or about which nothing is known.
         tally: of the complete episodes.
         with_states: how many recorded episodes have their states in the archive.
         with_actions: how many have their actions there.
@@ -99,7 +99,7 @@ class Session:
     infix: str
     env_id: str
     versions: Mapping[str, str]
-    surroundings: Mapping[str, Any]
+    provenance: Mapping[str, Any]
     rule: str | None
     was_killed: bool
     files: tuple[str, ...]
@@ -224,7 +224,7 @@ def _session(
         infix=monitor.infix,
         env_id=str((results.env_info or {}).get("env_id", "(unknown)")),
         versions={k: v for k, v in versions.items() if isinstance(v, str)},
-        surroundings=facts_in(details.get("surroundings")),
+        provenance=facts_in(details.get("provenance")),
         rule=rule if isinstance(rule, str) else None,
         was_killed=details.get("recovered") is True,
         files=tuple(files),

@@ -120,8 +120,8 @@ def _recording(files: MonitorFiles, arrays: dict[str, NDArray[Any]]) -> Recordin
         episodes=tuple(_episodes(files, journal, arrays)),
         evaluation_keep=journal.evaluation_keep,
         monitor_csv_start=_monitor_csv_start(files),
-        surroundings=journal.surroundings,
-        surroundings_after=journal.surroundings_after,
+        provenance=journal.provenance,
+        provenance_after=journal.provenance_after,
         was_killed=journal.was_killed,
         has_sources=any(
             path.suffix == ".zip"
@@ -149,8 +149,8 @@ class _Journal:
 
     def __init__(self, path: Path | None) -> None:
         self.run: Mapping[str, Any] = {}
-        self.surroundings: Mapping[str, Any] | None = None
-        self.surroundings_after = self._lines = 0
+        self.provenance: Mapping[str, Any] | None = None
+        self.provenance_after = self._lines = 0
         self.entries: dict[int, JournalEntry] = {}
         self.cuts: dict[int, Mapping[str, Any]] = {}
         self.irregular: dict[int, list[Mapping[str, Any]]] = {}
@@ -182,9 +182,9 @@ class _Journal:
         match kind, facts:
             case "run", dict():
                 self.run = facts
-            case "surroundings", dict():
-                self.surroundings = facts
-                self.surroundings_after = self._lines
+            case "provenance", dict():
+                self.provenance = facts
+                self.provenance_after = self._lines
             case "cut", {"episode_id": int(number)}:
                 self.cuts[number] = facts
             case "action", {"episode_id": int(number), "step": int()}:
@@ -305,7 +305,7 @@ def _with_trajectory(
 
 
 def _is_elsewhere(facts: Mapping[str, Any]) -> bool:
-    """Tell whether another MuJoCo, or another machine, is claimed."""
+    """Return whether another MuJoCo, or another machine, is claimed."""
     said = facts.get("versions")
     version = said.get("mujoco") if isinstance(said, Mapping) else None
     return version != versions().get("mujoco") or (

@@ -81,8 +81,8 @@ def monitor_again(
             statements=Statements(
                 infix=infix,
                 first_episode_id=recording.first_episode_id,
-                surroundings=recording.surroundings,
-                surroundings_after=recording.surroundings_after,
+                provenance=recording.provenance,
+                provenance_after=recording.provenance_after,
                 clock=clock,
                 only_counted=only_counted,
             ),

@@ -106,7 +106,7 @@ def _author(text: object) -> Author:
 
 
 def _is_orcid(text: str | None) -> bool:
-    """Tell whether the last character fits the digits before it (ISO 7064, 11-2)."""
+    """Return whether the last character fits the digits before it (ISO 7064, 11-2)."""
     if text is None:
         return True
     total = 0

@@ -2,7 +2,7 @@
 """The report of a verification: one HTML file for people, that loads nothing.
 
 Whatever is in it may come from a hostile archive. It is shown as text: escaped, cut
-where it is long, and with what nobody sees (control characters, marks that turn the
+where it is long, and invisible characters (control characters, marks that turn the
 direction of writing) spelled out.
 """
 

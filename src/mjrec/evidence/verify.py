@@ -194,7 +194,7 @@ class _Verifying:
         self._progress.begin(phase)
         failure = None
         with Sandbox(MODULE, request, place=place, readable=readable) as sandbox:
-            for said in sandbox.said(_TIMEOUT_S):
+            for said in sandbox.answers(_TIMEOUT_S):
                 if said is None:
                     failure = f"nothing was heard of it for {_TIMEOUT_S:g} seconds"
                     break
@@ -242,7 +242,7 @@ class _Progress:
     """Tells of progress, with the time left.
 
     Args:
-        told: is told.
+        told: called with each.
     """
 
     def __init__(self, told: Callable[[VerificationProgress], object] | None) -> None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Videos packed for somebody else: gym's upload archive.
+"""Videos packed for upload: gym's archive.
 
 A gzipped tar file, flat::
 

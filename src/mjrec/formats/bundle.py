@@ -47,7 +47,7 @@ _LONGEST_RANGE = 44
 
 
 def is_finished(path: Path) -> bool:
-    """Tell whether a trajectory is there, by the path of its own file."""
+    """Return whether a trajectory is there, by the path of its own file."""
     return path.is_file() or _is_bundled(path)
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How ffmpeg is told to encode: the codec, its quality, the colours, the kind of file.
+"""How ffmpeg encodes: the codec, its quality, the colours, the kind of file.
 
 The same frames give the same file on any CPU and with any number of cores: the number
 of threads is fixed, x264 keeps to what every CPU does alike (`cpu-independent=1`), and

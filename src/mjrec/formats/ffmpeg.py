@@ -33,7 +33,7 @@ from ..errors import (
     MissingDependency,
 )
 from ..frames import Frame
-from ..patience import Patience
+from ..timeouts import Timeout
 from .regular_files import read_regular
 
 _ENVIRONMENT_VARIABLE = "IMAGEIO_FFMPEG_EXE"
@@ -92,7 +92,7 @@ def remembered(program: str, question: str, answer: Callable[[], str]) -> str:
     a hundred small frames. So the answers lie in `$XDG_CACHE_HOME/mjrec/programs.json`
     (`~/.cache/mjrec/programs.json` by default), which can be deleted at any time. They
     count only for the very file that was asked: the same path, device, inode, size and
-    times, of which the kernel sets the last.
+    times; the kernel sets the last.
 
     Args:
         program: its path.
@@ -121,8 +121,8 @@ def remembered(program: str, question: str, answer: Callable[[], str]) -> str:
 def _read(path: Path) -> dict[str, dict[str, str]]:
     # Whatever stands there, it can be found out again.
     with contextlib.suppress(OSError, ValueError, TypeError, AttributeError):
-        said = json.loads(read_regular(path, limit=_MOST_BYTES))
-        return {key: dict(value) for key, value in said.items()}
+        stored = json.loads(read_regular(path, limit=_MOST_BYTES))
+        return {key: dict(value) for key, value in stored.items()}
     return {}
 
 
@@ -164,7 +164,7 @@ def run_ffmpeg(
         what: what fails when it fails: the first sentence of the error.
 
     Raises:
-        EncoderError: its exit status is not 0, or it took longer than `patience_s`.
+        EncoderError: its exit status is not 0, or it took longer than `timeout_s`.
         Error: it could not be started, as `ffmpeg_executable` where that is its fault.
     """
     with FfmpegProcess(arguments, what=what, reads=True, writes=True) as process:
@@ -182,7 +182,7 @@ class FfmpegProcess:
     which decides. When the parent dies, ffmpeg sees the end of its input and finishes
     its file by itself. Leaving `with` ends it.
 
-    Each method that waits for it ends it when it has hung for `patience_s`: when it
+    Each method that waits for it ends it when it has hung for `timeout_s`: when it
     takes no byte, gives none, or has all and does not write on in its file.
 
     Args:
@@ -210,7 +210,7 @@ class FfmpegProcess:
     ) -> None:
         self.command = [ffmpeg_executable(), *arguments]
         self._what = what
-        self._patience = Patience()
+        self._timeout = Timeout()
         try:
             with contextlib.ExitStack() as on_failure:
                 # A file, not a pipe: it need not be emptied while the process runs.
@@ -347,16 +347,16 @@ class FfmpegProcess:
         """Wait, and end the process if there is no progress for too long.
 
         Args:
-            is_ready: waits at most so many seconds for what is waited for.
+            is_ready: waits at most this many seconds.
             state: returns what changes as long as there is progress.
         """
         last = state()
-        self._patience.renew()
-        while not self._patience.wait(is_ready):
+        self._timeout.renew()
+        while not self._timeout.wait(is_ready):
             if (now := state()) != last:
                 last = now
-                self._patience.renew()
-            elif self._patience.is_over:
+                self._timeout.renew()
+            elif self._timeout.is_over:
                 self.kill()
                 raise self._error()
 
@@ -376,9 +376,9 @@ class FfmpegProcess:
 
     def _error(self) -> EncoderError:
         what = self._what
-        if self._patience.is_over:
+        if self._timeout.is_over:
             what += (
-                f" It made no progress for {self._patience.seconds:g} seconds, and was "
+                f" It made no progress for {self._timeout.seconds:g} seconds, and was "
                 "ended."
             )
         size = self._stderr.seek(0, os.SEEK_END)

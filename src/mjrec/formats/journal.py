@@ -63,7 +63,7 @@ MOST_EPISODES = 10**15
 # recorded; which videos were kept; the end; that another process has put the directory
 # in order; and of an evaluation's episodes, that one begins, or has failed.
 EVENTS = (
-    *("run", "surroundings", "cut", "clip", "action", "dropped"),
+    *("run", "provenance", "cut", "clip", "action", "dropped"),
     *("fault", "keep", "closed", "recovered", "begun", "failed"),
 )
 
@@ -230,7 +230,7 @@ def _shortened(values: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def is_of_spans(line: bytes) -> bool:
-    """Tell whether a line of a journal is about rows: `formats.spans` reads these."""
+    """Return whether a line of a journal is about rows: `formats.spans` reads these."""
     return line.startswith(_OF_SPANS)
 
 
@@ -380,6 +380,6 @@ def entry_of(values: Mapping[str, Any]) -> JournalEntry:
 def _count(value: Any) -> int:
     count = integer(value)
     if not 0 <= count < MOST_EPISODES:
-        # Not its digits, of which there may be thousands.
+        # Not its digits: there may be thousands.
         raise ValueError("it is negative, or larger than any count can be")
     return count

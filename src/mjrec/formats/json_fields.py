@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Values taken out of JSON that somebody else may have written.
+"""Values taken out of JSON that a stranger may have written.
 
 Every function here raises `ValueError` with a reason that can follow "Cannot read
 FILE:"; the readers of the file formats turn it into `UnreadableFile`.

@@ -2,16 +2,16 @@
 """Lock files: who is alive is asked of the kernel, never of a process number.
 
 An open monitor holds `.openaigym.<infix>.lock` locked (`flock`). The kernel drops
-that when the process ends, however it ends, so a lock file that nobody holds is what
-a dead monitor left. Process numbers come round again, in containers all the time.
+that when the process ends, however it ends, so a lock file that no process holds is
+what a dead monitor left. Process numbers come round again, in containers all the time.
 
 A monitor's lock is a name that is given once. The others (who renders a video, who
 uses a CPU, who rewrites a manifest) go from hand to hand, and what a dead process left
 is taken over.
 
 A directory may come from anybody. A link, a pipe or a file with a second name that
-stands where a lock belongs is nobody's lock: it is never followed, written or waited
-for. Whoever wants that lock gets an error that says so.
+stands where a lock belongs is no lock: it is never followed, written or waited
+for. Asking for that lock raises an error that says so.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ from typing import Self
 
 from ..errors import DirectoryNotWritable
 
-# Whoever asks `is_locked` holds a lock for a moment, which is no reason to give up.
+# `is_locked` holds a lock for a moment, which is no reason to give up.
 _MOMENTS = 5
 _MOMENT = 0.002
 
-# Not blocking, should somebody have put a pipe there.
+# Not blocking, should a pipe lie there.
 _CAREFULLY = os.O_NOFOLLOW | os.O_NONBLOCK | os.O_NOCTTY
 # Of a link, a directory, and a socket or a device without a driver.
 _OF_OTHER_THINGS = (errno.ELOOP, errno.EISDIR, errno.ENXIO)
@@ -94,10 +94,10 @@ class Lock:
     def release(self) -> None:
         """Remove the file and let it go; further calls do nothing.
 
-        A file that somebody has put in its place stays.
+        A file that another program has put in its place stays.
         """
         try:
-            # Removed while it is still held: nobody ever sees it unlocked.
+            # Removed while it is still held: it is never seen unlocked.
             if self._descriptor is not None and _is_at(self._descriptor, self._path):
                 self._path.unlink(missing_ok=True)
         finally:
@@ -174,9 +174,9 @@ def _opened(path: Path) -> int:
 
 
 def is_locked(path: Path) -> bool:
-    """Tell whether a living process holds the lock file at `path`.
+    """Return whether a living process holds the lock file at `path`.
 
-    Nobody holds what is a link or no regular file.
+    A link or no regular file counts as not held.
 
     Raises:
         OSError: the file is there and cannot be opened.

@@ -59,7 +59,7 @@ class Manifest:
 
 
 def read_manifest(path: Path) -> Manifest:
-    """Return what the manifest says. Keys that nobody knows are ignored.
+    """Return what the manifest says. Unknown keys are ignored.
 
     Raises:
         UnreadableFile: it is missing or damaged, or names a file elsewhere.

@@ -9,7 +9,7 @@
     ├── openaigym.episodes.<infix>.jsonl                journal, a line an episode
     ├── openaigym.video.<infix>.video000027.mp4         a video ...
     ├── openaigym.video.<infix>.video000027.meta.json   ... and all about it
-    ├── openaigym.video.<infix>.video000027.framehash   ... and its pictures' hashes
+    ├── openaigym.video.<infix>.video000027.framehash   ... and its frames' hashes
     ├── openaigym.video.<infix>.video000027.failed.json why it is still pending
     ├── openaigym.clip.<infix>.step000000137.failed.json    likewise, of a clip
     ├── openaigym.video.<infix>.video000027.json        a text recording (asciicast)
@@ -279,12 +279,12 @@ def bundle_name(infix: Infix | str) -> str:
 
 
 def is_bundle(name: str) -> bool:
-    """Tell whether `name` is that of a file with many trajectories."""
+    """Return whether `name` is that of a file with many trajectories."""
     return _VISIBLE["trajectories"].fullmatch(name) is not None
 
 
 def video_lock_name(infix: Infix, episode_id: int) -> str:
-    """Return the name of the file that whoever renders an episode holds locked."""
+    """Return the name of the lock file of an episode's rendering."""
     return f".{video_prefix(infix, episode_id)}.lock"
 
 
@@ -309,7 +309,7 @@ def log_name(infix: Infix | str, number: int) -> str:
 
 
 def clip_lock_name(infix: Infix, first_step: int) -> str:
-    """Return the name of the file that whoever renders such a video holds locked."""
+    """Return the name of the lock file of such a video's rendering."""
     return f".{clip_prefix(infix, first_step)}.lock"
 
 
@@ -337,7 +337,7 @@ def lock_name(infix: Infix) -> str:
 
 
 def manifest_lock_name(infix: Infix) -> str:
-    """Return the name of the file that whoever rewrites a manifest holds locked.
+    """Return the name of the lock file of a manifest's rewriting.
 
     It is another one than the monitor's: a monitor that is closed stays closed.
     """
@@ -345,7 +345,7 @@ def manifest_lock_name(infix: Infix) -> str:
 
 
 def is_manifest(name: str) -> bool:
-    """Tell whether `name` is a manifest's, finished."""
+    """Return whether `name` is a manifest's, finished."""
     return _MANIFEST.fullmatch(name) is not None
 
 
@@ -376,7 +376,7 @@ def final_name(name: str) -> str | None:
 
 
 def is_note(name: str) -> bool:
-    """Tell whether `name` is that of a note beside an unfinished video."""
+    """Return whether `name` is that of a note beside an unfinished video."""
     part = _PART.fullmatch(name)
     return part is not None and bool(part["note"]) and not part["hex"]
 
@@ -393,7 +393,7 @@ def iter_monitor_files(directory: Path, *, hidden: bool = False) -> Iterator[Pat
     """Yield the monitor files of `directory`, sorted by name.
 
     Only regular files (and links to them) with a name that a monitor gives; other
-    files that start with `openaigym.`, and directories, are somebody else's.
+    files that start with `openaigym.`, and directories, are not ours.
 
     Args:
         directory: where to look; not below it. A directory that is not there holds
@@ -428,7 +428,7 @@ def recording_directories(directory: Path) -> list[Path]:
 
 
 def where_recordings_are(directory: Path) -> str:
-    """Return what to tell whoever looks for recordings in a directory without any.
+    """Return the message for a directory without recordings.
 
     What is below it is looked at, because an evaluation has its recordings there.
     """
@@ -444,7 +444,7 @@ def where_recordings_are(directory: Path) -> str:
 def names_in(directory: Path) -> Iterator[str]:
     """Yield the names of all that is in a directory, in no order.
 
-    For who looks for a few among a million, of each of which a `Path` is not worth
+    For a search of a few among a million names, where a `Path` of each is not worth
     making.
     """
     with os.scandir(directory) as entries:
@@ -571,7 +571,7 @@ def view_of(video: str) -> str:
 
 
 def is_second_name(name: str) -> bool:
-    """Tell whether a video of ours may be called `name` besides its own name."""
+    """Return whether a video of ours may be called `name` besides its own name."""
     return _SECOND_NAME.fullmatch(name) is not None
 
 

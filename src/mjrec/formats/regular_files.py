@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Opening files that somebody else may have put into a directory.
+"""Opening files that a stranger may have put into a directory.
 
 What bears a monitor file's name may be a pipe, whose opening waits for ever, a device,
-which may do anything when it is opened, or a link to a file of whoever reads the
+which may do anything when it is opened, or a link to a file of the user who reads the
 directory. Only regular files are opened, and links are followed only inside their
 directory: what is read, packed or rendered never comes from elsewhere.
 """

@@ -186,7 +186,7 @@ def tail_path(log: Path) -> Path:
 
 
 def has_rows(log: Path) -> bool:
-    """Tell whether a log, or its tail, has rows."""
+    """Return whether a log, or its tail, has rows."""
     if log.stat().st_size:
         return True
     with contextlib.suppress(FileNotFoundError), open_regular(tail_path(log)) as tail:

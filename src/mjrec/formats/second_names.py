@@ -6,7 +6,7 @@ a link in the same directory, given last of all, so that no video is under it th
 not whole. The further videos of the episode, and the metadata of each, are called
 alike.
 
-What is there under such a name and is not the very file belongs to somebody else, and
+A different file under such a name belongs to another program, and
 is neither replaced nor removed.
 """
 
@@ -73,7 +73,7 @@ def take_second_names(video: Path) -> None:
 
 
 def is_called_like_second(name: str) -> bool:
-    """Tell whether `name` could be a second name, also of a further camera."""
+    """Return whether `name` could be a second name, also of a further camera."""
     for ending in (".mp4", ".meta.json"):
         if name.endswith(ending):
             video = f"{name.removesuffix(ending)}.mp4"
@@ -113,7 +113,7 @@ def _link(file: Path, link: Path) -> None:
                 file.name,
             )
         return
-    # Somebody else may be quicker.
+    # Another process may be quicker.
     with contextlib.suppress(FileExistsError):
         try:
             link.hardlink_to(file)

@@ -218,7 +218,7 @@ class OpenLog:
             self.columns[name] = whole.get(name, slots.view(dtype)[:, 0][name])
 
     def suits(self, dtype: np.dtype[Any]) -> bool:
-        """Tell whether a recording with such rows can go on in this log."""
+        """Return whether a recording with such rows can go on in this log."""
         size = self.rows.size + self.look_size
         is_short = size < _LONG and len(self.recordings) < _MANY
         is_free = self.rows.is_there and not self.is_alone

@@ -156,7 +156,7 @@ class _Spans:
     _seam: bytes = b""
 
     def goes_on_in(self, file: BinaryIO) -> bool:
-        """Tell whether a file is the one that was read, and has only grown."""
+        """Return whether a file is the one that was read, and has only grown."""
         before, now = self._status, os.fstat(file.fileno())
         if before is None or (before.st_dev, before.st_ino) != (now.st_dev, now.st_ino):
             return False
@@ -325,7 +325,7 @@ def find_recording(path: Path) -> Recording | None:
 
 
 def is_in_flight(path: Path) -> bool:
-    """Tell whether a recording is in a log only, by the path of its file.
+    """Return whether a recording is in a log only, by the path of its file.
 
     Raises:
         UnreadableFile: as `find_recording`.

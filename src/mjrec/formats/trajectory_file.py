@@ -57,7 +57,7 @@ def find_trajectory(
 
 
 def is_recorded(path: Path) -> bool:
-    """Tell whether a trajectory is there in any form, by the path of its own file.
+    """Return whether a trajectory is there in any form, by the path of its own file.
 
     Raises:
         UnreadableFile: the journal of its monitor cannot be read.
@@ -92,7 +92,7 @@ def finish_trajectory(path: Path) -> Path:
         except UnreadableFile:
             if not path.is_file():
                 raise
-            # Somebody else finished it just now.
+            # Another process finished it just now.
     if recording is not None:
         remove_if_done(recording.log)
     return path
@@ -205,6 +205,6 @@ def _how_it_ended(
     video = facts.get("video")
     is_deferred = isinstance(video, dict) and video.get("recording") == "deferred"
     if is_deferred and not reader.frame_count:
-        # So that nobody waits for a video of nothing.
+        # So that no process waits for a video of nothing.
         known["broken_reason"] = "the process was killed before its first frame"
     return known

@@ -344,7 +344,7 @@ def _reading(path: Path) -> Iterator[None]:
 
 
 def _linked(group: h5py.Group, name: str) -> Any:
-    # Links may lead into other files, of whoever reads this one.
+    # Links may lead into other files of the user who reads this one.
     if not isinstance(group.get(name, getlink=True), h5py.HardLink):
         raise ValueError(f"it has no {name!r} of its own")
     return group[name]

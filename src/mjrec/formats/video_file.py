@@ -219,7 +219,7 @@ class Encoding:
             self._wait_and_close()
 
     def _wait_and_close(self) -> None:
-        """See ffmpeg out, which has all of its input; its file is somebody else's."""
+        """Wait for ffmpeg, which has its input; another process owns its file."""
         if self._hashes is not None:
             self._hashes.close()
         with contextlib.suppress(EncoderError):

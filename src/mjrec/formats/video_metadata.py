@@ -3,7 +3,7 @@
 
 A video that was made while its episode ran and one that was rendered later say it with
 the same keys, because both take it from here. Who made the video adds what it knows
-besides: of the episode, of the pictures, of what went wrong.
+besides: of the episode, of the frames, of what went wrong.
 """
 
 from __future__ import annotations
@@ -162,9 +162,9 @@ def amend_metadata(video: Path, facts: Mapping[str, Any]) -> None:
     """
     path = metadata_path(video)
     with unreadable(path):
-        said = read_object(path)
-    if any(said.get(name) != value for name, value in facts.items()):
-        write_metadata(video, {**said, **facts})
+        known = read_object(path)
+    if any(known.get(name) != value for name, value in facts.items()):
+        write_metadata(video, {**known, **facts})
 
 
 def finished_videos(video: Path) -> list[tuple[str, str]]:
@@ -178,8 +178,8 @@ def finished_videos(video: Path) -> list[tuple[str, str]]:
         video: the first video.
     """
     names = [(video.name, metadata_path(video).name)]
-    said = metadata_of(video).get("further_videos")
-    for name in said if isinstance(said, list) else ():
+    known = metadata_of(video).get("further_videos")
+    for name in known if isinstance(known, list) else ():
         if isinstance(name, str) and _is_further(name, video):
             further = video.with_name(name)
             if further.is_file() and metadata_path(further).is_file():
@@ -190,11 +190,11 @@ def finished_videos(video: Path) -> list[tuple[str, str]]:
 def further_live_videos(video: Path) -> list[str]:
     """Return the names of what further cameras saw of an episode, drawn as it ran.
 
-    For whoever finds these files and not what belongs to them: what is rendered from a
+    For a reader who finds only these files: what is rendered from a
     trajectory, now or once more, says so in its metadata.
 
     Args:
-        video: the first video of the episode, be it there or not.
+        video: the first video of the episode, which need not exist.
     """
     return [
         path.name
@@ -205,13 +205,13 @@ def further_live_videos(video: Path) -> list[str]:
 
 
 def is_done(video: Path) -> bool:
-    """Tell whether nothing is left to do about a video: it is there, or given up."""
+    """Return whether nothing is left to do about a video: it is there, or given up."""
     metadata = metadata_path(video)
     return metadata.exists() and (video.exists() or is_broken(metadata))
 
 
 def is_broken(metadata: Path) -> bool:
-    """Tell whether a video's metadata says that it broke."""
+    """Return whether a video's metadata says that it broke."""
     return bool(_read_or_nothing(metadata).get("broken"))
 
 

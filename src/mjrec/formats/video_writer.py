@@ -254,7 +254,7 @@ class VideoWriter:
         )
 
     def _was_forked(self) -> bool:
-        """Tell whether this is a forked child's copy: the video is the parent's."""
+        """Return whether this is a forked child's copy: the video is the parent's."""
         return os.getpid() != self._process_id
 
 

@@ -66,12 +66,12 @@ def backend_in_environment(environ: Mapping[str, str] | None = None) -> str | No
 
 
 def rendering_is_off(environ: Mapping[str, str]) -> bool:
-    """Tell whether `MUJOCO_GL` turns rendering off."""
+    """Return whether `MUJOCO_GL` turns rendering off."""
     return _normalised(environ.get("MUJOCO_GL", "")) in _OFF
 
 
 def platforms_contradict(environ: Mapping[str, str], backend: str | None) -> bool:
-    """Tell whether `PYOPENGL_PLATFORM` keeps mujoco from using `backend`."""
+    """Return whether `PYOPENGL_PLATFORM` keeps mujoco from using `backend`."""
     platform = environ.get("PYOPENGL_PLATFORM", "").lower()
     return backend in ("egl", "osmesa") and platform not in ("", backend)
 

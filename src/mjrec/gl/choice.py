@@ -34,7 +34,7 @@ class Choice:
     Attributes:
         backend: its name.
         reason: where the name comes from.
-        probe: what came of trying it.
+        probe: the result of trying it.
         rejected: the backends tried before it, and why they were not taken.
     """
 

@@ -212,7 +212,7 @@ def _device(gpu: str, environ: Mapping[str, str]) -> tuple[EglDevice | None, Pro
     if gpu.startswith("GPU-") and hardware[0].uuid:
         return None, alone
     # The only one there is may be the GPU in spite of that: of another maker, or of a
-    # driver without its CUDA part, so that nobody has a number.
+    # driver without its CUDA part, so that no device has a number.
     everything = {k: v for k, v in environ.items() if k != CUDA_VISIBLE_DEVICES}
     seen = probe("egl", environ={**everything, _CHOSEN: "0"})
     is_known_to_cuda = any(device.cuda_id is not None for device in seen.devices)

@@ -98,7 +98,7 @@ def probe(
         backend: its name.
         environ: the environment variables; this process's, if None.
         measure: measure its speed too.
-        timeout: how many seconds to wait for the picture.
+        timeout: how many seconds to wait for the frame.
 
     Raises:
         UnknownName: there is no such backend.
@@ -125,7 +125,7 @@ def probe_environment(
     Args:
         environ: the child's environment variables, none of which is put right.
         measure: measure its speed too.
-        timeout: how many seconds to wait for the picture.
+        timeout: how many seconds to wait for the frame.
     """
     backend = environ["MUJOCO_GL"]
     facts, output = _ask_child(environ, measure=measure, timeout=timeout)
@@ -133,7 +133,7 @@ def probe_environment(
     devices = tuple(EglDevice(**device) for device in facts.get("devices", ()))
     if known.get("renders"):
         return Probe(backend=backend, devices=devices, **known)
-    # The words of a failure that nobody has explained yet are its cause.
+    # A failure that the table does not know is its own cause.
     words = "\n".join(list(filter(str.strip, output.splitlines()))[-3:])
     found = diagnose(output, backend=backend, environ=environ) or Diagnosis(
         words or "The child process said nothing.", ""
@@ -159,9 +159,9 @@ def _ask_child(
     except OSError as error:
         return {}, f"{sys.executable} could not be started: {error}"
     with child:
-        for said in child.messages(timeout):
-            is_silent = said is None
-            facts |= said or {}
+        for message in child.messages(timeout):
+            is_silent = message is None
+            facts |= message or {}
         if is_silent:
             child.stacks()
             end = f"no answer within {timeout:g} seconds"

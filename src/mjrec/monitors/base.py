@@ -207,7 +207,7 @@ class EnvironmentMonitor(MonitorBase):
         """
         self._recorder.model_changed()
 
-    def forget_pictures(self) -> None:
+    def forget_frames(self) -> None:
         """Make the next episode look as in a fresh environment.
 
         Gymnasium places its free camera at the first frame; infinite planes and
@@ -215,7 +215,7 @@ class EnvironmentMonitor(MonitorBase):
         the tenth than as the first. Call this between two episodes. It has no effect on
         live frames.
         """
-        self._recorder.forget_pictures()
+        self._recorder.forget_frames()
 
     @contextlib.contextmanager
     def _resetting(self) -> Iterator[None]:
@@ -308,17 +308,17 @@ def rendering_choice(
     *,
     no_simulation: str = NO_SIMULATION,
 ) -> RenderingChoice:
-    """Return when the pictures of an environment are drawn.
+    """Return when the frames of an environment are drawn.
 
     Args:
         asked: `"deferred"`, `"live"`, `"off"`, or None for deferred where it is known
-            that the pictures follow from the states, else live.
+            that the frames follow from the states, else live.
         scenes: what is known of the environment.
         env_id: its name, for messages.
         no_simulation: why there are no states, where there are none.
 
     Raises:
-        PicturesDiffer: deferred was asked for, and the pictures do not follow.
+        PicturesDiffer: deferred was asked for, and the frames do not follow.
     """
     if asked in (LIVE, OFF):
         return RenderingChoice(mode=str(asked), is_forced=True)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The pictures of a monitor with one camera or several."""
+"""The frames of a monitor with one camera or several."""
 
 from __future__ import annotations
 
@@ -9,27 +9,27 @@ from typing import Any
 from ..errors import InvalidArgument
 from ..formats.monitor_directory import further_parts
 from ..frames import Frame, check_frame, grid_frame, grid_shape
-from ..recorder.recorded_environment import EpisodePictures
-from ..recorder.video_recorder import can_give_pictures
+from ..recorder.recorded_environment import EpisodeFrames
+from ..recorder.video_recorder import can_give_frames
 from ..rendering.views import plain_camera
 
 _RGB_ARRAY = "rgb_array"
 
 
-def camera_pictures(
-    camera: Any, pictures_from: Callable[[Any], EpisodePictures], *, tiled: bool
+def camera_frames(
+    camera: Any, frames_from: Callable[[Any], EpisodeFrames], *, tiled: bool
 ) -> tuple[Any, dict[str, Any]]:
-    """Return the pictures from a camera, or from each of several.
+    """Return the frames from a camera, or from each of several.
 
     Args:
         camera: a name, a number, an `mujoco.MjvCamera`, None for what the environment
             itself shows, or a list of these.
-        pictures_from: makes the pictures from one camera.
+        frames_from: makes the frames from one camera.
         tiled: those of several cameras side by side, in one video.
 
     Returns:
         The only camera, or the first, the one that scenes are recorded with; and what
-        `RecordedEnvironment` gets: `pictures`, `further_pictures` and `cameras`.
+        `RecordedEnvironment` gets: `frames`, `further_frames` and `cameras`.
 
     Raises:
         InvalidArgument: the list is empty, or has one camera twice, or None in another
@@ -43,24 +43,24 @@ def camera_pictures(
     if len(cameras) == 1:
         if tiled:
             raise InvalidArgument(
-                "tiled=True lays the pictures of several cameras, or those of the "
+                "tiled=True lays the frames of several cameras, or those of the "
                 "sub-environments of a vector environment, side by side, and here is "
                 f"one of each: got the camera {camera!r}. Give several."
             )
-        return cameras[0], {"pictures": pictures_from(cameras[0])}
+        return cameras[0], {"frames": frames_from(cameras[0])}
     plain = tuple(None if each is None else plain_camera(each) for each in cameras)
-    sources = [pictures_from(each) for each in cameras]
-    said: dict[str, Any] = {"pictures": sources[0], "cameras": plain}
-    without = [source for source in sources if not can_give_pictures(source)]
+    sources = [frames_from(each) for each in cameras]
+    view: dict[str, Any] = {"frames": sources[0], "cameras": plain}
+    without = [source for source in sources if not can_give_frames(source)]
     if without:
         # All are drawn by workers, or none is.
-        said["pictures"] = without[0]
+        view["frames"] = without[0]
     elif tiled:
-        said["pictures"] = _CameraTiles(sources)
+        view["frames"] = _CameraTiles(sources)
     else:
         further = zip(further_parts(plain), sources[1:], strict=True)
-        said["further_pictures"] = dict(further)
-    return cameras[0], said
+        view["further_frames"] = dict(further)
+    return cameras[0], view
 
 
 def recorded_view(
@@ -69,7 +69,7 @@ def recorded_view(
     """Return what a journal says of how a run is shown; what is the default is not.
 
     Args:
-        camera: as of `camera_pictures`.
+        camera: as of `camera_frames`.
         height: that was asked for.
         width: likewise.
         own: number or name of the camera that the environment shows by itself.
@@ -79,13 +79,13 @@ def recorded_view(
         None if each is None else plain_camera(each)
         for each in (camera if several else [camera])
     ]
-    said = {
+    view = {
         "camera": plain if several else plain[0],
         "height": None if height is None else int(height),
         "width": None if width is None else int(width),
         "own_camera": own,
     }
-    return {name: value for name, value in said.items() if value is not None}
+    return {name: value for name, value in view.items() if value is not None}
 
 
 def _check(cameras: list[Any]) -> None:
@@ -112,7 +112,7 @@ class Tiles:
         sources: of the frames.
     """
 
-    def __init__(self, sources: Sequence[EpisodePictures]) -> None:
+    def __init__(self, sources: Sequence[EpisodeFrames]) -> None:
         self.sources = sources
 
     @property
@@ -137,7 +137,7 @@ class Tiles:
 
 
 class _CameraTiles(Tiles):
-    """The pictures of several cameras side by side."""
+    """The frames of several cameras side by side."""
 
     def facts(self) -> dict[str, Any]:
         cameras = [source.facts().get("camera") for source in self.sources]

@@ -11,11 +11,11 @@ from typing import Any
 import dm_env
 
 from ..environments.named_environment import is_terminated, is_truncated
-from ..environments.scenes import NoPictureSource, Scenes
+from ..environments.scenes import NoFrameSource, Scenes
 from ..errors import InvalidArgument
 from ..recorder.options import RecorderOptions
 from .base import EnvironmentMonitor
-from .cameras import camera_pictures, recorded_view
+from .cameras import camera_frames, recorded_view
 
 logger = logging.getLogger(__name__)
 
@@ -63,9 +63,9 @@ class DmEnvMonitor(EnvironmentMonitor, dm_env.Environment):  # type: ignore[misc
                 "steps have none. The journal has every episode's return and length."
             )
         size = {"height": height, "width": width}
-        first, pictures = camera_pictures(
+        first, frames = camera_frames(
             camera,
-            lambda each: _pictures(env, camera=each, **size),
+            lambda each: _frames(env, camera=each, **size),
             tiled=options.tiled,
         )
         self._open(
@@ -76,7 +76,7 @@ class DmEnvMonitor(EnvironmentMonitor, dm_env.Environment):  # type: ignore[misc
             close_environment=operator.methodcaller("close"),
             env_id=env_id or _env_id(env),
             view=recorded_view(camera, **size),
-            **pictures,
+            **frames,
         )
 
     def reset(self) -> dm_env.TimeStep:
@@ -156,19 +156,19 @@ class DmEnvMonitor(EnvironmentMonitor, dm_env.Environment):  # type: ignore[misc
         )
 
 
-def _pictures(
+def _frames(
     env: dm_env.Environment, *, camera: Any, height: int | None, width: int | None
 ) -> Any:
     if getattr(env, "physics", None) is not None:
-        from ..environments.dm_control_scenes import dm_control_pictures
+        from ..environments.dm_control_scenes import dm_control_frames
 
-        return dm_control_pictures(env, camera=camera, height=height, width=width)
+        return dm_control_frames(env, camera=camera, height=height, width=width)
     if (camera, height, width) != (None, None, None):
         raise InvalidArgument(
-            "camera, height and width choose among the pictures of a dm_control "
+            "camera, height and width choose among the frames of a dm_control "
             f"environment, and {type(env).__name__} has no physics."
         )
-    return NoPictureSource(_NO_PHYSICS)
+    return NoFrameSource(_NO_PHYSICS)
 
 
 def _scenes(env: dm_env.Environment, **known: Any) -> Scenes:

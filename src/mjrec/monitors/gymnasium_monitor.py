@@ -14,12 +14,12 @@ import gymnasium
 import numpy as np
 from gymnasium.envs.registration import EnvSpec
 
-from ..environments.gymnasium_pictures import close_environment, gymnasium_pictures
+from ..environments.gymnasium_frames import close_environment, gymnasium_frames
 from ..environments.gymnasium_scenes import gymnasium_scenes, own_camera
 from ..recorder.finishers import Finisher
 from ..recorder.options import RecorderOptions
 from .base import NO_SIMULATION, EnvironmentMonitor
-from .cameras import camera_pictures, recorded_view
+from .cameras import camera_frames, recorded_view
 
 logger = logging.getLogger(__name__)
 
@@ -60,9 +60,9 @@ class GymnasiumMonitor(EnvironmentMonitor, gymnasium.Wrapper[Any, Any, Any, Any]
         self._same_step_autoreset = bool(env.metadata.get("semantics.autoreset"))
         self._next_step_autoreset = _has_autoreset(env)
         size = {"height": height, "width": width}
-        first, pictures = camera_pictures(
+        first, frames = camera_frames(
             camera,
-            lambda each: gymnasium_pictures(env, camera=each, **size),
+            lambda each: gymnasium_frames(env, camera=each, **size),
             tiled=options.tiled,
         )
         self._open(
@@ -76,7 +76,7 @@ class GymnasiumMonitor(EnvironmentMonitor, gymnasium.Wrapper[Any, Any, Any, Any]
             env_id=env_id or env_id_of(env),
             env_index=env_index,
             view=recorded_view(camera, **size, own=own_camera(env)),
-            **pictures,
+            **frames,
         )
 
     # Gymnasium's own wrappers override the attribute by a property too.
@@ -173,7 +173,7 @@ class GymnasiumMonitor(EnvironmentMonitor, gymnasium.Wrapper[Any, Any, Any, Any]
             reward,
             terminated=terminated,
             truncated=truncated,
-            picture=not resets_itself,
+            frame=not resets_itself,
             observation=observation,
             success=success_in(info) if done else None,
         )

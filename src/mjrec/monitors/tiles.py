@@ -8,7 +8,7 @@ import logging
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from ..environments.gymnasium_pictures import gymnasium_pictures
+from ..environments.gymnasium_frames import gymnasium_frames
 from ..errors import InvalidArgument, NoPictures
 from ..formats.monitor_directory import video_prefix
 from ..recorder.ending_reasons import CLOSE, RESET, ending
@@ -24,7 +24,7 @@ logger = logging.getLogger(__name__)
 
 
 def has_videos(options: RecorderOptions) -> bool:
-    """Tell whether there are videos at all."""
+    """Return whether there are videos at all."""
     schedule = to_schedule(options.video_callable)
     return options.render != OFF and schedule is not disable_videos
 
@@ -56,11 +56,11 @@ def vector_tiles(
     camera = view["camera"]
     if isinstance(camera, list | tuple) and camera:
         view = {**view, "camera": camera[0]}
-    tiles = Tiles([gymnasium_pictures(each, **view) for each in envs])
+    tiles = Tiles([gymnasium_frames(each, **view) for each in envs])
     if tiles.render_mode is None:
         raise NoPictures(
             "tiled=True was asked for, and a tiled video is drawn while the "
-            "environments step, which needs pictures of each of them: make them with "
+            "environments step, which needs frames of each of them: make them with "
             'render_mode="rgb_array", and with the camera and the size that are wanted.'
         )
     return tiles

@@ -15,7 +15,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 
-from ..environments.gymnasium_pictures import close_environment, free_viewers
+from ..environments.gymnasium_frames import close_environment, free_viewers
 from ..errors import Error, ResetNeeded, ResetNotAllowed
 from ..formats.monitor_directory import infix_of, iter_monitor_files
 from ..recorder.opening import made_directory
@@ -299,7 +299,9 @@ class VectorMonitor(MonitorBase, gymnasium.vector.VectorWrapper):
             lasts = infos.get("final_obs", firsts)
             of_lasts = infos.get("final_info", infos)
         ends = np.logical_or(terminations, truncations)
-        said = {i: info_of(of_lasts, i) for i in slots if ends[i] and i not in begins}
+        last_infos = {
+            i: info_of(of_lasts, i) for i in slots if ends[i] and i not in begins
+        }
 
         def record(index: int, slot: GymnasiumMonitor) -> None:
             if index in begins:
@@ -310,13 +312,13 @@ class VectorMonitor(MonitorBase, gymnasium.vector.VectorWrapper):
                 rewards[index],
                 bool(terminations[index]),
                 bool(truncations[index]),
-                said.get(index, {}),
+                last_infos.get(index, {}),
                 firsts[index],
             )
 
         call_all(functools.partial(record, *each) for each in slots.items())
         if self._options.episode_info and not {"episode", "_episode"} & infos.keys():
-            _add_episode_info(infos, said, ends)
+            _add_episode_info(infos, last_infos, ends)
         return result
 
     def _open_slots(self) -> dict[int, GymnasiumMonitor]:
@@ -388,19 +390,22 @@ def _seed_of(env: VectorEnv, index: int, seed: Any) -> Any:
 
 
 def _add_episode_info(
-    infos: dict[str, Any], said: Mapping[int, Mapping[str, Any]], ends: Any
+    infos: dict[str, Any], last_infos: Mapping[int, Mapping[str, Any]], ends: Any
 ) -> None:
     """Say of the episodes that are over what Gymnasium's own wrapper says."""
-    if not said:
+    if not last_infos:
         return
     zeros = {"r": 0.0, "l": 0, "t": 0.0}
     infos["episode"] = {
         name: np.array(
-            [said[i]["episode"][name] if i in said else zero for i in range(len(ends))]
+            [
+                last_infos[i]["episode"][name] if i in last_infos else zero
+                for i in range(len(ends))
+            ]
         )
         for name, zero in zeros.items()
     }
-    infos["_episode"] = np.isin(np.arange(len(ends)), list(said))
+    infos["_episode"] = np.isin(np.arange(len(ends)), list(last_infos))
 
 
 def _options_of(

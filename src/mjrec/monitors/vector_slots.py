@@ -108,7 +108,7 @@ class Frames:
             if there != count:
                 raise InvalidArgument(
                     f"render() of {type(self._env.unwrapped).__name__} must give a "
-                    f"picture for each of its {count} sub-environments, and gave "
+                    f"frame for each of its {count} sub-environments, and gave "
                     f"{there}. Record without videos (video_callable=False), or put "
                     "Monitor around each environment, inside the functions that make "
                     "them."
@@ -159,7 +159,7 @@ def check_outside(env: VectorEnv, asked: str | None, view: Mapping[str, Any]) ->
 
     Args:
         env: the vector environment.
-        asked: when pictures are to be drawn.
+        asked: when frames are to be drawn.
         view: `camera`, `height` and `width`.
 
     Raises:
@@ -216,7 +216,7 @@ def way_out(env: VectorEnv) -> str:
 
 
 def is_async(env: VectorEnv) -> bool:
-    """Tell whether there is an AsyncVectorEnv below all wrappers."""
+    """Return whether there is an AsyncVectorEnv below all wrappers."""
     return isinstance(env.unwrapped, gymnasium.vector.AsyncVectorEnv)
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Videos that last so many steps, wherever they begin and whatever ends meanwhile.
+"""Clips: videos of N steps, which may cross episodes.
 
 A clip may go on across resets, and a recording is of one episode: so there is one for
 each part of it that is of one episode. `clip` in the facts of a part says
@@ -9,7 +9,7 @@ each part of it that is of one episode. `clip` in the facts of a part says
 - `steps_before`: of the running episode, before the part begins;
 - `reward_before`: their rewards;
 - `reset_time`: the simulated time of that episode's reset, where it is to be written on
-  the pictures.
+  the frames.
 
 The last part ends as an episode's trajectory does, with `complete`; those before say
 `continues`.
@@ -33,8 +33,8 @@ if TYPE_CHECKING:
 class Clips:
     """The videos of a run that are counted in steps, one at a time.
 
-    While one is recorded nothing begins another: each has the picture that it begins
-    with and those of exactly `length` steps, on across resets, which add a picture
+    While one is recorded nothing begins another: each has the frame that it begins
+    with and those of exactly `length` steps, on across resets, which add a frame
     each. Without a length it ends with the episode.
 
     Args:
@@ -50,7 +50,7 @@ class Clips:
         self._clip: _Clip | None = None
 
     def reset(self, *, is_chosen: bool) -> None:
-        """Take the picture of an episode that has just begun.
+        """Take the frame of an episode that has just begun.
 
         Args:
             is_chosen: a video begins with it, unless one is running.
@@ -71,9 +71,9 @@ class Clips:
                 self._start(taken)
 
     def step(
-        self, reward: float, *, terminated: bool, truncated: bool, has_picture: bool
+        self, reward: float, *, terminated: bool, truncated: bool, has_frame: bool
     ) -> None:
-        """Take the picture of a step; as `StateRecorder.step`."""
+        """Take the frame of a step; as `StateRecorder.step`."""
         clip = self._clip
         if clip is None:
             return
@@ -81,7 +81,7 @@ class Clips:
         clip.reward += reward
         is_over = self._length is None and (terminated or truncated)
         try:
-            clip.step(reward, terminated, truncated, has_picture=has_picture)
+            clip.step(reward, terminated, truncated, has_frame=has_frame)
         finally:
             if clip.steps == self._length or is_over:
                 self._end({"complete": True})
@@ -152,12 +152,12 @@ class _Clip:
             self.live.say(first_step=self._first_step, last_episode_id=self._episode_id)
 
     def begin(self) -> None:
-        """Take the picture of this moment, where it is drawn live."""
+        """Take the frame of this moment, where it is drawn live."""
         if self.live is not None:
             self.live.begin()
 
     def reset(self) -> None:
-        """Take the picture of an episode that has just begun."""
+        """Take the frame of an episode that has just begun."""
         self._last_episode_id = self._run.episode.episode_id
         if self.live is not None:
             self.live.say(last_episode_id=self._last_episode_id)
@@ -175,18 +175,18 @@ class _Clip:
             self._begin_part(start)
 
     def step(
-        self, reward: float, terminated: bool, truncated: bool, *, has_picture: bool
+        self, reward: float, terminated: bool, truncated: bool, *, has_frame: bool
     ) -> None:
-        """Take the picture of a step."""
+        """Take the frame of a step."""
         if self.live is not None:
-            self.live.take(is_there=has_picture, last=False)
+            self.live.take(is_there=has_frame, last=False)
         part = self._part
         if part is None or part.broken_reason is not None:
             return
-        if not has_picture:
+        if not has_frame:
             part.note(final_frame="missing")
         part.step(
-            reward, terminated=terminated, truncated=truncated, has_picture=has_picture
+            reward, terminated=terminated, truncated=truncated, has_frame=has_frame
         )
 
     def end(self, facts: Mapping[str, Any]) -> None:
@@ -234,7 +234,7 @@ class _Clip:
             facts={**run.recording_facts(start), **facts},
             capture=run.env.clip_states,
             start=start,
-            # What was done is of no use to a picture. Which frames are wanted is chosen
+            # What was done is of no use to a frame. Which frames are wanted is chosen
             # when they are drawn, because they are counted over all parts: so `max_fps`
             # is not said here.
             has_actions=False,

@@ -21,7 +21,7 @@ class EpisodeChoice:
 
     Args:
         options: what was asked for.
-        mode: when pictures are drawn.
+        mode: when frames are drawn.
 
     Attributes:
         selection: chooses among the episodes that are over; None where that is settled
@@ -58,7 +58,7 @@ class EpisodeChoice:
         return self._decided[1]
 
     def will_choose(self, episode_id: int) -> bool:
-        """Tell whether an episode will surely get a video: a user's schedule may wait.
+        """Return whether an episode surely gets a video: a user's schedule may wait.
 
         It is asked when the episode begins.
         """

@@ -72,7 +72,7 @@ class Selection:
         return {"rule": self.name}
 
     def __call__(self, episode_id: int) -> bool:
-        """Tell whether an episode is to be recorded, as if it got a video."""
+        """Return whether an episode is to be recorded, as if it got a video."""
         return True
 
     def add(self, episode: FinishedEpisode) -> None:
@@ -174,7 +174,7 @@ def _better(episode: FinishedEpisode) -> _Key:
 
 
 class _Extremes(Selection):
-    """The first so many in an order, as far as it is known."""
+    """The first N in an order, as far as it is known."""
 
     def __init__(
         self, name: str, count: int, order: Callable[[FinishedEpisode], _Key]

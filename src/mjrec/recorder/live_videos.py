@@ -23,7 +23,7 @@ class LiveVideos:
     Args:
         recorders: what records them, one or more; the first camera's comes first.
         tolerates: tells whether to go on after an error.
-        on_picture_error: called with one that is not tolerated while a picture of a
+        on_frame_error: called with one that is not tolerated while a frame of a
             step is taken: it may be the environment's own.
 
     Attributes:
@@ -35,11 +35,11 @@ class LiveVideos:
         recorders: Sequence[VideoRecorder],
         *,
         tolerates: Callable[[Exception], bool],
-        on_picture_error: Callable[[Exception], object] = lambda _: None,
+        on_frame_error: Callable[[Exception], object] = lambda _: None,
     ) -> None:
         self.recorders = recorders
         self._tolerates = tolerates
-        self._on_picture_error = on_picture_error
+        self._on_frame_error = on_frame_error
 
     @property
     def path(self) -> Path:
@@ -67,7 +67,7 @@ class LiveVideos:
             if last:
                 self.take_last()
         except Exception as error:
-            self._on_picture_error(error)
+            self._on_frame_error(error)
             raise
 
     def take_last(self) -> None:
@@ -80,7 +80,7 @@ class LiveVideos:
             recorder.metadata.update(facts)
 
     def give_up(self, reason: str) -> None:
-        """Take no more pictures, and say why; those that were taken stay."""
+        """Take no more frames, and say why; those that were taken stay."""
         for recorder in self.recorders:
             recorder.give_up(reason)
 
@@ -165,7 +165,7 @@ def live_videos(
     path: Path,
     *,
     second_name: Mapping[str, str],
-    on_picture_error: Callable[[Exception], object] = lambda _: None,
+    on_frame_error: Callable[[Exception], object] = lambda _: None,
 ) -> LiveVideos:
     """Return what draws videos of the running episode, of each camera.
 
@@ -173,13 +173,13 @@ def live_videos(
         run: the monitored run.
         path: of the first camera's, without its ending.
         second_name: as `MonitoredRun.second_name`.
-        on_picture_error: as of `LiveVideos`.
+        on_frame_error: as of `LiveVideos`.
     """
     options, env = run.options, run.env
-    sources = {"": env.pictures, **env.further_pictures}
+    sources = {"": env.frames, **env.further_frames}
     recorders = [
         VideoRecorder(
-            pictures,
+            frames,
             base_path=path.with_name(f"{path.name}.{name}" if name else path.name),
             metadata=run.live_facts(),
             fps=options.fps,
@@ -187,11 +187,11 @@ def live_videos(
             frame_hashes=True,
             clock=env.clock,
             declared=env.declared,
-            facts=pictures.facts,
+            facts=frames.facts,
             strict=options.strict,
             caption=run.caption if options.annotate else None,
         )
-        for name, pictures in sources.items()
+        for name, frames in sources.items()
     ]
     first, *others = recorders
     if first.path is not None:
@@ -207,5 +207,5 @@ def live_videos(
     return LiveVideos(
         recorders,
         tolerates=functools.partial(run.tolerates, "video"),
-        on_picture_error=on_picture_error,
+        on_frame_error=on_frame_error,
     )

@@ -114,7 +114,7 @@ class MonitoredRun:
         self._statements = options.statements
         # In the journal, after the first.
         self._lines = 0
-        self._surroundings = None if options.statements else look_around()
+        self._provenance = None if options.statements else look_around()
         self._environment_facts = {
             "infix": str(self.infix),
             "env_id": env.env_id,
@@ -149,7 +149,7 @@ class MonitoredRun:
         self.paces: dict[SpanLogs, Mapping[str, Any]] = {}
         # Recordings whose ends are not in the journal yet: the disk was full.
         self._late: list[Path] = []
-        self.no_video = VideoRecorder(env.pictures, enabled=False)
+        self.no_video = VideoRecorder(env.frames, enabled=False)
         self._episode: BegunEpisode | None = None
         # Why videos are drawn live, as far as it was said.
         self._said: set[str] = set()
@@ -165,7 +165,7 @@ class MonitoredRun:
         self.events.add(entry)
         self._lines += 1
         self._write(lambda: self._journal.append(entry))
-        self.note_surroundings()
+        self.note_provenance()
 
     def note(self, kind: str, facts: Any) -> None:
         """Write down another event, one of `formats.journal.EVENTS`.
@@ -177,16 +177,16 @@ class MonitoredRun:
         self._lines += 1
         self._write(lambda: self._journal.note(kind, facts))
 
-    def note_surroundings(self, *, wait: bool = False) -> None:
+    def note_provenance(self, *, wait: bool = False) -> None:
         """Write down what the run is made with, once that is known.
 
         Args:
             wait: wait for it a little.
         """
-        if self.events.surroundings is None:
+        if self.events.provenance is None:
             found = self._found(wait=wait)
             if found is not None:
-                self.note("surroundings", found)
+                self.note("provenance", found)
 
     def tolerates(
         self, what: What, error: BaseException, *, of_episode: bool = True
@@ -253,11 +253,9 @@ class MonitoredRun:
 
     def _found(self, *, wait: bool) -> Mapping[str, Any] | None:
         if (stated := self._statements) is not None:
-            is_time = wait or self._lines >= stated.surroundings_after
-            return stated.surroundings if is_time else None
-        found = (
-            None if self._surroundings is None else self._surroundings.found(wait=wait)
-        )
+            is_time = wait or self._lines >= stated.provenance_after
+            return stated.provenance if is_time else None
+        found = None if self._provenance is None else self._provenance.found(wait=wait)
         return None if found is None else {**found, **self._policy}
 
     def _write(self, write: Callable[[], None]) -> None:
@@ -291,7 +289,7 @@ class MonitoredRun:
         )
 
     def can_be_deferred(self, start: EpisodeStart) -> bool:
-        """Tell whether frames can be made from the states that begin with `start`.
+        """Return whether frames can be made from the states that begin with `start`.
 
         Why not is said once.
 

@@ -53,8 +53,8 @@ class Statements:
     Attributes:
         infix: what the names of its files have in the middle; it is not claimed yet.
         first_episode_id: the number of its first episode.
-        surroundings: its provenance; None where that was not known.
-        surroundings_after: how many lines the journal had before, after its first.
+        provenance: its provenance; None where that was not known.
+        provenance_after: how many lines the journal had before, after its first.
         clock: returns the time, in seconds since the epoch.
         only_counted: episodes without a video keep no trajectory: it is only asked
             what rewards and ends there were.
@@ -62,8 +62,8 @@ class Statements:
 
     infix: Infix
     first_episode_id: int
-    surroundings: Mapping[str, Any] | None
-    surroundings_after: int
+    provenance: Mapping[str, Any] | None
+    provenance_after: int
     clock: Callable[[], float]
     only_counted: bool = False
 
@@ -215,7 +215,7 @@ def _last_counted(results: MonitorResults) -> int:
         return -1
     if results.manifest.mjrec is not None:
         return int(results.manifest.mjrec.get("next_episode_id") or 0) - 1
-    # Gym's own: its numbers count the resets, each of which has a type, from 0.
+    # Gym's own: its numbers count the resets, which have a type each, from 0.
     stats = results.saved
     if stats is None:
         return -1

@@ -238,7 +238,7 @@ class RecorderOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class RenderingChoice:
-    """When the pictures of a run are drawn.
+    """When the frames of a run are drawn.
 
     Attributes:
         mode: `DEFERRED`, `LIVE` or `OFF`.

@@ -11,17 +11,17 @@ from typing import TYPE_CHECKING, Any, Protocol
 from ..errors import NoPictures, PicturesDiffer
 from ..formats.monitor_directory import further_parts
 from .options import RenderingChoice
-from .video_recorder import PictureSource, can_give_pictures
+from .video_recorder import FrameSource, can_give_frames
 
 if TYPE_CHECKING:
     from ..simulation.capture import Capture
 
 
-class EpisodePictures(PictureSource, Protocol):
-    """Where the live pictures of a run come from."""
+class EpisodeFrames(FrameSource, Protocol):
+    """Where the live frames of a run come from."""
 
     def facts(self) -> Mapping[str, Any]:
-        """Return what the metadata of a video says about its pictures."""
+        """Return what the metadata of a video says about its frames."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,12 +32,12 @@ class RecordedEnvironment:
         env_id: the environment's name.
         env_index: which sub-environment of a vector environment it is; None for an
             environment of its own.
-        pictures: where live pictures come from.
-        further_pictures: from further cameras, by what the names of their videos have
+        frames: where live frames come from.
+        further_frames: from further cameras, by what the names of their videos have
             in the end.
         clock: returns the simulated time in seconds, or None.
         declared: returns the rate to take where there is no simulated time.
-        rendering: when pictures are drawn.
+        rendering: when frames are drawn.
         cameras: all of them, for JSON, where there are several.
         states: of its simulation; None where there is none that can be seen.
         clip_states: the same once more, for videos that are counted in steps: they
@@ -50,12 +50,12 @@ class RecordedEnvironment:
     """
 
     env_id: str
-    pictures: EpisodePictures
+    frames: EpisodeFrames
     clock: Callable[[], float | None]
     declared: Callable[[], Fraction]
     rendering: RenderingChoice
     env_index: int | None = None
-    further_pictures: Mapping[str, EpisodePictures] = field(default_factory=dict)
+    further_frames: Mapping[str, EpisodeFrames] = field(default_factory=dict)
     cameras: tuple[Any, ...] = ()
     states: Capture | None = None
     clip_states: Capture | None = None
@@ -66,21 +66,21 @@ class RecordedEnvironment:
     @property
     def further_views(self) -> list[str]:
         """What the names of further cameras' videos have before their ending."""
-        return further_parts(self.cameras) or list(self.further_pictures)
+        return further_parts(self.cameras) or list(self.further_frames)
 
 
-def check_pictures(env: RecordedEnvironment) -> None:
-    """Check that live pictures can be had.
+def check_frames(env: RecordedEnvironment) -> None:
+    """Check that live frames can be had.
 
     Raises:
         NoPictures: they cannot.
     """
-    if can_give_pictures(env.pictures):
+    if can_give_frames(env.frames):
         return
     why = "" if env.rendering.reason is None else f" ({env.rendering.reason})"
     raise NoPictures(
-        f"Videos were asked for, and {env.env_id} gives no pictures{why}: "
-        f"{what_is_missing(env.pictures)}, or record statistics only with "
+        f"Videos were asked for, and {env.env_id} gives no frames{why}: "
+        f"{what_is_missing(env.frames)}, or record statistics only with "
         "video_callable=False."
     )
 
@@ -101,19 +101,19 @@ def check_refusal(env: RecordedEnvironment, refusal: str) -> None:
             f"The videos of {env.env_id} were to be rendered later, from recorded "
             f'states, and cannot be: {refusal}. Use render="live".'
         )
-    if not can_give_pictures(env.pictures):
+    if not can_give_frames(env.frames):
         raise NoPictures(
             f"The videos of {env.env_id} cannot be rendered from its states: "
             f"{refusal}. They cannot be drawn live either: "
-            f"{what_is_missing(env.pictures)}."
+            f"{what_is_missing(env.frames)}."
         )
 
 
-def what_is_missing(pictures: PictureSource) -> str:
-    """Return why there are no pictures, and what would help."""
-    mode = getattr(pictures, "render_mode", None)
+def what_is_missing(frames: FrameSource) -> str:
+    """Return why there are no frames, and what would help."""
+    mode = getattr(frames, "render_mode", None)
     return getattr(
-        pictures,
+        frames,
         "missing",
         f"its render_mode is {mode!r}. Make the environment with "
         'render_mode="rgb_array"',

@@ -35,7 +35,7 @@ from .kept_videos import KeptVideos
 from .monitored_run import BegunEpisode, MonitoredRun
 from .opening import open_directory
 from .options import DEFERRED, LIVE, RecorderOptions, type_of_mode
-from .recorded_environment import RecordedEnvironment, check_pictures
+from .recorded_environment import RecordedEnvironment, check_frames
 from .recording import EpisodeRecording
 from .states import DeferredVideo
 from .stats_recorder import StatsRecorder, reward_to_float
@@ -84,7 +84,7 @@ class Recorder:
         self._choice = EpisodeChoice(options, mode=env.rendering.mode)
         draws = self._choice.has_videos or options.has_clips
         if env.rendering.mode == LIVE and draws:
-            check_pictures(env)
+            check_frames(env)
         self._env = env
         self._options = options
         self._pid = os.getpid()
@@ -181,10 +181,10 @@ class Recorder:
         for states in self._states:
             states.model_changed()
 
-    def forget_pictures(self) -> None:
-        """Let the next episode's pictures depend on none that was made before."""
+    def forget_frames(self) -> None:
+        """Let the next episode's frames depend on none that was made before."""
         for states in self._states:
-            states.forget_pictures()
+            states.forget_frames()
 
     def resetting(self) -> AbstractContextManager[None]:
         """Return what to put around the reset of the environment."""
@@ -217,7 +217,7 @@ class Recorder:
         """Begin an episode; the environment has just been reset.
 
         A reset before any step of the running episode keeps its number and replaces
-        its picture. One in mid-episode ends that episode's video, marked incomplete.
+        its frame. One in mid-episode ends that episode's video, marked incomplete.
 
         Args:
             seed: the seed given to the environment's reset.
@@ -248,7 +248,7 @@ class Recorder:
         )
         self.episode_id += 1
         # That of the episode before is over, whatever the schedule raises.
-        recording = EpisodeRecording(self.run, on_picture_error=self.note_error)
+        recording = EpisodeRecording(self.run, on_frame_error=self.note_error)
         self._recording = recording
         try:
             self._begin_episode(recording, observation)
@@ -303,7 +303,7 @@ class Recorder:
         *,
         terminated: bool,
         truncated: bool,
-        picture: bool = True,
+        frame: bool = True,
         observation: Any = None,
         success: bool | None = None,
     ) -> None:
@@ -313,8 +313,8 @@ class Recorder:
             reward: a number or an array of one element.
             terminated: the task ended the episode.
             truncated: a limit from outside the task ended it.
-            picture: False where the environment has reset itself already, and its
-                picture belongs to the next episode.
+            frame: False where the environment has reset itself already, and its
+                frame belongs to the next episode.
             observation: what the step returned.
             success: at the end of an episode, what the environment says of it; None
                 where it says nothing.
@@ -330,7 +330,7 @@ class Recorder:
         is_counted = False
         try:
             # First of all: what is counted has a row, if it can have one.
-            if fast is not None and picture:
+            if fast is not None and frame:
                 is_counted = fast.step(reward, **flags)
             if states is not None and not is_counted:
                 states.step(
@@ -338,7 +338,7 @@ class Recorder:
                     **flags,
                     observation=observation,
                     is_last=done,
-                    has_picture=picture,
+                    has_frame=frame,
                 )
         except Error as error:
             failures.note(error)
@@ -352,7 +352,7 @@ class Recorder:
         else:
             self.stats_recorder.count(reward, done)
         if not done:
-            self._take_pictures(failures, clips, reward, flags, picture)
+            self._take_frames(failures, clips, reward, flags, frame)
             if clips is None and recording is not None:
                 self.fast = recording.fast_path()
         else:
@@ -361,9 +361,7 @@ class Recorder:
                 {"complete": True, **flags},
                 episode,
                 failures,
-                take=lambda: self._take_pictures(
-                    failures, clips, reward, flags, picture
-                ),
+                take=lambda: self._take_frames(failures, clips, reward, flags, frame),
             )
         failures.raise_first()
 
@@ -456,22 +454,22 @@ class Recorder:
         if is_running and recording is not None and not recording.is_over:
             recording.take_last()
 
-    def _take_pictures(
+    def _take_frames(
         self,
         failures: _Failures,
         clips: Clips | None,
         reward: float,
         flags: dict[str, bool],
-        picture: bool,
+        frame: bool,
     ) -> None:
         """Take the frames of a step that are drawn live, and those of a clip."""
         live = None if self._recording is None else self._recording.live
         if live is not None:
             with failures:
-                live.take(last=any(flags.values()), is_there=picture)
+                live.take(last=any(flags.values()), is_there=frame)
         if clips is not None:
             with failures:
-                clips.step(reward, **flags, has_picture=picture)
+                clips.step(reward, **flags, has_frame=frame)
 
     def _cut_episode(self, reason: str) -> None:
         """End the running episode, if there is one, before it is complete.
@@ -668,7 +666,7 @@ class Recorder:
 
     def _write_last_results(self) -> int:
         """Write what the run amounts to; return how many videos are pending."""
-        self.run.note_surroundings(wait=True)
+        self.run.note_provenance(wait=True)
         if self._kept is not None:
             self.run.note("keep", self._kept.details())
         self.run.note("closed", {"next_episode_id": self.episode_id})

@@ -26,7 +26,7 @@ class EpisodeRecording:
 
     Args:
         run: the monitored run.
-        on_picture_error: called with an error that is raised while a frame of a step
+        on_frame_error: called with an error that is raised while a frame of a step
             is drawn live: it may be the environment's own.
 
     Attributes:
@@ -42,7 +42,7 @@ class EpisodeRecording:
         self,
         run: MonitoredRun,
         *,
-        on_picture_error: Callable[[Exception], object],
+        on_frame_error: Callable[[Exception], object],
     ) -> None:
         self.episode_id = run.episode.episode_id
         self.video: VideoRecorder | DeferredVideo = run.no_video
@@ -50,7 +50,7 @@ class EpisodeRecording:
         self.live: LiveVideos | None = None
         self.stays = self.is_over = False
         self._run = run
-        self._on_picture_error = on_picture_error
+        self._on_frame_error = on_frame_error
         # What the log says of the video; None where there is none.
         self._pending_video: Mapping[str, Any] | None = None
 
@@ -101,7 +101,7 @@ class EpisodeRecording:
                 run,
                 run.directory / name,
                 second_name=second_name,
-                on_picture_error=self._on_picture_error,
+                on_frame_error=self._on_frame_error,
             )
             self.video = live.recorders[0]
             if self.video.enabled:

@@ -37,7 +37,7 @@ class StateRecorder:
     0, n, 2n ... where n is the smallest stride that keeps `max_fps`, and always the
     last one.
 
-    What goes wrong ends here. Where no picture can be made any more, the frames end
+    What goes wrong ends here. Where no frame can be made any more, the frames end
     and the states go on. Where nothing can be written any more, the recording ends
     there: an error, unless `on_error` has it that the simulation goes on.
 
@@ -164,7 +164,7 @@ class StateRecorder:
         truncated: bool,
         observation: Any = None,
         is_last: bool = False,
-        has_picture: bool = True,
+        has_frame: bool = True,
     ) -> None:
         """Record what the environment is like after a step.
 
@@ -176,7 +176,7 @@ class StateRecorder:
             truncated: a limit from outside the task ended it.
             observation: after the step; only where observations are recorded.
             is_last: it is the last one, and gets a frame.
-            has_picture: False where the environment has reset itself already: its
+            has_frame: False where the environment has reset itself already: its
                 state is the next episode's.
 
         Raises:
@@ -191,8 +191,8 @@ class StateRecorder:
             number, slot = span.steps + 1, span.make_room()
             is_frame = False
             try:
-                self._write_state(span, slot, has_picture=has_picture)
-                if has_picture and (is_last or number % self._stride == 0):
+                self._write_state(span, slot, has_frame=has_frame)
+                if has_frame and (is_last or number % self._stride == 0):
                     is_frame = self._write_snapshot(span, slot, number)
             finally:
                 # Whatever was raised: a missing step would be the end of the log.
@@ -412,12 +412,12 @@ class StateRecorder:
         layout = self._run.layouts[self._logs] = RowLayout(*kinds, dtype, words)
         return layout
 
-    def _write_state(self, span: SpanWriter, slot: int, *, has_picture: bool) -> None:
+    def _write_state(self, span: SpanWriter, slot: int, *, has_frame: bool) -> None:
         if "state" not in span.log.columns:
             return
         state = span.log.columns["state"][slot]
         state[...] = np.nan
-        if not has_picture or self._capture is None:
+        if not has_frame or self._capture is None:
             return
         try:
             self._capture.capture_state(state)
@@ -522,7 +522,7 @@ def _words(kind: np.dtype[Any] | None) -> int:
 
 
 class DeferredVideo:
-    """Stands where a `VideoRecorder` stands when pictures are drawn live.
+    """Stands where a `VideoRecorder` stands when frames are drawn live.
 
     Its frames are recorded snapshots. The files come when they are rendered, which the
     monitor's `close` waits for.

@@ -93,7 +93,7 @@ def step_array(example: Any) -> StepArray | None:
     """Return memory for arrays like `example`; None where it is nothing like an array.
 
     Floats are kept as float64 and integers as int64, whatever their width, so that
-    each value is kept exactly; a larger array of another width (a picture) keeps its
+    each value is kept exactly; a larger array of another width (a frame) keeps its
     own. A dictionary of arrays becomes one float64 vector.
     """
     if isinstance(example, Mapping):

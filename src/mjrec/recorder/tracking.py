@@ -2,7 +2,7 @@
 """Experiment trackers: they are notified of finished episodes and videos.
 
 A tracker is called in the process of the simulation, between two steps, and so should
-be quick. It is given facts and names of files, never pictures.
+be quick. It is given facts and names of files, never frames.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One video of one environment, picture by picture, with its metadata."""
+"""One video of one environment, frame by frame, with its metadata."""
 
 from __future__ import annotations
 
@@ -29,22 +29,22 @@ _IMAGE_MODES = ("rgb_array", "rgb_array_list")
 _TEXT_MODES = ("ansi", "ansi_list")
 
 
-class PictureSource(Protocol):
+class FrameSource(Protocol):
     """What a video is taken from: an environment, or what stands for one."""
 
     @property
     def render_mode(self) -> str | None:
         """What `render` gives: `rgb_array`, `rgb_array_list`, `ansi` or `ansi_list`.
 
-        With any other there are no pictures.
+        With any other there are no frames.
         """
 
     def render(self) -> Any:
-        """Return the picture of this moment, or the list of those since the last."""
+        """Return the frame of this moment, or the list of those since the last."""
 
 
-def can_give_pictures(source: object) -> bool:
-    """Tell whether `source` has a render mode that a video can be made of."""
+def can_give_frames(source: object) -> bool:
+    """Return whether `source` has a render mode that a video can be made of."""
     return getattr(source, "render_mode", None) in (*_IMAGE_MODES, *_TEXT_MODES)
 
 
@@ -97,7 +97,7 @@ class VideoRecorder:
 
     def __init__(
         self,
-        env: PictureSource,
+        env: FrameSource,
         path: str | os.PathLike[str] | None = None,
         metadata: Mapping[str, Any] | None = None,
         enabled: bool = True,
@@ -115,7 +115,7 @@ class VideoRecorder:
         if caption is not None:
             check_annotation()
         self.env = env
-        self.enabled = bool(enabled) and can_give_pictures(env)
+        self.enabled = bool(enabled) and can_give_frames(env)
         self.broken = self.finished = self.closed = False
         self.path: str | None = None
         self.metadata_path: str | None = None
@@ -309,12 +309,12 @@ class VideoRecorder:
         if self._sink is not None:
             self._sink.write(taken, caption)
         else:
-            # The environment may draw the next picture into the same array.
+            # The environment may draw the next frame into the same array.
             taken = taken if isinstance(taken, str) else taken.copy()
             self._waiting.append((taken, caption))
 
     def _settle_rate(self, step: int, frames: int) -> None:
-        """Open the video, once there are pictures of two steps to time it by."""
+        """Open the video, once there are frames of two steps to time it by."""
         if self._sink is not None or self._first is None:
             return
         self._timestep = _time_of_a_step(self._first, (step, self._clock()))

@@ -38,7 +38,7 @@ from ..formats.monitor_directory import infix_of
 from ..machine import check_workers
 from ..messages import log_message
 from ..parent import Parent
-from ..patience import Patience, patience_s
+from ..timeouts import Timeout, timeout_s
 from .jobs import Progress, VideoJob, key_of
 
 if TYPE_CHECKING:
@@ -52,7 +52,7 @@ _NICE = 10
 _SECONDS_BETWEEN_REPORTS = 0.2
 _SECONDS_BETWEEN_LOOKS = 0.05
 _SECONDS_TO_LEAVE = 2.0
-# What the process waits for itself, it gives up after one patience.
+# What the process waits for itself, it gives up after one timeout.
 _PATIENCES = 3
 
 
@@ -96,7 +96,7 @@ class Background:
         self._is_waited_for = self._is_prepared = False
         self._progress = Progress()
         self._is_stopped = self._waits_later = False
-        # How processes have died, the second of which was the last.
+        # How processes have died; the second death is the last.
         self._deaths: list[str] = []
         self.failures: dict[str, str] = {}
         # A dictionary for its order.
@@ -145,30 +145,30 @@ class Background:
         """
         if self._was_forked() or self._is_stopped or self._waits_later:
             return
-        patience, cpu_seconds = Patience(_PATIENCES * patience_s()), 0.0
+        timeout, cpu_seconds = Timeout(_PATIENCES * timeout_s()), 0.0
         while self.waiting and (child := self._child) is not None:
             if not self._is_waited_for:
                 self._send(waited_for=True)
                 self._is_waited_for = True
             on_progress(self._progress)
-            has_news = patience.wait(lambda slice_: wait_for_news([child], slice_))
+            has_news = timeout.wait(lambda slice_: wait_for_news([child], slice_))
             # What it waits for itself, it looks at every second. Blocked for good, by
             # a disk that does not answer for example, it uses no CPU.
             before, cpu_seconds = cpu_seconds, child.cpu_seconds()
             self._listen()
             if cpu_seconds > before:
-                patience.renew()
-            elif not has_news and patience.is_over:
+                timeout.renew()
+            elif not has_news and timeout.is_over:
                 logger.error(
                     "The process that renders the videos of %s has given no sign of "
                     "life for %g seconds, and is ended. What its threads were at:\n%s",
                     self._directory,
-                    patience.seconds,
+                    timeout.seconds,
                     child.stacks(),
                 )
                 child.kill()
-                self._replace(f"it hung for {patience.seconds:g} seconds and was ended")
-                patience.renew()
+                self._replace(f"it hung for {timeout.seconds:g} seconds and was ended")
+                timeout.renew()
         on_progress(self._progress)
         if self.waiting:
             reason = f"the process that renders is gone: {self._deaths[-1]}"
@@ -396,7 +396,7 @@ class _Work:
         if now - self._last_report >= _SECONDS_BETWEEN_REPORTS:
             self._last_report = now
             self._take_in_all()
-            # Nobody reads it before, and a pipe holds only so much.
+            # It is read only then, and a pipe's room is limited.
             if self._is_waited_for:
                 self._parent.send(progress=vars(progress))
 

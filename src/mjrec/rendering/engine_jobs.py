@@ -66,7 +66,7 @@ def do_on_engine(
         for name, job in by_name.items():
             run.submit(name, **job.as_json())
         for done in run.results():
-            # Without patience there is always one.
+            # Without timeout there is always one.
             assert done is not None
             result = result_of(done, by_name[done.key])
             # It was taken for one video.
@@ -98,7 +98,7 @@ def result_of(done: JobOutcome, job: VideoJob) -> RenderedVideos:
 
 
 def _name_of(job: VideoJob) -> str:
-    return job.key.told_name if job.video is None else job.video.name
+    return job.key.shown_name if job.video is None else job.video.name
 
 
 def environ_for_drawing() -> dict[str, str]:

@@ -120,7 +120,7 @@ class Finisher:
         return True
 
     def is_ready(self) -> bool:
-        """Tell whether the model of the next job is there."""
+        """Return whether the model of the next job is there."""
         _, plan = next(iter(self._waiting.values()))
         return plan is None or plan.has_model
 
@@ -159,7 +159,7 @@ class Finisher:
 
     def _do(self, job: VideoJob) -> RenderedVideos:
         if job.video is None:
-            nothing, name = RenderedVideos(directory=job.directory), job.key.told_name
+            nothing, name = RenderedVideos(directory=job.directory), job.key.shown_name
         else:
             nothing, name = RenderedVideos(directory=job.video.parent), job.video.name
         try:

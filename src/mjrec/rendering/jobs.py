@@ -78,7 +78,7 @@ class RecordingKey:
         return f"{video_prefix(self.infix, self.number)}.mp4"
 
     @property
-    def told_name(self) -> str:
+    def shown_name(self) -> str:
         """What it is called where nothing is known of it."""
         return self.name if self.is_clip else self.video_name
 
@@ -129,7 +129,7 @@ class VideoJob:
         cls, directory: Path, key: RecordingKey, *, strict: bool = False
     ) -> Self:
         """Return the job that finishes what is pending of a recording."""
-        return cls(directory=directory, recording=key.told_name, strict=strict)
+        return cls(directory=directory, recording=key.shown_name, strict=strict)
 
     @property
     def name(self) -> str:
@@ -161,20 +161,21 @@ class VideoJob:
         }
 
     @classmethod
-    def from_json(cls, said: Mapping[str, Any]) -> Self:
+    def from_json(cls, plain: Mapping[str, Any]) -> Self:
         """Return what another process of ours said with `as_json`."""
-        variant = said["variant"] and Variant(
-            view=View(**said["variant"]["view"]),
-            max_fps=said["variant"]["max_fps"] and Fraction(said["variant"]["max_fps"]),
-            fps=said["variant"]["fps"] and Fraction(said["variant"]["fps"]),
-            annotate=said["variant"]["annotate"],
+        variant = plain["variant"] and Variant(
+            view=View(**plain["variant"]["view"]),
+            max_fps=plain["variant"]["max_fps"]
+            and Fraction(plain["variant"]["max_fps"]),
+            fps=plain["variant"]["fps"] and Fraction(plain["variant"]["fps"]),
+            annotate=plain["variant"]["annotate"],
         )
         return cls(
-            directory=Path(said["directory"]),
-            recording=said["recording"],
-            strict=said["strict"],
+            directory=Path(plain["directory"]),
+            recording=plain["recording"],
+            strict=plain["strict"],
             variant=variant,
-            video=said["video"] and Path(said["video"]),
+            video=plain["video"] and Path(plain["video"]),
         )
 
 

@@ -46,13 +46,13 @@ def leftovers(files: MonitorFiles, kind: Kind) -> list[Path]:
 
 
 def has_leftovers(files: MonitorFiles) -> bool:
-    """Tell whether anything is left to do of a monitor."""
+    """Return whether anything is left to do of a monitor."""
     is_left = bool(logs_left(files)) or any(_kind_of(p, files) for p in files.paths)
     return is_left or lacks_results(files)
 
 
 def is_at_work(directory: Path, infix: Infix) -> bool:
-    """Tell whether an encoder or a renderer is at a file of a monitor that is gone."""
+    """Return whether an encoder or renderer is at a file of a monitor that is gone."""
     files = files_of(directory, infix)
     hidden = [path for path in files.paths if path.name.startswith(".")]
     return any(is_locked(path) for path in hidden if path != files.lock)
@@ -73,7 +73,7 @@ def stale_shared_files(directory: Path) -> list[Path]:
 
 
 def _has_work(log: Path) -> bool:
-    """Tell whether a log is to be finished or removed."""
+    """Return whether a log is to be finished or removed."""
     try:
         in_flight = [each for each in recordings_in(log) if each.is_in_flight]
     except UnreadableFile:
@@ -112,7 +112,7 @@ def _lock_of(video: Path) -> Path:
 
 
 def lacks_results(files: MonitorFiles) -> bool:
-    """Tell whether statistics or manifest are missing, or may be older than the rest.
+    """Return whether statistics or manifest are missing, or may be older than the rest.
 
     A monitor that has closed wrote both, and removed its lock.
     """

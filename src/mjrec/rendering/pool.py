@@ -41,8 +41,8 @@ from ..gl.backends import (
 )
 from ..machine import check_workers, usable_cpus
 from ..messages import log_message, unpacked
-from ..patience import Patience
 from ..simulation.model_trust import ALL_MODELS, TRUST_VARIABLE
+from ..timeouts import Timeout
 from .views import PlainCamera, View, plain_camera
 
 logger = logging.getLogger(__name__)
@@ -59,7 +59,7 @@ class WorkerPool:
     pipe. Of each at most two frames are kept here that were not asked for yet, however
     many are to come. One that dies is started again at the frame that it owes; the
     second time at one frame is an error. One that hangs, having sent nothing for
-    `patience_s` while it was waited for, is ended and counts as dead; where it hung is
+    `timeout_s` while it was waited for, is ended and counts as dead; where it hung is
     in the log.
 
     The processes are started as they are needed, or by `start`, and stay until `close`,
@@ -117,7 +117,7 @@ class WorkerPool:
         self._held: dict[int, Lock] = {}
         self._workers = [_Worker() for _ in range(count)]
         self._forks = forks
-        self._patience = Patience()
+        self._timeout = Timeout()
         self.gl_facts: dict[str, Any] = {}
         self._has_drawn = False
         self._job: _Job | None = None
@@ -306,7 +306,7 @@ class WorkerPool:
                     self._wait_for_news(job)
                     self._check_usable(job)
                 frame = worker.arrived.popleft()
-                self._patience.renew()
+                self._timeout.renew()
                 # Before the caller has it: it may be busy with it for long.
                 self._listen(job, 0)
                 yield frame
@@ -321,7 +321,7 @@ class WorkerPool:
         self._start(worker)
         assert worker.child is not None
         indices = [int(job.indices[position]) for position in worker.owes]
-        self._patience.renew()
+        self._timeout.renew()
         worker.child.send(drawing=job.drawing, indices=indices)
 
     def _wait_for_news(self, job: _Job) -> None:
@@ -330,12 +330,12 @@ class WorkerPool:
         for worker in hungry:
             if worker.child is None:
                 self._order(worker, job)
-        self._patience.wait(lambda seconds: self._listen(job, seconds))
-        if self._patience.is_over:
+        self._timeout.wait(lambda seconds: self._listen(job, seconds))
+        if self._timeout.is_over:
             # All that sent more have no room for it, or owe nothing.
             for worker in hungry:
                 self._end_hanging(worker, job)
-            self._patience.renew()
+            self._timeout.renew()
 
     def _listen(self, job: _Job, seconds: float) -> bool:
         """Take in what the workers send, waiting so long for it; tell if they did."""
@@ -360,30 +360,30 @@ class WorkerPool:
     def _take_in(self, worker: _Worker, child: Child) -> None:
         while worker.may_send:
             child.forget_words()
-            said = child.receive()
-            if said is None:
+            message = child.receive()
+            if message is None:
                 return
-            if isinstance(said, bytearray):
+            if isinstance(message, bytearray):
                 self._has_drawn = True
-                frame = np.frombuffer(said, np.uint8).reshape(worker.shape)
+                frame = np.frombuffer(message, np.uint8).reshape(worker.shape)
                 worker.arrived.append(frame)
                 worker.owes = worker.owes[1:]
-            elif log_message(said):
+            elif log_message(message):
                 continue
-            elif "untried" in said:
-                logger.info("A worker cannot draw with EGL: %s", said["untried"])
+            elif "untried" in message:
+                logger.info("A worker cannot draw with EGL: %s", message["untried"])
                 # It ends, and another one takes its place.
                 self._choose_backend()
-            elif "error" in said:
-                worker.error = unpacked(said["error"])
+            elif "error" in message:
+                worker.error = unpacked(message["error"])
             else:
                 worker.is_tried = True
-                worker.shape = (*said["size"], 3)
-                self.gl_facts = said["gl"]
+                worker.shape = (*message["size"], 3)
+                self.gl_facts = message["gl"]
 
     def _end_hanging(self, worker: _Worker, job: _Job) -> None:
         assert worker.child is not None
-        seconds = self._patience.seconds
+        seconds = self._timeout.seconds
         logger.error(
             "A drawing worker hangs: it has drawn nothing for %g seconds, and is "
             "ended. What its threads were at:\n%s",

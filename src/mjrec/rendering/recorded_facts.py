@@ -64,7 +64,7 @@ _ASKED_RATE = re.compile(r"\d{1,40}(\.\d{1,40}|/0*[1-9]\d{0,39})?", re.ASCII)
 
 
 def open_for_rendering(path: Path, *, is_vetted: bool = False) -> TrajectoryReader:
-    """Open a trajectory, whoever made it, and check its facts.
+    """Open a trajectory, also a stranger's, and check its facts.
 
     Afterwards `rate`, `timestep`, `scene`, `model`, `video` and `clip` are there as
     they should be, or None, or missing; `stride`, `kept` and `candidate` as they should
@@ -226,7 +226,7 @@ def captions(reader: TrajectoryReader, indices: Sequence[int]) -> Iterator[Capti
     """Return the captions of some frames of a trajectory, in their order.
 
     The return is the sum of the rewards up to the frame's step. The time is that of
-    the simulation since the reset; where no states were recorded, so many steps; where
+    the simulation since the reset; where no states were recorded, of the steps; where
     it is not known how long these are, there is none. A part of a clip may begin in the
     midst of an episode, and says what was before it.
 

@@ -170,7 +170,7 @@ def parts_of(directory: Path, key: RecordingKey) -> list[Path]:
 
 
 def may_be_left(directory: Path, key: RecordingKey) -> bool:
-    """Tell whether anything may be left to do about a recording, opening no file.
+    """Return whether anything may be left to do about a recording, opening no file.
 
     Where it is not, `look_at` returns None.
     """
@@ -180,7 +180,7 @@ def may_be_left(directory: Path, key: RecordingKey) -> bool:
 
 
 def _is_done(directory: Path, key: RecordingKey) -> bool:
-    """Tell whether an episode has all that it can have."""
+    """Return whether an episode has all that it can have."""
     if key.is_clip or not is_done(directory / key.video_name):
         return False
     return is_finished(directory / f"{key.name}{FINISHED}")
@@ -189,7 +189,7 @@ def _is_done(directory: Path, key: RecordingKey) -> bool:
 def look_at(directory: Path, key: RecordingKey) -> Plan | None:
     """Return what is left to do about a recording; None where it is nothing.
 
-    One that is still running, or of which its monitor has not decided yet whether it
+    One that is still running, or whose monitor has not decided yet whether it
     gets a video, is left to its monitor: its log does not say how it ended, or calls it
     a candidate, and the monitor's lock is held.
 

@@ -120,7 +120,7 @@ def recover(
         return Recovery(path, open_monitors=open_monitors)
     # Not at the top: it loads HDF5, which a simulation that goes on where a closed
     # monitor left off has no use for.
-    from .dead_monitor import Report, finish_dead_monitor
+    from .killed_monitor import Report, finish_killed_monitor
 
     report = Report()
     if not os.access(path, os.W_OK | os.X_OK):
@@ -132,7 +132,7 @@ def recover(
         # Once more, because another process may have done it meanwhile.
         dead, open_monitors = _dead_and_open(path)
         for infix in dead:
-            finish_dead_monitor(path, infix, report, bundles=bundle)
+            finish_killed_monitor(path, infix, report, bundles=bundle)
         for stale in stale_shared_files(path):
             report.remove(stale)
         give_all_second_names(path)

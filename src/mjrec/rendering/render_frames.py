@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pictures of recorded episodes and of given states, for whoever wants arrays."""
+"""Frames of recorded episodes and of given states, as arrays."""
 
 from __future__ import annotations
 

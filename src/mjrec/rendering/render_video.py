@@ -79,10 +79,10 @@ def render_video(
 ) -> RenderedVideos:
     """Render the video of a recording, with its frame hashes and its metadata.
 
-    Where several cameras were recorded, so many videos, or one of all side by side. All
-    files have temporary names until they are whole. Those that are there are replaced.
-    If it fails or is interrupted, nothing is left. An encoder that is killed or hangs
-    is given a second try.
+    Where several cameras were recorded, a video of each, or one of all side by side.
+    All files have temporary names until they are whole. Those that are there are
+    replaced. If it fails or is interrupted, nothing is left. An encoder that is killed
+    or hangs is given a second try.
 
     Args:
         parts: the trajectory of an episode, finished or not; or the parts of a clip.
@@ -122,7 +122,7 @@ def render_video(
     rate = _fps(recorded, chosen) if variant.fps is None else to_rate(variant.fps)
     stride = facts.get("stride", 1) * chosen.every
     timestep = recorded.timing.get("timestep")
-    said = {
+    description = {
         **_metadata(recorded),
         **timing_facts(
             StepRuns(recorded.frame_steps[chosen.indices].tolist(), stride=stride),
@@ -144,7 +144,7 @@ def render_video(
             draw = functools.partial(_drawn, workers, shot, runs, annotate=annotate)
             sink = _film(shot.path, rate, draw, on_frame)
             sinks.append(sink)
-            facts = sink.describe({**said, **shot.facts, **workers.gl_facts})
+            facts = sink.describe({**description, **shot.facts, **workers.gl_facts})
             videos[sink.path.name] = facts["frame_count"]
     except BaseException:
         for sink in sinks:
@@ -177,7 +177,7 @@ def _note_that_it_broke(recorded: Recorded, out: Path | None) -> None:
         refusal = facts.get("refusal")
         why = f": {refusal}" if refusal else ""
         raise NoPictures(
-            f"{path} holds states, and nothing that pictures can be made of{why}."
+            f"{path} holds states, and nothing that frames can be made of{why}."
         )
     broken = {"broken_reason": reason, "empty": True, "broken": True}
     write_metadata(video_path(path, facts), {**_metadata(recorded), **broken})
@@ -225,7 +225,7 @@ def _metadata(recorded: Recorded) -> dict[str, Any]:
     """Return what the metadata says of what was recorded."""
     first, last = recorded.facts[0], recorded.facts[-1]
     complete = bool(last.get("complete"))
-    said = {
+    description = {
         "content_type": "video/mp4",
         **recording_facts(first, recording="deferred"),
         "rendered_with": dict(versions()),
@@ -236,20 +236,22 @@ def _metadata(recorded: Recorded) -> dict[str, Any]:
         "reward": last.get("reward", recorded.reward),
     }
     if recorded.is_clip:
-        said["first_step"] = (first.get("clip") or {}).get("first_step")
-        said["last_episode_id"] = last.get("last_episode_id", last.get("episode_id"))
+        description["first_step"] = (first.get("clip") or {}).get("first_step")
+        description["last_episode_id"] = last.get(
+            "last_episode_id", last.get("episode_id")
+        )
         if any("final_frame" in facts for facts in recorded.facts):
-            said["final_frame"] = "missing"
+            description["final_frame"] = "missing"
     elif complete:
-        said |= {key: last.get(key) for key in ("terminated", "truncated")}
+        description |= {key: last.get(key) for key in ("terminated", "truncated")}
     if not complete:
         # A process that was killed could not say why it ended.
-        said["reason"] = last.get("reason", KILLED)
+        description["reason"] = last.get("reason", KILLED)
         if "exception" in last:
-            said["exception"] = last["exception"]
+            description["exception"] = last["exception"]
     if (broken := last.get("broken_reason")) is not None:
-        said |= {"broken_reason": broken, "broken": True}
-    return said
+        description |= {"broken_reason": broken, "broken": True}
+    return description
 
 
 def _shots(
@@ -272,8 +274,10 @@ def _shots(
         # The first one is as recorded, which is more than its name.
         tiles = (None, *map(plain_camera, further))
         rows, columns = grid_shape(len(tiles))
-        said = {"camera": [label, *further], "tiled": True, **second_name(first)}
-        return [_Shot(first, view, {**said, "rows": rows, "columns": columns}, tiles)]
+        description = {"camera": [label, *further], "tiled": True, **second_name(first)}
+        return [
+            _Shot(first, view, {**description, "rows": rows, "columns": columns}, tiles)
+        ]
     paths = further_video_paths(recording, facts) if out is None else []
     shots = [
         _Shot(
@@ -283,10 +287,10 @@ def _shots(
         )
         for path, camera in zip(paths, further, strict=False)
     ]
-    said = {"camera": label, **second_name(first)}
+    description = {"camera": label, **second_name(first)}
     if shots:
-        said["further_videos"] = [shot.path.name for shot in shots]
-    return [*shots, _Shot(first, view, said)]
+        description["further_videos"] = [shot.path.name for shot in shots]
+    return [*shots, _Shot(first, view, description)]
 
 
 def _film(

@@ -138,7 +138,7 @@ def iter_rendered_videos(
     engine: Executor | str | None = None,
     on_progress: _OnProgress | None = None,
 ) -> Iterator[RenderedVideos]:
-    """Do what `render_videos` does, and yield what became of each as it is over.
+    """Do what `render_videos` does, and yield each result when it is there.
 
     What is asked for is checked before anything is begun, and before this returns.
 

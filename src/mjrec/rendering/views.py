@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How pictures of a recording are wanted, as far as other than recorded."""
+"""How frames of a recording are wanted, as far as other than recorded."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ CAMERA_MEMBERS = (
 
 @dataclass(frozen=True, kw_only=True)
 class View:
-    """From where, how large and how well pictures are drawn; None is as recorded.
+    """From where, how large and how well frames are drawn; None is as recorded.
 
     Attributes:
         camera: the name or number of one of the model's cameras, -1 for the free
@@ -109,7 +109,7 @@ def plain_camera(camera: Any) -> PlainCamera:
         return int(camera)
     if isinstance(camera, Mapping):
         return {name: _plain_member(name, camera[name]) for name in camera}
-    # By its name: whoever has one has imported mujoco, and nobody else needs to.
+    # By its name: a caller who has one has imported mujoco, and others need not.
     if type(camera).__name__ == "MjvCamera":
         return {n: _plain_member(n, getattr(camera, n)) for n in CAMERA_MEMBERS}
     raise InvalidArgument(

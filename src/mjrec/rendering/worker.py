@@ -92,7 +92,7 @@ class Drawing:
         """
         if not 0 <= index < self._scene.count:
             raise InvalidArgument(
-                f"There is no picture {index}: there are {self._scene.count}, numbered "
+                f"There is no frame {index}: there are {self._scene.count}, numbered "
                 "from 0."
             )
         last, self._last = self._last, None

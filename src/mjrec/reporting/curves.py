@@ -38,7 +38,7 @@ _BELOW: Final = 38
 _MOST_DOTS: Final = 600
 _MOST_POINTS: Final = 160
 _MOST_COLUMNS: Final = 40
-# A window of more episodes than this is told from as many of it, evenly spread.
+# Of a longer window this many episodes are used, evenly spread.
 _WIDEST_WINDOW: Final = 1000
 _LARGEST: Final = 1e300
 _SMALLEST: Final = 1e-300

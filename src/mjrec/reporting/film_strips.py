@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Film strips for papers: some pictures of an episode, each with its time.
+"""Film strips for papers: some frames of an episode, each with its time.
 
-Pictures come from a video, or, sharper and of any size, from a recorded trajectory,
+Frames come from a video, or, sharper and of any size, from a recorded trajectory,
 which is drawn again. Pillow writes the times; it is an extra and is imported when a
 strip is made.
 """
@@ -44,7 +44,7 @@ _DOTS_PER_INCH: Final = 300
 _MOST_PIXELS: Final = 1 << 27
 
 _INK: Final = (32, 32, 32)
-# Of the smaller side of a picture.
+# Of the smaller side of a frame.
 _GAP: Final = 0.03
 _LETTERS: Final = 0.09
 _SMALLEST_LETTERS: Final = 9
@@ -108,8 +108,8 @@ def film_strip(
         times = [caption.time for caption in captions(reader, indices)]
     view = View(camera=camera, height=height, width=width, quality=quality)
     with contextlib.closing(WorkerPool(1)) as workers:
-        pictures = workers.frames(path, indices, view)
-        return _laid_out(pictures, times, columns or _usual_columns(frames))
+        drawn = workers.frames(path, indices, view)
+        return _laid_out(drawn, times, columns or _usual_columns(frames))
 
 
 def write_film_strip(path: str | os.PathLike[str], strip: Frame) -> None:
@@ -136,7 +136,7 @@ def write_film_strip(path: str | os.PathLike[str], strip: Frame) -> None:
 
 
 def _of_video(path: Path, count: int) -> tuple[Iterator[Frame], Sequence[float]]:
-    """Return pictures of a video, decoded when they are asked for, and their times."""
+    """Return frames of a video, decoded when they are asked for, and their times."""
     if video_kind(path) is None:
         raise UnreadableFile(
             path, "it is neither a video (mp4, avi, mkv) nor a trajectory (.h5)"
@@ -146,28 +146,28 @@ def _of_video(path: Path, count: int) -> tuple[Iterator[Frame], Sequence[float]]
     times: Sequence[float] = stream.times.tolist()
     height, width = stream.height, stream.width
     try:
-        said = read_object(metadata_path(path))
-        # Of the pictures before a row was added to make them even.
-        own_height, own_width = (field(said, key, integer) for key in _SIZE)
-        simulated = _simulated_times(said)
+        metadata = read_object(metadata_path(path))
+        # Of the frames before a row was added to make them even.
+        own_height, own_width = (field(metadata, key, integer) for key in _SIZE)
+        simulated = _simulated_times(metadata)
     except (OSError, ValueError):
         pass
     else:
         if 0 <= height - own_height <= 1 and 0 <= width - own_width <= 1:
             height, width = own_height, own_width
             times = simulated if len(simulated) == len(stream) else times
-    pictures = (frame[:height, :width] for frame in frames_at(stream, indices))
-    return pictures, [times[index] for index in indices]
+    drawn = (frame[:height, :width] for frame in frames_at(stream, indices))
+    return drawn, [times[index] for index in indices]
 
 
-def _simulated_times(said: Any) -> Sequence[float]:
-    """Return the simulated time of each picture; none where that is not said."""
-    if said.get("timestep") is None or said.get("first_step") is not None:
+def _simulated_times(metadata: Any) -> Sequence[float]:
+    """Return the simulated time of each frame; none where that is not said."""
+    if metadata.get("timestep") is None or metadata.get("first_step") is not None:
         return []
-    timestep: Fraction = field(said, "timestep", rate)
-    stride = field(said, "stride", integer)
-    count = field(said, "frame_count", integer)
-    runs = field(said, "frame_steps", list_of(list_of(integer)))
+    timestep: Fraction = field(metadata, "timestep", rate)
+    stride = field(metadata, "stride", integer)
+    count = field(metadata, "frame_count", integer)
+    runs = field(metadata, "frame_steps", list_of(list_of(integer)))
     if stride < 1 or any(len(run) != 2 for run in runs):
         return []
     steps = itertools.chain.from_iterable(
@@ -179,10 +179,10 @@ def _simulated_times(said: Any) -> Sequence[float]:
 
 
 def _spread(available: int, count: int, path: Path) -> list[int]:
-    """Return the numbers of pictures spread evenly, the first and the last included.
+    """Return the numbers of frames spread evenly, the first and the last included.
 
     Raises:
-        InvalidArgument: there are not so many.
+        InvalidArgument: the episode has fewer.
     """
     if count > available:
         raise InvalidArgument(
@@ -206,13 +206,13 @@ def _check_count(name: str, count: object) -> None:
 
 
 def _laid_out(
-    pictures: Iterator[Frame], times: Sequence[float | None], columns: int
+    frames: Iterator[Frame], times: Sequence[float | None], columns: int
 ) -> Frame:
-    """Return pictures in rows on white paper, the time of each under it."""
+    """Return frames in rows on white paper, the time of each under it."""
     # Here, because it is an extra.
     from PIL import Image, ImageDraw, ImageFont
 
-    first = next(pictures)
+    first = next(frames)
     height, width = first.shape[:2]
     columns = min(columns, len(times))
     rows = math.ceil(len(times) / columns)
@@ -229,15 +229,15 @@ def _laid_out(
     if size[0] * size[1] > _MOST_PIXELS:
         raise InvalidArgument(
             f"The strip would have {size[0]}x{size[1]} pixels. Ask for fewer or "
-            "smaller pictures (frames, size)."
+            "smaller frames (frames, size)."
         )
     paper = Image.new("RGB", size, "white")
     draw = ImageDraw.Draw(paper)
-    shown = itertools.chain([first], pictures)
-    for number, (picture, label) in enumerate(zip(shown, labels, strict=True)):
+    shown = itertools.chain([first], frames)
+    for number, (frame, label) in enumerate(zip(shown, labels, strict=True)):
         row, column = divmod(number, columns)
         left, top = gap + column * (width + gap), gap + row * (height + below + gap)
-        paper.paste(Image.fromarray(picture), (left, top))
+        paper.paste(Image.fromarray(frame), (left, top))
         middle = left + width / 2, top + height + gap // 2
         draw.text(middle, label, fill=_INK, font=font, anchor="ma")
     return np.array(paper)

@@ -228,7 +228,7 @@ def _monitors(
 ) -> Iterator[tuple[Path, MonitorResults]]:
     """Yield the monitors of directories; the caller keeps none of them.
 
-    A manifest says much of the machine, of which a page shows little.
+    A page shows little of what a manifest says about the machine.
     """
     for place in places:
         try:
@@ -387,19 +387,19 @@ def _read_verdict(path: Path) -> Verdict:
         UnreadableFile: it is missing, damaged, something else, or contradicts itself.
     """
     with unreadable(path):
-        said = read_object(path)
-        verdict = json_field(said, "verdict", one_of(*_VERDICTS))
-        findings = json_field(said, "findings", list_of(mapping))
+        verification = read_object(path)
+        verdict = json_field(verification, "verdict", one_of(*_VERDICTS))
+        findings = json_field(verification, "findings", list_of(mapping))
         outcomes = Counter(json_field(each, "outcome", text) for each in findings)
         if verdict != "FAIL" and outcomes["different"]:
             raise ValueError(
                 f"it says {verdict}, and that {outcomes['different']} items differ"
             )
         return Verdict(
-            source=f"{json_field(said, 'path', text)} ({path})",
+            source=f"{json_field(verification, 'path', text)} ({path})",
             verdict=verdict,
             counts={name: outcomes[name] for name in _OUTCOMES if outcomes[name]},
-            level=json_field(said, "level", one_of(*_LEVELS)),
+            level=json_field(verification, "level", one_of(*_LEVELS)),
         )
 
 

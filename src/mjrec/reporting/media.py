@@ -62,7 +62,7 @@ OnProgress = Callable[[ReportProgress], object]
 
 
 def is_own_name(name: str) -> bool:
-    """Tell whether a report's video or poster may be called so."""
+    """Return whether a report's video or poster may be called so."""
     return _OWN_NAME.fullmatch(name) is not None
 
 
@@ -73,7 +73,7 @@ def posters_of(contents: ReportContents, on_progress: OnProgress) -> list[bytes 
 
     Args:
         contents: whose videos have their recorded files.
-        on_progress: is told of each poster.
+        on_progress: called after each poster.
     """
     moving = [video for video in contents.videos if video.path.suffix != _TEXT]
     posters: dict[int, bytes | None] = {}
@@ -82,13 +82,13 @@ def posters_of(contents: ReportContents, on_progress: OnProgress) -> list[bytes 
         for video, made in zip(moving, pool.map(_poster, moving), strict=True):
             posters[id(video)] = made if isinstance(made, bytes) else None
             if isinstance(made, Error):
-                contents.problems.append(f"There is no picture of a video: {made}")
+                contents.problems.append(f"There is no frame of a video: {made}")
             on_progress(ReportProgress(POSTERS, len(posters), len(moving)))
     return [posters.get(id(video)) for video in contents.videos]
 
 
 def _poster(video: ReportVideo) -> bytes | Error:
-    """Return the picture in the middle of a video.
+    """Return the frame in the middle of a video.
 
     The first one is often a robot in its initial pose, alike in all videos of a task,
     and the last one a fall; what happens is in between.
@@ -117,7 +117,7 @@ def copy_videos(
         contents: whose videos have their recorded files.
         posters: of the videos.
         folder: of the page.
-        on_progress: is told of each video.
+        on_progress: called after each video.
 
     Raises:
         OSError: the disk is full.

@@ -2,7 +2,7 @@
 """The page of a report: one HTML text that opens from the disk and needs no network.
 
 All that it shows may come from files of strangers. It is shown as text: escaped, cut
-where it is long, and with what nobody sees spelled out (`page_text`). A content
+where it is long, and invisible characters are spelled out (`page_text`). A content
 security policy with the hashes of the page's own style and script lets nothing else
 run, and nothing be loaded but images and videos from the disk.
 """

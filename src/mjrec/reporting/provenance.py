@@ -80,9 +80,9 @@ class Provenance:
 
 def machine_of(monitor: MonitorResults) -> tuple[str, str]:
     """Return what a monitor says of the machine that it recorded on."""
-    surroundings = _mapping(_details(monitor).get("surroundings"))
-    cpu = _mapping(surroundings.get("cpu")).get("model")
-    return "Recorded on", _joined(cpu, surroundings.get("system"))
+    provenance = _mapping(_details(monitor).get("provenance"))
+    cpu = _mapping(provenance.get("cpu")).get("model")
+    return "Recorded on", _joined(cpu, provenance.get("system"))
 
 
 def pairs_of_monitor(monitor: MonitorResults) -> Pairs:
@@ -90,7 +90,7 @@ def pairs_of_monitor(monitor: MonitorResults) -> Pairs:
     details = _details(monitor)
     yield machine_of(monitor)
     yield "Monitors", monitor.files.infix
-    policy = _mapping(_mapping(details.get("surroundings")).get("policy"))
+    policy = _mapping(_mapping(details.get("provenance")).get("policy"))
     sha256 = policy.get("sha256")
     if isinstance(policy.get("file"), str):
         yield "Policy", _joined(policy["file"], f"sha256 {sha256}" if sha256 else None)
@@ -157,8 +157,8 @@ def _some(values: Iterable[str], between: str) -> str:
 
 
 def _versions(versions: Any) -> str:
-    said = _mapping(versions)
-    known = [(shown, said.get(package)) for package, shown in _PACKAGES.items()]
+    by_package = _mapping(versions)
+    known = [(shown, by_package.get(package)) for package, shown in _PACKAGES.items()]
     return ", ".join(f"{name} {of}" for name, of in known if isinstance(of, str))
 
 

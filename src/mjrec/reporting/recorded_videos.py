@@ -42,20 +42,20 @@ def recorded_videos(
     found: list[ReportVideo] = []
     for name in sorted(set(_names(results)), key=_order):
         path = directory / name
-        said: Mapping[str, Any] = {}
+        facts: Mapping[str, Any] = {}
         try:
             regular_path(path)
         except (OSError, ValueError) as error:
             problems.append(f"The video {path} is left out: {_reason(error)}.")
             continue
         try:
-            said = read_object(metadata_path(path))
+            facts = read_object(metadata_path(path))
         except (OSError, ValueError) as error:
             problems.append(
                 f"The metadata of {path} cannot be read: {_reason(error)}. The video "
                 "is shown without them."
             )
-        found.append(_video(path, said, results))
+        found.append(_video(path, facts, results))
     return found
 
 
@@ -82,40 +82,42 @@ def _reason(error: Exception) -> object:
     return error.strerror if isinstance(error, OSError) else error
 
 
-def _video(path: Path, said: Mapping[str, Any], results: MonitorResults) -> ReportVideo:
+def _video(
+    path: Path, facts: Mapping[str, Any], results: MonitorResults
+) -> ReportVideo:
     episode_id = episode_of(path.name)
-    if said.get("first_step") is not None or "sub_environments" in said:
+    if facts.get("first_step") is not None or "sub_environments" in facts:
         episode_id = None
-    drawn_with = (said.get("gl_renderer"), said.get("gl_version"))
+    drawn_with = (facts.get("gl_renderer"), facts.get("gl_version"))
     texts = [text[:_LONGEST_TEXT] for text in drawn_with if isinstance(text, str)]
-    sha256 = said.get("file_sha256")
+    sha256 = facts.get("file_sha256")
     is_hash = isinstance(sha256, str) and _SHA256.fullmatch(sha256)
     command = trajectory = None
-    if episode_id is not None and said.get("recording") == "deferred":
+    if episode_id is not None and facts.get("recording") == "deferred":
         trajectory = results.files.trajectories.get(episode_id)
-        command = None if trajectory is None else _command(path, said, trajectory)
-    frames, fps = _known(said, "frame_count", integer), _known(said, "fps", rate)
+        command = None if trajectory is None else _command(path, facts, trajectory)
+    frames, fps = _known(facts, "frame_count", integer), _known(facts, "fps", rate)
     return ReportVideo(
         path=path,
         infix=results.files.infix,
         episode_id=episode_id,
-        height=_known(said, "height", _pixels),
-        width=_known(said, "width", _pixels),
+        height=_known(facts, "height", _pixels),
+        width=_known(facts, "width", _pixels),
         seconds=float(frames / fps) if frames and frames > 0 and fps else None,
-        camera=_camera(said.get("camera")),
+        camera=_camera(facts.get("camera")),
         renderer=", ".join(texts) or None,
         sha256=sha256 if is_hash else None,
         command=command,
-        notes=list(_notes(said)),
+        notes=list(_notes(facts)),
         trajectory=trajectory,
     )
 
 
-def _command(path: Path, said: Mapping[str, Any], trajectory: Path) -> str | None:
+def _command(path: Path, facts: Mapping[str, Any], trajectory: Path) -> str | None:
     """Return what a shell takes to render a video again, beside the recorded ones."""
-    camera = said.get("camera")
+    camera = facts.get("camera")
     options = []
-    if view_of(path.name) and "tiled" not in said:
+    if view_of(path.name) and "tiled" not in facts:
         # A further camera's; without its name the first one is rendered.
         is_name = isinstance(camera, str) and not _NUMBER.fullmatch(camera)
         if not is_name and type(camera) is not int:
@@ -126,25 +128,25 @@ def _command(path: Path, said: Mapping[str, Any], trajectory: Path) -> str | Non
     return shlex.join(["mjrec", "render", target, *options, "--out", "again.mp4"])
 
 
-def _notes(said: Mapping[str, Any]) -> Iterator[str]:
-    if said.get("complete") is False:
-        reason = said.get("reason")
+def _notes(facts: Mapping[str, Any]) -> Iterator[str]:
+    if facts.get("complete") is False:
+        reason = facts.get("reason")
         why = reason if isinstance(reason, str) else "it is not known why"
         yield f"Incomplete: the episode was not over ({why[:_LONGEST_TEXT]})."
-    if said.get("first_step") is not None:
+    if facts.get("first_step") is not None:
         yield "Counted in steps: it may go on across episodes."
-    if "sub_environments" in said:
+    if "sub_environments" in facts:
         yield "Shows several sub-environments side by side."
-    if said.get("recording") == "live":
+    if facts.get("recording") == "live":
         yield "Recorded live: it cannot be rendered again from recorded states."
-    if said.get("quality") == "draft":
+    if facts.get("quality") == "draft":
         yield "Drawn in draft quality."
-    if "annotated" in said:
+    if "annotated" in facts:
         yield "Has captions on its frames."
-    speed = said.get("playback_speed")
+    speed = facts.get("playback_speed")
     if isinstance(speed, float) and abs(speed - 1) > 1e-3:
         yield f"Plays at {speed:.3g} times the speed of the simulation."
-    selection = said.get("selection")
+    selection = facts.get("selection")
     if isinstance(selection, Mapping) and isinstance(selection.get("rule"), str):
         rule, among = (
             spaced(selection["rule"][:_LONGEST_TEXT]),
@@ -157,10 +159,10 @@ def _notes(said: Mapping[str, Any]) -> Iterator[str]:
             yield f"Kept by a run that ended before it could choose by {rule}."
 
 
-def _known(said: Mapping[str, Any], key: str, read: Callable[[Any], T]) -> T | None:
+def _known(facts: Mapping[str, Any], key: str, read: Callable[[Any], T]) -> T | None:
     """Return what metadata says; None where that is nothing, or nonsense."""
     try:
-        return field(said, key, read)
+        return field(facts, key, read)
     except ValueError:
         return None
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What there is to be seen in the file of a video, and pictures out of it.
+"""What there is to be seen in the file of a video, and frames out of it.
 
 ffmpeg (imageio's) reads a file as nothing but what its first bytes say that it is, and
 opens no other file for it.
@@ -36,13 +36,13 @@ _PACKET: Final = re.compile(
 _NO_TIME: Final = -(2**63)
 # A crafted file may claim any size.
 _MOST_PIXELS: Final = 16384 * 16384
-# How many pictures are in memory.
+# How many frames are in memory.
 _AT_ONCE: Final = 16
 
 
 @dataclass(frozen=True)
 class VideoStream:
-    """The pictures of a video, none of them decoded.
+    """The frames of a video, none of them decoded.
 
     Attributes:
         path: of the file, no link.
@@ -81,7 +81,7 @@ def read_stream(path: Path) -> VideoStream:
     """Return what there is to be seen in a file.
 
     Raises:
-        UnreadableFile: it is no video, or has no picture.
+        UnreadableFile: it is no video, or has no frame.
         EncoderError: it is damaged.
         Error: ffmpeg cannot be started.
     """
@@ -99,8 +99,8 @@ def read_stream(path: Path) -> VideoStream:
         elif header is not None:
             headers[header["key"]] = (int(header["a"]), int(header["b"]))
     if not packets or len(headers) < 2 or not headers[b"tb"][1]:
-        raise UnreadableFile(path, "there is no picture in it")
-    # Pictures are stored in the order in which they are decoded.
+        raise UnreadableFile(path, "there is no frame in it")
+    # Frames are stored in the order in which they are decoded.
     packets.sort()
     unit = float(Fraction(*headers[b"tb"]))
     width, height = headers[b"dimensions"]
@@ -113,16 +113,16 @@ def read_stream(path: Path) -> VideoStream:
 def frames_at(
     stream: VideoStream, indices: Sequence[int], *, most_width: int | None = None
 ) -> Iterator[Frame]:
-    """Yield some pictures of a video, decoded, as `(height, width, 3) uint8`.
+    """Yield some frames of a video, decoded, as `(height, width, 3) uint8`.
 
     Args:
         stream: of `read_stream`.
-        indices: of the pictures, rising.
+        indices: of the frames, rising.
         most_width: in pixels; wider ones are made smaller.
 
     Raises:
         EncoderError: it cannot be decoded so far.
-        UnreadableFile: it has fewer pictures than it claims.
+        UnreadableFile: it has fewer frames than it claims.
     """
     width, scale = stream.width, ""
     if most_width is not None and most_width < width:
@@ -141,7 +141,7 @@ def frames_at(
         )
         if not data or len(data) % (len(some) * width * 3):
             raise UnreadableFile(
-                stream.path, f"it has fewer than its {len(stream)} pictures"
+                stream.path, f"it has fewer than its {len(stream)} frames"
             )
         yield from np.frombuffer(data, np.uint8).reshape(len(some), -1, width, 3)
 

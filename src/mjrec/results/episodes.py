@@ -135,7 +135,7 @@ def episodes_of(results: MonitorResults) -> Iterator[Episode]:
 
 
 def _is_every_one(results: MonitorResults, stats: StatsFile, first: int) -> bool:
-    """Tell whether every episode that began was completed, so that numbers follow."""
+    """Return whether every episode that began was completed, so that numbers follow."""
     count, following = len(stats.timestamps), results.details.get("next_episode_id")
     if results.details:
         return following is not None and following - first == count

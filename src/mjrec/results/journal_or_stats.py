@@ -28,7 +28,7 @@ from .run import Run
 
 logger = logging.getLogger(__name__)
 
-# A lock holds a line; this bounds what somebody may have put in its place.
+# A lock holds a line; this bounds what may have been put in its place.
 _LONGEST_LOCK = 1 << 16
 
 
@@ -174,7 +174,7 @@ def locked_run(path: Path) -> Mapping[str, Any]:
     Raises:
         OSError, ValueError: it cannot be read.
     """
-    # Empty for a moment after it was made. A link is nobody's lock.
+    # Empty for a moment after it was made. A link is no lock.
     descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
     try:
         run = json_object(os.read(descriptor, _LONGEST_LOCK)).get("run")

@@ -117,7 +117,8 @@ def write_manifest_and_stats(
         run: what is known of its run; its journal is read if None.
         stats: its statistics; if None, those of the journal or of the statistics file,
             whichever has more episodes.
-        is_own: the caller is the monitor, or holds its lock. Nobody else touches the
+        is_own: the caller is the monitor, or holds its lock. No other process touches
+        the
             manifest of a monitor that is open.
 
     Returns:
@@ -132,7 +133,7 @@ def write_manifest_and_stats(
     if run is not None and stats is not None:
         # First of all: it tells a directory that is full, or gone.
         write_stats_file(directory / name, stats)
-    # A monitor that is open has nobody beside it.
+    # No other process writes beside an open monitor.
     with contextlib.nullcontext() if run else manifest_lock(directory, infix):
         if not is_own and is_locked(directory / lock_name(infix)):
             return None
@@ -185,7 +186,7 @@ def _manifest(directory: Path, infix: Infix, run: Run, *, stats_name: str) -> Ma
         "next_episode_id": run.last_episode_id + 1,
         "faults": run.faults,
         "versions": run.facts.get("versions", {}),
-        "surroundings": run.surroundings,
+        "provenance": run.provenance,
         **({"recovered": True} if run.recovered else {}),
         "pending": pending,
         "broken": broken,

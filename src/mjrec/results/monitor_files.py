@@ -115,7 +115,7 @@ def monitors_of(directory: Path) -> list[MonitorFiles]:
     """Return the files of each monitor, hidden ones too, in the order of the infixes.
 
     Files that recordings in flight will become are among their trajectories, and
-    monitors of which there is a lock or an unfinished file only among them.
+    monitors with nothing but a lock or an unfinished file among them.
     """
     files, in_flight = (
         _by_infix(iter_monitor_files(directory, hidden=True)),
@@ -205,7 +205,7 @@ def clear_monitor_files(directory: str | os.PathLike[str]) -> None:
 
 def _second_names(directory: Path, paths: Iterable[Path]) -> list[Path]:
     """Return the other names in a directory of these files."""
-    # What a monitor's file itself is a link to is somebody else's.
+    # A link's target is not the monitor's file.
     files = {file for path in paths if (file := _file(path, follow=False))}
     return [
         path

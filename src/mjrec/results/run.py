@@ -31,7 +31,7 @@ class Run:
         facts: what the journal's first line says: `env_info`, `schedule` (its name),
             `keep` (`rule`), `first_episode_id`, `versions`, and `views`,
             what the names of further cameras' videos have before their ending.
-        surroundings: its provenance; None where that is not known.
+        provenance: its provenance; None where that is not known.
         count: how many episodes were completed.
         last_episode_id: the highest number of an episode that has begun; -1 before.
         chosen: the episodes that the schedule chose.
@@ -46,7 +46,7 @@ class Run:
     """
 
     facts: Mapping[str, Any] = field(default_factory=dict)
-    surroundings: Mapping[str, Any] | None = None
+    provenance: Mapping[str, Any] | None = None
     count: int = 0
     last_episode_id: int = -1
     chosen: set[int] = field(default_factory=set)
@@ -85,7 +85,7 @@ class Run:
                 "first_episode_id": details.get("first_episode_id", 0),
                 "versions": details.get("versions", {}),
             },
-            surroundings=details.get("surroundings"),
+            provenance=details.get("provenance"),
             last_episode_id=(details.get("next_episode_id") or 0) - 1,
             chosen=set(recorded),
             faults=list(details.get("faults") or ()),
@@ -128,8 +128,8 @@ class Run:
         match kind, facts:
             case "run", dict():
                 self.facts = facts
-            case "surroundings", dict():
-                self.surroundings = facts
+            case "provenance", dict():
+                self.provenance = facts
             case "cut", {"episode_id": int(number)}:
                 self._add(number, facts.get("chosen"), facts.get("recording"))
             case "clip", {"episode_id": int(number), "video": str(video)}:

@@ -121,7 +121,7 @@ def check_camera(model: mujoco.MjModel, camera: mujoco.MjvCamera) -> None:
 
 
 def is_tracking(camera: object) -> bool:
-    """Tell whether each picture moves a camera, a part of the way to a body."""
+    """Return whether each frame moves a camera, a part of the way to a body."""
     tracking = int(mujoco.mjtCamera.mjCAMERA_TRACKING)
     return isinstance(camera, mujoco.MjvCamera) and int(camera.type) == tracking
 
@@ -194,7 +194,7 @@ def _name_of(model: mujoco.MjModel, number: int) -> str | int:
 
 
 def has_infinite_plane(model: mujoco.MjModel) -> bool:
-    """Tell whether a plane has no end: it is drawn around the cameras."""
+    """Return whether a plane has no end: it is drawn around the cameras."""
     planes = model.geom_size[model.geom_type == _PLANE]
     return bool((planes[:, :2] <= 0).any())
 

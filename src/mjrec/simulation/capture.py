@@ -78,7 +78,7 @@ class Capture:
             dm_control's. The model may be another one after a reset.
         view: returns how the scene is shown; asked when an episode begins. The camera
             and the option in it are watched: they may be the environment's own.
-        at_picture: calls what it is given in the moment at which the environment would
+        at_frame: calls what it is given in the moment at which the environment would
             draw, and then puts everything back; None where any moment is as good.
         resetting: returns what to put around a reset.
         authored: returns what the model was made from, where that is known.
@@ -95,7 +95,7 @@ class Capture:
         simulation: Callable[[], tuple[Any, Any]],
         *,
         view: Callable[[], SceneView],
-        at_picture: Callable[[Callable[[], None]], None] | None = None,
+        at_frame: Callable[[Callable[[], None]], None] | None = None,
         resetting: Callable[[], AbstractContextManager[None]] = contextlib.nullcontext,
         authored: Callable[[], AuthoredModel | None] = lambda: None,
         obstacle: Callable[[], str | None] = lambda: None,
@@ -105,7 +105,7 @@ class Capture:
         self.resetting = resetting
         self._simulation = simulation
         self._view = view
-        self._at_picture = at_picture or (lambda capture: capture())
+        self._at_frame = at_frame or (lambda capture: capture())
         self._authored = authored
         self._obstacle = obstacle
         self._is_unmoved = is_unmoved
@@ -202,7 +202,7 @@ class Capture:
         self._looks_at_everything = True
         self._look_closely()
 
-    def forget_pictures(self) -> None:
+    def forget_frames(self) -> None:
         """Let the next episode's frames depend on none that was made before.
 
         To be called between episodes. Cameras that are placed at the first frame, or
@@ -278,7 +278,7 @@ class Capture:
     def _at_moment(self, do: Callable[[], T]) -> T:
         """Return what `do` returns in the moment when a frame would be drawn."""
         results: list[T] = []
-        self._at_picture(lambda: results.append(do()))
+        self._at_frame(lambda: results.append(do()))
         return results[-1]
 
     def _captured(
@@ -385,7 +385,7 @@ class _Frames:
         return facts
 
     def is_sound(self, fields: Iterable[str]) -> bool:
-        """Tell whether a snapshot was found to suffice with these fields changed.
+        """Return whether a snapshot was found to suffice with these fields changed.
 
         That is checked of the first frame, and again of the first one that has a
         visual option, or a changed field of the model, that none before it had.

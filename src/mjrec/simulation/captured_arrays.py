@@ -92,7 +92,7 @@ def array_kind(holder: Any, name: str) -> np.dtype[Any] | None:
 
 
 def has_limited_tendons(model: mujoco.MjModel) -> bool:
-    """Tell whether a tendon may be drawn in another colour than the model's."""
+    """Return whether a tendon may be drawn in another colour than the model's."""
     if not model.ntendon:
         return False
     spatial = model.wrap_type[model.tendon_adr] != _JOINT_WRAP
@@ -124,7 +124,7 @@ def needs_constraints(model: mujoco.MjModel, option: mujoco.MjvOption) -> str | 
 
 
 def _shows_more(option: mujoco.MjvOption) -> bool:
-    """Tell whether an option shows anything that MuJoCo's default does not."""
+    """Return whether an option shows anything that MuJoCo's default does not."""
     default = mujoco.MjvOption()
     return bool(
         (option.flags > default.flags).any()
@@ -139,7 +139,7 @@ def _flag(option: mujoco.MjvOption, name: str) -> bool:
 
 
 def _has_islands(model: mujoco.MjModel) -> bool:
-    """Tell whether islands of constraints are looked for in this model."""
+    """Return whether islands of constraints are looked for in this model."""
     # In mujoco 3.3 they had to be enabled, and the flag that shows them was on.
     enabling = getattr(mujoco.mjtEnableBit, "mjENBL_ISLAND", None)
     if enabling is not None:

@@ -128,7 +128,7 @@ def apply_fields(
 
 
 def is_settable(name: str) -> bool:
-    """Tell whether a field of a model may be set to what a file says.
+    """Return whether a field of a model may be set to what a file says.
 
     MuJoCo trusts types, addresses and most indices in a model: a wrong one makes it
     read foreign memory. Numbers with a point, flags, colours of textures and indices

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 _GIB = 1 << 30
 _LONGEST_REASON = 2000
 
-# What `load_trajectory` reads into memory: as much as that, or so many times the size
+# What `load_trajectory` reads into memory: as much as that, or this many times the size
 # of the file. A robot that stands still packs so well; a file that is made to fill the
 # memory packs a thousandfold.
 _READING_MEMORY = 2 * _GIB
@@ -57,7 +57,7 @@ _harmless: set[tuple[str | int, ...]] = set()
 
 
 def open_vetted_trajectory(path: Path) -> TrajectoryReader:
-    """Open a trajectory for reading, as `open_trajectory` does, whoever made it.
+    """Open a trajectory for reading, as `open_trajectory` does, also a stranger's.
 
     Raises:
         UnreadableFile: as `open_trajectory`; or the file is a stranger's and does harm
@@ -122,14 +122,14 @@ def _done(
             more_environ={"OPENBLAS_NUM_THREADS": "1"},
         ) as sandbox,
     ):
-        said = next(sandbox.said(seconds), {})
-        if said is None:
+        answer = next(sandbox.answers(seconds), {})
+        if answer is None:
             reason = f"to {task} it takes longer than {seconds:g} seconds"
             raise UnreadableFile(path, reason)
-        if "done" not in said:
+        if "done" not in answer:
             raise UnreadableFile(
                 path,
-                said.get("reason")
+                answer.get("reason")
                 or f"the process that was to {task} it {sandbox.last_words()} (it may "
                 f"use {limits['RLIMIT_DATA'] / _GIB:.1f} GiB of memory)",
             )

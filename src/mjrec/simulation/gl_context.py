@@ -104,9 +104,9 @@ def current_gl_facts() -> dict[str, Any]:
     driver says them, its `file` and its `uuid`. Empty where no context is current.
 
     CUDA's number is not asked for, because that would begin CUDA in a process that may
-    be somebody else's and forked later.
+    be another library's and forked later.
     """
-    # Whoever drew has imported it already, and nobody else may do it here.
+    # Code that drew has imported it already; it must not be imported here.
     if "OpenGL.platform" not in sys.modules:
         return {}
     gl = raw_opengl()
@@ -125,8 +125,8 @@ def current_gl_facts() -> dict[str, Any]:
         for device in egl_devices(with_cuda=False):
             if device.in_use:
                 known = {"file": device.device_file, "uuid": device.uuid}
-                said = {name: value for name, value in known.items() if value}
-                facts["gl_device"] = {"index": device.index, **said}
+                details = {name: value for name, value in known.items() if value}
+                facts["gl_device"] = {"index": device.index, **details}
     return facts
 
 
@@ -134,7 +134,7 @@ def current_gl_facts() -> dict[str, Any]:
 def context_kept() -> Iterator[None]:
     """Make the context that is current before the block current again after it.
 
-    With EGL. The other backends cannot make a context current that somebody else made;
+    With EGL. The other backends cannot make another library's context current;
     with them the block's context stays current, as it does where there was none.
     """
     before = _current_in_egl()
@@ -160,7 +160,7 @@ def refuse_fork_of_gl() -> None:
 
 def _note_fork() -> None:
     global _forked_from_gl
-    # Also where somebody else has made a context through mujoco's EGL.
+    # Also where another library has made a context through mujoco's EGL.
     display = getattr(sys.modules.get("mujoco.egl"), "EGL_DISPLAY", None)
     _forked_from_gl = _forked_from_gl or _has_made_context or display is not None
 
@@ -170,7 +170,7 @@ os.register_at_fork(after_in_child=_note_fork)
 
 def _current_in_egl() -> tuple[Any, ...] | None:
     """Return what makes the current context, if any, current again."""
-    # Whoever made a context has loaded it.
+    # Making a context has loaded it.
     egl = sys.modules.get("OpenGL.EGL")
     if egl is None or not (context := egl.eglGetCurrentContext()):
         return None

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The child process that tries one OpenGL backend: `python -m` this module.
 
-It imports mujoco as `MUJOCO_GL` says, draws a scene, looks at the picture, and sends
+It imports mujoco as `MUJOCO_GL` says, draws a scene, looks at the frame, and sends
 what it found to its parent, each thing at once: what was sent stays known if the driver
 crashes afterwards.
 
@@ -72,25 +72,25 @@ _EXPECTED = {
 _TOLERANCE = 40
 
 
-class WrongPicture(Exception):
+class WrongFrame(Exception):
     """A frame was drawn and does not show what it should."""
 
 
-def check_picture(picture: np.ndarray) -> None:
-    """Raise unless the probe's scene can be seen in `picture`.
+def check_frame(frame: np.ndarray) -> None:
+    """Raise unless the probe's scene can be seen in `frame`.
 
     Raises:
-        WrongPicture: it is black or of one colour, or a colour is not in its place.
+        WrongFrame: it is black or of one colour, or a colour is not in its place.
     """
-    if np.ptp(picture.reshape(-1, 3), axis=0).max() == 0:
-        colour = tuple(picture[0, 0].tolist())
-        raise WrongPicture(f"Every pixel of the picture is {colour}.")
-    height, width = picture.shape[:2]
+    if np.ptp(frame.reshape(-1, 3), axis=0).max() == 0:
+        colour = tuple(frame[0, 0].tolist())
+        raise WrongFrame(f"Every pixel of the frame is {colour}.")
+    height, width = frame.shape[:2]
     for name, ((row, column), colour) in _EXPECTED.items():
-        pixel = picture[int(row * height), int(column * width)]
+        pixel = frame[int(row * height), int(column * width)]
         if np.abs(pixel.astype(int) - colour).max() > _TOLERANCE:
-            raise WrongPicture(
-                f"The picture should show {name}, and that pixel is "
+            raise WrongFrame(
+                f"The frame should show {name}, and that pixel is "
                 f"{tuple(pixel.tolist())}."
             )
 
@@ -110,7 +110,7 @@ def draw_test_scene(
         What draws it again, and what metadata says of who draws.
 
     Raises:
-        WrongPicture: it does not show what it should.
+        WrongFrame: it does not show what it should.
         Exception: of any kind; drivers raise what they like.
     """
     # Not at the top: these imports are part of what is tried.
@@ -126,7 +126,7 @@ def draw_test_scene(
     renderer = SceneRenderer(
         model, height=side, width=side, camera="front", canvas=canvas
     )
-    check_picture(renderer.render(data))
+    check_frame(renderer.render(data))
     return lambda: renderer.render(data), renderer.gl_facts
 
 

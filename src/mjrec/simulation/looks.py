@@ -66,7 +66,7 @@ class Looks:
         self.present: list[Any] = []
 
     def is_of(self, model: mujoco.MjModel) -> bool:
-        """Tell whether `model` is the model remembered, in whatever wrapper."""
+        """Return whether `model` is the model remembered, in whatever wrapper."""
         # The address is of no other model while this one is kept alive.
         return bool(model._address == self._model._address)
 

@@ -100,7 +100,7 @@ def noting_models() -> Iterator[list[str]]:
 
 
 def is_stored(digest: object) -> bool:
-    """Tell whether this user has stored a model.
+    """Return whether this user has stored a model.
 
     Args:
         digest: the sha256 of the compiled model, as a file says; anything.
@@ -121,7 +121,7 @@ def directory_digest(directory: Path) -> str:
 
 
 def is_own_directory(directory: Path) -> bool:
-    """Tell whether this user has recorded into a directory."""
+    """Return whether this user has recorded into a directory."""
     return is_stored(directory_digest(directory))
 
 
@@ -139,7 +139,7 @@ def stored_models(directories: Iterable[Path]) -> list[str]:
 
 
 def is_trusted() -> bool:
-    """Tell whether the environment variable says that all models are to be loaded."""
+    """Return whether the environment variable says that all models are to be loaded."""
     return os.environ.get(TRUST_VARIABLE, "") not in ("", "0")
 
 

@@ -30,7 +30,7 @@ def address_of(array: NDArray[Any]) -> int:
 
 
 def raw_memory(address: int, size: int) -> Any:
-    """Return bytes of somebody else, who must be kept alive for as long.
+    """Return another object's bytes; keep that alive for as long.
 
     Compared with a `bytearray` they are not copied: that is a `memcmp`.
     """
@@ -53,7 +53,7 @@ def words_of(arrays: Iterable[NDArray[Any]]) -> NDArray[np.intp]:
 
 
 def can_be_gathered(arrays: Iterable[NDArray[Any]]) -> bool:
-    """Tell whether each array is contiguous and begins with a word."""
+    """Return whether each array is contiguous and begins with a word."""
     return all(
         array.flags.c_contiguous and address_of(array) % _WORD == 0
         for array in arrays

@@ -56,7 +56,7 @@ _KEPT_OF_PLANES = ("geom_type", "geom_size")
 
 
 def is_kept_by_context(name: str) -> bool:
-    """Tell whether an OpenGL context may keep a field of this name.
+    """Return whether an OpenGL context may keep a field of this name.
 
     Args:
         name: of an array of `MjModel` (`tex_data`), or of a member of its structs
@@ -150,7 +150,7 @@ class Canvas:
         """Free what lies in the context, then the context. Idempotent."""
         self._closed = True
         context, self._context = self._context, None
-        # At exit somebody else may have shut EGL down already, and all is gone. What a
+        # At exit EGL may have been shut down already, and all is gone. What a
         # forked child has is its parent's.
         if context is not None and os.getpid() == self._process_id:
             with context_kept(), contextlib.suppress(Exception):

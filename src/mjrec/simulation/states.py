@@ -200,7 +200,7 @@ def enter_state(
 
 
 def turns_by_rk4(model: mujoco.MjModel) -> bool:
-    """Tell whether quaternions are integrated by the method of Runge and Kutta."""
+    """Return whether quaternions are integrated by the method of Runge and Kutta."""
     kinds = (mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_BALL)
     is_rk4 = model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4
     return bool(is_rk4 and np.isin(model.jnt_type, [int(k) for k in kinds]).any())

@@ -50,7 +50,7 @@ def load_trajectory(
     path = Path(path)
     if path.is_symlink() and infix_of(path.name) is None:
         # The user's own name for a file, `latest.h5`; a link that bears the name of a
-        # monitor's file was put there by whoever made the directory.
+        # monitor's file was put there with the directory.
         path = Path(os.path.realpath(path))
     if path.is_dir() or (path.is_file() and is_bundle(path.name)):
         raise InvalidArgument(_what_is_in(path))
@@ -59,7 +59,7 @@ def load_trajectory(
 
 
 class Trajectory:
-    """A recorded episode of T steps, with F pictures made or promised of it.
+    """A recorded episode of T steps, with F frames made or promised of it.
 
     Rows `k` of `states`, `time` and `observations` are what was there after `k` steps;
     row 0 is what was there after the reset. Rows `k` of `actions`, `rewards`,
@@ -99,7 +99,7 @@ class Trajectory:
         terminated: `(T,) bool`, the task ended the episode.
         truncated: `(T,) bool`, a limit from outside the task ended it.
         observations: `(T + 1, *shape)`; None where they were not recorded.
-        frame_steps: `(F,) int64`, after how many steps each picture was taken.
+        frame_steps: `(F,) int64`, after how many steps each frame was taken.
         dropped: how many rows at the end were torn when its process was killed.
     """
 
@@ -187,7 +187,7 @@ class Trajectory:
 
     @functools.cached_property
     def snapshots(self) -> dict[str, NDArray[Any]]:
-        """What the pictures are made from: MuJoCo's arrays by name, `(F, *shape)`.
+        """What the frames are made from: MuJoCo's arrays by name, `(F, *shape)`.
 
         Raises:
             UnreadableFile: the file is gone or damaged.

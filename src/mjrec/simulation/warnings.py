@@ -22,13 +22,13 @@ def log_mujoco_warnings() -> None:
     for one, warns at each frame. For processes of our own only: there is one handler
     in a process.
     """
-    said: set[str] = set()
+    warned: set[str] = set()
 
     def warn(text: str) -> None:
         # One that says when it was, or where, is no other warning the next time.
         kind = _NUMBERS.sub("", text)
-        if kind not in said:
-            said.add(kind)
+        if kind not in warned:
+            warned.add(kind)
             logger.warning("MuJoCo: %s", text)
 
     mujoco.set_mju_user_warning(warn)

@@ -64,7 +64,7 @@ class EventFile:
         self._write_summary(*summaries, step=step, wall_time=wall_time)
 
     def write_gif(self, tag: str, gif: bytes, *, step: int, wall_time: float) -> None:
-        """Write an animated picture."""
+        """Write an animation."""
         width, height = _GIF_SIZE.unpack_from(gif, _GIF_SIZE_AT)
         image = summary_pb2.Summary.Image(
             height=height, width=width, colorspace=3, encoded_image_string=gif

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""TensorBoard: curves of the episodes, and the videos as animated pictures."""
+"""TensorBoard: curves of the episodes, and the videos as animations."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 # Videos that wait for their previews.
 _MOST_WAITING = 100
 _MOST_BYTES = 2 << 20
-# Of the longer side, in pixels. The last is small enough for any hundred pictures.
+# Of the longer side, in pixels. The last is small enough for any hundred frames.
 _SIDES = (320, 160, 80)
 _MOST_PICTURES = 100
 # In hundredths of a second, the format's unit.
@@ -158,10 +158,10 @@ class _TensorBoardRun:
 
 
 def animated_gif(path: Path, *, frame_count: int, fps: Fraction) -> bytes:
-    """Return a video as a GIF of at most 100 pictures and two megabytes.
+    """Return a video as a GIF of at most 100 frames and two megabytes.
 
     It lasts as long as the video, and is played again and again; a long one shows few
-    pictures a second. The longer side has 320 pixels at most.
+    frames a second. The longer side has 320 pixels at most.
 
     Args:
         path: the video.
@@ -186,14 +186,14 @@ def _delay(frame_count: int, fps: Fraction) -> int:
 
 def _convert(path: Path, *, side: int, delay: int, frame_count: int) -> bytes:
     skipping = ["-skip_frame", "nokey"] if frame_count >= _MANY_FRAMES else []
-    # A palette of the video's own, of which only what changes is stored.
+    # A palette of the video's own; only changes are stored.
     filters = (
-        # Up, so that even the shortest video has a picture.
+        # Up, so that even the shortest video has a frame.
         f"fps=100/{delay}:round=up,"
         f"scale=min(iw\\,{side}):min(ih\\,{side})"
         ":force_original_aspect_ratio=decrease:flags=area,"
-        "split[pictures][counted];[counted]palettegen=stats_mode=diff[palette];"
-        "[pictures][palette]paletteuse=dither=bayer:bayer_scale=4:diff_mode=rectangle"
+        "split[frames][counted];[counted]palettegen=stats_mode=diff[palette];"
+        "[frames][palette]paletteuse=dither=bayer:bayer_scale=4:diff_mode=rectangle"
     )
     return run_ffmpeg(
         [

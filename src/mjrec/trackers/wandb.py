@@ -87,12 +87,12 @@ class WandbTracker(Tracker):
 
         episode = video.episode or self._last_episodes[run]
         group, name = self._group(run, episode), name_of(video)
-        picture = wandb.Video(
+        frame = wandb.Video(
             str(video.path), caption=f"episode {video.episode_id}", format="mp4"
         )
         self._define(f"{group}/{name}", over=f"{group}/{_VIDEO_STEPS}")
         steps = episode.total_steps if episode else 0
-        self._log(group, {_VIDEO_STEPS: steps, name: picture})
+        self._log(group, {_VIDEO_STEPS: steps, name: frame})
 
     def end(self, run: Run) -> None:
         """Finish W&B's run, if it was started here and this was its last monitor."""

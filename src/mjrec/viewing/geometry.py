@@ -133,7 +133,7 @@ def linear(rgba: Any) -> list[float]:
 
 
 def sky(model: mujoco.MjModel) -> NDArray[np.uint8] | None:
-    """Return the model's sky as a narrow picture, from top to bottom, if it has one."""
+    """Return the model's sky as a narrow frame, from top to bottom, if it has one."""
     kinds = model.tex_type.tolist()
     if int(mujoco.mjtTexture.mjTEXTURE_SKYBOX) not in kinds:
         return None
@@ -159,7 +159,7 @@ def _coloured(
 def _textured(
     mesh: trimesh.Trimesh, uv: NDArray[Any], image: Image.Image, shape: Shape
 ) -> trimesh.Trimesh:
-    # glTF counts from the top of a picture, trimesh from its bottom.
+    # glTF counts from the top of a frame, trimesh from its bottom.
     flipped = image.transpose(Image.Transpose.FLIP_TOP_BOTTOM)
     mesh.visual = TextureVisuals(
         uv=uv, material=_material(np.array(shape.rgba), baseColorTexture=flipped)
@@ -280,7 +280,7 @@ def _unit_square(vertices: NDArray[Any]) -> NDArray[np.float64]:
 def _on_cube(mesh: trimesh.Trimesh) -> tuple[trimesh.Trimesh, NDArray[np.float64]]:
     """Return a mesh that a cube texture is laid around, and texture coordinates.
 
-    The six sides of the texture stand one below the other in one picture.
+    The six sides of the texture stand one below the other in one frame.
     """
     extents = np.maximum(mesh.extents / 2, 1e-9)
     directions = mesh.vertices / extents

@@ -31,7 +31,7 @@ from .scene import scene_page
 
 _LOG = logging.getLogger(__name__)
 _COMPRESSION = 6
-# Nothing is loaded from anywhere: scripts and pictures are in the page.
+# Nothing is loaded from anywhere: scripts and frames are in the page.
 _POLICY = (
     "default-src 'none'; script-src 'unsafe-inline' 'unsafe-eval' blob: data:; "
     "style-src 'unsafe-inline'; img-src data: blob:; font-src data:; "

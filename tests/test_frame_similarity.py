@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How alike pictures are, as an encoder sees them."""
+"""How alike frames are, as an encoder sees them."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from mjrec.evidence.decoded_video import DecodedVideo
-from mjrec.evidence.picture_similarity import (
+from mjrec.evidence.frame_similarity import (
     OTHER_CPU,
     OTHER_ENCODER,
     OTHER_RENDERER,
@@ -22,7 +22,7 @@ from mjrec.formats.video_writer import VideoWriter
 
 
 def noise(height: int = 48, width: int = 64) -> Any:
-    """Return a picture with everything in it, softened as pictures are."""
+    """Return a frame with everything in it, softened as frames are."""
     random = np.random.default_rng(0)
     small = random.integers(0, 256, (height // 4 + 1, width // 4 + 1, 3), np.uint8)
     return np.repeat(np.repeat(small, 4, 0), 4, 1)[:height, :width].copy()
@@ -44,7 +44,7 @@ def test_planes_are_those_that_the_encoder_is_given(
         assert np.abs(ours.astype(int) - theirs).max() <= 1
 
 
-def test_equal_pictures_are_as_alike_as_can_be() -> None:
+def test_equal_frames_are_as_alike_as_can_be() -> None:
     """And their numbers are numbers that JSON can say."""
     planes = planes_of(noise())
     assert similarity(planes, planes) == (100.0, pytest.approx(1.0), 0.0)
@@ -63,7 +63,7 @@ def test_psnr_counts_all_three_planes() -> None:
 def test_the_worst_block_sees_a_few_pixels_wherever_they_are(
     place: tuple[int, int],
 ) -> None:
-    """Also where they lie across the blocks' corners or at the picture's edge."""
+    """Also where they lie across the blocks' corners or at the frame's edge."""
     frame = np.full((48, 64, 3), 40, np.uint8)
     changed = frame.copy()
     changed[place[0] : place[0] + 4, place[1] : place[1] + 4] = 255
@@ -73,7 +73,7 @@ def test_the_worst_block_sees_a_few_pixels_wherever_they_are(
 
 
 def test_another_structure_lowers_the_structural_similarity() -> None:
-    """A picture and its mirror image have the same pixels."""
+    """A frame and its mirror image have the same pixels."""
     frame = noise()
     assert similarity(planes_of(frame), planes_of(frame[:, ::-1])).ssim < 0.5
 
@@ -99,8 +99,8 @@ def test_a_change_beyond_the_limits_is_noticed(
     assert strain(slice(11, 12), 40) < 1
 
 
-def test_a_shadow_is_taken_away_whichever_picture_it_is_in() -> None:
-    """A patch of any colours that is darker in one picture counts as equal."""
+def test_a_shadow_is_taken_away_whichever_frame_it_is_in() -> None:
+    """A patch of any colours that is darker in one frame counts as equal."""
     lit = noise()
     shaded = lit.copy()
     shaded[8:16, 8:24] = shaded[8:16, 8:24] // 4

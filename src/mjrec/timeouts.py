@@ -10,15 +10,15 @@ from collections.abc import Callable
 
 from .errors import InvalidArgument
 
-_ENVIRONMENT_VARIABLE = "MJREC_PATIENCE"
+_ENVIRONMENT_VARIABLE = "MJREC_TIMEOUT"
 _DEFAULT_S = 120.0
 _LONGEST_SLICE_S = 1.0
 
 
-def patience_s() -> float:
+def timeout_s() -> float:
     """Return the seconds without progress, such as a frame, that are waited for.
 
-    120, or what the environment variable `MJREC_PATIENCE` says.
+    120, or what the environment variable `MJREC_TIMEOUT` says.
 
     Raises:
         InvalidArgument: the variable is no positive number of seconds.
@@ -38,7 +38,7 @@ def patience_s() -> float:
     return seconds
 
 
-class Patience:
+class Timeout:
     """Waits for progress in slices, and says when it has been long enough.
 
     A slice counts for no more than it was to last: where the waiting process itself was
@@ -47,17 +47,17 @@ class Patience:
 
     ::
 
-        patience = Patience()
-        while not patience.is_over:
-            if patience.wait(look_for_news):
+        timeout = Timeout()
+        while not timeout.is_over:
+            if timeout.wait(look_for_news):
                 ...
 
     Args:
-        seconds: without progress; `patience_s()` if None.
+        seconds: without progress; `timeout_s()` if None.
     """
 
     def __init__(self, seconds: float | None = None) -> None:
-        self.seconds = patience_s() if seconds is None else seconds
+        self.seconds = timeout_s() if seconds is None else seconds
         self._waited = 0.0
 
     @property
@@ -66,14 +66,14 @@ class Patience:
         return self._waited >= self.seconds
 
     def renew(self) -> None:
-        """Begin anew: there was progress."""
+        """Begin again: there was progress."""
         self._waited = 0.0
 
     def wait(self, look: Callable[[float], object]) -> bool:
-        """Wait for a slice of the time, and begin anew where there was progress.
+        """Wait for a slice of the time, and begin again where there was progress.
 
         Args:
-            look: waits at most so many seconds, and tells whether there was progress.
+            look: waits at most this many seconds; returns whether there was progress.
         """
         seconds = max(0.0, min(_LONGEST_SLICE_S, self.seconds - self._waited))
         began = time.monotonic()

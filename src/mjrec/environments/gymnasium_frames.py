@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where the pictures of a Gymnasium environment come from."""
+"""Where the frames of a Gymnasium environment come from."""
 
 from __future__ import annotations
 
@@ -11,23 +11,23 @@ import gymnasium
 
 from ..errors import InvalidArgument
 from ..simulation.find_simulation import simulation_in
-from .scenes import NoPictureSource, simulation_below
+from .scenes import NoFrameSource, simulation_below
 
 _ANOTHER_VIEW = (
-    "camera, height and width ask for another picture than render() gives, which is "
+    "camera, height and width ask for another frame than render() gives, which is "
     "drawn from recorded states and never live. Make the environment with them "
     "(camera_name=, height=, width=), or leave render= out"
 )
 
 
-def gymnasium_pictures(
+def gymnasium_frames(
     env: gymnasium.Env[Any, Any],
     *,
     camera: Any = None,
     height: int | None = None,
     width: int | None = None,
-) -> EnvironmentPictures | NoPictureSource:
-    """Return the source of an environment's live pictures, which is `env.render()`.
+) -> EnvironmentFrames | NoFrameSource:
+    """Return the source of an environment's live frames, which is `env.render()`.
 
     Args:
         env: the environment as the user wrapped it.
@@ -36,18 +36,18 @@ def gymnasium_pictures(
         height: in pixels; None is the environment's own.
         width: likewise.
 
-    With one of the three there are no live pictures: workers draw from states.
+    With one of the three there are no live frames: workers draw from states.
 
     Raises:
         UnknownName: the model has no such camera.
         InvalidArgument: camera, height or width for what is no MuJoCo environment.
     """
     if camera is None and height is None and width is None:
-        return EnvironmentPictures(env)
+        return EnvironmentFrames(env)
     simulated = simulation_below(env)
     if simulated is None:
         raise InvalidArgument(
-            "camera, height and width choose among the pictures of a MuJoCo "
+            "camera, height and width choose among the frames of a MuJoCo "
             f"environment, and {env} has no MuJoCo model and data. Make the "
             "environment itself with the camera and size that the videos are to have."
         )
@@ -57,11 +57,11 @@ def gymnasium_pictures(
         from ..simulation.cameras import resolve_camera
 
         resolve_camera(simulated.model, camera)
-    return NoPictureSource(_ANOTHER_VIEW)
+    return NoFrameSource(_ANOTHER_VIEW)
 
 
-class EnvironmentPictures:
-    """The pictures that `env.render()` gives.
+class EnvironmentFrames:
+    """The frames that `env.render()` gives.
 
     Args:
         env: the environment as the user wrapped it.
@@ -78,7 +78,7 @@ class EnvironmentPictures:
         return self._env.render_mode
 
     def render(self) -> Any:
-        """Return the picture of this moment, or the list of those not seen yet."""
+        """Return the frame of this moment, or the list of those not seen yet."""
         with _own_context(self._env):
             rendered: Any = self._env.render()
         if self._keeps_frames and isinstance(rendered, list):
@@ -86,9 +86,9 @@ class EnvironmentPictures:
         return rendered
 
     def facts(self) -> dict[str, Any]:
-        """Return what the metadata of a video says about its pictures."""
+        """Return what the metadata of a video says about its frames."""
         facts: dict[str, Any] = {"pictures": "env.render", "quality": "full"}
-        own_facts = getattr(self._env.unwrapped, "picture_facts", None)
+        own_facts = getattr(self._env.unwrapped, "frame_facts", None)
         if own_facts is not None:
             # An environment of ours knows better than a look from outside.
             return {**facts, **own_facts()}
@@ -120,7 +120,7 @@ def free_viewers(env: gymnasium.Env[Any, Any]) -> None:
     """Free what lies in an environment's OpenGL contexts; it is to be closed next.
 
     Gymnasium leaves that to the garbage collector, which frees it in whichever context
-    is current then, and so blackens somebody else's pictures.
+    is current then, and so blackens another viewer's frames.
     """
     for viewer in getattr(_renderer(env), "_viewers", {}).values():
         with _current(viewer):
@@ -134,7 +134,7 @@ def _own_context(env: gymnasium.Env[Any, Any]) -> Iterator[None]:
 
     Gymnasium itself does so only when it makes the context: of two environments that
     take turns, one would be drawn with the other's meshes and textures, or not at all.
-    What was current before, for somebody else's pictures, is so again afterwards.
+    The context that was current before is current again afterwards.
     """
     renderer = _renderer(env)
     if renderer is None:
@@ -161,6 +161,6 @@ def _renderer(env: gymnasium.Env[Any, Any]) -> Any:
 
 
 def _keeps_frames(env: gymnasium.Env[Any, Any]) -> bool:
-    """Tell whether `render` gives all frames every time, old ones too."""
+    """Return whether `render` gives all frames every time, old ones too."""
     # What gymnasium.wrappers.RenderCollection(pop_frames=False) does.
     return env.has_wrapper_attr("pop_frames") and not env.get_wrapper_attr("pop_frames")

@@ -157,7 +157,7 @@ def finish_text(
         for frame in frames:
             sink.write(frame)
         sink.finish()
-        said = {
+        description = {
             "episode_id": episode_of(path.name),
             "content_type": "video/vnd.openai.ansivid",
             **recording_facts(facts, recording="live"),
@@ -165,5 +165,5 @@ def finish_text(
             **timing_facts(StepRuns(range(len(frames))), fps=rate, timestep=None),
             "recovered": True,
         }
-        yield path.name, _counted(len(frames), sink.describe(said))
+        yield path.name, _counted(len(frames), sink.describe(description))
     part.unlink(missing_ok=True)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How alike two pictures are, seen as an encoder sees them.
+"""How alike two frames are, seen as an encoder sees them.
 
-Pictures are compared as the planes that a video holds: luma, and colour at half the
-height and width. Turned back into red, green and blue, a picture without any loss but
+Frames are compared as the planes that a video holds: luma, and colour at half the
+height and width. Turned back into red, green and blue, a frame without any loss but
 that of its colours' resolution would seem as far off as a forged one.
 """
 
@@ -17,12 +17,12 @@ from numpy.typing import NDArray
 
 from ..frames import Frame, pad_to_even
 
-# Two pictures that are equal have an infinite one, which JSON cannot say.
+# Two frames that are equal have an infinite one, which JSON cannot say.
 _BEST_PSNR: Final = 100.0
 # In pixels, and the samples of all planes in it.
 BLOCK: Final = 8
 SAMPLES_OF_BLOCK: Final = BLOCK**2 * 3 // 2
-# Of a cell of two by two pixels that is in shadow in one picture only: by how many
+# Of a cell of two by two pixels that is in shadow in one frame only: by how many
 # levels its lumas differ at least, and its colours at most from those in shadow.
 _LEAST_SHADOW: Final = 12
 _SHADOW_COLOUR: Final = 10
@@ -30,7 +30,7 @@ _SHADOW_COLOUR: Final = 10
 _C1: Final = (0.01 * 255) ** 2
 _C2: Final = (0.03 * 255) ** 2
 
-# BT.709, limited range, as the encoder is told: what red, green and blue weigh, and how
+# BT.709, limited range, as the encoder uses it: what red, green and blue weigh, and how
 # far each plane reaches.
 _RED, _BLUE = 0.2126, 0.0722
 _LUMA = np.array([_RED, 1 - _RED - _BLUE, _BLUE], np.float32)
@@ -38,7 +38,7 @@ _LUMA_RANGE, _COLOUR_RANGE = 219.0, 224.0
 
 
 class Planes(NamedTuple):
-    """A picture as yuv420p holds it.
+    """A frame as yuv420p holds it.
 
     Attributes:
         luma: `(height, width) uint8`.
@@ -52,7 +52,7 @@ class Planes(NamedTuple):
 
 
 class Similarity(NamedTuple):
-    """How alike two pictures are.
+    """How alike two frames are.
 
     Attributes:
         psnr: peak signal to noise of all samples of the three planes, in dB; 100 where
@@ -90,7 +90,7 @@ class Limits:
         return max(noise, (1 - found.ssim) / (1 - self.ssim), found.block / self.block)
 
 
-# The same pictures through x264 at crf 18: in 23 scenes of dm_control's suite and of
+# The same frames through x264 at crf 18: in 23 scenes of dm_control's suite and of
 # Gymnasium, from 32x32 to 640x480, the worst frames had 35.7 dB, 0.987 and 11.5 levels
 # against the drawn ones. Two encodings of them are apart by at most twice the noise.
 # A square of two by two pixels that is painted over has 21 levels or more.
@@ -117,7 +117,7 @@ OTHER_RENDERER: Final = Limits(psnr=28.0, ssim=0.88, block=44.0, shadow=0.04)
 
 
 def planes_of(frame: Frame) -> Planes:
-    """Return the planes of a drawn picture, its sides padded to even ones.
+    """Return the planes of a drawn frame, its sides padded to even ones.
 
     They are those that the encoder is given, to within a level.
     """
@@ -137,7 +137,7 @@ def planes_of(frame: Frame) -> Planes:
 
 
 def similarity(one: Planes, other: Planes) -> Similarity:
-    """Return how alike two pictures of one size are."""
+    """Return how alike two frames of one size are."""
     squares = [
         np.square(a.astype(np.float32) - b) for a, b in zip(one, other, strict=True)
     ]
@@ -150,10 +150,10 @@ def but_for_shadows(one: Planes, other: Planes) -> tuple[Planes, float]:
     """Return `other` with the samples of `one` where only their light differs.
 
     There either is the other one made darker: the same colour, times a number from
-    0 to 1. So a shadow changes it; and so does whoever paints it black.
+    0 to 1. So a shadow changes it; and so does painting it black.
 
     Returns:
-        The picture, and how much of it is from `one`, from 0 to 1.
+        The frame, and how much of it is from `one`, from 0 to 1.
     """
     lumas = [_halved(planes.luma) - 16 for planes in (one, other)]
     is_one_lighter = lumas[0] >= lumas[1]

@@ -50,8 +50,8 @@ from ..formats.trajectory_file import (
 from ..results.journal_or_stats import MonitorResults, locked_run
 from ..results.manifest_writing import manifest_lock, write_manifest_and_stats
 from ..results.monitor_files import MonitorFiles, files_of
-from .cut_videos import finish_text, finish_video
 from .jobs import key_of
+from .killed_videos import finish_text, finish_video
 from .leftovers import Kind, lacks_results, leftovers, logs_left
 from .recorded_facts import open_for_rendering, video_path
 from .recordings import claim, parts_of
@@ -99,7 +99,7 @@ class Report:
                 self.note(stale.name, "left behind, removed")
 
 
-def finish_dead_monitor(
+def finish_killed_monitor(
     directory: Path, infix: Infix, report: Report, *, bundles: bool
 ) -> None:
     """Do all that is left to do of one monitor but drawing, unless it is open.
@@ -113,7 +113,7 @@ def finish_dead_monitor(
     path = directory / lock_name(infix)
     with report.attempt(path.name):
         was_killed = path.exists()
-        monitor = _DeadMonitor(directory, infix, report, bundles=bundles)
+        monitor = _KilledMonitor(directory, infix, report, bundles=bundles)
         # Before there is a lock, which is what a killed monitor leaves.
         is_behind = lacks_results(files_of(directory, infix))
         lock = try_lock(path)
@@ -133,7 +133,7 @@ def finish_dead_monitor(
             write_manifest_and_stats(directory, infix)
 
 
-class _DeadMonitor:
+class _KilledMonitor:
     """A monitor that is not open."""
 
     def __init__(
@@ -276,8 +276,8 @@ class _DeadMonitor:
             keys = ("complete", "terminated", "truncated", "reason", "exception")
             known |= {key: facts[key] for key in keys if key in facts}
         if entry is not None:
-            said = ("length", "reward", "terminated", "truncated")
-            known |= {"complete": True, **{key: getattr(entry, key) for key in said}}
+            names = ("length", "reward", "terminated", "truncated")
+            known |= {"complete": True, **{key: getattr(entry, key) for key in names}}
         return known
 
     # Journal, statistics, manifest
