@@ -40,7 +40,7 @@ from ..formats.json_fields import (
 )
 from ..formats.monitor_directory import Infix, video_prefix
 from ..formats.notebook import shown
-from ..formats.trajectory_file import find_trajectory
+from ..formats.spans import find_trajectory
 from ..json_text import dumps
 from .dataclass_json import from_json, to_json
 from .episode_results import EpisodeResult

@@ -14,7 +14,8 @@ from typing import Any
 
 from ..formats.journal import JournalWriter
 from ..formats.monitor_directory import Infix, journal_name
-from ..formats.trajectory_file import amend_trajectories, find_trajectory
+from ..formats.spans import find_trajectory
+from ..formats.trajectory_file import amend_trajectories
 from ..results.manifest_writing import write_manifest_and_stats
 from .inputs import RecordingInputs
 from .notes import Notes

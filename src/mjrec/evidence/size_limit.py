@@ -22,7 +22,7 @@ from ..errors import ArchiveTooLarge, InvalidArgument, PackError
 from ..formats.json_fields import read_object, unreadable
 from ..formats.manifest import read_manifest
 from ..formats.monitor_directory import Infix, episode_of, infix_of, is_manifest
-from ..formats.trajectory_file import find_trajectory
+from ..formats.spans import find_trajectory
 from ..formats.video_metadata import metadata_path
 from ..machine import usable_cpus
 from ..rendering.jobs import Progress

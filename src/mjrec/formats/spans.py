@@ -50,6 +50,7 @@ from .monitor_directory import (
     log_name,
     log_number,
     names_in,
+    trajectory_prefix,
 )
 from .regular_files import open_regular
 from .row_log import has_rows, tail_path
@@ -322,6 +323,26 @@ def find_recording(path: Path) -> Recording | None:
     if recording is None or recording.is_gone or not recording.log.exists():
         return None
     return recording
+
+
+def find_trajectory(
+    directory: Path, infix: Infix | str, episode_id: int
+) -> Path | None:
+    """Return the path of an episode's own file; None where none is recorded."""
+    known = infix if isinstance(infix, Infix) else Infix.parse(infix)
+    if known is None:
+        return None
+    path = directory / f"{trajectory_prefix(known, episode_id)}{FINISHED}"
+    return path if is_recorded(path) else None
+
+
+def is_recorded(path: Path) -> bool:
+    """Return whether a trajectory is there in any form, by the path of its own file.
+
+    Raises:
+        UnreadableFile: the journal of its monitor cannot be read.
+    """
+    return is_finished(path) or find_recording(path) is not None
 
 
 def is_in_flight(path: Path) -> bool:

@@ -9,10 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import Error, UnreadableFile
-from .bundle import FINISHED, bundle_of, file_of, is_finished
+from .bundle import bundle_of, file_of, is_finished
 from .journal import KILLED
 from .json_fields import unreadable
-from .monitor_directory import Infix, trajectory_prefix
 from .regular_files import open_regular
 from .spans import Recording, find_recording, is_in_flight, remove_if_done
 from .trajectory import TrajectoryReader, added_up
@@ -43,26 +42,6 @@ def open_trajectory(path: Path) -> TrajectoryReader:
             if file.read(len(SIGNATURE)) != SIGNATURE:
                 raise ValueError("it is no trajectory")
     return open_hdf5(path)
-
-
-def find_trajectory(
-    directory: Path, infix: Infix | str, episode_id: int
-) -> Path | None:
-    """Return the path of an episode's own file; None where none is recorded."""
-    known = infix if isinstance(infix, Infix) else Infix.parse(infix)
-    if known is None:
-        return None
-    path = directory / f"{trajectory_prefix(known, episode_id)}{FINISHED}"
-    return path if is_recorded(path) else None
-
-
-def is_recorded(path: Path) -> bool:
-    """Return whether a trajectory is there in any form, by the path of its own file.
-
-    Raises:
-        UnreadableFile: the journal of its monitor cannot be read.
-    """
-    return is_finished(path) or find_recording(path) is not None
 
 
 def finish_trajectory(path: Path) -> Path:

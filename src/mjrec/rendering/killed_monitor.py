@@ -37,13 +37,13 @@ from ..formats.monitor_directory import (
 )
 from ..formats.spans import (
     files_beside,
+    find_trajectory,
     recordings_in,
     recordings_in_flight,
     remove_log,
 )
 from ..formats.trajectory_file import (
     bundle_trajectories,
-    find_trajectory,
     finish_trajectory,
     open_trajectory,
 )

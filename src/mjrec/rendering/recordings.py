@@ -27,9 +27,8 @@ from ..formats.monitor_directory import (
     lock_name,
     unfinished_files,
 )
-from ..formats.spans import find_recording, recordings_in_flight
+from ..formats.spans import find_recording, find_trajectory, recordings_in_flight
 from ..formats.trajectory import added_up
-from ..formats.trajectory_file import find_trajectory
 from ..formats.video_metadata import is_done, metadata_path
 from .jobs import RecordingKey, key_of
 from .recorded_facts import (

@@ -23,7 +23,7 @@ from ..formats.monitor_directory import (
     name_part,
     where_recordings_are,
 )
-from ..formats.trajectory_file import is_recorded
+from ..formats.spans import is_recorded
 from ..machine import check_workers, usable_cpus
 from ..simulation.model_trust import trusting_models
 from .engine_jobs import do_on_engine
