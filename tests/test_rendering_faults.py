@@ -18,9 +18,8 @@ from trajectories_by_hand import write_log, write_pending_manifest
 
 from mjrec import BlankVideo, Monitor, RenderError, render_videos
 from mjrec.formats.ffmpeg import ffmpeg_executable
-from mjrec.formats.spans import recordings_in_flight
+from mjrec.formats.spans import find_trajectory, recordings_in_flight
 from mjrec.formats.trajectory_file import (
-    find_trajectory,
     finish_trajectory,
     open_trajectory,
 )
