@@ -36,8 +36,8 @@ def tasks_of(domain: str) -> Sequence[str]:
 def make_dm_control(domain: str, task: str, options: EnvironmentOptions) -> Any:
     """Return a task of the suite.
 
-    Camera and size are not the environment's but of each frame: whoever draws it
-    gives them. Episodes end after `max_steps`, or after 1000 steps where the task has
+    Camera and size belong to each frame, not to the environment. Episodes end after
+    `max_steps`, or after 1000 steps where the task has
     no time limit.
 
     Args:

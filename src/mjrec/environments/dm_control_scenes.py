@@ -298,8 +298,8 @@ def _authored(env: Any) -> AuthoredModel | None:
 def _authored_of_suite(task: Any) -> AuthoredModel | None:
     """Return what a task's module says that its domain's models are made from.
 
-    A task keeps nothing of it, and may have changed it before it was compiled; whoever
-    stores it compiles it and looks whether it makes this model.
+    A task keeps nothing of it, and may have changed it before it was compiled.
+    Storing it compiles it, and checks that it makes this model.
     """
     name = type(task).__module__
     domain = sys.modules.get(name) if name.startswith("dm_control.suite.") else None

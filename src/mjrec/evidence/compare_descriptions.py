@@ -89,7 +89,7 @@ def _compare(name: str, path: Path, text: str) -> Same | Difference:
 
 
 def _first_more(lines: list[str], others: list[str]) -> tuple[int, str] | None:
-    """Return the first line, with its number, of which the others have fewer."""
+    """Return the first line, with its number, that the others have less often."""
     more = Counter(lines) - Counter(others)
     found = (
         (number, line)

@@ -176,8 +176,8 @@ def compare_frame_hashes(
     with unreadable(given), open_regular(made) as other:
         total = sum(1 for line in other if _HASH_BEGINS.match(line))
     for number, a, b in _different_lines(given, made):
-        begins = [_HASH_BEGINS.match(line or b"") for line in (a, b)]
-        if not all(begins) or begins[0][0] != begins[1][0]:  # type: ignore[index]
+        begins_a, begins_b = (_HASH_BEGINS.match(line or b"") for line in (a, b))
+        if not begins_a or not begins_b or begins_a[0] != begins_b[0]:
             yield _differs(file, f"line {number}", *map(_text, (a, b)))
         elif a is not None and b is not None:
             differing += 1

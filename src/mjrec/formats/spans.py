@@ -281,7 +281,7 @@ def infix_of_recording(name: str) -> str | None:
 def log_paths(directory: Path, infix: Infix | str | None = None) -> Iterator[Path]:
     """Return the paths of the logs of a directory, or of one monitor in it.
 
-    Also of one of which only the files beside it are left.
+    A log counts as long as a file beside it is left.
     """
     logs = {
         directory / log_name(own, number)

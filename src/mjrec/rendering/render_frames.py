@@ -53,7 +53,7 @@ def render(
 
     Args:
         trajectory: from `mjrec.load_trajectory`, or its path. If it was loaded with
-            `trust_models=True`, its compiled model is loaded whoever wrote it.
+            `trust_models=True`, its compiled model is loaded too.
         camera: name or number of a model's camera, -1 for the free camera where the
             model places it, an `mujoco.MjvCamera`, or a mapping of its members. None is
             as recorded.

@@ -144,9 +144,9 @@ def write_replays(
     """Write a page in 3D of each best, median and worst episode whose states are there.
 
     Args:
-        contents: whose videos are told of their pages.
+        contents: its videos get the names of their pages.
         folder: of the report.
-        on_progress: is told of each page.
+        on_progress: called after each page.
 
     Raises:
         MissingDependency: viser is not installed.
@@ -157,16 +157,14 @@ def write_replays(
     from ..viewing.replay import write_replay
 
     wanted = [
-        (f"{index:04d}-{_slug(task.name)}", video)
+        (f"{index:04d}-{_slug(task.name)}", video, video.trajectory)
         for index, (task, video) in enumerate(
             (task, video) for task in contents.tasks for video in task.videos
         )
         if video.roles and video.trajectory is not None
     ]
     done: dict[Path, str] = {}
-    for stem, video in wanted:
-        path = video.trajectory
-        assert path is not None
+    for stem, video, path in wanted:
         try:
             if path not in done:
                 page = f"{REPLAYS}/{stem}.html"

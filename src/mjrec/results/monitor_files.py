@@ -48,7 +48,7 @@ class MonitorFiles:
         metadata: their metadata, likewise.
         trajectories: the own files of recorded states, likewise; also what is in
             flight, or in a bundle.
-        logs: its row logs; also one of which only a file beside it is left.
+        logs: its row logs; one counts as long as a file beside it is left.
         last_episode_id: the highest number of an episode in a name, also of a file
             that was never finished; -1 where there is none.
     """

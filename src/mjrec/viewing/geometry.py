@@ -133,7 +133,7 @@ def linear(rgba: Any) -> list[float]:
 
 
 def sky(model: mujoco.MjModel) -> NDArray[np.uint8] | None:
-    """Return the model's sky as a narrow frame, from top to bottom, if it has one."""
+    """Return the model's sky as a narrow image, from top to bottom, if it has one."""
     kinds = model.tex_type.tolist()
     if int(mujoco.mjtTexture.mjTEXTURE_SKYBOX) not in kinds:
         return None
@@ -159,7 +159,7 @@ def _coloured(
 def _textured(
     mesh: trimesh.Trimesh, uv: NDArray[Any], image: Image.Image, shape: Shape
 ) -> trimesh.Trimesh:
-    # glTF counts from the top of a frame, trimesh from its bottom.
+    # glTF counts from the top of an image, trimesh from its bottom.
     flipped = image.transpose(Image.Transpose.FLIP_TOP_BOTTOM)
     mesh.visual = TextureVisuals(
         uv=uv, material=_material(np.array(shape.rgba), baseColorTexture=flipped)
