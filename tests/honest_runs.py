@@ -105,6 +105,27 @@ def vector(directory: Path, **options: Any) -> None:
     monitor.close()
 
 
+def evaluated(directory: Path, **options: Any) -> None:
+    """Evaluate episodes in several chunks, whose videos are chosen among all."""
+    given = {"num_seeds": 3, "keep": "best,worst", "max_steps": 4, **options}
+    mjrec.evaluate(
+        [_POLE],
+        policy="random",
+        directory=directory,
+        episodes=1,
+        height=32,
+        width=32,
+        workers=1,
+        **given,
+    )
+
+
+def extended(directory: Path) -> None:
+    """Evaluate one seed, and later one more."""
+    evaluated(directory, num_seeds=1)
+    evaluated(directory, num_seeds=2, resume=True)
+
+
 def clips(directory: Path) -> None:
     """Record clips of four steps, which cross episodes."""
     pendulum(directory, step_trigger=_every_sixth, video_length=4)

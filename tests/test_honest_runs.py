@@ -47,6 +47,8 @@ HONEST = (
     Honest(honest.cheetah),
     Honest(honest.suite, quick=True),
     Honest(honest.vector),
+    Honest(honest.evaluated),
+    Honest(honest.extended, PARTLY, {"rule"}),
     Honest(honest.clips, PARTLY, {"schedule"}),
     Honest(honest.kept, quick=True),
     Honest(honest.live),

@@ -38,6 +38,7 @@ from ..formats.monitor_directory import (
 )
 from ..gl.choice import choose
 from ..provenance import versions
+from ..recorder.keep_rules import keep_rule
 from ..rendering.engine_jobs import environ_for_drawing
 from ..results import clear_monitor_files
 from .dataclass_json import to_json
@@ -58,8 +59,8 @@ from .following import (
     results_of,
     run_chunks,
 )
-from .kept_episodes import NO_GL, keep_rule
 from .plan import (
+    NO_GL,
     PLAN_NAME,
     SEEDED,
     EvaluationPlan,

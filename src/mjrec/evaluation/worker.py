@@ -31,8 +31,7 @@ from ..messages import carried
 from ..rendering.recovery import recover
 from ..simulation.model_trust import noting_models
 from .dataclass_json import from_json
-from .kept_episodes import NO_GL
-from .plan import Chunk, EvaluationPlan
+from .plan import NO_GL, Chunk, EvaluationPlan
 from .running import Evaluator
 
 logger = logging.getLogger(__name__)

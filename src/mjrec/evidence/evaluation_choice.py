@@ -1,60 +1,122 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The videos that an evaluation chose among the episodes of many recordings.
+"""The choice among the episodes of an evaluation, made again.
 
-Most of these may not be in the archive: the choice is not made again.
+An evaluation chooses videos among the episodes of all recordings of an environment.
+Where all of these are in the archive, its rule is asked again. Where some are missing,
+or the evaluation was extended, the choice is believed.
 """
 
 from __future__ import annotations
 
-import contextlib
-import functools
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any
 
-from ..formats.journal import JournalWriter
+from .. import json_text
+from ..errors import InvalidArgument
+from ..formats.journal import JournalEntry, read_journal
 from ..formats.monitor_directory import Infix, journal_name
-from ..formats.spans import find_trajectory
-from ..formats.trajectory_file import amend_trajectories
-from ..results.manifest_writing import write_manifest_and_stats
+from ..plain_text import counted
+from ..recorder.keep_rules import keep_rule
+from ..rendering.chosen_videos import write_choice
+from ..rendering.jobs import RecordingKey
 from .inputs import RecordingInputs
 from .notes import Notes
 
+# Those that were chosen among so many episodes.
+_Choices = dict[int, dict[RecordingKey, list[str]]]
 
-def choose_for_evaluation(
-    recording: RecordingInputs, directory: Path, notes: Notes
+
+def choose_for_evaluations(
+    recordings: Iterable[RecordingInputs], directory: Path, notes: Notes
 ) -> None:
-    """Let the trajectories that were chosen promise their videos.
+    """Choose the videos of evaluations, and write it down where they were played.
 
     Args:
-        recording: its inputs.
-        directory: where it was played; its monitor is closed.
-        notes: that the choice is believed.
+        recordings: the inputs of all recordings.
+        directory: where they were played; their monitors are closed.
+        notes: which choices are believed.
     """
-    infix, keep = Infix.parse(recording.infix), recording.evaluation_keep
-    assert infix is not None
-    assert keep is not None
-    amend_trajectories(
-        {
-            path: functools.partial(_with_promise, dict(episode.selection))
-            for episode in recording.episodes
-            if episode.selection is not None
-            and (path := find_trajectory(directory, infix, episode.episode_id))
-        }
-    )
-    with contextlib.closing(JournalWriter(directory / journal_name(infix))) as journal:
-        journal.note("keep", dict(keep))
-    write_manifest_and_stats(directory, infix, is_own=True)
-    notes.add(
-        recording.name,
-        "rule",
-        "its videos were chosen among all episodes of an evaluation: that is believed",
-        count=len(recording.episodes),
-    )
+    groups: dict[str, list[RecordingInputs]] = {}
+    for each in recordings:
+        if (directory / journal_name(each.infix)).exists() and each.is_evaluation:
+            what = json_text.dumps([each.env_id, each.environment])
+            groups.setdefault(what, []).append(each)
+    for group in groups.values():
+        rules = {str(keep.get("rule")) for e in group for keep in e.evaluation_keeps}
+        for rule in sorted(rules):
+            _choose(group, rule, directory, notes)
 
 
-def _with_promise(
-    selection: Mapping[str, Any], known: Mapping[str, Any]
-) -> Mapping[str, Any]:
-    video = {**known["possible_video"], "selection": selection}
-    return {**known, "video": video}
+def _choose(
+    group: list[RecordingInputs], rule: str, directory: Path, notes: Notes
+) -> None:
+    choices = _stated(group)
+    again = _made_again(group, rule, directory)
+    if choices.keys() == again.keys():
+        choices = again
+    else:
+        among = " and later ".join(map(str, sorted(choices)))
+        here = counted(sum(len(each.episodes) for each in group), "episode")
+        notes.add(
+            group[0].name,
+            "rule",
+            f"its videos were chosen among {among} episodes of an evaluation, and here "
+            f"are {here}: that the rule {rule!r:.80} chose them is believed",
+            count=sum(map(len, choices.values())),
+            unit="video",
+        )
+    for finished, chosen in sorted(choices.items()):
+        for each in group:
+            infix = Infix.parse(each.infix)
+            own = {key: roles for key, roles in chosen.items() if key.infix == infix}
+            write_choice(directory, own, rule=rule, finished=finished, among=each.infix)
+
+
+def _stated(group: Iterable[RecordingInputs]) -> _Choices:
+    """Return what the archive says of the choice."""
+    found: _Choices = {}
+    for recording in group:
+        infix = Infix.parse(recording.infix)
+        assert infix is not None, "it was read"
+        known: set[int] = set()
+        for keep in recording.evaluation_keeps:
+            numbers = {*keep["chosen"]} - known
+            chosen = found.setdefault(_count(keep), {})
+            # What they were called is overwritten where they were chosen again.
+            chosen |= {RecordingKey(infix, number): [] for number in numbers}
+            known |= numbers
+        for episode in recording.episodes:
+            if (selection := episode.selection) is not None:
+                key = RecordingKey(infix, episode.episode_id)
+                roles = selection.get("roles")
+                found.setdefault(_count(selection), {})[key] = [*map(str, roles or ())]
+    return found
+
+
+def _made_again(
+    group: Iterable[RecordingInputs], rule: str, directory: Path
+) -> _Choices:
+    """Return what the rule chooses among the episodes that were played."""
+    played: list[tuple[tuple[int, int], RecordingKey, JournalEntry]] = []
+    for recording in group:
+        infix = Infix.parse(recording.infix)
+        assert infix is not None, "it was read"
+        for entry in read_journal(directory / journal_name(infix)):
+            unit = entry.evaluation or {}
+            order = (int(unit.get("seed", 0)), int(unit.get("episode", 0)))
+            played.append((order, RecordingKey(infix, entry.episode_id), entry))
+    played.sort(key=lambda each: each[0])
+    keys = {id(entry): key for _, key, entry in played}
+    try:
+        chosen = keep_rule(rule).choose([entry for *_, entry in played])
+    except InvalidArgument:
+        return {}
+    roles: dict[RecordingKey, list[str]] = {}
+    for entry, role in chosen:
+        roles.setdefault(keys[id(entry)], []).append(role)
+    return {len(played): roles}
+
+
+def _count(facts: Mapping[str, object]) -> int:
+    finished = facts.get("finished")
+    return finished if isinstance(finished, int) else 0

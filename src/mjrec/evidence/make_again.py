@@ -30,7 +30,6 @@ from ..errors import UnreadableFile
 from ..formats.journal import KILLED
 from ..recorder.ending_reasons import EXCEPTION, INTERRUPT, RESET
 from ..simulation.model_sources import read_authored
-from .evaluation_choice import choose_for_evaluation
 from .inputs import EpisodeInputs, RecordingInputs, given_actions
 from .notes import Notes, read_notes
 from .recorder_again import monitor_again
@@ -197,8 +196,6 @@ class _Playing:
             self._notes.write(self._directory.parent)
             os.kill(os.getpid(), signal.SIGKILL)
         self._monitor.close()
-        if self._recording.evaluation_keep is not None:
-            choose_for_evaluation(self._recording, self._directory, self._notes)
 
     def _evaluation_facts(self, said: Mapping[str, Any]) -> Mapping[str, Any]:
         warnings = new_warnings(self._warned, self._recreated.warnings())

@@ -118,7 +118,7 @@ def _recording(files: MonitorFiles, arrays: dict[str, NDArray[Any]]) -> Recordin
         kept=journal.kept,
         clip_starts=tuple(sorted(journal.clip_starts())),
         episodes=tuple(_episodes(files, journal, arrays)),
-        evaluation_keep=journal.evaluation_keep,
+        evaluation_keeps=tuple(journal.evaluation_keeps),
         monitor_csv_start=_monitor_csv_start(files),
         provenance=journal.provenance,
         provenance_after=journal.provenance_after,
@@ -155,7 +155,7 @@ class _Journal:
         self.cuts: dict[int, Mapping[str, Any]] = {}
         self.irregular: dict[int, list[Mapping[str, Any]]] = {}
         self.clips: list[Mapping[str, Any]] = []
-        self.evaluation_keep: Mapping[str, Any] | None = None
+        self.evaluation_keeps: list[Mapping[str, Any]] = []
         self.kept: tuple[int, ...] = ()
         self.was_killed = self.is_closed = False
         if path is None:
@@ -191,8 +191,9 @@ class _Journal:
                 self.irregular.setdefault(number, []).append(facts)
             case "clip", dict():
                 self.clips.append(facts)
-            case "keep", {"scope": "evaluation"}:
-                self.evaluation_keep = facts
+            case "keep", {"scope": "evaluation", "chosen": list(numbers)}:
+                chosen = [*map(_count, numbers)]
+                self.evaluation_keeps.append({**facts, "chosen": chosen})
             case "keep", {"recorded": list(numbers)}:
                 self.kept = tuple(map(_count, numbers))
             case "recovered", _:

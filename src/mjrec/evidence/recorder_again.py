@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import re
 from collections.abc import Callable, Iterable, Sequence
 from fractions import Fraction
@@ -11,9 +12,10 @@ from typing import Any
 
 from ..environments.recreate import NotRecreated, Recreated
 from ..environments.scenes import simulation_below
-from ..errors import Error
+from ..errors import Error, InvalidArgument
 from ..formats.monitor_directory import Infix
 from ..monitors.base import EnvironmentMonitor
+from ..recorder.keep_rules import RULES, keep_rule
 from ..recorder.opening import JOIN, Statements
 from ..recorder.options import RecorderOptions
 from ..recorder.tracking import FinishedEpisode, Tracker
@@ -29,7 +31,6 @@ _SCHEDULES = {
     "disable_videos": "none",
 }
 _SCHEDULE = re.compile(r"(every|at):[\d,]+", re.ASCII)
-_RULE = re.compile(r"(best|worst|failures):\d{1,18}|failures|median", re.ASCII)
 
 
 def monitor_again(
@@ -133,8 +134,10 @@ def _rule(
     recording: RecordingInputs, notes: Notes
 ) -> str | Callable[[Sequence[FinishedEpisode]], Iterable[int]] | None:
     name = recording.rule
-    if name is None or _RULE.fullmatch(name):
-        return name
+    if name is None:
+        return None
+    with contextlib.suppress(InvalidArgument):
+        return keep_rule(name, RULES).name
     notes.add(
         recording.name,
         "rule",

@@ -111,6 +111,7 @@ def _make(request: Mapping[str, Any], say: _Say) -> None:
     from ..environments.recreate import NotRecreated
     from ..rendering.recovery import recover
     from .draw_again import draw_all, draw_sample
+    from .evaluation_choice import choose_for_evaluations
     from .make_again import play_recording
     from .pack import pack_folder
     from .read_inputs import packing_options
@@ -149,6 +150,7 @@ def _make(request: Mapping[str, Any], say: _Say) -> None:
                 notes.add(recording.name, error.excuse, str(error), count=episodes)
     if any(recording.was_killed for recording in inputs.recordings):
         recover(played)
+    choose_for_evaluations(inputs.recordings, played, notes)
     say(phase="drawing")
     if not any(played.iterdir()):
         is_packed = False
