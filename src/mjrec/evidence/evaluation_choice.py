@@ -10,10 +10,11 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from pathlib import Path
+from typing import Any, NamedTuple
 
 from .. import json_text
 from ..errors import InvalidArgument
-from ..formats.journal import JournalEntry, read_journal
+from ..formats.journal import read_journal
 from ..formats.monitor_directory import Infix, journal_name
 from ..plain_text import counted
 from ..recorder.keep_rules import keep_rule
@@ -21,6 +22,16 @@ from ..rendering.chosen_videos import write_choice
 from ..rendering.jobs import RecordingKey
 from .inputs import RecordingInputs
 from .notes import Notes
+
+
+class _Ended(NamedTuple):
+    """An episode of an evaluation that is over."""
+
+    key: RecordingKey
+    reward: float | None
+    terminated: bool | None
+    success: bool | None
+
 
 # Those that were chosen among so many episodes.
 _Choices = dict[int, dict[RecordingKey, list[str]]]
@@ -97,24 +108,29 @@ def _made_again(
     group: Iterable[RecordingInputs], rule: str, directory: Path
 ) -> _Choices:
     """Return what the rule chooses among the episodes that were played."""
-    played: list[tuple[tuple[int, int], RecordingKey, JournalEntry]] = []
+    ended: dict[tuple[Any, Any], _Ended | None] = {}
     for recording in group:
         infix = Infix.parse(recording.infix)
         assert infix is not None, "it was read"
+        for facts in recording.failed:
+            number, key = facts.get("episode_id"), None
+            if isinstance(number, int):
+                key = RecordingKey(infix, number)
+            failed = None if key is None else _Ended(key, None, None, None)
+            ended[facts["seed"], facts["episode"]] = failed
         for entry in read_journal(directory / journal_name(infix)):
-            unit = entry.evaluation or {}
-            order = (int(unit.get("seed", 0)), int(unit.get("episode", 0)))
-            played.append((order, RecordingKey(infix, entry.episode_id), entry))
-    played.sort(key=lambda each: each[0])
-    keys = {id(entry): key for _, key, entry in played}
+            unit, key = entry.evaluation or {}, RecordingKey(infix, entry.episode_id)
+            ended[unit.get("seed"), unit.get("episode")] = _Ended(
+                key, entry.reward, entry.terminated, entry.success
+            )
     try:
-        chosen = keep_rule(rule).choose([entry for *_, entry in played])
+        chosen = keep_rule(rule).choose([ended[unit] for unit in sorted(ended)])
     except InvalidArgument:
         return {}
     roles: dict[RecordingKey, list[str]] = {}
-    for entry, role in chosen:
-        roles.setdefault(keys[id(entry)], []).append(role)
-    return {len(played): roles}
+    for each, role in chosen:
+        roles.setdefault(each.key, []).append(role)
+    return {len(ended): roles}
 
 
 def _count(facts: Mapping[str, object]) -> int:

@@ -124,6 +124,8 @@ class RecordingInputs:
         kept: the episodes that the rule has chosen in the end.
         clip_starts: the numbers of steps at which clips were begun by a trigger.
         episodes: in their order.
+        evaluation_events: kind and facts of what the journal says of an evaluation's
+            episodes that began and failed, in its order.
         evaluation_keeps: what the choices among all recordings of an evaluation said.
         monitor_csv_start: the time in Stable-Baselines3's file, a statement; None where
             that was not asked for.
@@ -145,6 +147,7 @@ class RecordingInputs:
     kept: Sequence[int] = ()
     clip_starts: Sequence[int] = ()
     episodes: Sequence[EpisodeInputs] = ()
+    evaluation_events: Sequence[tuple[str, Mapping[str, Any] | None]] = ()
     evaluation_keeps: Sequence[Mapping[str, Any]] = ()
     monitor_csv_start: float | None = None
     provenance: Mapping[str, Any] | None = None
@@ -156,7 +159,13 @@ class RecordingInputs:
     @property
     def is_evaluation(self) -> bool:
         """Whether it has an evaluation's episodes."""
-        return any(each.evaluation is not None for each in self.episodes)
+        return bool(self.evaluation_events)
+
+    @property
+    def failed(self) -> Sequence[Mapping[str, Any]]:
+        """What is said of an evaluation's episodes that could not be completed."""
+        events = self.evaluation_events
+        return [facts for kind, facts in events if kind == "failed" and facts]
 
     @property
     def name(self) -> str:

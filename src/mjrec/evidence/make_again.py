@@ -157,6 +157,7 @@ class _Playing:
         self._only_counted = only_counted
         self._now = 0.0
         self._warned: Mapping[str, int] = {}
+        self._events = [*recording.evaluation_events]
         self.rewards: dict[str, NDArray[np.float64]] = {}
         # Of either framework.
         self._monitor: Any = monitor_again(
@@ -175,11 +176,11 @@ class _Playing:
         """Play all episodes. Where the recording was killed, so is this process."""
         recorder = self._monitor.recorder
         for episode in self._recording.episodes:
-            if episode.evaluation is not None:
+            if self._recording.is_evaluation:
                 self._monitor.forget_frames()
-                recorder.note_event("begun", dict(episode.evaluation))
+                self._say_begun(episode)
                 recorder.evaluation_facts = functools.partial(
-                    self._evaluation_facts, episode.evaluation
+                    self._evaluation_facts, episode.evaluation or {}
                 )
             self._begin(episode)
             self._warned = self._recreated.warnings()
@@ -188,6 +189,7 @@ class _Playing:
             elif episode.cut is None or episode.steps:
                 self._believe(episode)
             self._cut_off(episode)
+            self._say_failed()
             if episode.cut == KILLED:
                 break
         if self._recording.has_sources:
@@ -196,6 +198,29 @@ class _Playing:
             self._notes.write(self._directory.parent)
             os.kill(os.getpid(), signal.SIGKILL)
         self._monitor.close()
+
+    def _say_begun(self, episode: EpisodeInputs) -> None:
+        """Say what the journal says of an evaluation until an episode begins."""
+        while self._events:
+            kind, facts = self._events.pop(0)
+            self._say(kind, facts)
+            if kind == "begun" and facts and facts == episode.evaluation:
+                break
+
+    def _say_failed(self) -> None:
+        """Say that an episode failed, if that comes next."""
+        while self._events and self._events[0][0] == "failed":
+            self._say(*self._events.pop(0))
+
+    def _say(self, kind: str, facts: Mapping[str, Any] | None) -> None:
+        self._monitor.recorder.note_event(kind, None if facts is None else dict(facts))
+        if kind == "failed" and facts is not None:
+            self._notes.add(
+                self._recording.name,
+                "exception",
+                f"seed {facts['seed']}, episode {facts['episode']} failed, as its "
+                f"author says: {facts.get('failure')!s:.200}",
+            )
 
     def _evaluation_facts(self, said: Mapping[str, Any]) -> Mapping[str, Any]:
         warnings = new_warnings(self._warned, self._recreated.warnings())
