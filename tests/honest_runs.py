@@ -107,10 +107,10 @@ def vector(directory: Path, **options: Any) -> None:
 
 def evaluated(directory: Path, **options: Any) -> None:
     """Evaluate episodes in several chunks, whose videos are chosen among all."""
-    given = {"num_seeds": 3, "keep": "best,worst", "max_steps": 4, **options}
+    given = {"policy": "random", "num_seeds": 3, "keep": "best,failures"}
+    given |= {"max_steps": 4, **options}
     mjrec.evaluate(
         [_POLE],
-        policy="random",
         directory=directory,
         episodes=1,
         height=32,
@@ -118,6 +118,41 @@ def evaluated(directory: Path, **options: Any) -> None:
         workers=1,
         **given,
     )
+
+
+def evaluated_in_part(directory: Path) -> None:
+    """Evaluate a policy that raises in some episodes."""
+
+    def policy(observation: Any) -> Any:
+        if observation[0] > 0:
+            raise ValueError("it is on the right")
+        return np.zeros(1, np.float32)
+
+    evaluated(directory, policy=policy)
+
+
+def evaluated_to_death(directory: Path) -> None:
+    """Evaluate a policy that kills its process in some episodes."""
+
+    def policy(observation: Any) -> Any:
+        if observation[0] > 0:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return np.zeros(1, np.float32)
+
+    evaluated(directory, policy=policy)
+
+
+def evaluated_again(directory: Path) -> None:
+    """Evaluate a policy that kills its process at its seventh action."""
+    calls = []
+
+    def policy(observation: Any) -> Any:
+        calls.append(observation)
+        if len(calls) == 7:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return np.zeros(1, np.float32)
+
+    evaluated(directory, policy=policy)
 
 
 def extended(directory: Path) -> None:

@@ -192,6 +192,14 @@ class _Playing:
             self._say_failed()
             if episode.cut == KILLED:
                 break
+        for event in self._events:
+            self._say(*event)
+        if self._recording.was_killed and not self._recording.episodes:
+            self._notes.add(
+                self._recording.name,
+                "kill",
+                "it was killed before the first step of an episode: that is believed",
+            )
         if self._recording.has_sources:
             recorder.finish_models()
         if self._recording.was_killed:
