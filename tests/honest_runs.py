@@ -280,7 +280,7 @@ def views(directory: Path) -> None:
         directory,
         mode="evaluation",
         workers=1,
-        camera=["track", -1],
+        camera=[{"azimuth": 70.0, "distance": 3.0}, "track", -1],
         width=48,
         height=32,
         max_fps=10,

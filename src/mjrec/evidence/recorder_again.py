@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 from ..environments.recreate import NotRecreated, Recreated
-from ..environments.scenes import simulation_below
 from ..errors import Error, InvalidArgument
 from ..formats.monitor_directory import Infix
 from ..monitors.base import EnvironmentMonitor
@@ -92,7 +91,7 @@ def monitor_again(
             recreated.environment,
             directory,
             options,
-            camera=_camera(given.get("camera"), recreated),
+            camera=given.get("camera"),
             height=given.get("height"),
             width=given.get("width"),
             env_id=recording.env_id,
@@ -196,17 +195,3 @@ def _rate(text: str | None) -> float | Fraction | None:
         return None
     is_float = "." in text or "e" in text
     return float(text) if is_float else Fraction(text)
-
-
-def _camera(said: Any, recreated: Recreated) -> Any:
-    if isinstance(said, list):
-        return [_camera(each, recreated) for each in said]
-    if not isinstance(said, dict):
-        return said
-    # Loads MuJoCo, which not every recording needs.
-    from ..simulation.cameras import resolve_camera
-
-    simulated = simulation_below(recreated.environment)
-    if simulated is None:
-        raise ValueError("it has no cameras")
-    return resolve_camera(simulated.model, said)

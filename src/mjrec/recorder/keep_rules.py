@@ -144,9 +144,7 @@ def keep_rule(text: str, rules: Sequence[str] = RULES_OF_EVALUATIONS) -> KeepRul
     names = [name.strip() for name in text.split(",")]
     for name in names:
         if name not in rules and not _COUNTED.fullmatch(name):
-            raise UnknownName(
-                "keep rule", name, rules, hint="N is 1 or more."
-            )
+            raise UnknownName("keep rule", name, rules, hint="N is 1 or more.")
     kinds = [name.partition(":")[0] for name in names]
     if len(kinds) > 1 and set(kinds) & set(_ALONE):
         raise InvalidArgument(
