@@ -16,7 +16,6 @@ import rich.table
 import tyro
 
 from ..errors import InvalidArgument, UnknownName
-from ..evaluation.dataclass_json import to_json
 from ..evaluation.episode_results import EpisodeResult
 from ..evaluation.evaluating import evaluate as evaluate_policy
 from ..evaluation.evaluation import Evaluation
@@ -25,6 +24,7 @@ from ..evaluation.plan import PLAN_NAME
 from ..evaluation.statistics import Interval
 from ..evaluation.summaries import TaskSummary
 from ..evaluation.task_sets import tasks_from
+from ..formats.dataclass_json import to_json
 from ..monitors.progress import ShowProgress, progress_bar
 from ..recorder.keep_rules import keep_rule
 from .options import NO_ENGINE, AsJson, Engine, camera_of, kwargs_of, size_of

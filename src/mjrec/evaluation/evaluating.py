@@ -28,6 +28,7 @@ from ..errors import (
     PolicyError,
 )
 from ..formats.bundle import FINISHED, finished_trajectories
+from ..formats.dataclass_json import to_json
 from ..formats.locks import try_lock
 from ..formats.monitor_directory import (
     Infix,
@@ -41,7 +42,6 @@ from ..provenance import versions
 from ..recorder.keep_rules import keep_rule
 from ..rendering.engine_jobs import environ_for_drawing
 from ..results import clear_monitor_files
-from .dataclass_json import to_json
 from .episode_results import EpisodeResult
 from .evaluation import (
     RESULT_NAMES,
