@@ -12,7 +12,6 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from .. import json_text
 from ..errors import InvalidArgument
 from ..formats.journal import read_journal
 from ..formats.monitor_directory import Infix, journal_name
@@ -50,8 +49,8 @@ def choose_for_evaluations(
     groups: dict[str, list[RecordingInputs]] = {}
     for each in recordings:
         if (directory / journal_name(each.infix)).exists() and each.is_evaluation:
-            what = json_text.dumps([each.env_id, each.environment])
-            groups.setdefault(what, []).append(each)
+            # Arguments may differ: some tasks are drawn from the seed.
+            groups.setdefault(each.env_id, []).append(each)
     for group in groups.values():
         rules = {str(keep.get("rule")) for e in group for keep in e.evaluation_keeps}
         for rule in sorted(rules):
