@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What holds of jobs on every engine: ours, and any executor of one's own.
 
-`docs/howto/clusters.md` has the table of these guarantees.
+`docs/howto/clusters.md` lists these guarantees.
 """
 
 import contextlib

@@ -42,8 +42,8 @@ class RayEngine(Executor):
         workers: how many at once. None is as many as the cluster has room for, also
             while it grows.
         address: of the cluster. None is `RAY_ADDRESS`, else a Ray is started on this
-            machine and ends with the engine. An existing connection of this process is
-            used and left open.
+            machine, without usage statistics and dashboard, and ends with the engine.
+            An existing connection of this process is used and left open.
         gpus: part of a GPU for each worker; with 0.25 four share one.
         require_gpu: a worker that was given a GPU but renders in software is an error,
             not only a warning.

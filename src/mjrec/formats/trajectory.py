@@ -3,7 +3,7 @@
 
 A recorded episode is first a span of the monitor's row log (`trajectory_log`), then an
 HDF5 file (`trajectory_hdf5`). Both hold facts, rows and changes of the model. One NumPy
-structured dtype says what a row is. `docs/reference/trajectories.md` specifies both.
+structured dtype says what a row is. `docs/reference/trajectories.md` has the file.
 """
 
 from __future__ import annotations

@@ -129,14 +129,14 @@ def Monitor(  # noqa: N802  named as the class that it was in gym
             `suspect_constant`, and the log a warning.
         keep: choose the videos after episodes have ended, instead of `video_callable`:
             "best:3" or "worst:3" (by return), "failures" or "failures:20" (the first
-            20), "median", or a function from the finished episodes
-            (`mjrec.trackers.FinishedEpisode`) to the numbers to keep. A failure has
-            `info["is_success"]` or `info["success"]` false in its last step; without
-            either, it terminated. Other episodes are deleted as soon as the rule
-            allows; "median" and functions keep all states on disk until `close`.
-            Incomplete episodes are never chosen. Trajectories kept for another reason
-            stay, without their video. Manifest and metadata name the rule. After a
-            kill, all candidates are pending. If the function raises or names unknown
+            20), "median", several of these joined by commas, or a function from the
+            finished episodes (`mjrec.trackers.FinishedEpisode`) to the numbers to
+            keep. A failure has `info["is_success"]` or `info["success"]` false in its
+            last step; without either, it terminated. Other episodes are deleted as soon
+            as the rule allows; "median" and functions keep all states on disk until
+            `close`. Incomplete episodes are never chosen. Trajectories kept for another
+            reason stay, without their video. Manifest and metadata name the rule. After
+            a kill, all candidates are pending. If the function raises or names unknown
             episodes, `close` says so and keeps all.
         step_trigger: maps the number of steps so far to whether a clip starts, before
             each step; instead of `video_callable`. Its first frame is the one before
