@@ -135,6 +135,18 @@ every_way = pytest.mark.usefixtures("_way")
 
 
 @every_way
+def test_a_process_that_exits_at_once_says_nothing():
+    """The child that lists the packages goes with it."""
+    program = (
+        "import logging; logging.basicConfig();"
+        "from mjrec.provenance import look_around; look_around()"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, check=True
+    )
+    assert done.stderr == b""
+
+
 def test_packages_are_those_that_python_itself_names():
     """All of them, in the order of their names, each with its version."""
     found = installed_packages()

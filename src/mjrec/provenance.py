@@ -122,8 +122,10 @@ class Provenance:
             self._found = {**found, "code": None}
             self._found = {**found, "code": _code(self._root)}
         except Exception:
-            # No recording is to fail of it.
-            logger.warning("The provenance is not known.", exc_info=True)
+            # No recording fails because of it. A process that exits takes the child
+            # with it that lists the packages, and has no more use for them.
+            if threading.main_thread().is_alive():
+                logger.warning("The provenance is not known.", exc_info=True)
 
 
 @functools.cache
