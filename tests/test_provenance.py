@@ -134,7 +134,6 @@ def _way(request, monkeypatch, tmp_path):
 every_way = pytest.mark.usefixtures("_way")
 
 
-@every_way
 def test_a_process_that_exits_at_once_says_nothing():
     """The child that lists the packages goes with it."""
     program = (
@@ -147,6 +146,7 @@ def test_a_process_that_exits_at_once_says_nothing():
     assert done.stderr == b""
 
 
+@every_way
 def test_packages_are_those_that_python_itself_names():
     """All of them, in the order of their names, each with its version."""
     found = installed_packages()
