@@ -137,8 +137,10 @@ every_way = pytest.mark.usefixtures("_way")
 def test_a_process_that_exits_at_once_says_nothing():
     """The child that lists the packages goes with it."""
     program = (
-        "import logging; logging.basicConfig();"
-        "from mjrec.provenance import look_around; look_around()"
+        "import logging; logging.basicConfig()\n"
+        "from mjrec import child_python, provenance\n"
+        "provenance.look_around()\n"
+        "while not child_python._children: pass"
     )
     done = subprocess.run(
         [sys.executable, "-c", program], capture_output=True, check=True
