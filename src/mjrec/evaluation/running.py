@@ -268,7 +268,7 @@ class _ChunkRun:
         """Run an episode, and return whether it was completed.
 
         Raises:
-            Error: it could not be recorded.
+            Error: the episode could not be recorded.
         """
         monitor = self._monitored(unit, continues=continues)
         # Frames must not depend on earlier episodes, because chunks may differ.

@@ -31,7 +31,7 @@ _LARGEST = 1 << 53
 
 
 class Step(Protocol):
-    """Records a step by its reward, and counts it."""
+    """A function that records and counts a step, given its reward."""
 
     def __call__(
         self, reward: Any, *, terminated: bool = ..., truncated: bool = ...
@@ -142,7 +142,7 @@ def gathering(
 
 
 def _makes_room(log: RowLog) -> bool:
-    """Write a full tail to the log; return whether another row may stay in it."""
+    """Write a full tail to the log; return whether the next row may stay in it."""
     # On a full disk the recorder tries again and reports it.
     with contextlib.suppress(FileNotWritten):
         log.make_room()

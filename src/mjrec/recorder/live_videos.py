@@ -85,7 +85,7 @@ class LiveVideos:
             recorder.give_up(reason)
 
     def discard(self) -> None:
-        """End without a video and without metadata."""
+        """Discard the videos and write no metadata."""
         for recorder in self.recorders:
             recorder.discard()
 

@@ -200,7 +200,7 @@ class MonitoredRun:
         """Note a fault and return whether the simulation may continue.
 
         Args:
-            what: the kind of thing that could not be recorded.
+            what: the part of the recording that failed, such as "video".
             error: the reason.
             of_episode: whether the fault belongs to the running episode.
         """
@@ -345,7 +345,7 @@ class MonitoredRun:
         """Return a video's second name, for its metadata; empty without `name_prefix`.
 
         Args:
-            what: what the video begins with, "episode" or "step".
+            what: the kind of event that begins the video, "episode" or "step".
             number: the number of that episode or step.
         """
         prefix = self.options.name_prefix

@@ -219,7 +219,7 @@ def _last_counted(results: MonitorResults) -> int:
         return -1
     if results.manifest.mjrec is not None:
         return int(results.manifest.mjrec.get("next_episode_id") or 0) - 1
-    # A manifest of gym itself: episodes are numbered from 0 by resets, and each reset
+    # A manifest written by gym: episodes are numbered from 0 by resets, and each reset
     # has a type.
     stats = results.saved
     if stats is None:

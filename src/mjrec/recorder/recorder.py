@@ -48,12 +48,11 @@ logger = logging.getLogger(__name__)
 class Recorder:
     """Drives statistics, journal, trajectories, videos and manifest of one monitor.
 
-    It is notified of an environment's calls and never calls the environment itself,
-    except for frames and states. For a reset, call `before_reset`, reset the
-    environment inside `resetting`, and call `reset`. For a step, call `before_step`,
-    step the environment, and call `step`; while there is a `fast` path, call its
-    functions instead. At the end, call `close`. A recorder belongs to the process that
-    created it.
+    It is notified of an environment's calls and does not call the environment, except
+    for frames and states. For a reset, call `before_reset`, reset the environment
+    inside `resetting`, and call `reset`. For a step, call `before_step`, step the
+    environment, and call `step`; while there is a `fast` path, call its functions
+    instead. At the end, call `close`. A recorder belongs to its creating process.
 
     Args:
         directory: the monitor directory.

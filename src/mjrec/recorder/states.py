@@ -44,7 +44,7 @@ class StateRecorder:
         run: the monitored run.
         name: name of the resulting file, without suffix.
         logs: the logs that its rows are written to.
-        what: what is lost if the rows cannot be written, for messages.
+        what: the part of the run that is lost if rows cannot be written, for messages.
         facts: the facts known at the beginning.
         capture: captures states; None if no simulation is accessible.
         start: the value that `capture.begin_episode` returned.
@@ -552,7 +552,7 @@ class DeferredVideo:
 
     @property
     def functional(self) -> bool:
-        """Whether frames are (or were) recorded: not broken."""
+        """Whether frames are (or were) recorded, the opposite of `broken`."""
         return not self.broken
 
     @property

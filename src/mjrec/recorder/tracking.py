@@ -98,7 +98,7 @@ class FinishedVideo:
 
 
 class Tracker:
-    """Follows what a monitor records; for `mjrec.Monitor(..., trackers=...)`.
+    """Base class for experiment trackers, for `mjrec.Monitor(..., trackers=...)`.
 
     Subclass it and override methods; each does nothing by default. One tracker can
     serve several runs at once, such as those of a vector environment: each call names

@@ -248,7 +248,7 @@ class VideoRecorder:
         self.closed = True
 
     def discard(self) -> None:
-        """End without a video and without metadata."""
+        """Discard the video and write no metadata."""
         if not self.closed:
             self.closed = True
             self._drop_frames()
