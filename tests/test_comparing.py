@@ -194,7 +194,7 @@ def test_other_conditions_are_a_caution(tmp_path):
     # A return of at most 500 on one side, and of 1000 on the other.
     assert comparison.scored == ()
     within = compared([a, b], write_evaluation(tmp_path / "c", {WALK: [[1, 2]]}))
-    assert "was 500 or the environment's own in A" in within.cautions[1]
+    assert "is 500 or the environment's own in A" in within.cautions[1]
 
 
 @pytest.mark.parametrize(
