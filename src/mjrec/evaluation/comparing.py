@@ -195,10 +195,9 @@ def compare(
 def holm_adjusted(p_values: Mapping[str, float]) -> dict[str, float]:
     """Return p-values adjusted for their number by Holm's method.
 
-    The k-th smallest of m p-values (from 0) is multiplied by m - k, raised to the
-    previous adjusted value if it is below that, and capped at 1. If all values below
-    0.05 are called different, any of these claims is wrong in at most 5 of 100
-    comparisons.
+    The k-th smallest of m p-values (from 0) is multiplied by m - k and capped at 1. It
+    is at least as large as the adjusted value before it. If all values below 0.05 are
+    called different, any of these claims is wrong in at most 5 of 100 comparisons.
     """
     adjusted: dict[str, float] = {}
     largest = 0.0

@@ -131,9 +131,9 @@ def evaluate(
     and fails after three deaths.
 
     A worker creates the environment and policy once per task and resets them for each
-    episode. An environment that draws its model from the seed when it is created
-    (dm_control's `lqr`) is created once per seed, and one that is drawn live once per
-    episode.
+    episode. There are two exceptions: an environment that draws its model from the seed
+    (dm_control's `lqr`) is created once per seed, and an environment whose frames are
+    drawn live once per episode.
 
     Ctrl-C and other exceptions end the workers. Finished episodes are kept, and the
     same call with `resume=True` continues.

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """The recordings of a run whose videos are chosen after their episodes have ended.
 
-Every episode is recorded as if it got a video. Undecided recordings are held: the log
-marks each as a candidate, which no other process touches while the monitor is open, and
-which any process may render once the monitor is gone. Dropped recordings are deleted
-immediately.
+Every episode is recorded as if it got a video. Undecided recordings are held, and the
+log marks each of them as a candidate. While the monitor is open, no other process
+touches a candidate; once the monitor is gone, any process may render it. Dropped
+recordings are deleted immediately.
 """
 
 from __future__ import annotations

@@ -60,9 +60,9 @@ def mesh_of(model: mujoco.MjModel, shape: Shape) -> trimesh.Trimesh:
 
     Args:
         model: the model that the shape belongs to.
-        shape: a geom or a site. Anything else becomes a unit mesh of its `geom_type`
-            (an icosphere of radius 1, a box of half size 1, or a cylinder of radius
-            and half length 1), which is then scaled to its size.
+        shape: a geom or a site. Anything else becomes a unit mesh, which its scale
+            brings to size: an icosphere of radius 1, a box of half size 1, or a
+            cylinder of radius 1 and half length 1.
     """
     if shape.object_type == _SITE:
         return _coloured(_smoothed(create_site_mesh(model, shape.object_id)), shape)
