@@ -95,7 +95,7 @@ def test_sets_of_evaluations(tmp_path, capsys):
         ("difference > 0", "the difference of Hopper-v5 is 0"),
         ("Hopper-v5: p-value < 0.05", "the p-value of Hopper-v5 is 1"),
         ("probability of improvement low > 0.75", "improvement low of all tasks is 0."),
-        ("p-value low < 0.05", "is not known"),
+        ("p-value low < 0.05", "is unknown"),
     ],
 )
 def test_what_is_required(required, reason, two, capsys):

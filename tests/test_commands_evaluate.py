@@ -65,7 +65,7 @@ def test_tasks_with_a_scale_are_summarized_together(run):
     status, out, _ = run(*tasks, "--score-range", *ranges)
     assert status == 0
     assert "Over 2 tasks, as scores from 0 to 1: IQM" in out
-    assert "without Hopper-v5: it has no scale of its own" in out
+    assert "without Hopper-v5: it has no default scale" in out
 
 
 def test_json_is_one_object_and_nothing_else(run):

@@ -89,7 +89,7 @@ def test_an_evaluation_counts_once(tmp_path):
     a = write_evaluation(tmp_path / "a", {WALK: [[1, 2]]})
     with pytest.raises(InvalidArgument, match="twice: B"):
         compare(a, [a, tmp_path / "." / "a"])
-    with pytest.raises(InvalidArgument, match="side of A"):
+    with pytest.raises(InvalidArgument, match="Side A"):
         compare([], a)
     with pytest.raises(UnreadableFile, match="no evaluation"):
         compare(a, tmp_path)
@@ -186,7 +186,7 @@ def test_other_conditions_are_a_caution(tmp_path):
     )
     comparison = compared(a, b)
     (caution,) = comparison.cautions
-    assert "max_steps was 500 in A and is the environment's own in B" in caution
+    assert "max_steps is 500 in A and the environment's own in B" in caution
     assert comparison.remarks == (
         "seeds: 0, 1 in A, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9 ... in B",
         "mujoco: 3.3 in A, 3.4 in B",
@@ -194,7 +194,7 @@ def test_other_conditions_are_a_caution(tmp_path):
     # A return of at most 500 on one side, and of 1000 on the other.
     assert comparison.scored == ()
     within = compared([a, b], write_evaluation(tmp_path / "c", {WALK: [[1, 2]]}))
-    assert "was 500 or the environment's own in A" in within.cautions[1]
+    assert "is 500 or the environment's own in A" in within.cautions[1]
 
 
 @pytest.mark.parametrize(

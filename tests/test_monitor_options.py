@@ -76,7 +76,7 @@ IMPOSSIBLE = {
         ({"keep": 3}, "InvalidArgument", "must be one of"),
         ({"keep": "worst:3", "video_callable": False}, "InvalidArgument", "before"),
         ({"keep": "worst:3", "video_callable": bool}, "InvalidArgument", "one of them"),
-        ({"keep": "worst:3", "render": "off"}, "InvalidArgument", "there are none"),
+        ({"keep": "worst:3", "render": "off"}, "InvalidArgument", "disables videos"),
         ({"keep": "worst:3", "video_length": 3}, "InvalidArgument", "in steps"),
         ({"keep": "worst:3", "step_trigger": bool}, "InvalidArgument", "in steps"),
         ({"camera": []}, "InvalidArgument", "no camera"),

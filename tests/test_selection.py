@@ -137,11 +137,11 @@ def no_function(episodes):
     ("keep", "what"),
     [
         (no_function, "no_function .*ZeroDivisionError: of the user"),
-        (lambda episodes: [7, 0], "returned 7, .* there are 0, 1, 2"),
+        (lambda episodes: [7, 0], "returned 7, .* episodes are 0, 1, 2"),
         (lambda episodes: None, "TypeError"),
         (lambda episodes: 2, "TypeError"),
         (lambda episodes: [0.5], "TypeError"),
-        (lambda episodes: [True, False, True], "True is no number of an episode"),
+        (lambda episodes: [True, False, True], "True is not an episode number"),
         (lambda episodes: episodes[:1], "TypeError"),
     ],
 )

@@ -159,8 +159,8 @@ def test_figures_across_tasks_by_hand():
     # Scores 0, .8; .5, .5; .5, 1.
     assert across.tasks == ("a", "b", "c")
     assert across.left_out == {
-        "x": "it has no scale of its own, and none was given",
-        "dm_control/lqr-x": "its rewards have no bound",
+        "x": "it has no default scale, and no scale was given",
+        "dm_control/lqr-x": "its rewards are unbounded",
         "y": "no episode was completed",
     }
     assert (across.mean, across.median) == (pytest.approx(0.55), pytest.approx(0.5))

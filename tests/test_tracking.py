@@ -118,6 +118,6 @@ def test_tracker_that_raises_is_dismissed_and_the_rest_goes_on(tmp_path, caplog)
         record(tmp_path, "InvertedPendulum-v5", trackers=[failing, listening])
     assert (failing.calls, failing.ends) == (1, 1)
     assert len(listening.of("episode")) == 2
-    assert "Failing has failed" in caplog.text
+    assert "Failing failed" in caplog.text
     [fault] = manifest_of(tmp_path)["mjrec"]["faults"]
     assert fault == {"episode_id": 0, "what": "tracker", "reason": "Failing: no server"}

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Evaluating policies: episodes of many tasks, and their statistics."""
+"""Evaluating policies on episodes of many tasks, with statistics."""

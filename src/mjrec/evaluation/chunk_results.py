@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is done of a chunk, as the journals in its directory tell it.
+"""The finished episodes of a chunk, read from the journals in its directory.
 
-An episode of an evaluation is up to three lines of a journal. `begun` comes before its
-reset; its end is the journal's usual line, with `evaluation`, or a line `failed`::
+An episode of an evaluation has up to three lines in a journal. `begun` is written
+before its reset. Its end is either the journal's usual line, with `evaluation`, or a
+line `failed`::
 
     {"begun": {"seed": 7, "episode": 0}}
     {"episode_id": 0, "length": 200, ..., "evaluation": {"seed": 7, "episode": 0,
@@ -10,9 +11,9 @@ reset; its end is the journal's usual line, with `evaluation`, or a line `failed
     {"failed": {"seed": 7, "episode": 1, "episode_id": 1, "failure": "...",
      "length": 12, "start_time": 1790000000.0, "seconds": 0.2}}
 
-A monitor that closes says so in its journal, and a process that is ended by no fault of
-its own adds `{"begun": null}`. Where neither that nor an end follows a `begun`, the
-process died of the episode, or was killed at it.
+A monitor that closes notes that in its journal, and a process that is stopped from
+outside adds `{"begun": null}`. If a `begun` is followed by none of these, the process
+crashed or was killed in that episode.
 """
 
 from __future__ import annotations
@@ -35,12 +36,13 @@ _JOURNALS = "openaigym.episodes.*.jsonl"
 
 @dataclass
 class ChunkResults:
-    """What is done of a chunk.
+    """The finished episodes of a chunk.
 
     Attributes:
-        results: of the episodes that ended, by seed and number.
-        deaths: how often a process ended in an episode that has no result.
-        is_drawn_live: videos were drawn while episodes ran.
+        results: results of the episodes that ended, keyed by seed and number.
+        deaths: number of processes that died in an episode without a result, keyed by
+            seed and number.
+        is_drawn_live: whether videos were drawn while episodes ran.
     """
 
     results: dict[Unit, EpisodeResult] = field(default_factory=dict)
@@ -49,15 +51,15 @@ class ChunkResults:
 
     @property
     def size(self) -> int:
-        """How much is done of it; episodes that killed their process count, too."""
+        """Amount of work done, including episodes in which a process died."""
         return len(self.results) + self.deaths.total()
 
 
 def read_chunk(folder: Path, task: str) -> ChunkResults:
-    """Return what is done of a chunk.
+    """Read the finished episodes of a chunk.
 
     Args:
-        folder: its monitor directory, which may be missing.
+        folder: the chunk's monitor directory, which may be missing.
         task: the environment's name.
 
     Raises:
@@ -72,12 +74,12 @@ def read_chunk(folder: Path, task: str) -> ChunkResults:
 
 
 def recorded_results(directory: Path) -> Iterator[tuple[Path, EpisodeResult]]:
-    """Yield the episodes of an evaluation that are over, with their directories.
+    """Yield the finished episodes of an evaluation, with their monitor directories.
 
-    They are in the order of the plan, also where it is not finished.
+    They come in the plan's order, even if the evaluation is not finished.
 
     Raises:
-        UnreadableFile: the plan, or a journal, cannot be read.
+        UnreadableFile: the plan or a journal cannot be read.
     """
     plan = read_plan(directory)
     for task in plan.tasks:
@@ -99,7 +101,7 @@ def _read(path: Path, task: str, found: ChunkResults) -> None:
         if kind == "closed":
             running.clear()
         elif kind == "begun":
-            # Nothing is running where the process was ended by no fault of its own.
+            # None means that the process was stopped from outside.
             running[:] = [] if facts is None else [_unit(facts)]
         elif kind == "failed":
             running.clear()

@@ -1,12 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Comparing evaluations: how much better B is than A.
 
-Every figure is of B against A: differences are B - A, and the probability of
-improvement is that of B having a higher return than A. Where each side is one
-evaluation, the figures are of its episodes, and say something of these two policies
-only. Where a side is several, one for each training, the figures are of the
-evaluations' means, and say something of the two methods: see
-`docs/reference/statistics.md`.
+All figures compare B with A: differences are B - A, and the probability of improvement
+is the probability that B has a higher return than A. If each side is one evaluation,
+the figures are computed from its episodes and only hold for these two policies. If a
+side has several evaluations, one per training, the figures are computed from the
+evaluations' means and hold for the two methods: see `docs/reference/statistics.md`.
 """
 
 from __future__ import annotations
@@ -34,29 +33,30 @@ TASK_FIGURES: Final = (
     *("mean A", "mean B", "difference", "paired difference"),
     *(IMPROVEMENT, "p-value"),
 )
-"""What is said of a task, in the order of tables."""
+"""Names of a task's figures, in the order of tables."""
 OVERALL_FIGURES: Final = (IMPROVEMENT, "IQM A", "IQM B", "IQM difference")
-"""What is said of all tasks together, likewise."""
+"""Names of the figures across all tasks, in the order of tables."""
 
 _MOST_TOLD: Final = 10
 
 
 @dataclass(frozen=True, kw_only=True)
 class TaskComparison:
-    """What is said of one task; what is in pairs is of A and of B.
+    """The comparison of A and B on one task. Tuples hold the values of A and B.
 
     Attributes:
-        task: its name.
-        episodes: how many were completed; the figures are theirs.
-        failed: how many were not.
-        not_finite: how many of the completed ones have a return that is NaN or
-            infinite. Where any has, there are no figures.
-        figures: by name, those of `TASK_FIGURES` that can be said. The means are of the
-            returns or, of several evaluations, of their means. The paired difference is
-            that of episodes which began alike. The p-value is that of the two-sided
-            Mann-Whitney test, adjusted (Holm) for the number of tasks.
-        pairs: of how many pairs of episodes the paired difference is.
-        unknown: why there are no figures; None where there are.
+        task: the task's name.
+        episodes: number of completed episodes, which the figures are computed from.
+        failed: number of failed episodes.
+        not_finite: number of completed episodes whose return is NaN or infinite. If
+            there are any, there are no figures.
+        figures: the available figures, keyed by their names in `TASK_FIGURES`. The
+            means are of returns, or, with several evaluations, of their mean returns.
+            The paired difference uses episodes that began in the same state. The
+            p-value is from the two-sided Mann-Whitney test, adjusted (Holm) for the
+            number of tasks.
+        pairs: number of pairs of episodes in the paired difference.
+        unknown: why there are no figures; None if there are figures.
     """
 
     task: str
@@ -70,23 +70,25 @@ class TaskComparison:
 
 @dataclass(frozen=True, kw_only=True)
 class Comparison:
-    """B against A. Pairs are of A and B.
+    """The comparison of B with A. Two-element tuples hold the values of A and B.
 
     Attributes:
         a: directories of A.
         b: directories of B.
-        unit: what is resampled: `"episodes"`, with one evaluation on each side, or
-            `"evaluations"`.
+        unit: the unit of resampling: `"episodes"` with one evaluation on each side,
+            otherwise `"evaluations"`.
         policies: the policies.
-        cautions: reasons not to trust the figures: different conditions, failed
-            episodes.
-        remarks: other differences, which do not matter for the figures.
+        cautions: reasons not to trust the figures, such as different conditions or
+            failed episodes.
+        remarks: other differences, which do not affect the figures.
         left_out: tasks of one side that are not in all evaluations of the other.
-        tasks: common tasks, in the order of A.
-        figures: by name, of `OVERALL_FIGURES`: the probability of improvement, averaged
-            over tasks, and interquartile means of scores.
-        scored: tasks with these scores: those with the same scale everywhere.
-        bootstrap: how intervals were made.
+        tasks: the common tasks, in the order of A.
+        figures: the available figures, keyed by their names in `OVERALL_FIGURES`: the
+            probability of improvement, averaged over tasks, and the interquartile means
+            of scores.
+        scored: tasks that the scores are computed from: those with the same scale in
+            all evaluations.
+        bootstrap: settings of the confidence intervals.
     """
 
     a: tuple[Path, ...]
@@ -112,20 +114,22 @@ def compare(
 ) -> Comparison:
     """Compare two evaluations, or two sets of them: how much better is B than A?
 
-    With one evaluation on each side, episodes are resampled: the figures are of these
-    two policies. With several (trainings of one method with different seeds), each
-    evaluation counts as its mean return, and these are resampled task by task.
+    With one evaluation on each side, episodes are resampled, and the figures hold for
+    these two policies. With several evaluations (trainings of one method with different
+    seeds), each evaluation is represented by its mean return, and the means are
+    resampled task by task.
 
     Args:
-        a: the directory of an evaluation, or several.
-        b: likewise.
+        a: the evaluation directory of A, or several.
+        b: the evaluation directory of B, or several.
         confidence: confidence level of the intervals.
-        resamples: bootstrap resamples.
+        resamples: number of bootstrap resamples.
         seed: seed of the bootstrap.
 
     Raises:
         UnreadableFile: a directory has no finished evaluation, or it is damaged.
-        InvalidArgument: no task is in all of them, or a directory is given twice.
+        InvalidArgument: the evaluations have no task in common, a side has no
+            directory, or a directory is given twice.
     """
     how = Bootstrap(resamples=resamples, seed=seed, confidence=confidence)
     sides = of_a, of_b = _Side("A", a), _Side("B", b)
@@ -189,11 +193,11 @@ def compare(
 
 
 def holm_adjusted(p_values: Mapping[str, float]) -> dict[str, float]:
-    """Return p-values that are adjusted for how many there are.
+    """Return p-values adjusted for their number by Holm's method.
 
-    The k-th smallest of m (from 0) times m - k, none smaller than one before it, at
-    most 1. To call those below 0.05 different is to be wrong about any of them in at
-    most 5 of 100 comparisons.
+    The k-th smallest of m p-values (from 0) is multiplied by m - k and capped at 1. It
+    is at least as large as the adjusted value before it. If all values below 0.05 are
+    called different, any of these claims is wrong in at most 5 of 100 comparisons.
     """
     adjusted: dict[str, float] = {}
     largest = 0.0
@@ -204,11 +208,11 @@ def holm_adjusted(p_values: Mapping[str, float]) -> dict[str, float]:
 
 
 class _Side:
-    """The evaluations of one side.
+    """The evaluations of one side of a comparison.
 
     Args:
         name: `"A"` or `"B"`.
-        directories: one, or several.
+        directories: one directory, or several.
     """
 
     def __init__(self, name: str, directories: Directories) -> None:
@@ -217,9 +221,11 @@ class _Side:
         self.name = name
         self.directories = tuple(map(Path, directories))
         if not self.directories:
-            raise InvalidArgument(f"There is no evaluation on the side of {name}.")
+            raise InvalidArgument(
+                f"Side {name} has no evaluation. Give at least one directory."
+            )
         if len({path.resolve() for path in self.directories}) < len(self.directories):
-            raise InvalidArgument(f"An evaluation is there twice: {self.told}.")
+            raise InvalidArgument(f"An evaluation is given twice: {self.told}.")
         self.results = [read_results(path) for path in self.directories]
 
     @property
@@ -228,7 +234,7 @@ class _Side:
 
     @property
     def tasks(self) -> list[str]:
-        """The tasks that are in all evaluations."""
+        """The tasks that all evaluations have in common."""
         rest = [each.by_task for each in self.results[1:]]
         first = self.results[0].by_task
         return [task for task in first if all(task in other for other in rest)]
@@ -238,27 +244,27 @@ class _Side:
         return [each.plan.policy for each in self.results]
 
     def without(self, tasks: Sequence[str]) -> tuple[str, ...]:
-        """Return the other tasks."""
+        """Return all tasks except the given ones."""
         return tuple(task for task in self.tasks if task not in tasks)
 
     def returns(self, task: str) -> list[FloatArray]:
-        """Return those of the completed episodes of each evaluation."""
+        """Return the returns of completed episodes, one array per evaluation."""
         columns = [each.by_task[task] for each in self.results]
         return [each.rows["total_reward"][~each.failed] for each in columns]
 
     def sample(self, task: str, is_single: bool) -> FloatArray:
-        """Return what the figures are of: returns, or the mean of each evaluation."""
+        """Return the sample for the figures: returns, or each evaluation's mean."""
         returns = self.returns(task)
         return returns[0] if is_single else np.array([r.mean() for r in returns])
 
     def counts(self, task: str) -> tuple[int, int, int]:
-        """Return how many episodes were completed, failed, and returned no number."""
+        """Return the numbers of completed, failed and non-finite episodes."""
         failed = sum(len(each.by_task[task].failures) for each in self.results)
         returns = np.concatenate(self.returns(task))
         return len(returns), failed, _not_finite(returns)
 
     def unknown(self, task: str) -> str | None:
-        """Return why there are no figures of a task."""
+        """Return why there are no figures for a task; None if there are figures."""
         for path, returns in zip(self.directories, self.returns(task), strict=True):
             name = self.name if len(self.results) == 1 else path
             if not len(returns):
@@ -306,7 +312,7 @@ def _overall_figures(
 
 
 def _paired_differences(task: str, a: Evaluation, b: Evaluation) -> FloatArray:
-    """Return B - A of the episodes that began in the same state in both."""
+    """Return the differences B - A of episodes that began in the same state."""
     if not (
         a.plan.protocol == b.plan.protocol == SEEDED
         and a.plan.env_kwargs == b.plan.env_kwargs
@@ -323,12 +329,12 @@ def _by_unit(columns: TaskResults) -> dict[tuple[int, int], float]:
 
 
 def _scales(results: Sequence[Evaluation]) -> dict[str, tuple[float, float]]:
-    """Return the returns that count as 0 and as 1, of tasks where all say the same."""
+    """Return the score ranges of the tasks on which all evaluations agree."""
     said: dict[str, set[tuple[float, float] | None]] = {}
     for each in results:
         for summary in each.summaries:
             said.setdefault(summary.task, set()).add(summary.score_range)
-    # A file may say anything.
+    # The files are untrusted, so the range is checked.
     return {
         task: scale
         for task, (scale, *others) in said.items()
@@ -340,13 +346,13 @@ def _cautions(a: _Side, b: _Side, tasks: Sequence[TaskComparison]) -> Iterator[s
     for side, other in ((a, b), (b, a)):
         if len(side.results) == 1 < len(other.results):
             yield (
-                f"{side.name} is a single evaluation: how much another training would "
-                "differ is not known, and there are no intervals"
+                f"{side.name} is a single evaluation, so the variation between "
+                "trainings is unknown and there are no intervals"
             )
     for name, of_a, of_b in _different(a, b, _conditions):
         yield (
-            f"{name} was {of_a} in A and is {of_b} in B: returns under different "
-            "conditions do not tell which policy is better"
+            f"{name} is {of_a} in A and {of_b} in B, and returns under different "
+            "conditions do not show which policy is better"
         )
     for task in tasks:
         for name, failed, completed in zip(
@@ -355,18 +361,18 @@ def _cautions(a: _Side, b: _Side, tasks: Sequence[TaskComparison]) -> Iterator[s
             if failed:
                 yield (
                     f"{task.task}: {failed} of {failed + completed} episodes of "
-                    f"{name} failed; the figures are of the others"
+                    f"{name} failed; the figures leave them out"
                 )
 
 
 def _conditions(results: Evaluation) -> Mapping[str, object]:
-    """Return what changes returns though the policy is the same."""
+    """Return the conditions that change the returns of the same policy."""
     plan = results.plan
     return {"max_steps": plan.max_steps, "env_kwargs": plan.env_kwargs}
 
 
 def _choices(results: Evaluation) -> Mapping[str, object]:
-    """Return what chooses which episodes are seen, and what ran them."""
+    """Return the choice of episodes, and the versions that ran them."""
     plan = results.plan
     return {
         "protocol": plan.protocol,
@@ -379,7 +385,7 @@ def _choices(results: Evaluation) -> Mapping[str, object]:
 def _different(
     a: _Side, b: _Side, facts: Callable[[Evaluation], Mapping[str, object]]
 ) -> Iterator[tuple[str, str, str]]:
-    """Yield the facts that are not the same everywhere, as each side says them."""
+    """Yield each fact that differs between evaluations, with both sides' values."""
     said = [[facts(each) for each in side.results] for side in (a, b)]
     for name in dict.fromkeys(name for side in said for fact in side for name in fact):
         of_a, of_b = ([fact.get(name, "none") for fact in side] for side in said)

@@ -9,26 +9,30 @@ from dataclasses import dataclass, field
 
 @dataclass(frozen=True, kw_only=True)
 class EpisodeResult:
-    """One episode, completed or failed.
+    """The result of one episode, completed or failed.
 
     Attributes:
         task: the environment's name.
-        seed: of the run.
-        episode: its number in the run of that task and seed, from 0.
-        total_reward: the return; None where the episode failed.
-        length: number of steps; of a failed episode those until then.
-        terminated: the task ended it; None where it failed.
-        truncated: a limit from outside the task ended it; None where it failed.
-        success: what the environment said of it; None where it said nothing.
-        failure: why the episode could not be completed, in one line; None where it
-            was.
-        warnings: how often MuJoCo warned in it, by the names of `mujoco.mjtWarning`
-            without `mjWARN_`, those that are not zero.
-        monitor: the infix of its monitor's files; None where it failed before there
-            was a monitor.
-        episode_id: its number in that monitor; None likewise.
-        start_time: wall clock when it began; None likewise.
-        seconds: how long it took.
+        seed: the run's seed.
+        episode: the episode's number in the run of this task and seed, from 0.
+        total_reward: the return; None if the episode failed.
+        length: number of steps; for a failed episode, the steps before the failure.
+        terminated: whether the task ended the episode; None if it failed.
+        truncated: whether a limit outside the task ended the episode; None if it
+            failed.
+        success: whether the environment reports a success; None if it does not report
+            that.
+        failure: why the episode could not be completed, in one line; None if it was
+            completed.
+        warnings: number of MuJoCo's warnings by kind, for kinds that occurred. Kinds
+            are the names in `mujoco.mjtWarning` without `mjWARN_`.
+        monitor: infix of its monitor's files; None if it failed before there was a
+            monitor.
+        episode_id: the episode's number in that monitor; None if it failed before the
+            monitor began it.
+        start_time: wall clock when the episode began, in seconds since the epoch; None
+            if unknown.
+        seconds: duration in seconds; None if unknown.
     """
 
     task: str
@@ -48,10 +52,10 @@ class EpisodeResult:
 
     @property
     def reward(self) -> float | None:
-        """The return, as keep rules ask for it."""
+        """The return, under the name that keep rules use."""
         return self.total_reward
 
     @property
     def unit(self) -> tuple[int, int]:
-        """Seed and number, which tell it from the others of its task."""
+        """Seed and number, which identify the episode within its task."""
         return self.seed, self.episode

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Evaluating a policy: `evaluate` hands out the work, and writes down the results.
+"""Evaluating a policy: `evaluate` distributes the work and writes the results.
 
-Workers record the episodes, chunk by chunk. This process simulates nothing and, until
-videos are drawn, needs no OpenGL: it may be killed at any time, and what goes on with
-the evaluation repeats nothing that is finished.
+Workers record the episodes, chunk by chunk. This process simulates nothing and needs no
+OpenGL until videos are drawn. It may be killed at any time: resuming the evaluation
+repeats nothing that is finished.
 """
 
 from __future__ import annotations
@@ -79,8 +79,8 @@ logger = logging.getLogger(__name__)
 _WORKER = "mjrec.evaluation.worker:EvaluationWorker"
 _LOCK_NAME = ".mjrec.evaluation.lock"
 
-# Sums in another order are other numbers, and how many threads a library takes depends
-# on the machine; and this many processes keep all CPUs busy.
+# The number of threads that a library uses depends on the machine and would change the
+# order of sums, and so their values. The worker processes keep all CPUs busy anyway.
 _ONE_THREAD_EACH = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 _GL = "MUJOCO_GL"
@@ -125,73 +125,78 @@ def evaluate(
 ) -> Evaluation:
     """Run episodes of each task and seed, and write their results.
 
-    Every episode keeps its trajectory, so each can be rendered later. An episode fails
-    if the policy or the environment raises, or if an action is NaN or misshaped; the
-    others continue. If its worker dies it is started again, and fails after three
-    deaths.
+    Every episode keeps its trajectory, so it can be rendered later. An episode fails if
+    the policy or the environment raises, or if an action is NaN or has the wrong shape;
+    the other episodes continue. If a worker dies in an episode, the episode is retried,
+    and fails after three deaths.
 
-    A worker makes environment and policy once per task and resets them for each
-    episode. An environment that builds its model when it is made (dm_control's `lqr`)
-    is made per seed, one that is drawn live per episode.
+    A worker creates the environment and policy once per task and resets them for each
+    episode. There are two exceptions: an environment that draws its model from the seed
+    (dm_control's `lqr`) is created once per seed, and an environment whose frames are
+    drawn live once per episode.
 
-    Ctrl-C and other exceptions end the workers. Finished episodes stay, and the same
-    call with `resume=True` continues.
+    Ctrl-C and other exceptions end the workers. Finished episodes are kept, and the
+    same call with `resume=True` continues.
 
     Args:
         tasks: environments as in `mjrec record`, sets (`dm_control:benchmarking`,
             `dm_control:all`, `dm_control:easy`, `dm_control:hard`, `dm_control:extra`,
             `gymnasium:mujoco`), or patterns (`dm_control/walker-*`).
-        policy: a text as in `mjrec record` (`random`, `zero`, `module:name`,
+        policy: a string as in `mjrec record` (`random`, `zero`, `module:name`,
             `module:name()`); or a function of the observation, an object with
             `predict`, or a class that is built with each environment. Objects are
             pickled and sent to each worker.
-        directory: of the evaluation; empty or new, unless `resume` or `force`.
-        episodes: episodes per task and seed. None is 10.
+        directory: the evaluation's directory; it must be empty or new, unless `resume`
+            or `force` is given.
+        episodes: number of episodes per task and seed. Defaults to 10.
         seeds: the seeds.
-        num_seeds: number of seeds, from 0 on, instead of `seeds`. 5 without either.
-        workers: worker processes, which also render. None is one per usable CPU.
-            Results do not depend on it. If `engine` is a name, the number of its
-            workers.
-        keep: which episodes of each task get a video: `best[:N]`, `median`, `worst[:N]`
-            and `failures[:N]`, joined by commas; or `cubic`, `all` or `none`. None is
-            `"best,median,worst"`.
-        protocol: `"seeded"`, or None: episode i of seed s starts from `SeedSequence([s,
-            i])`. `"suite"`: each task and seed has one random stream, seeded with s.
+        num_seeds: number of seeds, counted from 0, instead of `seeds`. Defaults to 5.
+        workers: number of worker processes, which also render. Defaults to one per
+            usable CPU. Results do not depend on it. If `engine` is a name, the number
+            of the engine's workers.
+        keep: rule that chooses the episodes of each task that get a video: `best[:N]`,
+            `median`, `worst[:N]` and `failures[:N]`, joined by commas; or `cubic`,
+            `all` or `none`. Defaults to `"best,median,worst"`.
+        protocol: `"seeded"` (the default): episode i of seed s starts from
+            `SeedSequence([s, i])`. `"suite"`: each task and seed has one random stream,
+            seeded with s.
         resume: continue the evaluation in the directory and repeat nothing that is
-            finished. Arguments that are None stay as they were. You may add tasks,
-            seeds and (not with `"suite"`) episodes. Everything else must be equal, the
-            policy's code and weights too.
+            finished. Arguments that are None keep their earlier values. You may add
+            tasks, seeds and (except with `"suite"`) episodes. Everything else must be
+            the same, including the policy's code and weights.
         force: delete the evaluation in the directory first.
-        max_steps: truncate episodes after this many steps. None is the environment's
+        max_steps: truncate episodes after this many steps. None for the environment's
             limit, or 1000.
-        episode_timeout: an episode that takes longer, in seconds, fails, and its worker
-            is ended.
-        camera: of the videos. None is the model's tracking camera, if it has one.
-        height: of the videos, in pixels. None is the environment's own.
-        width: likewise.
-        max_fps: most frames per second of simulated time. None is every step.
-        quality: `"full"`, or None; or `"draft"`.
+        episode_timeout: maximum duration of an episode in seconds. An episode that
+            takes longer fails, and its worker is ended.
+        camera: the videos' camera. None for the model's tracking camera, if it has one.
+        height: height of the videos in pixels. None for the environment's own.
+        width: width of the videos in pixels. None for the environment's own.
+        max_fps: maximum frames per second of simulated time. None for a frame at every
+            step.
+        quality: `"full"` (the default) or `"draft"`.
         env_kwargs: arguments for each environment.
         policy_kwargs: arguments for the policy.
-        score_ranges: by task, the returns that count as scores 0 and 1 across tasks.
-            dm_control tasks have their own.
+        score_ranges: the returns that count as scores 0 and 1 across tasks, by task.
+            dm_control tasks have default ranges.
         confidence: confidence level of the intervals.
         on_progress: called several times a second with the progress.
-        engine: where to run, instead of processes of this one: an executor, or
-            `"local"`, `"ray"` or `"slurm"`. Its workers also render. All of them see
-            the directory under the same path. Results do not depend on it.
+        engine: where to run, instead of in child processes: an executor, or `"local"`,
+            `"ray"` or `"slurm"`. Its workers also render. All of them must see the
+            directory under the same path. Results do not depend on it.
 
     Returns:
         The results, which are also in the directory: `results.json`, `results.csv`,
         `timing.csv`.
 
     Raises:
-        MissingDependency: a task's framework, or the engine's package, is missing.
-        DifferentEvaluation: `resume` with other options.
-        DirectoryInUse: another evaluation writes into the directory.
-        PolicyError: the policy cannot be built, or not be sent to other processes.
-        Error: an argument, a task or the policy is wrong. All of these are raised
-            before anything runs.
+        MissingDependency: a task's framework, or the engine's package, is not
+            installed.
+        DifferentEvaluation: `resume` was given with different options.
+        DirectoryInUse: another evaluation is writing to the directory.
+        PolicyError: the policy cannot be built or sent to other processes.
+        Error: an argument, a task or the policy is invalid. All of these errors are
+            raised before any episode runs.
     """
     how = Bootstrap(confidence=confidence)
     given = given_engine(engine, workers)
@@ -236,7 +241,7 @@ def evaluate(
         executor = given or local
         is_here = isinstance(executor, LocalEngine)
         work = _work(plan, sent, place, chooses_gl=given is not None)
-        # What is quick is done here: nothing has to wait in a cluster's queue.
+        # Quick checks run locally, so that they need not wait in a cluster's queue.
         with Run(executor if is_here else local, work) as home:
             load_scipy()
             needed = min(local.workers, len(plan.tasks) * len(plan.chunks))
@@ -247,7 +252,8 @@ def evaluate(
                 _clear(place)
             write_plan(place, plan)
             chunks = chunks_in(place, plan)
-            # What takes long comes first, so that all workers end at about one time.
+            # The slowest tasks come first, so that all workers end at about the same
+            # time.
             chunks.sort(key=lambda each: -velocities.get(each.task.name, 0))
             if is_here:
                 progress = run_chunks(home, chunks, tell)
@@ -256,7 +262,7 @@ def evaluate(
                 progress = run_chunks(run, chunks, tell)
         results = results_of(plan, chunks)
         choice = choose_videos(plan, chunks, results)
-        # Before videos are drawn, which takes long.
+        # Written before the videos are drawn, because drawing takes long.
         _write(place, plan, results, choice, ranges, how)
         videos, pending = draw_videos(
             choice,
@@ -270,11 +276,11 @@ def evaluate(
 
 
 def _begun(directory: Path, *, resume: bool, force: bool) -> EvaluationPlan | None:
-    """Return the plan of the evaluation that goes on; None where a new one begins.
+    """Return the plan of the evaluation to resume; None if a new one begins.
 
     Raises:
-        InvalidArgument: there is something in the directory, which is not to go on or
-            is no evaluation.
+        InvalidArgument: the directory has an evaluation, but neither `resume` nor
+            `force` was given; or it has files that are not an evaluation.
     """
     there = (directory / PLAN_NAME).exists()
     if there and resume and not force:
@@ -282,17 +288,19 @@ def _begun(directory: Path, *, resume: bool, force: bool) -> EvaluationPlan | No
     if not directory.exists() or (there and force):
         return None
     if not directory.is_dir():
-        raise InvalidArgument(f"{directory} is a file: an evaluation is a directory.")
+        raise InvalidArgument(
+            f"{directory} is a file, but an evaluation needs a directory."
+        )
     if there:
         raise InvalidArgument(
-            f"{directory} already holds an evaluation. To continue it, or to add seeds "
-            "or episodes: resume=True (--resume). To delete it: force=True (--force). "
-            "For another one, use another directory."
+            f"{directory} already has an evaluation. To continue it, or to add seeds "
+            "or episodes, use resume=True (--resume). To delete it, use force=True "
+            "(--force). For a new evaluation, use a different directory."
         )
     names = {*names_in(directory)} - {_LOCK_NAME, WORK_FOLDER}
     if names:
         raise InvalidArgument(
-            f"{directory} holds files that are no evaluation ({min(names)} "
+            f"{directory} has files that are not an evaluation ({min(names)} "
             f"{'and others' if len(names) > 1 else 'only'}). An evaluation needs an "
             "empty or new directory."
         )
@@ -300,7 +308,7 @@ def _begun(directory: Path, *, resume: bool, force: bool) -> EvaluationPlan | No
 
 
 def _options(begun: EvaluationPlan | None, **given: Any) -> dict[str, Any]:
-    """Return options; those that were not given are as when it was begun."""
+    """Return the options, with defaults or earlier values for those that are None."""
     if begun is None:
         return {
             name: _DEFAULTS.get(name) if value is None else value
@@ -317,8 +325,8 @@ def _options(begun: EvaluationPlan | None, **given: Any) -> dict[str, Any]:
 def _policy_as_begun(begun: EvaluationPlan) -> str:
     if begun.is_object:
         raise PolicyError(
-            f"The policy of this evaluation is an object, {begun.policy}: give it "
-            "again (policy=...) to continue."
+            f"The policy of this evaluation is an object, {begun.policy}. To continue, "
+            "pass it again (policy=...)."
         )
     return begun.policy
 
@@ -330,9 +338,9 @@ def _work(
         entry=_WORKER,
         settings={
             "directory": str(directory.absolute()),
-            # Each job brings its own chunk.
+            # Each job has its own chunk.
             "plan": to_json(replace(plan, chunks=())),
-            # What works here may not work where an engine has its workers.
+            # A backend that works here may not work on an engine's machines.
             "chooses_gl": chooses_gl,
         },
         environ=_environ_of_workers(plan, is_elsewhere=chooses_gl),
@@ -349,7 +357,8 @@ def _environ_of_workers(plan: EvaluationPlan, *, is_elsewhere: bool) -> dict[str
             **environ_for_drawing(),
         }
     if not keep_rule(plan.keep).keeps_none:
-        # Now, and not after hours. A task that is drawn live needs it in its worker.
+        # Checked now instead of after hours. A task that is drawn live needs the
+        # backend in its worker.
         try:
             wanted[_GL] = choose().backend
         except GLError as error:
@@ -365,10 +374,10 @@ def _make(directory: Path) -> None:
 
 
 def _clear(directory: Path) -> None:
-    """Delete the evaluation in a directory, if there is one, and nothing else.
+    """Delete the evaluation in a directory, if any, and nothing else.
 
     Raises:
-        DirectoryInUse: a monitor of it is open.
+        DirectoryInUse: one of its monitors is open.
     """
     if not (directory / PLAN_NAME).exists():
         return
@@ -390,8 +399,8 @@ def _held(directory: Path) -> Iterator[None]:
     lock = try_lock(directory / _LOCK_NAME)
     if lock is None:
         raise DirectoryInUse(
-            f"Another evaluation writes into {directory}. Wait for its end, or use "
-            "another directory."
+            f"Another evaluation is writing to {directory}. Wait until it has "
+            "finished, or use a different directory."
         )
     with lock:
         yield
@@ -428,14 +437,14 @@ def _write(
         across=summarize_across(returns, scales, bootstrap=bootstrap),
         bootstrap=bootstrap,
         selection=choice.selection,
-        # It computes the statistics.
+        # SciPy computes the statistics.
         versions=versions("scipy"),
         files=_Files(directory, plan, choice),
     )
 
 
 class _Files:
-    """Tells which files are an episode's."""
+    """A lookup of the files of an episode."""
 
     def __init__(self, directory: Path, plan: EvaluationPlan, choice: Choice) -> None:
         self._directory = directory
@@ -445,7 +454,7 @@ class _Files:
             for task, chosen in choice.selection.items()
         }
         self._folders = {task.name: task.folder for task in plan.tasks}
-        # Of the folder of the episode before, which is listed once.
+        # Cached file names of the previous episode's folder.
         self._folder = ""
         self._names: set[str] = set()
 
@@ -461,7 +470,7 @@ class _Files:
             self._folder, self._names = folder, {path.name for path in files}
         trajectory = f"{trajectory_prefix(infix, result.episode_id)}{FINISHED}"
         prefix = video_prefix(infix, result.episode_id)
-        # Text is recorded as such.
+        # Text environments have a text recording instead of a video.
         video = f"{prefix}.json" if f"{prefix}.json" in self._names else None
         if video is None and result.unit in self._chosen.get(result.task, ()):
             video = f"{prefix}.mp4"

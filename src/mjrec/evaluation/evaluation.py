@@ -1,17 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""An evaluation: its results, and the files in its directory that hold them.
+"""An evaluation's results, and the files in its directory that hold them.
 
 ::
 
     directory/
     ├── evaluation.json     the plan, written before anything is run
-    ├── results.json        plan, choice of videos, summaries, versions: written last
-    ├── results.csv         one row for each episode
+    ├── results.json        plan, choice of videos, summaries, versions; written last
+    ├── results.csv         one row per episode
     ├── timing.csv          wall times and files of the same episodes
-    └── <task>/<chunk>/     monitor directories, for each task a few
+    └── <task>/<chunk>/     monitor directories, a few per task
 
-`results.json` and `results.csv` follow from the plan and from what is installed: they
-are the same, byte for byte, whatever the number of workers, and however often the
+`results.json` and `results.csv` depend only on the plan and on the installed packages.
+They are byte-identical for any number of workers, and no matter how often the
 evaluation was killed and resumed. `result_tables` describes the tables.
 """
 
@@ -66,9 +66,10 @@ class ChosenEpisode:
     """An episode that was chosen to get a video.
 
     Attributes:
-        seed: of its run.
-        episode: its number in it.
-        role: why: `"best"`, `"median"`, `"worst"`, `"failure"`, `"cubic"`, `"all"`.
+        seed: the seed of its run.
+        episode: the episode's number in the run.
+        role: why it was chosen: `"best"`, `"median"`, `"worst"`, `"failure"`, `"cubic"`
+            or `"all"`.
     """
 
     seed: int
@@ -78,20 +79,20 @@ class ChosenEpisode:
 
 @dataclass(frozen=True, kw_only=True)
 class Evaluation:
-    """The results of an evaluation, as they stand in its directory.
+    """The results of an evaluation, as stored in its directory.
 
     Attributes:
-        directory: of the evaluation.
-        plan: what was evaluated.
-        summaries: of the tasks, in the order of the plan.
-        across: what is said of all tasks that have a scale; None where nothing is.
-        bootstrap: how intervals were made.
-        selection: which episodes were chosen to get a video, by task.
-        versions: of what ran, by package.
-        by_task: the episodes of each task, in the order of the plan.
-        videos: those that are there, where it was just run.
-        pending: why videos that were chosen are not there, by the path they will have;
-            likewise.
+        directory: the evaluation's directory.
+        plan: the plan of the evaluation.
+        summaries: summaries of the tasks, in the plan's order.
+        across: the summary of all tasks that have a scale; None if there is none.
+        bootstrap: settings of the confidence intervals.
+        selection: the episodes that were chosen to get a video, by task.
+        versions: versions of the packages that ran, by package.
+        by_task: the episodes of each task, in the plan's order.
+        videos: the existing videos; only known after a run, otherwise empty.
+        pending: reasons why chosen videos are missing, keyed by their future paths;
+            only known after a run, otherwise empty.
     """
 
     directory: Path
@@ -106,13 +107,13 @@ class Evaluation:
     pending: Mapping[Path, str] = dataclasses.field(default_factory=dict)
 
     def __iter__(self) -> Iterator[EpisodeResult]:
-        """Yield the episodes in the order of the plan, without their warnings."""
+        """Yield the episodes in the plan's order, without their warnings."""
         for columns in self.by_task.values():
             yield from columns
 
     @functools.cached_property
     def results(self) -> Sequence[EpisodeResult]:
-        """All episodes, in the order of the plan, without their warnings."""
+        """All episodes, in the plan's order, without their warnings."""
         return list(self)
 
     def _repr_html_(self) -> str:
@@ -141,10 +142,10 @@ class Evaluation:
         return [each for each, r in returns if r is not None and not math.isfinite(r)]
 
     def summary(self, task: str) -> TaskSummary:
-        """Return what is said of one task.
+        """Return the summary of one task.
 
         Raises:
-            KeyError: it was not evaluated.
+            KeyError: the task was not evaluated.
         """
         return {each.task: each for each in self.summaries}[task]
 
@@ -154,7 +155,10 @@ class Evaluation:
         return self.directory / name
 
     def file_of(self, result: EpisodeResult) -> Path | None:
-        """Return the video of an episode, or its trajectory where there is none."""
+        """Return an episode's video, or its trajectory if there is no video.
+
+        Return None if both are missing.
+        """
         infix = Infix.parse(result.monitor or "")
         if infix is None or result.episode_id is None:
             return None
@@ -168,7 +172,7 @@ class Evaluation:
 
 
 def is_evaluation(directory: Path) -> bool:
-    """Return whether a directory is that of an evaluation, finished or not."""
+    """Return whether a directory has an evaluation, finished or not."""
     return any((directory / name).is_file() for name in (PLAN_NAME, RESULTS_NAME))
 
 
@@ -186,26 +190,26 @@ def write_results(
 ) -> None:
     """Write the results of an evaluation, `results.json` last.
 
-    Where there were results, those are gone until the new ones are complete: tables
-    and summaries of two plans are never found together.
+    An old `results.json` is removed first, so that the tables and summaries of
+    different plans are never found together.
 
     Args:
-        directory: of the evaluation.
-        plan: what was evaluated.
-        results: of every episode of the plan, in its order.
-        summaries: of the tasks, in the plan's order.
-        across: what is said of all tasks.
-        bootstrap: how intervals were made.
+        directory: the evaluation's directory.
+        plan: the plan of the evaluation.
+        results: the results of all episodes of the plan, in its order.
+        summaries: summaries of the tasks, in the plan's order.
+        across: the summary of all tasks.
+        bootstrap: settings of the confidence intervals.
         selection: see `Evaluation`.
         versions: see `Evaluation`.
-        files: tells which files are an episode's.
+        files: returns the files of an episode.
 
     Raises:
         FileNotWritten: the disk is full, or the directory is gone or read-only.
     """
     value = {
         "format_version": FORMAT_VERSION,
-        # How it was cut tells when more was asked for, which changes no result.
+        # Chunks depend on when episodes were added, which does not change results.
         "plan": to_json(replace(plan, chunks=())),
         "selection": {
             "rule": plan.keep,
@@ -228,19 +232,19 @@ def write_results(
 
 
 def read_results(directory: Path, *, needs_timing: bool = False) -> Evaluation:
-    """Return the results that are in an evaluation's directory.
+    """Read the results in an evaluation's directory.
 
-    They may be anybody's: sizes, numbers, names and their order are checked, and no
-    file outside of the directory is opened.
+    The files are untrusted: sizes, numbers, names and their order are checked, and no
+    file outside the directory is opened.
 
     Args:
-        directory: of the evaluation.
-        needs_timing: whether `timing.csv` must be there; else times and files are not
-            known where it is not.
+        directory: the evaluation's directory.
+        needs_timing: whether `timing.csv` must exist. Otherwise times and files are
+            unknown if it is missing.
 
     Raises:
-        UnreadableFile: there are none, the evaluation is not finished, or a file is
-            damaged or missing.
+        UnreadableFile: the directory has no evaluation, the evaluation is not finished,
+            or a file is damaged or missing.
     """
     read = read_summaries(directory)
     table, timing = directory / _TABLE_NAME, directory / _TIMING_NAME
@@ -249,10 +253,10 @@ def read_results(directory: Path, *, needs_timing: bool = False) -> Evaluation:
 
 
 def read_summaries(directory: Path) -> Evaluation:
-    """Return the results without episodes: what `results.json` alone holds.
+    """Read the results without episodes, from `results.json` alone.
 
     Raises:
-        UnreadableFile: there is no such file, or it is damaged.
+        UnreadableFile: the file is missing or damaged.
     """
     path = directory / RESULTS_NAME
     if not path.exists():
@@ -262,14 +266,14 @@ def read_summaries(directory: Path) -> Evaluation:
         version = field(value, "format_version", integer)
         if version != FORMAT_VERSION:
             raise ValueError(
-                f"its format is version {version}, and this mjrec reads "
+                f"its format is version {version}, but this mjrec reads version "
                 f"{FORMAT_VERSION}"
             )
         plan = field(value, "plan", _plan)
         tasks = [each.name for each in plan.tasks]
         summaries = field(value, "tasks", list_of(partial(from_json, TaskSummary)))
         if [each.task for each in summaries] != tasks:
-            raise ValueError("its summaries are not those of the tasks of its plan")
+            raise ValueError("its summaries do not match the tasks of its plan")
         across = field(value, "across", optional(partial(from_json, AcrossTasks)))
         bootstrap = field(value, "bootstrap", partial(from_json, Bootstrap))
         selection = field(value, "selection", _selection)
@@ -300,10 +304,10 @@ def _write(path: Path, write: Callable[[TextIO], None]) -> None:
 def _why_missing(directory: Path) -> str:
     if (directory / PLAN_NAME).exists():
         return (
-            "the evaluation is not finished; the command that began it goes on where "
-            "it was with --resume"
+            "the evaluation is not finished; to continue it, run the same command with "
+            "--resume"
         )
-    return "there is no evaluation in the directory"
+    return "the directory has no evaluation"
 
 
 def _plan(value: Any) -> EvaluationPlan:
@@ -314,7 +318,7 @@ def _plan(value: Any) -> EvaluationPlan:
         ("seed", plan.seeds),
     ):
         if len(set(values)) < len(values):
-            raise ValueError(f"a {what} is there twice")
+            raise ValueError(f"a {what} is listed twice")
     return plan
 
 
@@ -330,7 +334,7 @@ def _selection(value: Any) -> Mapping[str, Sequence[ChosenEpisode]]:
 
 def _chosen(value: Any) -> ChosenEpisode:
     if not isinstance(value, list) or len(value) != 3:
-        raise ValueError("a chosen episode is seed, number and role")
+        raise ValueError("a chosen episode must be a list of seed, number and role")
     seed, episode, role = value
     return ChosenEpisode(integer(seed), integer(episode), text(role))
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Handing out an evaluation, and following it until every episode is over.
+"""Distributing an evaluation to workers and following it until all episodes are over.
 
-What was done is read from the journals of the chunks, never from what workers return.
+Results are read from the chunks' journals, never from the workers' return values.
 """
 
 from __future__ import annotations
@@ -33,25 +33,26 @@ from .plan import Chunk, EvaluatedTask, EvaluationPlan
 
 logger = logging.getLogger(__name__)
 
-# How often progress is reported, and the most of the time that counting it takes.
+# Seconds between progress reports, and the maximum share of time spent on counting.
 _SECONDS_BETWEEN_REPORTS = 0.25
 _MOST_OF_TIME = 0.05
 
 
 @dataclass(frozen=True, kw_only=True)
 class EvaluationProgress:
-    """How far an evaluation is.
+    """The progress of an evaluation.
 
     Attributes:
-        done: how many episodes are over, failed ones too, and those that were done
-            when it was resumed.
-        failed: how many of them failed.
-        total: how many there are.
-        videos_done: how many videos are over.
-        videos: how many there are, as far as is known.
-        frames_done: how many frames of these videos are drawn; 0 where the workers of
-            an engine draw.
-        frames: how many frames these videos have; likewise.
+        done: number of finished episodes, including failed ones and those that were
+            already finished when the evaluation was resumed.
+        failed: number of failed episodes.
+        total: number of all episodes.
+        videos_done: number of finished videos.
+        videos: number of all videos, as far as known.
+        frames_done: number of frames drawn for these videos; 0 if the workers of an
+            engine draw them.
+        frames: number of all frames of these videos; 0 if the workers of an engine draw
+            them.
     """
 
     done: int = 0
@@ -68,17 +69,17 @@ _Tell = Callable[[EvaluationProgress], object]
 
 @dataclass
 class ChunkRun:
-    """A chunk of a task while it is run.
+    """A chunk of a task while it runs.
 
     Attributes:
-        task: whose.
-        chunk: which one.
+        task: the task.
+        chunk: the chunk.
         folder: its monitor directory.
-        known: what is done of it.
-        rounds: how often it was handed out.
-        size: how much was done of it when it was handed out last.
-        reason: why episodes of it have no result.
-        is_over: nothing more comes.
+        known: its finished episodes.
+        rounds: number of times that it was submitted.
+        size: amount of work that was done when it was last submitted.
+        reason: why some of its episodes have no result.
+        is_over: whether no more results will come.
     """
 
     task: EvaluatedTask
@@ -87,12 +88,12 @@ class ChunkRun:
     known: ChunkResults
     rounds: int = 0
     size: int = 0
-    reason: str = "nothing is known of it"
+    reason: str = "its result is missing"
     is_over: bool = False
 
     @property
     def is_complete(self) -> bool:
-        """Whether all of its episodes have ended."""
+        """Whether all of its episodes have a result."""
         return all(unit in self.known.results for unit in self.chunk)
 
 
@@ -101,9 +102,10 @@ class Choice:
     """The episodes that get a video.
 
     Attributes:
-        selection: those of each task.
-        videos: the recordings, each once, by their chunks' monitor directories.
-        impossible: why videos cannot be drawn, by their paths.
+        selection: the chosen episodes of each task.
+        videos: pairs of a chunk's monitor directory and a recording in it, without
+            duplicates.
+        impossible: reasons why videos cannot be drawn, keyed by their paths.
     """
 
     selection: Mapping[str, Sequence[ChosenEpisode]]
@@ -114,19 +116,21 @@ class Choice:
 def check_tasks(
     run: Run, plan: EvaluationPlan, *, workers: int = 1
 ) -> tuple[EvaluationPlan, Mapping[str, int]]:
-    """Let workers make the environment and the policy of each new task, and no step.
+    """Have workers create the environment and policy of each new task, without a step.
 
     Args:
         run: the workers.
-        plan: what is evaluated.
-        workers: how many begin, where there are new tasks: all will make one of them
-            anyway, and so they do it at once.
+        plan: the plan of the evaluation.
+        workers: number of workers to start if there are new tasks. All of them will
+            have to create a task anyway, so they do it in parallel.
 
     Returns:
-        The plan with their step limits; and how much work a step is, roughly.
+        The plan with the tasks' step limits, and a rough measure of the cost of a step
+        for each new task.
 
     Raises:
-        Error: the one that making them raised, such as an `UnknownName`.
+        Error: an environment or policy could not be created; this is the original
+            error, such as an `UnknownName`.
     """
     unknown = {task.name: task for task in plan.tasks if task.step_limit is None}
     if unknown:
@@ -135,12 +139,12 @@ def check_tasks(
             run.submit(f"{number}", kind="check", task=name)
     velocities: dict[str, int] = {}
     for outcome in run.results():
-        # Without timeout there is always one.
+        # Without a timeout there is always an outcome.
         assert outcome is not None
         said = outcome.value or {}
         name = [*unknown][int(outcome.key) % len(unknown)]
         if outcome.failure is not None:
-            # No error of ours, which would have been carried: its worker died.
+            # Our own errors come back as "error", so the worker must have died.
             raise EnvironmentNotMade(name, outcome.failure)
         if "error" in said:
             raise unpacked(said["error"])
@@ -152,7 +156,7 @@ def check_tasks(
 
 
 def chunks_in(directory: Path, plan: EvaluationPlan) -> list[ChunkRun]:
-    """Return the chunks of an evaluation, with what is done of them."""
+    """Return the chunks of an evaluation, with their finished episodes."""
     return [
         ChunkRun(task, chunk, folder, read_chunk(folder, task.name))
         for task in plan.tasks
@@ -162,12 +166,12 @@ def chunks_in(directory: Path, plan: EvaluationPlan) -> list[ChunkRun]:
 
 
 def run_chunks(run: Run, chunks: Sequence[ChunkRun], tell: _Tell) -> EvaluationProgress:
-    """Have the missing episodes of chunks run, and return how far they are.
+    """Run the missing episodes of chunks, and return the final progress.
 
     Args:
         run: the workers.
-        chunks: in the order in which they are handed out.
-        tell: called with how far they are.
+        chunks: the chunks, in the order in which to submit them.
+        tell: called with the progress.
 
     Raises:
         Error: workers cannot be started, or a journal is damaged.
@@ -183,17 +187,18 @@ def run_chunks(run: Run, chunks: Sequence[ChunkRun], tell: _Tell) -> EvaluationP
         if outcome is not None:
             each = by_key.pop(outcome.key)
             each.known = read_chunk(each.folder, each.task.name)
-            # This user's, though it was done elsewhere: by workers of this process.
+            # Models stored by this process's workers are trusted as this user's own.
             note_models((outcome.value or {}).get("models", ()))
             if not each.is_complete and each.known.size > each.size:
-                # It came nearer to its end, and a poisoned episode fails alone.
+                # Progress was made, so try again: an episode that kills its process
+                # then fails on its own.
                 by_key[_submit(run, each)] = each
                 continue
             each.is_over = True
             if not each.is_complete:
                 said = outcome.failure or (
-                    f"A worker has done {each.folder}, and what it recorded is not "
-                    "there: all machines must see the directory under the same name."
+                    f"A worker has finished {each.folder}, but its recordings are "
+                    "missing. All machines must see the directory under the same path."
                 )
                 logger.warning("%s", said)
                 each.reason = said.partition(" Its last output")[0]
@@ -209,7 +214,7 @@ def run_chunks(run: Run, chunks: Sequence[ChunkRun], tell: _Tell) -> EvaluationP
 
 
 def results_of(plan: EvaluationPlan, chunks: Iterable[ChunkRun]) -> list[EpisodeResult]:
-    """Return the results of all episodes, in the order of the plan."""
+    """Return the results of all episodes, in the plan's order."""
     by_name = {(each.task.name, each.chunk.folder): each for each in chunks}
     results = []
     for task in plan.tasks:
@@ -234,7 +239,7 @@ def results_of(plan: EvaluationPlan, chunks: Iterable[ChunkRun]) -> list[Episode
 def choose_videos(
     plan: EvaluationPlan, chunks: Sequence[ChunkRun], results: Iterable[EpisodeResult]
 ) -> Choice:
-    """Choose which episodes get a video, and write it down where they were recorded."""
+    """Choose the episodes that get a video, and write the choice to their folders."""
     selection: dict[str, list[ChosenEpisode]] = {}
     videos: list[tuple[Path, RecordingKey]] = []
     impossible: dict[Path, str] = {}
@@ -243,7 +248,7 @@ def choose_videos(
         by_task[result.task].append(result)
     for task, own in by_task.items():
         chosen: dict[str, dict[RecordingKey, list[ChosenEpisode]]] = {}
-        # So that nothing but what was recorded decides among equals.
+        # Ties must depend on nothing but the recorded episodes.
         own.sort(key=lambda each: each.unit)
         begun = [each if each.episode_id is not None else None for each in own]
         kept = keep_rule(plan.keep).choose(begun)
@@ -265,12 +270,12 @@ def choose_videos(
                     each.folder, roles, rule=plan.keep, finished=len(own)
                 )
             except Error as error:
-                logger.warning("%s: no videos are chosen: %s", each.folder, error)
+                logger.warning("%s: no videos can be chosen: %s", each.folder, error)
                 keys = {*mine}
                 impossible |= {each.folder / k.video_name: str(error) for k in keys}
             videos += [(each.folder, key) for key in mine if key in keys]
             drawable |= {e for key in mine if key in keys for e in mine[key]}
-        # In the order of the rule.
+        # In the rule's order.
         selection[task] = [
             episode
             for result, role in kept
@@ -291,15 +296,16 @@ def draw_videos(
     """Draw the chosen videos.
 
     Args:
-        choice: which.
-        directory: of the evaluation.
-        engine: whose workers draw; None is processes of this one.
-        workers: how many of these.
-        progress: of the episodes.
-        tell: called with how far it is.
+        choice: the chosen episodes.
+        directory: the evaluation's directory.
+        engine: the engine whose workers draw; None for child processes.
+        workers: number of child processes.
+        progress: the progress of the episodes.
+        tell: called with the progress.
 
     Returns:
-        The videos that are there, and why others are not, by their paths.
+        The existing videos, and the reasons why others are missing, keyed by their
+        paths.
     """
     jobs = [VideoJob.finishing(folder, key) for folder, key in choice.videos]
     why = dict(choice.impossible)
@@ -328,7 +334,7 @@ def draw_videos(
     videos, pending = [], {}
     for folder, key in choice.videos:
         path = folder / key.video_name
-        # Text is recorded as such.
+        # Text environments have a text recording instead of a video.
         as_text = path.with_suffix(".json")
         path = as_text if as_text.exists() else path
         if path.exists():

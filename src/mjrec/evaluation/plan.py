@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is evaluated, in which chunks, and `evaluation.json`, which says so.
+"""The plan of an evaluation, its chunks, and its file `evaluation.json`.
 
-That file is written before anything is run.
+The file is written before anything is run.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ from ..json_text import dumps
 FORMAT_VERSION = 1
 PLAN_NAME = "evaluation.json"
 
-# What is logged, with the reason, where no video can be drawn.
+# Logged with the reason if no video can be drawn.
 NO_GL = (
-    "No video can be drawn here, and those that are chosen will stay pending "
-    "(--keep none wants none): %s"
+    "No video can be drawn here, so chosen videos will stay pending "
+    "(--keep none chooses none): %s"
 )
 
 Protocol: TypeAlias = Literal["seeded", "suite"]
@@ -34,9 +34,9 @@ SEEDED: Protocol = "seeded"
 SUITE: Protocol = "suite"
 
 Unit: TypeAlias = tuple[int, int]
-"""Seed and number, which tell an episode from the others of its task."""
+"""Seed and number, which identify an episode within its task."""
 
-# What may be asked for anew, and what follows from it or changes no result.
+# Fields that may differ when an evaluation is resumed.
 _MAY_DIFFER = ("tasks", "chunks", "episode_timeout")
 
 _Positive: TypeAlias = Annotated[int, positive]
@@ -47,9 +47,10 @@ class EvaluatedTask:
     """An environment that a policy is evaluated in.
 
     Attributes:
-        name: as `environments.names.parse_environment_name` takes it.
-        folder: the base name of its folder in the evaluation's directory.
-        step_limit: after how many steps its episodes end; None where it was not made.
+        name: the environment's name, as in `environments.names.parse_environment_name`.
+        folder: base name of its folder in the evaluation's directory.
+        step_limit: maximum number of steps per episode; None until the environment has
+            been created.
     """
 
     name: str
@@ -59,13 +60,13 @@ class EvaluatedTask:
 
 @dataclass(frozen=True)
 class Chunk:
-    """Episodes that one job runs, into a monitor directory of their own.
+    """Episodes that one job runs and records into a separate monitor directory.
 
     Attributes:
-        folder: the base name of that directory, in the folder of each task.
-        seeds: of the episodes, rising.
-        first: the number of each seed's first episode.
-        stop: the number after its last.
+        folder: base name of the monitor directory, in the folder of each task.
+        seeds: seeds of the episodes, in ascending order.
+        first: number of each seed's first episode.
+        stop: number after each seed's last episode.
     """
 
     folder: Annotated[str, base_name]
@@ -74,7 +75,7 @@ class Chunk:
     stop: int
 
     def __iter__(self) -> Iterator[Unit]:
-        """Yield the episodes in the order in which they are run."""
+        """Yield the episodes in the order in which they run."""
         for seed in self.seeds:
             for number in range(self.first, self.stop):
                 yield seed, number
@@ -85,33 +86,36 @@ class Chunk:
 
 @dataclass(frozen=True, kw_only=True)
 class EvaluationPlan:
-    """What is evaluated, checked. It stands in `evaluation.json`.
+    """The checked plan of an evaluation, stored in `evaluation.json`.
 
-    What it means (whether there are such tasks, such a rule) is not checked when it is
-    read back.
+    When it is read back, only types and ranges are checked, not whether its tasks and
+    rules exist.
 
     Attributes:
-        tasks: in the order of the results.
-        policy: a text as in `mjrec record`, or what an object is called whose bytes
-            travel beside the plan (`is_object`).
-        is_object: whether the policy is such an object.
-        policy_kwargs: more arguments for it.
-        policy_digests: SHA-256 of the policy's parts, by what they are.
-        seeds: in the order of the results.
-        episodes: of each task and seed.
+        tasks: the tasks, in the order of the results.
+        policy: a string as in `mjrec record`, or the name of an object that is sent
+            separately (see `is_object`).
+        is_object: whether the policy is an object.
+        policy_kwargs: further arguments for the policy.
+        policy_digests: SHA-256 of the policy's parts, keyed by a description of the
+            part.
+        seeds: the seeds, in the order of the results.
+        episodes: number of episodes per task and seed.
         protocol: `"seeded"`: episode i of seed s starts from `SeedSequence([s, i])`.
-            `"suite"`: the environment has one random stream for each task and seed.
-        chunks: in which the episodes of each task are run.
-        keep: which episodes get a video, see `recorder.keep_rules`.
-        max_steps: ends an episode as truncated; None is the environment's own limit,
-            and 1000 where it has none.
-        episode_timeout: seconds after which an episode has failed; None is never.
-        camera: of the videos; None is the model's tracking camera where there is one.
-        height: of the videos; None is the environment's own.
-        width: likewise.
-        max_fps: the most frames per second of simulated time; None is every step.
+            `"suite"`: the environment has one random stream per task and seed.
+        chunks: the chunks in which the episodes of each task run.
+        keep: rule that chooses the episodes that get a video; see
+            `recorder.keep_rules`.
+        max_steps: number of steps after which an episode is truncated; None for the
+            environment's own limit, or 1000 if it has no limit.
+        episode_timeout: seconds after which an episode fails; None for no timeout.
+        camera: the videos' camera; None for the model's tracking camera, if it has one.
+        height: height of the videos; None for the environment's own.
+        width: width of the videos; None for the environment's own.
+        max_fps: maximum frames per second of simulated time; None for a frame at every
+            step.
         quality: `"full"` or `"draft"`.
-        env_kwargs: more arguments for each environment.
+        env_kwargs: further arguments for each environment.
     """
 
     tasks: tuple[EvaluatedTask, ...]
@@ -134,7 +138,7 @@ class EvaluationPlan:
     env_kwargs: Mapping[str, Any] = field(default_factory=dict)
 
     def chunk_of(self, unit: Unit) -> Chunk | None:
-        """Return the chunk that an episode is in."""
+        """Return the chunk that contains an episode; None if there is none."""
         seed, number = unit
         chunks = self._chunks_by_seed.get(seed, ())
         return next((each for each in chunks if each.first <= number < each.stop), None)
@@ -148,14 +152,14 @@ class EvaluationPlan:
         return chunks
 
     def __iter__(self) -> Iterator[Unit]:
-        """Yield the episodes of each task in the order of the results."""
+        """Yield the episodes of a task in the order of the results."""
         for seed in self.seeds:
             for number in range(self.episodes):
                 yield seed, number
 
 
 def write_plan(directory: Path, plan: EvaluationPlan) -> None:
-    """Write the plan into an evaluation's directory.
+    """Write the plan to an evaluation's directory.
 
     Raises:
         FileNotWritten: the disk is full, or the directory is gone or read-only.
@@ -165,10 +169,10 @@ def write_plan(directory: Path, plan: EvaluationPlan) -> None:
 
 
 def read_plan(directory: Path) -> EvaluationPlan:
-    """Return the plan of the evaluation in a directory.
+    """Read the plan of the evaluation in a directory.
 
     Raises:
-        UnreadableFile: it is missing, damaged, or of a newer format.
+        UnreadableFile: the plan is missing, damaged, or in a different format version.
     """
     path = directory / PLAN_NAME
     with unreadable(path):
@@ -177,7 +181,7 @@ def read_plan(directory: Path) -> EvaluationPlan:
         if version != FORMAT_VERSION:
             raise UnreadableFile(
                 path,
-                f"its format is version {version}, and this mjrec reads "
+                f"its format is version {version}, but this mjrec reads version "
                 f"{FORMAT_VERSION}",
             )
         return json_fields.field(
@@ -188,14 +192,15 @@ def read_plan(directory: Path) -> EvaluationPlan:
 def check_continues(
     directory: Path, begun: EvaluationPlan, asked: EvaluationPlan
 ) -> None:
-    """Check that what is asked for goes on with what was begun.
+    """Check that a requested plan can continue one that was begun.
 
-    Other tasks and more seeds may be asked for, and more episodes; with the protocol
-    `"suite"` not those, whose number belongs to the unit of work. All else makes other
-    results, or other videos; and those who leave episodes out have seen their returns.
+    Different tasks, more seeds and more episodes are allowed, except that the protocol
+    `"suite"` does not allow more episodes, because their number belongs to the unit of
+    work. Any other difference would change results or videos. Episodes cannot be left
+    out, because their returns may already be known.
 
     Raises:
-        DifferentEvaluation: it does not.
+        DifferentEvaluation: the requested plan cannot continue the begun one.
     """
     was, now = to_json(begun), to_json(asked)
     for plan in (was, now):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From what is asked for to a plan, checked without making an environment."""
+"""Building an evaluation's plan, checked without creating an environment."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ _MOST_UNITS = 4_000_000
 _OUTSIDE = re.compile(r"[^A-Za-z0-9._-]")
 _LONGEST_FOLDER = 100
 
-# A chunk costs about a tenth of a second and six files. So many processes have work
-# for one task, and larger chunks would save little.
+# A chunk costs about a tenth of a second and six files. This many processes can work on
+# one task, and larger chunks would save little.
 _USUAL_CHUNKS = 8
 _MOST_EPISODES_OF_CHUNK = 25
 
@@ -47,22 +47,23 @@ def plan_from(
     begun: EvaluationPlan | None = None,
     **options: Any,
 ) -> EvaluationPlan:
-    """Return the plan of an evaluation; `mjrec.evaluate` says what each option means.
+    """Return the plan of an evaluation; `mjrec.evaluate` describes the options.
 
     Args:
-        tasks: as of `evaluate`; those of `begun`, if empty.
+        tasks: see `evaluate`; if empty, the tasks of `begun`.
         sent: the policy.
-        seeds: as of `evaluate`; those of `begun`, if neither they nor their number
-            is given.
-        num_seeds: likewise.
-        begun: the plan that is gone on with: folders and chunks stay.
-        **options: fields of the plan, all but `tasks`, `seeds` and what follows.
+        seeds: see `evaluate`; if `seeds` and `num_seeds` are both None, the seeds of
+            `begun`.
+        num_seeds: see `evaluate`.
+        begun: the plan to continue; its folders and chunks are kept.
+        **options: all other fields of the plan, except those that follow from the
+            policy, the tasks and the seeds.
 
     Raises:
-        UnknownName, InvalidArgument: something cannot be.
+        UnknownName, InvalidArgument: an argument is invalid.
         MissingDependency, EnvironmentNotMade: see `tasks_from`.
     """
-    # What is quick to check comes first: sets of tasks start a process.
+    # Quick checks come first, because resolving sets of tasks starts a process.
     if options["protocol"] not in _PROTOCOLS:
         raise UnknownName("protocol", options["protocol"], _PROTOCOLS)
     is_same = begun is not None and seeds is None and num_seeds is None
@@ -78,7 +79,10 @@ def plan_from(
         to_rate(options["max_fps"], name="max_fps")
         options["max_fps"] = float(options["max_fps"])
     if (timeout := options["episode_timeout"]) is not None and not 0 < timeout < 1e9:
-        raise InvalidArgument(f"episode_timeout is in seconds, got {timeout!r}.")
+        raise InvalidArgument(
+            "episode_timeout must be a positive number of seconds below 1e9, got "
+            f"{timeout!r}."
+        )
     check_quality(options["quality"])
     for name in ("env_kwargs", "policy_kwargs"):
         options[name] = _json_of(name, options[name] or {})
@@ -88,8 +92,8 @@ def plan_from(
     if units > _MOST_UNITS:
         raise InvalidArgument(
             f"{len(names)} tasks, {len(checked_seeds)} seeds and "
-            f"{options['episodes']} episodes are {units} episodes; an evaluation has "
-            f"at most {_MOST_UNITS}."
+            f"{options['episodes']} episodes are {units} episodes, but an evaluation "
+            f"can have at most {_MOST_UNITS}."
         )
     plan = EvaluationPlan(
         tasks=_with_folders(names, known),
@@ -104,10 +108,10 @@ def plan_from(
 
 
 def chunks_of(plan: EvaluationPlan, known: Sequence[Chunk]) -> tuple[Chunk, ...]:
-    """Return the chunks of a plan: those that are known, and those of what is left.
+    """Return the chunks of a plan: the known ones, and new ones for other episodes.
 
-    A chunk is one seed or consecutive seeds; with the protocol `"seeded"`, where each
-    episode stands for itself, a seed with many episodes is cut.
+    A chunk has one seed or consecutive seeds. With the protocol `"seeded"`, where
+    episodes are independent, a seed with many episodes is split into several chunks.
     """
     stops = {seed: chunk.stop for chunk in known for seed in chunk.seeds}
     left: dict[int, list[int]] = {}
@@ -133,11 +137,11 @@ def chunks_of(plan: EvaluationPlan, known: Sequence[Chunk]) -> tuple[Chunk, ...]
 def check_score_ranges(
     score_ranges: Mapping[str, tuple[float, float]] | None, tasks: Iterable[str]
 ) -> dict[str, tuple[float, float]]:
-    """Return the returns that count as 0 and as 1, for the tasks that have some given.
+    """Return the checked score ranges, by task.
 
     Raises:
-        UnknownName: one is of a task that is not evaluated.
-        InvalidArgument: one is not two finite numbers, the lower one first.
+        UnknownName: a range is for a task that is not evaluated.
+        InvalidArgument: a range is not two finite numbers, the lower one first.
     """
     names = list(tasks)
     checked = {}
@@ -155,7 +159,7 @@ def _chunk_name(seeds: Sequence[int], first: int, stop: int, episodes: int) -> s
 
 
 def _range(what: str, first: int, last: int) -> str:
-    """Return `seed-003`, or `seeds-000-011` of several."""
+    """Return a name such as `seed-003`, or `seeds-000-011` for several."""
     if first == last:
         return f"{what}-{first:03d}"
     return f"{what}s-{first:03d}-{last:03d}"
@@ -180,8 +184,8 @@ def _seeds(seeds: Iterable[int] | None, num_seeds: int | None) -> tuple[int, ...
         return tuple(range(_positive("num_seeds", number)))
     if num_seeds is not None:
         raise InvalidArgument(
-            f"seeds={seeds!r} names the seeds and num_seeds={num_seeds!r} counts them "
-            "from 0: give one of them."
+            f"seeds={seeds!r} lists the seeds, and num_seeds={num_seeds!r} counts them "
+            "from 0. Give only one of them."
         )
     if isinstance(seeds, int | np.integer):
         seeds = [int(seeds)]
@@ -190,7 +194,7 @@ def _seeds(seeds: Iterable[int] | None, num_seeds: int | None) -> tuple[int, ...
         episode_seeds(seed, 0)
     if not given or len(set(given)) < len(given):
         raise InvalidArgument(
-            f"seeds must be at least one, and each once, got {list(given)}."
+            f"seeds must not be empty or contain duplicates, got {list(given)}."
         )
     return tuple(map(int, given))
 
@@ -203,16 +207,16 @@ def _positive(name: str, value: object) -> int:
 
 
 def _json_of(what: str, given: Mapping[str, Any]) -> dict[str, Any]:
-    """Return arguments as they come out of JSON, which is how they reach a worker."""
+    """Convert arguments to JSON and back, which is how they reach a worker."""
     kwargs = {}
     for name, value in given.items():
         try:
             kwargs[name] = loads(json.dumps(value, allow_nan=False))
         except (TypeError, ValueError, RecursionError) as error:
             raise InvalidArgument(
-                f"{what} go to other processes, and into a file, as JSON (texts, "
-                f"numbers, lists and objects of them), and {name!r} cannot, which is "
-                f"{value!r}: {error}."
+                f"{what} must be JSON (strings, numbers, lists and objects), because "
+                f"they are sent to other processes and stored in a file, but {name!r} "
+                f"is {value!r}: {error}."
             ) from error
     return kwargs
 
@@ -230,10 +234,10 @@ def _with_folders(
 
 def _folder(name: str, taken: set[str]) -> str:
     parsed = parse_environment_name(name)
-    # Where a file lies is not told to those who are shown the results.
+    # The location of a file must not appear in the results.
     text = parsed.path.name if isinstance(parsed, MjcfName) else name
     base = _OUTSIDE.sub(_encoded, text.replace("/", "-"))[:_LONGEST_FOLDER]
-    # Not a hidden one, nor one that leads elsewhere.
+    # Neither a hidden folder nor a relative path such as `..`.
     base = f"-{base}" if base.startswith(".") else base
     folder, number = base, 1
     while folder in taken:

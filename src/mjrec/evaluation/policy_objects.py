@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Policies on their way to the workers: as a text, or as an object's bytes.
+"""Policies in the form that is sent to workers: a name, or a pickled object.
 
-What a policy is made of has a digest each, so that nothing is added to the results of
-another one: the source of its module, the files that its arguments name, an object's
-pickled content.
+Each part of a policy has a digest: the source of its module, the files that its
+arguments name, and an object's pickled content. The digests prevent results of
+different policies from being mixed.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ class SentPolicy:
     """A policy that can be sent.
 
     Attributes:
-        name: what was given as a text, or what the object is called.
-        payload: the object's bytes; None for a text.
-        digests: SHA-256 of its parts, by what they are.
+        name: the given string, or the object's qualified name.
+        payload: the pickled object; None for a string.
+        digests: SHA-256 of its parts, keyed by a description of the part.
     """
 
     name: str
@@ -38,20 +38,20 @@ class SentPolicy:
 
     @property
     def is_object(self) -> bool:
-        """Whether it is an object."""
+        """Whether the policy is an object."""
         return self.payload is not None
 
 
 def sent_policy(policy: Any, kwargs: Mapping[str, Any]) -> SentPolicy:
-    """Return a policy as it is sent.
+    """Return a policy in the form that is sent to workers.
 
     Args:
-        policy: a text as in `mjrec record`; or a function, something with `predict`,
+        policy: a string as in `mjrec record`; or a function, an object with `predict`,
             or a class that is built with each environment.
-        kwargs: more arguments for it.
+        kwargs: further arguments for the policy.
 
     Raises:
-        PolicyError: it can be no policy, or cannot be pickled.
+        PolicyError: `policy` is not a valid policy, or cannot be pickled.
     """
     arguments = {
         f"the file of its argument {name}": digest
@@ -62,8 +62,8 @@ def sent_policy(policy: Any, kwargs: Mapping[str, Any]) -> SentPolicy:
         return SentPolicy(policy, None, {**_digests_of_text(policy), **arguments})
     if not (callable(policy) or callable(getattr(policy, "predict", None))):
         raise PolicyError(
-            f"The policy {policy!r:.200} neither can be called nor has predict(). Give "
-            "such an object, a class that is built with the environment, or a text: "
+            f"The policy {policy!r:.200} is not callable and has no predict(). Give "
+            "such an object, a class that is built with the environment, or a string: "
             "random, zero, module:name or module:name()."
         )
     named = policy if hasattr(policy, "__qualname__") else type(policy)
@@ -79,7 +79,7 @@ def sent_policy(policy: Any, kwargs: Mapping[str, Any]) -> SentPolicy:
 
 
 def _digests_of_text(policy: str) -> dict[str, str]:
-    """Return the digest of the file that a text names, or of its module's source."""
+    """Return the digest of the file that a string names, or of its module's source."""
     module, colon, _ = policy.partition(":")
     if not colon:
         digest = _file_digest(Path(policy))
@@ -91,7 +91,7 @@ def _digests_of_text(policy: str) -> dict[str, str]:
                 found = importlib.util.find_spec(module)
             source = None if found is None else found.origin
     except Exception:
-        # Importing it, which the workers do, says what is wrong with it.
+        # The workers import it and report what is wrong with it.
         return {}
     digest = None if source is None else _file_digest(Path(source))
     return {} if digest is None else {"its code": digest}
@@ -105,8 +105,8 @@ def _file_digest(path: Path) -> str | None:
 
 
 def _pickled(policy: Any, name: str) -> bytes:
-    # Not at the top: it is gymnasium's, which is only needed where things are run.
-    # What is pickled goes through our own pipe, to processes of ours.
+    # Imported here because only running needs it; it is a dependency of gymnasium. The
+    # pickle goes through our own pipe to our own processes.
     import cloudpickle  # type: ignore[import-untyped]  # it has no types
 
     try:
@@ -115,7 +115,7 @@ def _pickled(policy: Any, name: str) -> bytes:
         raise PolicyError(
             f"The policy {name} cannot be sent to the processes that run it: "
             f"{type(error).__name__}: {error}. Give its name instead, "
-            "policy='module:name': each process then imports it, and builds a class "
+            "policy='module:name'. Each process then imports it, and builds a class "
             "with its environment."
         ) from error
     return payload
@@ -124,7 +124,7 @@ def _pickled(policy: Any, name: str) -> bytes:
 def _digest_of_pickle(payload: bytes) -> str:
     from cloudpickle import cloudpickle
 
-    # Classes that are sent whole get a random name in each process.
+    # Classes that are pickled by value get a random name in each process.
     names = getattr(cloudpickle, "_DYNAMIC_CLASS_TRACKER_BY_CLASS", {})
     for name in names.values():
         payload = payload.replace(name.encode(), b"0" * len(name))

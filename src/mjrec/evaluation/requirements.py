@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a comparison must show, such as `probability of improvement > 0.75`."""
+"""Requirements on comparisons, such as `probability of improvement > 0.75`."""
 
 from __future__ import annotations
 
@@ -27,16 +27,17 @@ _FORM: Final = re.compile(
 
 @dataclass(frozen=True)
 class Requirement:
-    """What a figure of a comparison must be.
+    """A requirement on a figure of a comparison.
 
     Attributes:
-        text: as it was given.
-        task: of which task; None is all together or, of a figure that only tasks have,
-            each of them.
-        figure: its name.
-        end: `"low"` or `"high"`, that end of its interval; None is the figure itself.
-        sign: how it is compared.
-        number: with what.
+        text: the requirement as given.
+        task: the task; None for all tasks together, or, for figures that only exist per
+            task, for each of them.
+        figure: the figure's name.
+        end: `"low"` or `"high"` for that end of the figure's interval; None for the
+            figure itself.
+        sign: the comparison operator.
+        number: the number to compare with.
     """
 
     text: str
@@ -47,10 +48,10 @@ class Requirement:
     number: float
 
     def shortfalls(self, comparison: Comparison) -> Iterator[str]:
-        """Yield why a comparison falls short of this; nothing where it does not.
+        """Yield a message for each figure that violates the requirement.
 
         Raises:
-            UnknownName: the task is not compared.
+            UnknownName: the comparison does not include the task.
         """
         figures_of = {each.task: each.figures for each in comparison.tasks}
         if self.task is not None:
@@ -65,7 +66,7 @@ class Requirement:
             value = self._value(figures.get(self.figure))
             what = " ".join(filter(None, [self.figure, self.end]))
             if value is None:
-                yield f"{self.text}: the {what} of {whose} is not known"
+                yield f"{self.text}: the {what} of {whose} is unknown"
             elif not _SIGNS[self.sign](value, self.number):
                 yield f"{self.text}: the {what} of {whose} is {value:.4g}"
 
@@ -81,17 +82,17 @@ class Requirement:
 
 
 def parse_requirement(text: str) -> Requirement:
-    """Return what a text requires: `[TASK: ]FIGURE [low|high] SIGN NUMBER`.
+    """Parse a requirement: `[TASK: ]FIGURE [low|high] SIGN NUMBER`.
 
     Raises:
-        InvalidArgument: it has another form.
-        UnknownName: there is no such figure.
+        InvalidArgument: the string does not have this form.
+        UnknownName: the figure does not exist.
     """
     match = _FORM.fullmatch(text.strip())
     if match is None:
         raise InvalidArgument(
-            "What is required is FIGURE > NUMBER (or >=, <, <=), such as 'probability "
-            f"of improvement > 0.75', got {text!r}."
+            "A requirement must be FIGURE > NUMBER (or >=, <, <=), such as "
+            f"'probability of improvement > 0.75', got {text!r}."
         )
     task, figure = match["task"], match["figure"]
     figures = TASK_FIGURES if task else {*TASK_FIGURES, *OVERALL_FIGURES}

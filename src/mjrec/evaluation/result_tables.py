@@ -1,21 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`results.csv` and `timing.csv`: one row for each episode, in the plan's order.
+"""`results.csv` and `timing.csv`: one row per episode, in the plan's order.
 
-`results.csv` holds what follows from the plan alone: it is the same, byte for byte,
-whatever the number of workers, however often the evaluation was killed and resumed::
+`results.csv` depends only on the plan: it is byte-identical for any number of workers,
+and no matter how often the evaluation was killed and resumed::
 
     task,seed,episode,return,length,terminated,truncated,success,failure
 
-Truth is `true`, `false`, or empty where nothing is known; numbers are as Python's
-`repr` writes them, so they are read back bit for bit; a failure is one line.
+Truth values are `true`, `false`, or empty if unknown. Numbers are written with Python's
+`repr`, so they are read back exactly. A failure is a single line.
 
-`timing.csv` holds what is different in every run: wall times, and which files an
-episode is in. Its rows are those of the same episodes, in the same order::
+`timing.csv` holds what differs between runs: wall times, and the files of an episode.
+Its rows are for the same episodes, in the same order::
 
     task,seed,episode,start,seconds,folder,monitor,episode_id,trajectory,video
 
-What is read may have been written by anybody: all that is used of it is checked, no row
-can be longer than `_LONGEST_LINE`, and rows go into columns, never into objects.
+The files are untrusted: all values that are used are checked, lines are shorter than
+`_LONGEST_LINE`, and rows are read into columns, never into objects.
 """
 
 from __future__ import annotations
@@ -48,8 +48,8 @@ _TIMING: Final = (
     *("episode_id", "trajectory", "video"),
 )
 
-# A name, a few numbers and one line of an error; csv's own limit for a field is twice
-# as much.
+# Room for a name, a few numbers and one line of an error. The csv module's own limit
+# for a single field is twice as much.
 _LONGEST_LINE: Final = 1 << 16
 _LONGEST_FAILURE: Final = 2000
 _MOST_ROWS: Final = 4_000_000
@@ -71,10 +71,10 @@ class EpisodeFiles:
     """The files of an episode.
 
     Attributes:
-        folder: its monitor directory, in that of the evaluation; None where it has no
-            files.
-        trajectory: the base name of its trajectory, None where it has none.
-        video: that of its video, finished or pending; None where it gets none.
+        folder: the monitor directory, relative to the evaluation's directory; None if
+            the episode has no files.
+        trajectory: base name of the trajectory; None if there is no trajectory.
+        video: base name of the video, finished or pending; None if there is no video.
     """
 
     folder: str | None = None
@@ -82,7 +82,7 @@ class EpisodeFiles:
     video: str | None = None
 
 
-# Of an episode. Where -1 or NaN stands, nothing is known.
+# One episode. -1 and NaN mean unknown.
 ROW: Final = np.dtype(
     [
         *(("seed", "<i8"), ("episode", "<i8"), ("total_reward", "<f8")),
@@ -95,19 +95,19 @@ ROW: Final = np.dtype(
 
 @dataclass(frozen=True, kw_only=True)
 class TaskResults:
-    """The episodes of one task, in the order of the plan: by seed, then by number.
+    """The episodes of one task, in the plan's order: by seed, then by number.
 
-    A million of them take 70 MB.
+    A million episodes take 70 MB.
 
     Attributes:
         task: the environment's name.
-        rows: `(n,)` of `ROW`, with what `EpisodeResult` has. `total_reward` is NaN
-            where it failed, and where that is the return; truth is 1, 0 or -1;
+        rows: `(n,)` of `ROW`, with the fields of `EpisodeResult`. `total_reward` is NaN
+            for a failed episode or a NaN return. Truth values are 1, 0 or -1.
             `monitor` is an index into `monitors`.
-        failures: why, by index, of those that failed.
-        places: the indices of the monitors that recorded them, by monitor directory, in
-            that of the evaluation, and infix.
-        videos: by index, the base names of the videos of those that get one.
+        failures: the failures of failed episodes, keyed by index.
+        places: the indices of the monitors that recorded the episodes, keyed by monitor
+            directory (relative to the evaluation's directory) and infix.
+        videos: base names of the episodes' videos, keyed by index.
     """
 
     task: str
@@ -121,25 +121,28 @@ class TaskResults:
 
     @property
     def failed(self) -> NDArray[np.bool_]:
-        """`(n,) bool`: which ones failed."""
+        """`(n,) bool`, whether each episode failed."""
         failed = np.zeros(len(self), dtype=np.bool_)
         failed[list(self.failures)] = True
         return failed
 
     @property
     def monitors(self) -> list[str]:
-        """The infixes of the monitors that recorded them."""
+        """The infixes of the monitors that recorded the episodes."""
         return [infix for _, infix in self.places]
 
     def video_path(self, index: int) -> str | None:
-        """Return the path of an episode's video in the evaluation's directory."""
+        """Return the path of an episode's video, or None if it has no video.
+
+        The path is relative to the evaluation's directory.
+        """
         if index not in self.videos:
             return None
         folder, _ = list(self.places)[self.rows["monitor"][index]]
         return f"{folder}/{self.videos[index]}"
 
     def __iter__(self) -> Iterator[EpisodeResult]:
-        """Yield each episode as a result; its warnings are not known."""
+        """Yield each episode as a result, without its warnings."""
         monitors = self.monitors
         for index, row in enumerate(self._rows_in_python()):
             failure, monitor = self.failures.get(index), row["monitor"]
@@ -165,8 +168,8 @@ def write_results_table(file: TextIO, results: Iterable[EpisodeResult]) -> None:
     """Write `results.csv`.
 
     Args:
-        file: opened with `newline=""`.
-        results: in the plan's order.
+        file: the file, opened with `newline=""`.
+        results: all episodes, in the plan's order.
     """
     writer = csv.writer(file, lineterminator="\n")
     writer.writerow(_RESULTS)
@@ -188,7 +191,7 @@ def write_timing_table(
     results: Iterable[EpisodeResult],
     files: Callable[[EpisodeResult], EpisodeFiles],
 ) -> None:
-    """Write `timing.csv`; `files` tells of an episode which ones are its own."""
+    """Write `timing.csv`; `files` returns the files of an episode."""
     writer = csv.writer(file, lineterminator="\n")
     writer.writerow(_TIMING)
     for each in results:
@@ -208,17 +211,16 @@ def write_timing_table(
 def read_tables(
     results: Path, timing: Path, plan: EvaluationPlan, *, needs_timing: bool = False
 ) -> dict[str, TaskResults]:
-    """Return the episodes of each task, in the plan's order.
+    """Read the episodes of each task, in the plan's order.
 
     Args:
         results: the path of `results.csv`.
-        timing: the path of `timing.csv`. Where there is none, times and files are not
-            known.
-        plan: what was evaluated: exactly its episodes must be there.
-        needs_timing: whether `timing.csv` must be there, too.
+        timing: the path of `timing.csv`. If it is missing, times and files are unknown.
+        plan: the plan of the evaluation. The tables must have exactly its episodes.
+        needs_timing: whether `timing.csv` must exist, too.
 
     Raises:
-        UnreadableFile: a table is damaged or missing, or is that of another plan.
+        UnreadableFile: a table is damaged or missing, or belongs to a different plan.
     """
     with unreadable(results):
         if len(plan.seeds) * plan.episodes * len(plan.tasks) > _MOST_ROWS:
@@ -246,9 +248,9 @@ def _read_result(of: TaskResults, index: int, values: Sequence[str]) -> None:
     total_reward, length, *truths, failure = values
     if failure:
         if total_reward:
-            raise ValueError("an episode that failed has no return")
+            raise ValueError("a failed episode must not have a return")
         if not failure.isprintable() or len(failure) > _LONGEST_FAILURE:
-            raise ValueError(f"{failure!r:.80} is not one line")
+            raise ValueError(f"{failure!r:.80} is not a single line")
         of.failures[index] = failure
     row = of.rows[index]
     row["total_reward"], row["length"] = _number(total_reward), _whole(length)
@@ -262,18 +264,18 @@ def _read_timing(of: TaskResults, index: int, values: Sequence[str]) -> None:
     row["start_time"], row["seconds"] = _number(start), _number(seconds)
     if not folder:
         if any(values[2:]):
-            raise ValueError("an episode without a folder has files")
+            raise ValueError("an episode without a folder must not have files")
         return
     place = folder, monitor
     infix = Infix.parse(monitor)
     if infix is None or not _FOLDER.fullmatch(folder):
-        raise ValueError(f"{folder!r:.80}, {monitor!r:.80} is no monitor")
+        raise ValueError(f"{folder!r:.80}, {monitor!r:.80} is not a monitor")
     row["monitor"] = of.places.setdefault(place, len(of.places))
     row["episode_id"] = number = _whole(episode_id)
     if video:
         prefix = video_prefix(infix, number)
         if video not in (f"{prefix}{end}" for end in (".mp4", ".json", ".avi")):
-            raise ValueError(f"{video!r:.200} is no video of its episode")
+            raise ValueError(f"{video!r:.200} is not a video of its episode")
         of.videos[index] = video
 
 
@@ -283,7 +285,7 @@ def _read_rows(
     columns: Mapping[str, TaskResults],
     read: Callable[[TaskResults, int, Sequence[str]], None],
 ) -> None:
-    """Read a table whose rows must be exactly those of the columns."""
+    """Read a table, whose rows must match the episodes of `columns` exactly."""
     with open_regular(path) as binary:
         file = io.TextIOWrapper(binary, encoding="utf-8", newline="")
         reader = csv.reader(_lines(file), strict=True)
@@ -295,11 +297,11 @@ def _read_rows(
             for line, (of, index) in enumerate(units, start=2):
                 row = next(reader, [])
                 if len(row) != len(header) or reader.line_num != line:
-                    raise ValueError(f"it has not one row of {len(header)} values")
+                    raise ValueError(f"it is not one row of {len(header)} values")
                 unit = [_encodable(of.task), *map(str, of.rows[index].item()[:2])]
                 if row[:3] != unit:
                     raise ValueError(
-                        f"the episode {', '.join(unit)} belongs there, not "
+                        f"expected the episode {', '.join(unit)}, found "
                         f"{', '.join(row[:3]):.80}"
                     )
                 read(of, index, row[3:])
@@ -307,7 +309,7 @@ def _read_rows(
                 line += 1
                 raise ValueError("it has more episodes than the plan")
         except UnicodeDecodeError as error:
-            raise ValueError(f"after line {line} it is not UTF-8 text") from error
+            raise ValueError(f"it is not UTF-8 text after line {line}") from error
         except (csv.Error, ValueError) as error:
             raise ValueError(f"line {line or 1}: {error}") from error
 
@@ -315,7 +317,7 @@ def _read_rows(
 def _lines(file: TextIO) -> Iterator[str]:
     while line := file.readline(_LONGEST_LINE):
         if len(line) == _LONGEST_LINE:
-            raise ValueError("it is longer than any line of a table")
+            raise ValueError("it is too long for a line of a table")
         yield line
 
 
@@ -332,7 +334,7 @@ def _truth_text(value: bool | None) -> str:
 
 
 def _one_line(text: str) -> str:
-    # A failure is there also where nothing is said of it.
+    # A failed episode needs a text here, even if the error has no message.
     shown = "".join(c if c.isprintable() else " " for c in _encodable(text))
     return " ".join(shown.split())[:_LONGEST_FAILURE] or "unknown"
 
@@ -343,7 +345,7 @@ def _encodable(text: str) -> str:
 
 def _whole(text: str) -> int:
     if not _WHOLE.fullmatch(text):
-        raise ValueError(f"{text!r:.80} is no whole number")
+        raise ValueError(f"{text!r:.80} is not a whole number")
     return int(text)
 
 
@@ -351,7 +353,7 @@ def _number(text: str) -> float:
     if not text:
         return math.nan
     if not _NUMBER.fullmatch(text):
-        raise ValueError(f"{text!r:.80} is no number")
+        raise ValueError(f"{text!r:.80} is not a number")
     return float(text)
 
 

@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Running the missing episodes of a chunk.
 
-Environment and policy stay from chunk to chunk of a task. They are made anew after an
-episode that failed, whose environment may be in any state; for each seed where the
-environment draws its model from the seed when it is made (`lqr` of dm_control); and for
-each episode that is drawn live, because its frames depend on those before.
+The environment and the policy are reused across the chunks of a task. They are
+recreated in three cases: after a failed episode, because the environment may be in any
+state; for each seed, if the environment draws its model from the seed when it is
+created (dm_control's `lqr`); and for each episode that is drawn live, because its
+frames depend on earlier ones.
 """
 
 from __future__ import annotations
@@ -61,14 +62,14 @@ _Begin: TypeAlias = Callable[[NamedEnvironment, Any, EpisodeSeeds], Any]
 
 @dataclass(frozen=True)
 class Acting:
-    """An environment and what acts in it.
+    """An environment and its policy.
 
     Attributes:
         task: the environment's name.
-        seed: that it was made with.
+        seed: the seed that it was created with.
         named: the environment.
-        policy: acts.
-        is_drawn_live: its frames are drawn while it is stepped.
+        policy: the policy.
+        is_drawn_live: whether frames are drawn while the environment is stepped.
     """
 
     task: str
@@ -79,18 +80,20 @@ class Acting:
 
 
 class Evaluator:
-    """Runs chunks, one after the other.
+    """Runs chunks, one after another.
 
     Args:
-        plan: what is evaluated.
-        policy: the pickled policy, where it is an object; else None.
+        plan: the plan of the evaluation.
+        policy: the pickled policy if it is an object, otherwise None.
+
+    Attributes:
+        journal: the running episode's journal; None if there is no open monitor.
     """
 
     def __init__(self, plan: EvaluationPlan, policy: bytes | None) -> None:
         self._plan = plan
         self._policy = policy
         self._acting: Acting | None = None
-        # That of the running episode.
         self.journal: Path | None = None
 
     @property
@@ -99,12 +102,13 @@ class Evaluator:
         return not keep_rule(self._plan.keep).keeps_none
 
     def fits(self, task: str, seed: int, *, continues: bool) -> bool:
-        """Return whether environment and policy of before are those of an episode.
+        """Return whether the current environment and policy fit an episode.
 
         Args:
-            task: its environment's name.
-            seed: of its run.
-            continues: it goes on with the random stream of the episode before.
+            task: the episode's environment name.
+            seed: the seed of the episode's run.
+            continues: whether the episode continues the previous episode's random
+                stream.
         """
         known = self._acting
         if known is None or known.task != task:
@@ -115,10 +119,10 @@ class Evaluator:
         return continues or (is_of_seed and not known.is_drawn_live)
 
     def acting(self, task: str, seed: int, *, continues: bool = False) -> Acting:
-        """Return an environment and what acts in it, those of before where they fit.
+        """Return an environment and its policy, reusing the current ones if they fit.
 
         Raises:
-            Error: of `environment_from_name`, `load_policy` or `policy_from`.
+            Error: see `environment_from_name`, `load_policy` and `policy_from`.
         """
         if not self.fits(task, seed, continues=continues):
             self.close()
@@ -127,7 +131,7 @@ class Evaluator:
         return self._acting
 
     def leave(self) -> None:
-        """Note that the running episode is not to blame for the end of this process."""
+        """Note that the running episode did not cause the end of this process."""
         if self.journal is not None:
             with self.journal.open("ab") as file:
                 file.write(b'{"begun": null}\n')
@@ -139,22 +143,22 @@ class Evaluator:
             acting.named.environment.close()
 
     def complete(self, task: str, folder: Path, chunk: Chunk) -> None:
-        """Run those episodes of a chunk that have not ended.
+        """Run the episodes of a chunk that have no result yet.
 
         Args:
             task: the environment's name.
-            folder: the chunk's monitor directory, which no other process writes into,
-                and in which what killed ones left is in order.
-            chunk: which episodes.
+            folder: the chunk's monitor directory. No other process may write to it, and
+                recordings of killed processes must have been recovered.
+            chunk: the episodes.
 
         Raises:
-            Error: something cannot be made or recorded. What was done is in the
+            Error: something cannot be created or recorded. Finished episodes are in the
                 journal.
         """
         try:
             _ChunkRun(self, self._plan, task, folder, chunk).run()
         except BaseException:
-            # It may be in the midst of a step.
+            # The environment may be in the middle of a step.
             self.close()
             raise
         finally:
@@ -189,18 +193,18 @@ class Evaluator:
             return load_policy(name, environment, self._plan.policy_kwargs)
         try:
             with working_directory_importable():
-                # Through our own pipe, from the process that evaluates.
+                # Safe to unpickle: it comes through our own pipe from the parent.
                 chosen = pickle.loads(self._policy)
         except Exception as error:
             raise PolicyError(
-                f"The policy {name} could not be made again in a worker process: "
+                f"The policy {name} could not be recreated in a worker process: "
                 f"{_in_one_line(error)}. Give its name instead, policy='module:name'."
             ) from error
         return policy_from(chosen, name, environment, self._plan.policy_kwargs)
 
 
 class _ChunkRun:
-    """A chunk that is run, and the monitor around its environment."""
+    """The run of one chunk, with the monitor around its environment."""
 
     def __init__(
         self,
@@ -240,9 +244,9 @@ class _ChunkRun:
     def _run_stream(self, seed: int, missing: set[int]) -> None:
         """Run the missing episodes of a seed's random stream.
 
-        Those before them that are done are run again without being recorded: each
-        begins where the one before it has ended. After one that failed, another
-        stream begins.
+        Each episode begins where the previous one ended, so finished episodes before
+        the missing ones are run again without being recorded. After a failed episode a
+        new stream begins.
         """
         stream: int | None = seed
         for number in range(self._chunk.first, max(missing) + 1):
@@ -264,10 +268,10 @@ class _ChunkRun:
         """Run an episode, and return whether it was completed.
 
         Raises:
-            Error: it could not be recorded.
+            Error: the episode could not be recorded.
         """
         monitor = self._monitored(unit, continues=continues)
-        # What was shown before it does not count: other chunks have other episodes.
+        # Frames must not depend on earlier episodes, because chunks may differ.
         monitor.forget_frames()
         episode_id, start = monitor.episode_id, time.time()
         seed, number = unit
@@ -278,7 +282,7 @@ class _ChunkRun:
         def failed(why: str) -> dict[str, Any]:
             facts = _failed(unit, why, start_time=start, seconds=time.time() - start)
             if monitor.episode_id > episode_id:
-                # Else the monitor was never told of it.
+                # Otherwise the monitor was never notified of the episode.
                 length = monitor.stats_recorder.steps or 0
                 facts.update(episode_id=episode_id, length=length)
             return facts
@@ -289,13 +293,13 @@ class _ChunkRun:
         try:
             with time_limit(limit, journal, f"{dumps({'failed': too_long})}\n"):
                 self._play_recorded(acting, monitor, unit, begin)
-        # A policy may call sys.exit(), or an environment's library.
+        # A policy, or an environment's library, may call sys.exit().
         except (Exception, SystemExit) as error:
-            # Errors of ours are of the recording, such as a full disk, unless they
-            # speak of an action, or a reward, that is none.
+            # Our own errors concern the recording, such as a full disk, unless they are
+            # about an invalid action or reward.
             if isinstance(error, Error) and not isinstance(error, _OF_EPISODES):
                 raise
-            logger.warning("An episode failed. What was raised:", exc_info=True)
+            logger.warning("An episode failed with this error:", exc_info=True)
             monitor.recorder.note_error(error)
             monitor.recorder.note_event("failed", failed(_in_one_line(error)))
             self._renew()
@@ -311,7 +315,7 @@ class _ChunkRun:
             named: NamedEnvironment, env: Any, seeds: EpisodeSeeds
         ) -> Any:
             first = begin(named, env, seeds)
-            # Not every reset sets them to zero.
+            # Not every reset clears the warning counts.
             before.update(_warnings(named.environment))
             return first
 
@@ -323,7 +327,7 @@ class _ChunkRun:
         _play(acting, monitor, episode_seeds(*unit), begin_counting)
 
     def _monitored(self, unit: Unit, *, continues: bool = False) -> _Monitor:
-        """Return the monitor for an episode, that of before where it fits."""
+        """Return a monitor for an episode, reusing the current one if it fits."""
         self._renew_unless_it_fits(unit[0], continues=continues)
         if self._monitor is None:
             acting = self._evaluator.acting(self._task, unit[0], continues=continues)
@@ -331,8 +335,8 @@ class _ChunkRun:
             monitor = Monitor(
                 named.environment,
                 self._folder,
-                # Those that cannot be drawn later are all drawn, and the others' videos
-                # removed when the choice is made.
+                # Episodes that cannot be drawn later are all drawn live; videos that
+                # are not chosen are removed afterwards.
                 record_all if acting.is_drawn_live else False,
                 resume=True,
                 uid=_uid(self._folder),
@@ -344,7 +348,7 @@ class _ChunkRun:
                 policy_file=None if plan.is_object else policy_file(plan.policy),
                 **named.view,
             )
-            # A name is that of one environment, never of a vector environment.
+            # A name always means a single environment, never a vector environment.
             self._monitor = cast("_Monitor", monitor)
             self._monitor.recorder.bundle_trajectories()
             self._monitor.leave_environment_open()
@@ -359,7 +363,7 @@ class _ChunkRun:
             self._renew()
 
     def _renew(self) -> None:
-        """Close monitor and environment: the next episode gets others."""
+        """Close monitor and environment, so that the next episode gets new ones."""
         self._monitor = self._evaluator.journal = None
         self._open.close()
         self._evaluator.close()
@@ -372,7 +376,7 @@ def _begin_episode(named: NamedEnvironment, env: Any, seeds: EpisodeSeeds) -> An
 def _begin_in_stream(
     stream: int | None, named: NamedEnvironment, env: Any, seeds: EpisodeSeeds
 ) -> Any:
-    """Begin an episode; `stream` seeds a new stream, None goes on with the last one."""
+    """Begin an episode; `stream` seeds a new stream, None continues the last one."""
     return named.begin(env, seeds, stream)
 
 
@@ -392,16 +396,16 @@ def _warnings(environment: Any) -> dict[str, int]:
     simulation = simulation_below(environment)
     if simulation is None:
         return {}
-    # Not at the top, because it loads MuJoCo, which not every task has.
+    # Imported here because it loads MuJoCo, which not every task needs.
     from ..simulation.warnings import warning_counts
 
     return warning_counts(simulation)
 
 
 def _uid(folder: Path) -> str:
-    """Return what a chunk's files have in their names, which no other chunk's have.
+    """Return the part of file names that identifies a chunk.
 
-    So those of a whole evaluation fit into one directory.
+    It is unique, so that the files of a whole evaluation can share one directory.
     """
     room = _LONGEST_UID - len(folder.name) - 1
     task = _OUTSIDE_UID.sub("_", folder.parent.name)[:room].lstrip(".")
@@ -423,7 +427,7 @@ def _failed(unit: Unit, why: str, **facts: Any) -> dict[str, Any]:
 
 def _in_one_line(error: BaseException) -> str:
     text = " ".join(str(error).split())
-    # Ours say what happened; of others the name of the class says half.
+    # Our own messages are complete; other errors are unclear without the class name.
     if isinstance(error, Error):
         return text
     return f"{type(error).__name__}: {text}" if text else type(error).__name__

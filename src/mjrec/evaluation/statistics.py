@@ -1,13 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The figures that are said of returns and scores, and their confidence intervals.
+"""Figures of returns and scores, with confidence intervals.
 
-Every figure is written down once, as a function of samples along their last axis, so
-that SciPy's bootstrap can give it thousands of resamples at once.
-`docs/reference/statistics.md` has the formulas and their sources; the tests compare
-them with rliable, and figures by hand.
+Every figure is defined once, as a function of samples along their last axis, so that
+SciPy's bootstrap can evaluate thousands of resamples at once.
+`docs/reference/statistics.md` has the formulas and their sources. The tests compare the
+figures with rliable and with values computed by hand.
 
-All of it takes finite numbers: `summaries` and `comparing` decide what becomes of
-others.
+All numbers must be finite: `summaries` and `comparing` handle NaN and infinity.
 """
 
 from __future__ import annotations
@@ -31,11 +30,11 @@ PERCENTILE_BOOTSTRAP: Final = "percentile bootstrap"
 LARGE_SAMPLE: Final = "large-sample normal interval"
 
 MOST_RESAMPLED: Final = 3000
-"""Of how many values, of all samples together, figures are bootstrapped."""
+"""Maximum number of values, over all samples, for which figures are bootstrapped."""
 
 _MOST_RESAMPLES: Final = 1_000_000
 
-# The values of a block of resamples: 2 MB of them stay in a CPU's cache.
+# Number of values in a block of resamples: 2 MB, which fit into a CPU's cache.
 _BLOCK: Final = 1 << 18
 
 
@@ -44,8 +43,8 @@ class Interval:
     """A confidence interval.
 
     Attributes:
-        low: its lower end.
-        high: its upper end.
+        low: the lower end.
+        high: the upper end.
     """
 
     low: float
@@ -54,12 +53,12 @@ class Interval:
 
 @dataclass(frozen=True)
 class Estimate:
-    """A figure, and how far it could be off.
+    """A figure with its confidence interval.
 
     Attributes:
         value: the figure.
-        interval: of that; None where there is none.
-        interval_method: how it was made; None likewise.
+        interval: the figure's interval; None if there is no interval.
+        interval_method: method of the interval; None if there is no interval.
     """
 
     value: float
@@ -69,11 +68,11 @@ class Estimate:
 
 @dataclass(frozen=True, kw_only=True)
 class Bootstrap:
-    """How confidence intervals are made.
+    """Settings for bootstrap confidence intervals.
 
     Attributes:
         resamples: number of resamples.
-        seed: of their generator.
+        seed: seed of the random generator.
         confidence: confidence level.
 
     Raises:
@@ -87,30 +86,30 @@ class Bootstrap:
     def __post_init__(self) -> None:
         if not 1 <= self.resamples <= _MOST_RESAMPLES:
             raise InvalidArgument(
-                f"Intervals are made from 1 to {_MOST_RESAMPLES} resamples (10000 is "
-                f"usual), got {self.resamples}."
+                f"resamples must be from 1 to {_MOST_RESAMPLES} (10000 is usual), got "
+                f"{self.resamples}."
             )
         if not 0 < self.confidence < 1:
             raise InvalidArgument(
-                "The confidence of an interval lies between 0 and 1 (0.95 is usual), "
-                f"got {self.confidence}."
+                "confidence must be between 0 and 1 (0.95 is usual), got "
+                f"{self.confidence}."
             )
         if not 0 <= self.seed < 2**64:
             raise InvalidArgument(
-                f"A seed is a whole number from 0 to 2^64 - 1, got {self.seed}."
+                f"seed must be a whole number from 0 to 2^64 - 1, got {self.seed}."
             )
 
 
 @dataclass(frozen=True)
 class Figure:
-    """A figure of one sample or several.
+    """A figure of one or more samples.
 
     Attributes:
-        samples: which are drawn from independently of each other, along their last
-            axis.
-        of: returns the figure of samples, `(...)` or, of a figure that is many numbers,
-            `(k, ...)`.
-        error: returns the standard error of the figure, where the samples are large.
+        samples: the samples, which are resampled independently of each other, along
+            their last axis.
+        of: returns the figure of samples: `(...)`, or `(k, ...)` for a figure of k
+            numbers.
+        error: returns the standard error of the figure, for large samples.
     """
 
     samples: tuple[npt.NDArray[Any], ...]
@@ -119,19 +118,19 @@ class Figure:
 
     @property
     def values(self) -> FloatArray:
-        """The figure, if it is many numbers."""
+        """The figure as an array."""
         return np.asarray(self.of(self.samples))
 
     @property
     def value(self) -> float:
-        """The figure, if it is one number."""
+        """The figure as a number, if it is a single number."""
         return float(self.values)
 
     @property
     def interval_method(self) -> str | None:
-        """How intervals are made; None where a sample has a single value.
+        """The method of intervals; None if a sample has only one value.
 
-        An interval of no width would say that all is known.
+        An interval of zero width would suggest certainty.
         """
         sizes = [len(sample) for sample in self.samples]
         if min(sizes) < 2:
@@ -139,7 +138,7 @@ class Figure:
         return PERCENTILE_BOOTSTRAP if sum(sizes) <= MOST_RESAMPLED else LARGE_SAMPLE
 
     def ends(self, how: Bootstrap) -> tuple[FloatArray, FloatArray] | None:
-        """Return the lower and upper ends of the intervals of a figure."""
+        """Return the lower and upper ends of the intervals; None without intervals."""
         if self.interval_method is None:
             return None
         if self.interval_method == LARGE_SAMPLE:
@@ -158,16 +157,16 @@ class Figure:
         return found.confidence_interval.low, found.confidence_interval.high
 
     def interval(self, how: Bootstrap) -> Interval | None:
-        """Return the interval of a figure that is one number."""
+        """Return the interval, if the figure is a single number."""
         ends = self.ends(how)
         return None if ends is None else Interval(*map(float, ends))
 
     def estimate(self, how: Bootstrap) -> Estimate:
-        """Return a figure that is one number, with its interval."""
+        """Return the figure with its interval, if it is a single number."""
         return Estimate(self.value, self.interval(how), self.interval_method)
 
     def __sub__(self, other: Figure) -> Figure:
-        """Return the difference of the figures of independent samples."""
+        """Return the difference of two figures of independent samples."""
         split = len(self.samples)
         return Figure(
             self.samples + other.samples,
@@ -177,7 +176,10 @@ class Figure:
 
 
 def average(figures: Iterable[Figure]) -> Figure:
-    """Return the mean of the figures of independent samples: of tasks, each alike."""
+    """Return the mean of figures of independent samples, such as tasks.
+
+    All figures have the same weight.
+    """
     parts = list(figures)
 
     def of(samples: Sequence[FloatArray]) -> FloatArray:
@@ -195,7 +197,7 @@ def average(figures: Iterable[Figure]) -> Figure:
 def mean(sample: FloatArray) -> Figure:
     """Return the mean of a sample."""
     return Figure(
-        # So that it does not depend on the order in which episodes are given.
+        # Sorted, so that the result does not depend on the order of episodes.
         (np.sort(sample),),
         lambda samples: samples[0].mean(axis=-1),
         lambda: _stats().sem(sample),
@@ -203,10 +205,10 @@ def mean(sample: FloatArray) -> Figure:
 
 
 def interquartile_mean(samples: Iterable[FloatArray]) -> Figure:
-    """Return the mean of the middle half of all samples as one.
+    """Return the mean of the middle half of all samples pooled together.
 
-    floor(n / 4) of all n values are cut off at each end. Where samples have different
-    sizes, a larger one weighs more.
+    floor(n / 4) of all n values are cut off at each end. Larger samples have a larger
+    weight.
     """
     strata = tuple(np.sort(sample) for sample in samples)
 
@@ -215,8 +217,7 @@ def interquartile_mean(samples: Iterable[FloatArray]) -> Figure:
         return np.asarray(_stats().trim_mean(pooled, 0.25, axis=-1))
 
     def error() -> FloatArray:
-        # Each value moves it by its winsorised self; what varies inside a stratum
-        # varies.
+        # The variance of the winsorised values within each stratum.
         values = np.sort(np.concatenate(strata))
         first = len(values) // 4
         low, high = values[first], values[-1 - first]
@@ -227,21 +228,21 @@ def interquartile_mean(samples: Iterable[FloatArray]) -> Figure:
 
 
 def optimality_gap(scores: Iterable[FloatArray]) -> Figure:
-    """Return by how much scores fall short of 1, averaged over tasks.
+    """Return the amount by which scores fall short of 1, averaged over tasks.
 
-    What is above 1 makes up for nothing.
+    Scores above 1 count as 1.
     """
     return average(mean(1 - np.minimum(values, 1)) for values in scores)
 
 
 def performance_profile(scores: Iterable[FloatArray], thresholds: FloatArray) -> Figure:
-    """Return for each threshold the share of scores above it, averaged over tasks.
+    """Return the share of scores above each threshold, averaged over tasks.
 
     Args:
-        scores: of each task.
-        thresholds: rising.
+        scores: the scores of each task.
+        thresholds: the thresholds, in ascending order.
     """
-    # How many thresholds each score is above says all that is needed of it.
+    # All that matters about a score is the number of thresholds below it.
     return average(
         _shares_above(np.searchsorted(thresholds, values), len(thresholds))
         for values in scores
@@ -266,16 +267,16 @@ def _shares_above(places: npt.NDArray[np.int64], count: int) -> Figure:
 
 
 def improvement(x: FloatArray, y: FloatArray) -> Figure:
-    """Return the probability that a value of `x` is above one of `y`.
+    """Return the probability that a value of `x` is greater than a value of `y`.
 
-    #{(i, j) : x_i > y_j} / (n_x n_y), where equal ones count half: the Mann-Whitney
+    It is #{(i, j) : x_i > y_j} / (n_x n_y), where ties count half: the Mann-Whitney
     statistic U of `x`, divided by the number of pairs.
     """
 
     def of(samples: Sequence[FloatArray]) -> FloatArray:
         size, others = (each.shape[-1] for each in samples)
         ranks = _stats().rankdata(np.concatenate(samples, axis=-1), axis=-1)
-        # Ranks are whole or half, so that it is 1/2 where it should be.
+        # Ranks are multiples of 1/2, so the result is exactly 1/2 where it should be.
         above = ranks[..., :size].sum(axis=-1) - size * (size + 1) / 2
         return np.asarray(above / (size * others))
 
@@ -288,20 +289,23 @@ def improvement(x: FloatArray, y: FloatArray) -> Figure:
 
 
 def _placements(x: FloatArray, y: FloatArray) -> FloatArray:
-    """Return for each value of `x` which share of `y` is below it."""
+    """Return the share of `y` below each value of `x`; ties count half."""
     y = np.sort(y)
     below, up_to = (np.searchsorted(y, x, side=side) for side in ("left", "right"))
     return np.asarray((below + up_to) / (2 * len(y)))
 
 
 def wilson_interval(successes: int, n: int, confidence: float) -> Interval:
-    """Return Wilson's score interval, without correction for continuity, of a share."""
+    """Return Wilson's score interval of a share, without continuity correction."""
     found = _stats().binomtest(successes, n).proportion_ci(confidence, method="wilson")
     return Interval(float(found.low), float(found.high))
 
 
 def two_sided_p_value(x: FloatArray, y: FloatArray) -> float:
-    """Return that of the Mann-Whitney test, exact for small samples without ties."""
+    """Return the p-value of the two-sided Mann-Whitney test.
+
+    It is exact for small samples without ties.
+    """
     if np.ptp(np.concatenate([x, y])) == 0:
         # SciPy would divide zero by zero.
         return 1.0
@@ -309,17 +313,17 @@ def two_sided_p_value(x: FloatArray, y: FloatArray) -> float:
 
 
 def load_scipy() -> None:
-    """Load SciPy on a thread: it takes a second, in which workers do their jobs."""
+    """Load SciPy on a thread, because it takes a second, while workers are busy."""
 
     def load() -> None:
-        # Who needs it says what is missing.
+        # If SciPy is missing, the code that needs it reports that.
         with contextlib.suppress(ImportError):
             _stats()
 
-    # No daemon: the interpreter must not end in the midst of loading C++ modules.
+    # Not a daemon: the interpreter must not exit while C++ modules are loading.
     threading.Thread(target=load, name="mjrec-scipy").start()
 
 
 def _stats() -> Any:
-    # Not at the top, because it takes longer to import than all else.
+    # Imported here because it takes longer to import than everything else.
     return importlib.import_module("scipy.stats")

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is said of the episodes of a task, and of several tasks.
+"""Summaries of the episodes of one task, and of several tasks.
 
-Failed episodes have no return and no length: they are counted, and are no part of the
-figures. A claim about a task needs `failed` and `not_finite` to be 0.
+Failed episodes have no return: they are counted, but not included in the figures.
+Claims about a task are only sound if `failed` and `not_finite` are 0.
 """
 
 from __future__ import annotations
@@ -29,35 +29,35 @@ _UNBOUNDED_IN_SUITE: Final = "dm_control/lqr-"
 
 @dataclass(frozen=True, kw_only=True)
 class TaskSummary:
-    """What is said of one task. What cannot be said is None.
+    """The summary of one task. Unknown figures are None.
 
     Attributes:
-        task: its name.
-        runs: how many seeds (of a monitor directory: monitors) have episodes.
-        episodes: how many were completed; the figures below are theirs.
-        failed: how many were not.
-        mean: of the returns.
-        std: of the returns, with n - 1.
-        median: of the returns.
-        iqm: the interquartile mean of the returns.
-        minimum: of the returns.
-        maximum: of the returns.
-        mean_interval: of the mean.
-        iqm_interval: of the interquartile mean.
-        mean_length: of the episodes, in steps.
-        terminated: how many the task ended.
-        truncated: how many a limit from outside ended.
-        success_known: of how many episodes, failed ones included, it is known whether
-            they were a success; a failed one was none where the task says of any.
-        success_rate: of those.
-        success_interval: Wilson's, of the rate.
-        warnings: how often MuJoCo warned, by kind.
-        score_range: the returns that count as 0 and as 1; None where the task has no
+        task: the task's name.
+        runs: number of seeds (in a monitor directory: monitors) with episodes.
+        episodes: number of completed episodes, which the figures are computed from.
+        failed: number of failed episodes.
+        mean: mean return.
+        std: standard deviation of the returns, with n - 1.
+        median: median return.
+        iqm: interquartile mean of the returns.
+        minimum: lowest return.
+        maximum: highest return.
+        mean_interval: confidence interval of the mean.
+        iqm_interval: confidence interval of the interquartile mean.
+        mean_length: mean length of the episodes, in steps.
+        terminated: number of episodes that the task ended.
+        truncated: number of episodes that a limit outside the task ended.
+        success_known: number of episodes known to be a success or not. If the task
+            reports success at all, failed episodes are included as not successful.
+        success_rate: share of successes among those.
+        success_interval: Wilson's interval of the success rate.
+        warnings: number of MuJoCo's warnings, by kind.
+        score_range: the returns that count as scores 0 and 1; None if the task has no
             scale.
-        not_finite: how many of the returns are NaN or infinite. Where any is, there
-            are no figures of the returns: without it they would say too much, and
-            with it nothing.
-        interval_method: how the intervals of mean and interquartile mean were made.
+        not_finite: number of NaN or infinite returns. If there are any, there are no
+            figures of the returns: including such returns would make the figures
+            meaningless, and leaving them out would make them misleading.
+        interval_method: method of the intervals of mean and interquartile mean.
     """
 
     task: str
@@ -86,14 +86,15 @@ class TaskSummary:
 
 @dataclass(frozen=True, kw_only=True)
 class Profile:
-    """A performance profile: which share of the scores lies above a threshold.
+    """A performance profile: the share of scores above each threshold.
 
     Attributes:
-        thresholds: rising.
-        shares: for each threshold the share of scores above it, averaged over tasks.
-        low: the pointwise interval's lower end; the share itself where there are no
-            intervals, as `AcrossTasks.interval_method` tells.
-        high: its upper end; likewise.
+        thresholds: the thresholds, in ascending order.
+        shares: share of scores above each threshold, averaged over tasks.
+        low: lower ends of the pointwise intervals; equal to `shares` if there are no
+            intervals (`AcrossTasks.interval_method` is None).
+        high: upper ends of the pointwise intervals; equal to `shares` if there are no
+            intervals.
     """
 
     thresholds: tuple[float, ...]
@@ -104,20 +105,20 @@ class Profile:
 
 @dataclass(frozen=True, kw_only=True)
 class AcrossTasks:
-    """What is said of all tasks that have a scale, by their scores from 0 to 1.
+    """The summary of all tasks that have a scale, computed from scores.
 
     Attributes:
-        tasks: which ones.
-        left_out: the others, each with the reason.
-        mean: of the tasks' mean scores.
-        median: of the tasks' mean scores.
-        iqm: the interquartile mean of all scores.
-        iqm_interval: of that.
-        optimality_gap: by how much scores fall short of 1, on average.
-        optimality_gap_interval: of that.
-        profile: of all scores.
-        interval_method: how the intervals were made; None where there are none,
-            because a task has a single episode.
+        tasks: the tasks with a scale.
+        left_out: the other tasks, each with the reason.
+        mean: mean of the tasks' mean scores.
+        median: median of the tasks' mean scores.
+        iqm: interquartile mean of all scores.
+        iqm_interval: confidence interval of the interquartile mean.
+        optimality_gap: average amount by which scores fall short of 1.
+        optimality_gap_interval: confidence interval of the optimality gap.
+        profile: performance profile of all scores.
+        interval_method: method of the intervals; None if there are no intervals because
+            a task has only one episode.
     """
 
     tasks: tuple[str, ...]
@@ -146,24 +147,26 @@ def summarize_task(
     score_range: tuple[float, float] | None = None,
     bootstrap: Bootstrap | None = None,
 ) -> TaskSummary:
-    """Return what is said of one task.
+    """Summarize the episodes of one task.
 
-    The arrays have an element for each completed episode, in the same order; how they
-    are ordered changes no figure by more than rounding. A million episodes take a
-    second.
+    The arrays have one element per completed episode, in the same order. The order
+    changes no figure by more than rounding errors. A million episodes take a second.
 
     Args:
-        task: its name.
+        task: the task's name.
         total_rewards: the returns.
-        runs: how many seeds, or monitors, the episodes are of.
-        lengths: in steps; empty where they were not recorded.
-        terminated: truth values; nothing likewise.
-        truncated: likewise.
-        success: 1 and 0, NaN where the environment said nothing; nothing likewise.
-        failed: how many episodes could not be completed.
-        warnings: how often MuJoCo warned, by kind, in all episodes, failed ones too.
-        score_range: the returns that count as 0 and as 1.
-        bootstrap: how intervals are made; as `Bootstrap()` says, if None.
+        runs: number of seeds, or monitors, of the episodes.
+        lengths: lengths in steps; empty if they were not recorded.
+        terminated: whether the task ended each episode; empty if not recorded.
+        truncated: whether a limit outside the task ended each episode; empty if not
+            recorded.
+        success: 1 for success, 0 for none, NaN if the environment does not report it;
+            empty if not recorded.
+        failed: number of episodes that could not be completed.
+        warnings: number of MuJoCo's warnings, by kind, in all episodes, including
+            failed ones.
+        score_range: the returns that count as scores 0 and 1.
+        bootstrap: settings of the confidence intervals; None for `Bootstrap()`.
     """
     returns = np.asarray(total_rewards, dtype=np.float64)
     how = bootstrap or Bootstrap()
@@ -194,7 +197,7 @@ def summarize_results(
     score_range: tuple[float, float] | None = None,
     bootstrap: Bootstrap | None = None,
 ) -> TaskSummary:
-    """Return what is said of one task, all of whose results these are."""
+    """Summarize one task, given the results of all its episodes."""
     completed = [result for result in results if result.failure is None]
     warnings: Counter[str] = Counter()
     for result in results:
@@ -217,14 +220,14 @@ def summarize_results(
 def default_score_range(
     task: str, step_limit: int | None = None
 ) -> tuple[float, float] | None:
-    """Return the returns that count as 0 and as 1; None where they are unknown.
+    """Return the returns that count as scores 0 and 1; None if they are unknown.
 
-    The tasks of the dm_control suite reward every step with 0 to 1 and have 1000 steps
-    (arXiv 1801.00690), all but `lqr`, whose rewards have no bound.
+    Tasks of the dm_control suite have 1000 steps with rewards from 0 to 1 (arXiv
+    1801.00690), except `lqr`, whose rewards are unbounded.
 
     Args:
-        task: its name.
-        step_limit: the most steps of an episode, where that was asked for.
+        task: the task's name.
+        step_limit: maximum number of steps per episode, if one was requested.
     """
     if not task.startswith(_SUITE) or task.startswith(_UNBOUNDED_IN_SUITE):
         return None
@@ -232,7 +235,7 @@ def default_score_range(
 
 
 def scaled(total_rewards: FloatArray, score_range: tuple[float, float]) -> FloatArray:
-    """Return scores: 0 and 1 where returns are at the ends of the range."""
+    """Scale returns to scores, so that the ends of the range become 0 and 1."""
     low, high = score_range
     return (total_rewards - low) / (high - low)
 
@@ -243,13 +246,13 @@ def summarize_across(
     *,
     bootstrap: Bootstrap | None = None,
 ) -> AcrossTasks:
-    """Return what is said of all tasks that have a scale.
+    """Summarize all tasks that have a scale.
 
     Args:
-        total_rewards: the returns of the completed episodes, for each task.
-        score_ranges: the returns that count as 0 and as 1; a task that is not there has
-            no scale.
-        bootstrap: how intervals are made; as `Bootstrap()` says, if None.
+        total_rewards: returns of the completed episodes, by task.
+        score_ranges: the returns that count as scores 0 and 1, by task; a task that is
+            missing or None has no scale.
+        bootstrap: settings of the confidence intervals; None for `Bootstrap()`.
     """
     scores: dict[str, FloatArray] = {}
     left_out: dict[str, str] = {}
@@ -296,7 +299,7 @@ def summarize_across(
 def _figures(returns: FloatArray, how: Bootstrap) -> dict[str, Any]:
     mean = statistics.mean(returns)
     iqm = statistics.interquartile_mean([returns])
-    # Returns near the largest number there is have a sum that is none.
+    # The sum of returns near the largest float overflows.
     with np.errstate(over="ignore", invalid="ignore"):
         return {
             "mean": _finite(mean.value),
@@ -316,7 +319,7 @@ def _successes(success: npt.ArrayLike, failed: int, how: Bootstrap) -> dict[str,
     known_successes = known_successes[~np.isnan(known_successes)]
     if not len(known_successes):
         return {}
-    # Who fails to complete an episode does not succeed in it.
+    # A failed episode counts as not successful.
     known = len(known_successes) + failed
     successes = int(np.count_nonzero(known_successes))
     return {
@@ -328,8 +331,8 @@ def _successes(success: npt.ArrayLike, failed: int, how: Bootstrap) -> dict[str,
 
 def _why_no_scale(task: str) -> str:
     if task.startswith(_UNBOUNDED_IN_SUITE):
-        return "its rewards have no bound"
-    return "it has no scale of its own, and none was given"
+        return "its rewards are unbounded"
+    return "it has no default scale, and no scale was given"
 
 
 def _number(value: float | None) -> float:

@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The tasks that a person names: environments, sets of them, and patterns.
+"""Task names from the user: environments, sets of environments, and patterns.
 
 ======================  ==============================================================
-`HalfCheetah-v5`        an environment as in `mjrec record`: an id of Gymnasium's,
+`HalfCheetah-v5`        an environment as in `mjrec record`: a Gymnasium id,
                         `dm_control/<domain>-<task>`, or the path of an MJCF file;
-                        an id without its version is the newest
+                        an id without a version means the newest
 `dm_control:all`        a set, see `TASK_SETS`
-`dm_control/walker-*`   a pattern of `*`, `?` and `[...]`, matched against the tasks of
-                        the dm_control suite and the ids in Gymnasium's registry; one
-                        that names no versions (`Half*`) means the newest of each
-`module:Fetch*-v4`      likewise, of the ids that this module registers
+`dm_control/walker-*`   a pattern with `*`, `?` and `[...]`, matched against the tasks
+                        of the dm_control suite and the ids in Gymnasium's registry; a
+                        pattern without versions (`Half*`) means the newest of each
+`module:Fetch*-v4`      a pattern matched against the ids that this module registers
 ======================  ==============================================================
 """
 
@@ -45,13 +45,13 @@ _WILD = re.compile(r"[*?\[]")
 
 
 def tasks_from(texts: Sequence[str]) -> tuple[str, ...]:
-    """Return the names of the environments that `texts` name, each once, in order.
+    """Return the environments that `texts` name, in order and without duplicates.
 
     Raises:
-        UnknownName: there is no such set or file, or nothing matches a pattern.
-        InvalidArgument: nothing is named, or a name cannot be one.
-        MissingDependency, EnvironmentNotMade: the framework of a set is not
-            installed, or cannot be imported.
+        UnknownName: a set or file does not exist, or nothing matches a pattern.
+        InvalidArgument: `texts` is empty, or a name is invalid.
+        MissingDependency, EnvironmentNotMade: a set's framework is not installed, or
+            cannot be imported.
     """
     if isinstance(texts, str):
         texts = [texts]
@@ -81,17 +81,18 @@ def _named(text: str) -> Sequence[str]:
     if not isinstance(name, GymnasiumName) or version_of(text) >= 0:
         return [text]
     module, colon, env_id = text.rpartition(":")
-    # Where there is none, making it says what there is.
+    # If the id is unknown, creating the environment will list the known ones.
     newest = newest_versions(gymnasium_ids(module)).get(env_id, env_id)
     return [f"{module}{colon}{newest}"]
 
 
 def _is_set(text: str) -> bool:
-    """Return whether it can only have been meant as a set."""
+    """Return whether the name can only mean a set."""
     framework, colon, name = text.partition(":")
     if not colon or _WILD.search(name):
         return False
-    # `gymnasium:Ant-v5` is an environment of a module that registers some.
+    # `gymnasium:Ant-v5` is not a set: it names an environment and the module that
+    # registers it.
     return framework == "dm_control" or (
         framework == "gymnasium" and version_of(name) < 0
     )
@@ -102,14 +103,14 @@ def _matching(pattern: str) -> Sequence[str]:
     known = list(_candidates(module, wanted))
     newest = newest_versions(known)
     matching = [newest[name] for name in newest if fnmatch.fnmatchcase(name, wanted)]
-    # Else the pattern is one of names with their versions.
+    # Otherwise the pattern must include versions.
     matching = matching or [n for n in known if fnmatch.fnmatchcase(n, wanted)]
     if not matching:
         raise UnknownName(
             "task that matches",
             pattern,
             known,
-            hint="Looked through the tasks of the dm_control suite, where it is "
+            hint="The search covers the tasks of the dm_control suite, if it is "
             "installed, and the ids in Gymnasium's registry. Sets are "
             f"{', '.join(TASK_SETS)}.",
         )
@@ -130,5 +131,5 @@ def _suite_if_installed() -> Sequence[str]:
     try:
         return suite_tasks("all")
     except MissingDependency:
-        # Nothing was said of it: the pattern may mean others.
+        # Not an error, because the pattern may mean other environments.
         return ()

@@ -1,18 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a worker process of an evaluation does.
+"""The worker process of an evaluation.
 
-Settings: `{"directory": DIR, "plan": <the plan as JSON, without its chunks>}`;
-`"payload"`, the file with the pickled policy, where that is an object; and
-`"chooses_gl": true` where the worker is to choose an OpenGL backend that works on its
-machine, if episodes get videos. Jobs, by their `kind`; doing one again is harmless:
+Settings: `{"directory": DIR, "plan": <the plan as JSON, without its chunks>}`. If the
+policy is an object, `"payload"` is the file with the pickled policy. With
+`"chooses_gl": true` the worker chooses an OpenGL backend that works on its machine, if
+episodes get videos.
 
-`check`  `{"task"}`: makes the environment and the policy, and takes no step. Returns
-         `{"step_limit", "velocities"}`, the last one the number of degrees of freedom
-         (0 without MuJoCo), or `{"error": ...}` where they cannot be made: as
-         `messages.carried` packs it, so that it comes home as what it is, and leaves no
-         traceback in the log.
+Jobs, by their `kind`; repeating a job is harmless:
+
+`check`  `{"task"}`: creates the environment and the policy, without taking a step.
+         Returns `{"step_limit", "velocities"}`, where `velocities` is the number of
+         degrees of freedom (0 without MuJoCo). If creation fails, returns `{"error":
+         ...}`, packed by `messages.carried`, so that the caller can raise the same
+         error and no traceback is logged.
 `run`    `{"task", "folder", "chunk"}`: runs the missing episodes of a chunk. Returns
-         `{"models": [sha256 of compiled ones that it has stored, ...]}`.
+         `{"models": [SHA-256 of each compiled model that it has stored, ...]}`.
 """
 
 from __future__ import annotations
@@ -40,10 +42,10 @@ _LOCK = ".mjrec.chunk.lock"
 
 
 class EvaluationWorker:
-    """Does the jobs of an evaluation; a handler of `engines.jobs`.
+    """Runs an evaluation's jobs; a handler for `engines.jobs`.
 
     Args:
-        settings: see the module.
+        settings: see the module docstring.
     """
 
     def __init__(self, settings: Mapping[str, Any]) -> None:
@@ -53,32 +55,31 @@ class EvaluationWorker:
         self._evaluator = Evaluator(
             self._plan, None if policy is None else Path(policy).read_bytes()
         )
-        # dm_control tries GLFW where no other backend was found, and complains of the
-        # display that a machine without a screen has not got. Where that matters,
-        # drawing says so.
+        # If dm_control finds no other backend it tries GLFW, which warns about the
+        # missing display on a headless machine. If that matters, drawing reports it.
         warnings.filterwarnings("ignore", message=r"\(65550\) b'X11")
         if settings.get("chooses_gl") and self._evaluator.draws:
             try:
                 use_gl()
             except GLError as error:
                 logger.warning(NO_GL, error)
-        # Not at the top, because it loads MuJoCo, which takes its backend then.
+        # Imported here because it loads MuJoCo, which then picks its GL backend.
         from ..simulation.warnings import log_mujoco_warnings
 
         log_mujoco_warnings()
 
     def __call__(self, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
-        """Do a job.
+        """Run a job.
 
         Raises:
-            Error: of what the job is about, unless it is a check.
+            Error: the job failed. A check returns its error instead.
         """
         if arguments["kind"] == "check":
             return self._check(arguments["task"])
         return self._run(arguments)
 
     def leave(self) -> None:
-        """Note in the journal that nothing here is to blame for the end."""
+        """Note in the journal that the running episode did not end this process."""
         self._evaluator.leave()
 
     def close(self) -> None:
@@ -102,7 +103,7 @@ class EvaluationWorker:
             folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise DirectoryNotWritable(folder, error.strerror) from error
-        # That of a run whose driver was killed may be at it still.
+        # A worker of an earlier run whose driver was killed may still be at work.
         with wait_for_lock(folder / _LOCK), noting_models() as models:
             recover(folder, bundle=True)
             chunk = from_json(Chunk, arguments["chunk"])

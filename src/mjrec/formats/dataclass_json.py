@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Dataclasses as JSON, and back: each is an object with the names of its fields."""
+"""Conversion between dataclasses and JSON objects with the same field names."""
 
 from __future__ import annotations
 
@@ -58,14 +58,13 @@ def _plain(value: Any) -> Any:
 
 
 def from_json(kind: type[D], value: Any) -> D:
-    """Return what `to_json` wrote.
+    """Return a dataclass from the output of `to_json`.
 
-    Keys that this version does not know are ignored, and of those that are missing the
-    defaults are taken. A field that is annotated with `Annotated[kind, read]` is what
-    `read` makes of its value.
+    Unknown keys are ignored, and missing keys get the field's default. For a field
+    annotated as `Annotated[kind, read]`, `read` converts the value.
 
     Raises:
-        ValueError: it is no such object.
+        ValueError: `value` is not an object of this kind.
     """
     values = mapping(value)
     fields, hints = _fields_and_hints(typing.cast(Any, kind))
@@ -89,7 +88,7 @@ def _is_needed(each: dataclasses.Field[Any]) -> bool:
 
 
 def _reader(hint: Any) -> _Read:
-    """Return what reads a field that is annotated so."""
+    """Return the function that reads a field with this annotation."""
     if hint in _PLAIN:
         return _PLAIN[hint]
     if dataclasses.is_dataclass(hint):
@@ -132,7 +131,7 @@ def _tuple(inner: tuple[Any, ...]) -> Callable[[Any], tuple[Any, ...]]:
     def read_so_many(value: Any) -> tuple[Any, ...]:
         items = read(value)
         if len(items) != len(inner):
-            raise ValueError(f"{len(inner)} values belong there, not {len(items)}")
+            raise ValueError(f"expected {len(inner)} values, got {len(items)}")
         return items
 
     return read_so_many

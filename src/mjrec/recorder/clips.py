@@ -1,17 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """Clips: videos of N steps, which may cross episodes.
 
-A clip may go on across resets, and a recording is of one episode: so there is one for
-each part of it that is of one episode. `clip` in the facts of a part says
+A clip may continue across resets, but a recording belongs to one episode. So a clip has
+one recording, called a part, for each episode that it touches. `clip` in a part's facts
+has these keys:
 
-- `first_step`: how many steps the monitor had recorded when the video began;
-- `part`: its number, from 0;
-- `steps_before`: of the running episode, before the part begins;
-- `reward_before`: their rewards;
-- `reset_time`: the simulated time of that episode's reset, where it is to be written on
-  the frames.
+- `first_step`: number of steps that the monitor had recorded when the clip began
+- `part`: the part's number, from 0
+- `steps_before`: number of steps of the running episode before the part begins
+- `reward_before`: sum of the rewards of those steps
+- `reset_time`: simulated time of that episode's reset, if it is written on the frames
 
-The last part ends as an episode's trajectory does, with `complete`; those before say
+The last part ends with `complete`, like an episode's trajectory; earlier parts end with
 `continues`.
 """
 
@@ -31,16 +31,17 @@ if TYPE_CHECKING:
 
 
 class Clips:
-    """The videos of a run that are counted in steps, one at a time.
+    """The clips of a run, recorded one at a time.
 
-    While one is recorded nothing begins another: each has the frame that it begins
-    with and those of exactly `length` steps, on across resets, which add a frame
-    each. Without a length it ends with the episode.
+    No clip begins while another is being recorded. A clip has its first frame and the
+    frames of exactly `video_length` steps. It continues across resets, which add a
+    frame each. Without a length it ends with the episode.
 
     Args:
-        run: the monitored run. `video_length` is theirs in steps, None until the end of
-            the episode; `step_trigger` tells by the number of steps taken so far
-            whether one begins before the next, None where only episodes begin them.
+        run: the monitored run. Its options set the clips: `video_length` is the length
+            in steps, None for the rest of the episode. `step_trigger` is called with
+            the number of steps taken so far and returns whether a clip begins before
+            the next step; if it is None, clips begin only with episodes.
     """
 
     def __init__(self, run: MonitoredRun) -> None:
@@ -50,10 +51,10 @@ class Clips:
         self._clip: _Clip | None = None
 
     def reset(self, *, is_chosen: bool) -> None:
-        """Take the frame of an episode that has just begun.
+        """Take the first frame of an episode that has just begun.
 
         Args:
-            is_chosen: a video begins with it, unless one is running.
+            is_chosen: whether a clip begins with the episode, unless one is running.
         """
         if self._clip is not None:
             self._clip.reset()
@@ -61,7 +62,7 @@ class Clips:
             self._start(None)
 
     def before_step(self) -> None:
-        """Begin a video, if it is its time."""
+        """Begin a clip if `step_trigger` chooses this step."""
         taken = self._run.stats.total_steps
         if self._clip is None and self._trigger is not None:
             is_chosen: Any = False
@@ -73,7 +74,7 @@ class Clips:
     def step(
         self, reward: float, *, terminated: bool, truncated: bool, has_frame: bool
     ) -> None:
-        """Take the frame of a step; as `StateRecorder.step`."""
+        """Record a step; see `StateRecorder.step`."""
         clip = self._clip
         if clip is None:
             return
@@ -87,15 +88,15 @@ class Clips:
                 self._end({"complete": True})
 
     def close(self, facts: Mapping[str, Any]) -> None:
-        """End the running video, if there is one. Idempotent.
+        """End the running clip, if any. Idempotent.
 
         Args:
-            facts: why it ends early.
+            facts: why the clip ends early.
         """
         self._end({"complete": False, **facts})
 
     def leave(self) -> None:
-        """Let go of the files as they are; recovery finishes them."""
+        """Release the files as they are; recovery finishes them."""
         if self._clip is not None and self._clip.live is not None:
             self._clip.live.leave()
 
@@ -110,17 +111,17 @@ class Clips:
 
 
 class _Clip:
-    """One video, drawn live, or recorded in parts of one episode each.
+    """One clip, drawn live or recorded in parts, one per episode.
 
     Args:
         run: the monitored run.
-        taken: the steps so far, where a step began it; None where it begins with an
-            episode.
+        taken: number of steps so far, if a step began the clip; None if it begins with
+            an episode.
 
     Attributes:
-        steps: how many it has.
-        reward: their sum.
-        live: draws it, or not.
+        steps: number of steps in the clip.
+        reward: sum of their rewards.
+        live: draws the clip live; None if it is rendered later.
     """
 
     def __init__(self, run: MonitoredRun, taken: int | None) -> None:
@@ -152,12 +153,12 @@ class _Clip:
             self.live.say(first_step=self._first_step, last_episode_id=self._episode_id)
 
     def begin(self) -> None:
-        """Take the frame of this moment, where it is drawn live."""
+        """Take the first frame if the clip is drawn live."""
         if self.live is not None:
             self.live.begin()
 
     def reset(self) -> None:
-        """Take the frame of an episode that has just begun."""
+        """Take the first frame of an episode and begin a new part."""
         self._last_episode_id = self._run.episode.episode_id
         if self.live is not None:
             self.live.say(last_episode_id=self._last_episode_id)
@@ -177,7 +178,7 @@ class _Clip:
     def step(
         self, reward: float, terminated: bool, truncated: bool, *, has_frame: bool
     ) -> None:
-        """Take the frame of a step."""
+        """Record a step."""
         if self.live is not None:
             self.live.take(is_there=has_frame, last=False)
         part = self._part
@@ -190,7 +191,7 @@ class _Clip:
         )
 
     def end(self, facts: Mapping[str, Any]) -> None:
-        """Write what is known of the end, and hand the video on."""
+        """End the clip and submit it."""
         run = self._run
         known = {**facts, "length": self.steps, "reward": self.reward}
         said = {"episode_id": self._episode_id, "video": self._video.name}
@@ -209,14 +210,14 @@ class _Clip:
                 last = {"last_episode_id": self._last_episode_id}
                 self._part.end({**known, **last, "end_time": run.clock()})
             finally:
-                # Else the disk was too full for a single row: no video will come.
+                # Otherwise the disk was too full for a single row: no video will come.
                 if self._parts > 1 or self._part.is_there:
                     run.note("clip", {**said, "clip": self._name(0)})
                     run.trackers.expect(self._video)
                     self._part.submit(run.directory / self._name(0))
 
     def _begin_part(self, start: EpisodeStart) -> None:
-        """Record the part that begins now."""
+        """Begin a new part."""
         run = self._run
         clip = {
             "first_step": self._first_step,
@@ -234,9 +235,8 @@ class _Clip:
             facts={**run.recording_facts(start), **facts},
             capture=run.env.clip_states,
             start=start,
-            # What was done is of no use to a frame. Which frames are wanted is chosen
-            # when they are drawn, because they are counted over all parts: so `max_fps`
-            # is not said here.
+            # Frames do not depend on actions. `max_fps` is left out because frames are
+            # selected when they are drawn, counted over all parts.
             has_actions=False,
         )
         self._parts += 1

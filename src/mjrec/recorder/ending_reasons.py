@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Why an episode ended before it was over, as files say it."""
+"""The recorded reasons why an episode ended early."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ _LONGEST_MESSAGE = 1000
 
 
 def ending(error: BaseException | None, *, otherwise: str = CLOSE) -> dict[str, Any]:
-    """Return the facts of an end that an exception has brought about.
+    """Return the facts about an early end, possibly caused by an exception.
 
     Args:
-        error: the exception; None where there was none.
-        otherwise: the reason, where there was none, or one that is an ordinary way to
-            leave a program (`sys.exit()`).
+        error: the exception; None if there was none.
+        otherwise: the reason to give if there was no exception, or only an ordinary
+            way to leave a program (`sys.exit()`).
 
     Returns:
         `reason` and, for the reason "exception", `exception` with its `type` (module
-        and name; those of Python itself without a module) and its `message`.
+        and name; built-in exceptions without a module) and its `message`.
     """
     if error is None or _is_ordinary(error):
         return {"reason": otherwise}
@@ -36,10 +36,10 @@ def ending(error: BaseException | None, *, otherwise: str = CLOSE) -> dict[str, 
 
 
 def last_error() -> BaseException | None:
-    """Return the exception that is ending this process, as far as that can be seen.
+    """Return the exception that is ending this process, if it can be found.
 
-    At exit the interpreter has printed it already, and kept it. An interactive session
-    keeps every one that it has printed, and does not end by it.
+    At exit the interpreter has already printed and stored it. In an interactive session
+    the stored exception proves nothing, because printed exceptions do not end it.
     """
     if hasattr(sys, "ps1"):
         return None

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which episodes get a video, and which keep their trajectory."""
+"""Choosing which episodes get a video and which keep their trajectory."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ _EVALUATION = "e"
 
 
 class EpisodeChoice:
-    """Chooses as an episode begins, from what was asked for.
+    """Decides at the beginning of an episode, by the user's options.
 
     Args:
-        options: what was asked for.
+        options: the user's options.
         mode: when frames are drawn.
 
     Attributes:
-        selection: chooses among the episodes that are over; None where that is settled
-            when they begin.
+        selection: chooses among finished episodes; None if episodes are chosen when
+            they begin.
     """
 
     def __init__(self, options: RecorderOptions, *, mode: str) -> None:
@@ -38,13 +38,13 @@ class EpisodeChoice:
         self._trajectories = options.trajectory_callable
         stated = options.statements
         self._only_counted = stated is not None and stated.only_counted
-        # The episodes that were asked about last.
+        # The last episode number passed to each function, and its result.
         self._decided = (-1, False)
         self._kept = (-1, False)
 
     @property
     def schedule_name(self) -> str:
-        """What a manifest calls the schedule."""
+        """The schedule's name in the manifest."""
         return schedule_name(self._schedule)
 
     @property
@@ -54,13 +54,14 @@ class EpisodeChoice:
 
     @property
     def is_scheduled(self) -> bool:
-        """Whether the schedule chose the episode that `decide` was asked about last."""
+        """Whether the schedule chose the episode of the last call to `decide`."""
         return self._decided[1]
 
     def will_choose(self, episode_id: int) -> bool:
-        """Return whether an episode surely gets a video: a user's schedule may wait.
+        """Return whether it is already certain that an episode gets a video.
 
-        It is asked when the episode begins.
+        A user's schedule is not called before the episode begins, so this is True only
+        for the default schedule.
         """
         is_ours = self._schedule is capped_cubic_video_schedule
         return is_ours and self._schedule(episode_id)
@@ -68,14 +69,18 @@ class EpisodeChoice:
     def decide(self, episode_id: int) -> bool:
         """Return whether an episode gets a video.
 
-        The schedule is asked once for a number, which resets may share.
+        The schedule is called once per episode number, although several resets may
+        share it.
         """
         if self._decided[0] != episode_id:
             self._decided = (episode_id, bool(self._schedule(episode_id)))
         return self._decided[1]
 
     def may_keep_trajectory(self, episode_type: str) -> bool:
-        """Return whether an episode of a type may have one, before `decide`."""
+        """Return whether an episode of this type may keep its trajectory.
+
+        This can be called before `decide`.
+        """
         return (
             self.has_videos
             or self._trajectories is not None
@@ -87,12 +92,13 @@ class EpisodeChoice:
     ) -> bool:
         """Return whether an episode keeps its trajectory.
 
-        A function is asked once for a number, which resets may share.
+        A user's function is called once per episode number, although several resets may
+        share it.
 
         Args:
-            episode_id: its number.
+            episode_id: the episode's number.
             episode_type: "t" for training, "e" for evaluation.
-            has_video: it gets a video.
+            has_video: whether the episode gets a video.
         """
         asked = self._trajectories
         if self._only_counted:
@@ -106,5 +112,5 @@ class EpisodeChoice:
         return self._kept[1]
 
     def keeps_without_video(self, episode_type: str) -> bool:
-        """Return whether a trajectory that is kept stays where its video does not."""
+        """Return whether a kept trajectory stays even if its video is dropped."""
         return self._trajectories is not None or episode_type == _EVALUATION

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Closing once, whatever happens first: a call, garbage collection, or exit."""
+"""Closing exactly once: on a call, at garbage collection, or at exit."""
 
 from __future__ import annotations
 
@@ -9,21 +9,22 @@ import threading
 import weakref
 from collections.abc import Callable
 
-# How the names of this package's own threads begin.
+# Prefix of the names of this package's threads.
 _OWN_THREADS = "mjrec-"
 
 
 class ExitGuard:
     """Calls `close` once: when called, when `owner` is collected, or at exit.
 
-    In a forked child nothing is called: the files belong to the process that made
-    them.
+    In a forked child nothing is called, because the files belong to the process that
+    created them.
 
     Args:
-        owner: the object whose end means close.
-        close: what to call. It must not refer to `owner`, which would then live for
-            ever.
-        at_exit: called before it where the interpreter is ending, likewise.
+        owner: the object to close for when it is collected.
+        close: the function to call. It must not refer to `owner`, which would then
+            never be collected.
+        at_exit: called before `close` at interpreter exit. It must not refer to
+            `owner` either.
     """
 
     def __init__(
@@ -35,24 +36,24 @@ class ExitGuard:
     ) -> None:
         self._close = _in_process(os.getpid(), close)
         self._finalize = weakref.finalize(owner, _aside, self._close)
-        # weakref's own exit hook is as old as its first use in the process, and hooks
-        # run newest first: simulators would have torn OpenGL down before us.
+        # weakref registers its exit hook at its first use in the process, and hooks run
+        # newest first: simulators would tear OpenGL down before this one.
         self._finalize.atexit = False
         self._first = False
         self._at_exit = _one_after_the_other(at_exit, self._finalize)
         atexit.register(self._at_exit)
 
     def run_first_at_exit(self) -> None:
-        """Put this hook before all exit hooks that were registered so far; once."""
+        """Run this hook before all exit hooks registered so far. Works once."""
         if not self._first and self._finalize.alive:
             self._first = True
             atexit.unregister(self._at_exit)
             atexit.register(self._at_exit)
 
     def close(self) -> None:
-        """Call `close`, unless that was done already.
+        """Call `close`, unless it has already succeeded.
 
-        Where it raised or was interrupted (Ctrl-C), the next call calls it again.
+        If `close` raises or is interrupted (Ctrl-C), the next call tries again.
         """
         if self._finalize.alive:
             self._close()
@@ -80,10 +81,10 @@ def _one_after_the_other(
 
 
 def _aside(close: Callable[[], None]) -> None:
-    """Call `close`, on another thread where this one is ours.
+    """Call `close`, on a new thread if the current one belongs to this package.
 
-    Garbage is collected on whichever thread happens to allocate. Closing waits for the
-    encoder's thread, which must not be the one that waits.
+    Garbage collection runs on any thread that allocates. Closing waits for the
+    encoder's thread, so it must not run on that thread.
     """
     if threading.current_thread().name.startswith(_OWN_THREADS):
         threading.Thread(target=close, name="close").start()

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Recording steps after which nothing but the state is new.
+"""The fast path: recording steps that change nothing but the state.
 
-A fast simulation's step takes as long as some hundred lines of Python. Nearly all steps
-are alike: no error, no end, the same model, the same view. A `FastPath` stands in place
-of `Recorder.before_step` and `Recorder.step` for as long as the recorder has one. Where
-one of its functions returns False nothing was recorded, and the recorder's method of
-that name is to be called.
+A step of a fast simulation takes as long as a few hundred lines of Python. Nearly all
+steps are alike: no error, no end, the same model, the same view. While a recorder has a
+`FastPath`, its functions are called instead of `Recorder.before_step` and
+`Recorder.step`. If one of them returns False, nothing was recorded, and the caller must
+call the recorder's method of that name.
 """
 
 from __future__ import annotations
@@ -24,27 +24,27 @@ from ..formats.trajectory import FRAME, STEP, TERMINATED, TRUNCATED
 from ..simulation.raw_memory import WORDS
 from .stats_recorder import StatsRecorder
 
-# Rewards are NumPy's float64 as a rule: `+` would make one of the sum, too.
+# Rewards are usually NumPy's float64, and `+` would turn the sum into one, too.
 _sum = float.__add__
-# A float has each integer up to here, and one far beyond it is no float.
+# Floats represent every integer exactly up to here.
 _LARGEST = 1 << 53
 
 
 class Step(Protocol):
-    """Records a step by its reward, and counts it."""
+    """A function that records and counts a step, given its reward."""
 
     def __call__(
         self, reward: Any, *, terminated: bool = ..., truncated: bool = ...
     ) -> bool:
-        """Return False where it is not usual, and nothing was recorded."""
+        """Return False if the step is unusual and was not recorded."""
 
 
 class FastPath(NamedTuple):
-    """What nearly all steps are recorded with.
+    """The functions that record nearly all steps.
 
     Attributes:
-        before_step: notes the action, and tells whether a step may be taken.
-        step: records a step. That the episode is over by it is the recorder's to say.
+        before_step: notes the action and returns whether a step may be taken.
+        step: records a step. The recorder itself handles the end of the episode.
     """
 
     before_step: Callable[[Any], bool]
@@ -52,17 +52,17 @@ class FastPath(NamedTuple):
 
 
 def counting(stats: StatsRecorder) -> FastPath:
-    """Return what counts steps and records nothing else."""
+    """Return a fast path that only counts steps and rewards."""
 
     def before_step(action: Any) -> bool:
-        # Others may have ended the episode, or its recording.
+        # The episode, or its recording, may have been ended elsewhere.
         return stats.done is False and not stats.closed
 
     def step(reward: Any, *, terminated: bool = False, truncated: bool = False) -> bool:
         if not isinstance(reward, float):
             return False
         total = _sum(reward, stats.rewards)  # type: ignore[arg-type]
-        # No call from here on, behind which a signal's handler could raise.
+        # No calls from here on, because a signal handler could raise after a call.
         stats.rewards = total
         stats.steps += 1  # type: ignore[operator]
         stats.total_steps += 1
@@ -81,22 +81,23 @@ def gathering(
     is_on_pace: Callable[[], bool],
     stride: int,
 ) -> FastPath:
-    """Return what records steps with one copy of memory each.
+    """Return a fast path that records each step with one copy of memory.
 
     Args:
         stats: counts the steps.
-        span: the recording, which has its first row.
-        words: those of a row but its head, in `WORDS`.
-        set_action: puts the action into the memory that is gathered; False where it is
-            not like those before.
-        is_current: tells, after the step, whether nothing but the state is new.
-        is_on_pace: tells, after the first step, whether it lasted as long as supposed.
-        stride: only its multiples have a frame.
+        span: the recording, which already has its first row.
+        words: indices into `WORDS` of a row's content after its head.
+        set_action: copies the action into the gathered memory; returns False if the
+            action has a different type or shape than before.
+        is_current: returns, after a step, whether nothing but the state has changed.
+        is_on_pace: returns, after the first step, whether it took the expected
+            simulated time.
+        stride: steps that are multiples of it get a frame, and so does the last step.
     """
     log, bodies = span.log.rows, span.log.bodies
     take, both = WORDS.take, STEP | FRAME
-    # Code that simulates leaves little of ours in a CPU's caches: an item costs less
-    # there than `struct` does.
+    # The simulation evicts our code from the CPU's caches; then assigning an item is
+    # cheaper than `struct`.
     whole, floats = memoryview(log.memory).cast("q"), memoryview(log.memory).cast("d")
     capacity, width, first = log.capacity, log.row_size // 8, TAIL_HEAD // 8
 
@@ -125,8 +126,8 @@ def gathering(
         whole[head], whole[head + 1], whole[head + 3] = row, number, flags
         floats[head + 2] = reward
         total = _sum(reward, stats.rewards)  # type: ignore[arg-type]
-        # No call from here on, behind which a signal's handler could raise: what is
-        # counted is what is there.
+        # No calls from here on, because a signal handler could raise after a call, and
+        # the counters would not match the rows.
         whole[0] = log.count = row + 1
         span.steps = number
         if is_frame:
@@ -141,8 +142,8 @@ def gathering(
 
 
 def _makes_room(log: RowLog) -> bool:
-    """Write a full tail away; return False where rows do not stay in it, or cannot."""
-    # On a full disk the recorder tries again, and says so.
+    """Write a full tail to the log; return whether the next row may stay in it."""
+    # On a full disk the recorder tries again and reports it.
     with contextlib.suppress(FileNotWritten):
         log.make_room()
     return log.count < log.limit

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What takes over recordings that have ended."""
+"""Finishers, which take over recordings that have ended."""
 
 from __future__ import annotations
 
@@ -11,36 +11,37 @@ from ..formats.monitor_directory import ClipPart
 
 
 class Finisher(Protocol):
-    """Turns ended recordings into trajectories and videos, beside the simulation."""
+    """Turns ended recordings into trajectories and videos while the simulation runs."""
 
     def expect(self, recording: Path | None = None) -> None:
-        """Get ready: a recording will come that has a video. Never waits.
+        """Get ready for a recording that will have a video. Never waits.
 
         Args:
-            recording: which, once it begins; others will most likely be drawn alike.
+            recording: the recording, once it has begun. Later ones will most likely
+                be drawn in the same way.
         """
 
     def submit(self, recording: Path) -> None:
-        """Take over an ended trajectory, or a clip by its first part. Never waits."""
+        """Take over an ended trajectory, or a clip (its first part). Never waits."""
 
     def wait(self, on_progress: Callable[[Any], None]) -> None:
-        """Return when all that was taken over is done."""
+        """Wait until all submitted recordings are finished."""
 
     def stop(self) -> None:
-        """Stop at once; the rest stays pending. Idempotent."""
+        """Stop immediately and leave the rest pending. Idempotent."""
 
     @property
     def failures(self) -> Mapping[str, str]:
-        """Why videos could not be rendered, by the base names of the videos."""
+        """Reasons why videos could not be rendered, keyed by the videos' base names."""
 
 
 class LaterFinisher:
-    """Draws nothing; makes the trajectories when the monitor closes.
+    """A finisher that draws nothing and writes trajectories when the monitor closes.
 
-    It is a `Finisher` for runs whose videos are rendered another time, or never.
+    It is the `Finisher` of runs whose videos are rendered later, or never.
 
     Attributes:
-        bundles: they lie in one file.
+        bundles: whether all trajectories are written to one file.
     """
 
     def __init__(self) -> None:
@@ -52,16 +53,17 @@ class LaterFinisher:
         """Do nothing."""
 
     def submit(self, recording: Path) -> None:
-        """Keep a trajectory in mind; clips stay as they are."""
+        """Queue a trajectory. Clips stay as they are."""
         self._waiting.append(recording)
 
     def wait(self, on_progress: Callable[[Any], None]) -> None:
-        """Make the trajectories.
+        """Write the queued trajectories.
 
         Raises:
-            Error: of the last that could not be made; the others are there.
+            Error: a trajectory could not be written. If several failed, this is the
+                last error; all other trajectories are written.
         """
-        # Not at the top: it loads h5py, which the simulation has no use for.
+        # Imported here because it loads h5py, which the simulation does not need.
         from ..formats.trajectory_file import bundle_trajectories, finish_trajectories
 
         waiting = [each for each in self._waiting if ClipPart.parse(each.name) is None]

@@ -1,28 +1,28 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which episodes get a video, by how they ended: `keep`.
+"""Rules for `keep`, which chooses the episodes that get a video by their results.
 
-A rule is one or several of these, separated by commas:
+A rule is one or more of these, separated by commas:
 
 ==============  ======================================================================
-`best[:N]`      the N of the highest return, one if no number is given
-`worst[:N]`     the N of the lowest return
-`median`        the one whose return is the median, of an even number the lower one
-`failures[:N]`  the first N, or all, that were no success; where the environment does
-                not say, those that it terminated; and those that could not be completed
+`best[:N]`      the N episodes with the highest return; N defaults to 1
+`worst[:N]`     the N episodes with the lowest return; N defaults to 1
+`median`        the episode with the median return; the lower one for an even number
+`failures[:N]`  the first N failures, or all: episodes without success, or, if the
+                environment does not report success, those that it terminated; and
+                those that could not be completed
 ==============  ======================================================================
 
-or, of an evaluation only, one of these:
+In an evaluation it may instead be one of these:
 
 ==========  ==========================================================================
 `cubic`     0, 1, 8, 27 ... and every 1000th, counted over all seeds
-`all`       every one
-`none`      none
+`all`       every episode
+`none`      no episode
 ==========  ==========================================================================
 
-Of equal returns the earlier episode counts. A return that is not a number is the worst.
-What could not be completed has no return, and is neither best, median nor worst. An
-episode may be several of these: where all returns are equal, the first is the best, the
-median and the worst.
+Ties go to the earlier episode. A NaN return ranks worst. An episode that could not be
+completed has no return and is never best, median or worst. One episode can fill several
+roles: if all returns are equal, the first is the best, the median and the worst.
 """
 
 from __future__ import annotations
@@ -46,19 +46,19 @@ _COUNTED = re.compile(
 
 
 class Ended(Protocol):
-    """An episode that is over."""
+    """A finished episode."""
 
     @property
     def reward(self) -> float | None:
-        """The return; None where it could not be completed."""
+        """The return; None if the episode could not be completed."""
 
     @property
     def terminated(self) -> bool | None:
-        """Whether the task ended it."""
+        """Whether the task ended the episode."""
 
     @property
     def success(self) -> bool | None:
-        """What the environment said of it; None where it said nothing."""
+        """Whether it was a success; None if the environment does not report that."""
 
 
 _E = TypeVar("_E", bound=Ended)
@@ -69,19 +69,19 @@ class Part:
     """A part of a rule.
 
     Attributes:
-        role: what it chooses: `"best"`, `"worst"`, `"median"`, `"failure"`, `"cubic"`
-            or `"all"`.
-        count: the most episodes; None where that is not limited.
+        role: the role that it assigns: `"best"`, `"worst"`, `"median"`, `"failure"`,
+            `"cubic"` or `"all"`.
+        count: maximum number of episodes; None for no limit.
     """
 
     role: str
     count: int | None = None
 
     def choose(self, episodes: Sequence[_E | None]) -> list[_E]:
-        """Return the chosen episodes, in the order of the rule.
+        """Return the chosen episodes, in the rule's order.
 
         Args:
-            episodes: in their order; None stands for one that was never begun.
+            episodes: all episodes, in order; None for one that never began.
         """
         begun = [each for each in episodes if each is not None]
         match self.role:
@@ -104,11 +104,11 @@ class Part:
 
 @dataclass(frozen=True)
 class KeepRule:
-    """A rule.
+    """A parsed `keep` rule.
 
     Attributes:
-        name: as the manifest has it.
-        parts: of it.
+        name: the rule's name in the manifest.
+        parts: the rule's parts.
     """
 
     name: str
@@ -120,26 +120,26 @@ class KeepRule:
         return not self.parts
 
     def choose(self, episodes: Sequence[_E | None]) -> list[tuple[_E, str]]:
-        """Return the chosen episodes with their roles, in the order of the rule."""
+        """Return the chosen episodes with their roles, in the rule's order."""
         return [(e, part.role) for part in self.parts for e in part.choose(episodes)]
 
 
 def keep_rule(text: str, rules: Sequence[str] = RULES_OF_EVALUATIONS) -> KeepRule:
-    """Return the rule that `text` names.
+    """Parse a `keep` rule.
 
     Args:
-        text: see the module.
-        rules: those that there are, for messages; without them, `cubic`, `all` and
-            `none` are none.
+        text: the rule; see the module docstring.
+        rules: the valid names, listed in messages. `cubic`, `all` and `none` are
+            accepted only if listed here.
 
     Raises:
-        UnknownName: there is no such rule.
-        InvalidArgument: it is no text, a part of it is there twice, or one that stands
-            alone is not alone.
+        UnknownName: the rule does not exist.
+        InvalidArgument: `text` is not a string, a part is given twice, or `cubic`,
+            `all` or `none` is combined with another part.
     """
     if not isinstance(text, str):
         raise InvalidArgument(
-            f"keep must be a text such as 'best,median,worst', got {text!r}."
+            f"keep must be a string such as 'best,median,worst', got {text!r}."
         )
     names = [name.strip() for name in text.split(",")]
     for name in names:
@@ -148,11 +148,11 @@ def keep_rule(text: str, rules: Sequence[str] = RULES_OF_EVALUATIONS) -> KeepRul
     kinds = [name.partition(":")[0] for name in names]
     if len(kinds) > 1 and set(kinds) & set(_ALONE):
         raise InvalidArgument(
-            f"keep={text!r}: {', '.join(_ALONE)} stand alone; only best, median, worst "
-            "and failures go together."
+            f"keep={text!r} is invalid: {', '.join(_ALONE)} must be used alone; only "
+            "best, median, worst and failures can be combined."
         )
     if len(set(kinds)) < len(kinds):
-        raise InvalidArgument(f"keep={text!r} names something twice.")
+        raise InvalidArgument(f"keep={text!r} names the same rule twice.")
     parts = () if names == ["none"] else tuple(map(_part, names))
     return KeepRule(",".join(names), parts)
 
@@ -160,8 +160,8 @@ def keep_rule(text: str, rules: Sequence[str] = RULES_OF_EVALUATIONS) -> KeepRul
 def has_failed(episode: Ended) -> bool:
     """Return whether an episode is a failure.
 
-    By what the environment says; by its termination where it says nothing, which is
-    right for tasks that end when the robot falls.
+    This is the success that the environment reports. Without a report, a terminated
+    episode is a failure, which is right for tasks that end when the robot falls.
     """
     if episode.reward is None:
         return True
@@ -184,12 +184,12 @@ def _completed(episodes: Sequence[_E]) -> list[_E]:
 
 def _rank(episode: Ended) -> tuple[bool, float]:
     reward = episode.reward
-    # No number is below minus infinity.
+    # NaN must rank below minus infinity, hence the bool.
     return (False, 0.0) if reward is None or math.isnan(reward) else (True, reward)
 
 
 def _median(episodes: Sequence[_E]) -> list[_E]:
-    # Sorting keeps the order of equal ones, in reverse too.
+    # Sorting is stable, even in reverse.
     ordered = sorted(map(_rank, episodes))
     middle = ordered[(len(ordered) - 1) // 2 :][:1]
     return [each for each in episodes if _rank(each) in middle][:1]

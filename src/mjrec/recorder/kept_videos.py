@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The recordings of a run whose videos are chosen after the episodes have ended.
+"""The recordings of a run whose videos are chosen after their episodes have ended.
 
-Every episode is recorded as if it got a video. What is not decided yet is held: its
-log calls it a candidate, which no other process touches while the monitor is open, and
-any may render once the monitor is gone. What falls out is deleted at once.
+Every episode is recorded as if it got a video. Undecided recordings are held, and the
+log marks each of them as a candidate. While the monitor is open, no other process
+touches a candidate; once the monitor is gone, any process may render it. Dropped
+recordings are deleted immediately.
 """
 
 from __future__ import annotations
@@ -21,64 +22,64 @@ logger = logging.getLogger(__name__)
 
 
 class KeptVideos:
-    """Holds, hands on or deletes recordings, as a selection has it.
+    """Holds, submits or deletes recordings as a selection decides.
 
     Args:
-        selection: chooses.
+        selection: chooses the episodes that get a video.
     """
 
     def __init__(self, selection: Selection) -> None:
         self.selection = selection
         self._held: dict[int, EpisodeRecording] = {}
         self._is_decided = False
-        # Why nothing could be decided, and which episodes stay for that.
+        # Why nothing could be decided, and the episodes that are kept because of that.
         self._failure: str | None = None
         self._left: list[int] = []
 
     def chosen_facts(self) -> dict[str, Any]:
-        """Return what is said of a video that is chosen, by which it is known."""
+        """Return the facts that mark a video as chosen."""
         selection = self.selection
         facts = {"rule": selection.name, "decided": True}
         return {**facts, "finished": selection.finished}
 
     def judge(self, episode_id: int, episode: FinishedEpisode | None) -> Standing:
-        """Tell how an episode stands that has just ended.
+        """Return the standing of an episode that has just ended.
 
         Args:
-            episode_id: its number.
-            episode: the episode; None where it was not completed.
+            episode_id: the episode's number.
+            episode: the episode; None if it was not completed.
         """
         if episode is not None:
             if self.selection.holds_all and not self.selection.finished:
                 logger.info(
-                    "Which episodes get a video is decided at the end (keep=%s): until "
-                    "then the recordings of all of them stay on the disk.",
+                    "keep=%s chooses the episodes that get a video at the end. Until "
+                    "then the recordings of all episodes stay on disk.",
                     self.selection.name,
                 )
             self.selection.add(episode)
         return self.selection.standing(episode_id)
 
     def hold(self, recording: EpisodeRecording) -> None:
-        """Hold what there is of an episode that has ended, until it is decided on."""
+        """Hold the recording of an ended episode until it is chosen or dropped."""
         self._held[recording.episode_id] = recording
 
     def settle(self) -> None:
-        """Hand on what is chosen by now, and delete what has fallen out.
+        """Submit the recordings chosen by now, and delete the dropped ones.
 
         Raises:
-            DirectoryNotWritable, FileNotWritten: as `EpisodeRecording.choose` and
-                `drop`; one that fails is no other's fate.
+            DirectoryNotWritable, FileNotWritten: see `EpisodeRecording.choose` and
+                `drop`. A failure does not affect the other recordings.
         """
         if len(self._held) > self.selection.undecided:
             self._hand_on(list(self._held))
 
     def decide(self) -> None:
-        """Decide about all that is held: there are no more episodes.
+        """Decide about all held recordings; no more episodes will come.
 
         Raises:
-            InvalidArgument: the user's function could not choose. All episodes that
-                are held stay, and their videos are pending, or there.
-            DirectoryNotWritable, FileNotWritten: as of `settle`.
+            InvalidArgument: the user's function could not choose. All held episodes
+                are kept; their videos are pending or already exist.
+            DirectoryNotWritable, FileNotWritten: see `settle`.
         """
         if self._is_decided or self._failure is not None:
             return
@@ -91,12 +92,12 @@ class KeptVideos:
                 recording.expect()
             raise
         self._is_decided = True
-        # What is wanted first: should this be killed, it has not lost that.
+        # Chosen recordings first, so that a kill in between does not lose them.
         chosen = set(self.selection.chosen)
         self._hand_on(sorted(self._held, key=lambda number: number not in chosen))
 
     def details(self) -> dict[str, Any]:
-        """Return what the journal says of the choice, once it is made."""
+        """Return the journal's facts about the choice, once it is made."""
         failure = {} if self._failure is None else {"failure": self._failure}
         return {
             "rule": self.selection.name,

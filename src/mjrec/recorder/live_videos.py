@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The videos of an episode that are drawn while it runs, one for each camera."""
+"""An episode's videos that are drawn while it runs, one for each camera."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ from .video_recorder import VideoRecorder
 
 
 class LiveVideos:
-    """The videos of one episode.
+    """The live videos of one episode.
 
     Args:
-        recorders: what records them, one or more; the first camera's comes first.
-        tolerates: tells whether to go on after an error.
-        on_frame_error: called with one that is not tolerated while a frame of a
-            step is taken: it may be the environment's own.
+        recorders: the video recorders, at least one, the first camera's first.
+        tolerates: returns whether to continue after an error.
+        on_frame_error: called with an error that is not tolerated and was raised while
+            taking a step's frame. It may come from the environment itself.
 
     Attributes:
-        recorders: as given.
+        recorders: the video recorders.
     """
 
     def __init__(
@@ -47,15 +47,15 @@ class LiveVideos:
         return Path(str(self.recorders[0].path))
 
     def begin(self) -> None:
-        """Take the frames of a reset."""
+        """Take the reset's frames."""
         self._each(VideoRecorder.capture_frame)
 
     def take(self, *, is_there: bool, last: bool) -> None:
-        """Take the frames of a step.
+        """Take a step's frames.
 
         Args:
-            is_there: False where the environment has reset itself already.
-            last: the episode is over.
+            is_there: False if the environment has already reset itself.
+            last: whether the episode is over.
         """
         if not is_there:
             for recorder in self.recorders:
@@ -71,37 +71,37 @@ class LiveVideos:
             raise
 
     def take_last(self) -> None:
-        """Take the frames of the last step, where they were left out."""
+        """Take the last step's frames if `max_fps` left them out."""
         self._each(VideoRecorder.capture_last)
 
     def say(self, **facts: Any) -> None:
-        """Add to the metadata."""
+        """Add facts to the metadata."""
         for recorder in self.recorders:
             recorder.metadata.update(facts)
 
     def give_up(self, reason: str) -> None:
-        """Take no more frames, and say why; those that were taken stay."""
+        """Stop taking frames and log the reason; keep the frames taken so far."""
         for recorder in self.recorders:
             recorder.give_up(reason)
 
     def discard(self) -> None:
-        """End without a video and without metadata."""
+        """Discard the videos and write no metadata."""
         for recorder in self.recorders:
             recorder.discard()
 
     def leave(self) -> None:
-        """Let go of the files as SIGKILL would; recovery finishes them."""
+        """Release the files as SIGKILL would; recovery finishes them."""
         for recorder in self.recorders:
             recorder.leave()
 
     def end(self, facts: Mapping[str, Any]) -> None:
         """Finish the files.
 
-        The metadata of the first camera's video is the sign that all are there, and
-        names the others: it comes last, also where ending another one raises.
+        The metadata of the first camera's video lists the other videos and shows that
+        all of them exist. So it is written last, even if ending another video raises.
 
         Args:
-            facts: what is known of the episode, for the metadata.
+            facts: the episode's facts, for the metadata.
         """
         self.say(**facts)
         first, *others = self.recorders
@@ -125,7 +125,7 @@ class LiveVideos:
             give_second_names(self.path)
 
     def amend(self, facts: Mapping[str, Any]) -> None:
-        """Add to the metadata of finished videos.
+        """Add facts to the metadata of finished videos.
 
         Raises:
             FileNotWritten: the disk is full.
@@ -138,9 +138,10 @@ class LiveVideos:
         """Remove finished videos.
 
         Raises:
-            DirectoryNotWritable: they cannot be removed.
+            DirectoryNotWritable: the files cannot be removed.
         """
-        # The first camera's metadata, written last, is the sign that all are there.
+        # The first camera's metadata, written last, shows that all videos exist, so it
+        # is removed last.
         for recorder in reversed(self.recorders):
             video = Path(str(recorder.path))
             about = Path(str(recorder.metadata_path))
@@ -167,13 +168,13 @@ def live_videos(
     second_name: Mapping[str, str],
     on_frame_error: Callable[[Exception], object] = lambda _: None,
 ) -> LiveVideos:
-    """Return what draws videos of the running episode, of each camera.
+    """Return the live videos of the running episode, one for each camera.
 
     Args:
         run: the monitored run.
-        path: of the first camera's, without its ending.
-        second_name: as `MonitoredRun.second_name`.
-        on_frame_error: as of `LiveVideos`.
+        path: the first camera's video, without extension.
+        second_name: the video's second name; see `MonitoredRun.second_name`.
+        on_frame_error: see `LiveVideos`.
     """
     options, env = run.options, run.env
     sources = {"": env.frames, **env.further_frames}

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What all recordings of one run share: its journal, its logs, and its facts."""
+"""The state shared by all recordings of one run: journal, logs, and facts."""
 
 from __future__ import annotations
 
@@ -41,17 +41,17 @@ What = Literal["video", "trajectory", "statistics", "journal", "model", "tracker
 
 @dataclass(frozen=True, kw_only=True)
 class BegunEpisode:
-    """What is known of an episode when it begins.
+    """The facts known about an episode when it begins.
 
     Attributes:
-        episode_id: its number.
+        episode_id: the episode's number.
         type: `"t"` for training, `"e"` for evaluation.
         start_time: wall clock just before the reset, in seconds since the epoch.
-        seed: as given to `reset`.
-        options: as given to `reset`.
-        random_state: of the environment's generator before the reset, for JSON; None
-            where it is not known or not needed.
-        reset_clock: the simulated time of the reset, where it is written on frames.
+        seed: the seed given to `reset`.
+        options: the options given to `reset`.
+        random_state: state of the environment's random generator before the reset, for
+            JSON; None if unknown or not needed.
+        reset_clock: simulated time of the reset, if it is written on frames.
     """
 
     episode_id: int
@@ -64,32 +64,38 @@ class BegunEpisode:
 
 
 class MonitoredRun:
-    """What all recordings of one run share, and what files say of them.
+    """The state shared by all recordings of one run, and their facts for files.
 
-    It writes the run's journal. With `on_error="raise"` a fault is an error that the
-    caller raises; with "warn" it is one warning and a line in the manifest, and the
-    simulation goes on.
+    It writes the run's journal. With `on_error="raise"` the caller raises an error for
+    each fault; with `on_error="warn"` a fault is logged once and listed in the
+    manifest, and the simulation continues.
 
     Args:
         place: the open directory.
-        env: what is recorded.
-        options: what was asked for.
+        env: the recorded environment.
+        options: the user's options.
         stats: counts steps and rewards.
         finisher: takes over recordings that have ended.
-        selection: what is said of a video that is chosen after its episode's end; empty
-            where it is chosen before.
+        selection: facts for videos that are chosen after their episodes have ended;
+            empty if they are chosen before.
 
     Attributes:
-        env, options, stats, finisher, selection: as given.
+        env: the recorded environment.
+        options: the user's options.
+        stats: counts steps and rewards.
+        finisher: takes over recordings that have ended.
+        selection: facts for videos that are chosen after their episodes have ended.
         directory: the monitor directory.
-        infix: what its files have in the middle.
+        infix: the middle part of its file names.
         clock: returns the time, in seconds since the epoch.
-        events: what the journal says so far, also what the disk was too full for.
-        trackers: get episodes and finished videos.
-        logs: of the episodes' rows.
-        clip_logs: of the clips'.
-        layouts, paces: of the last recording in each of these.
-        no_video: stands for the video of an episode that gets none.
+        events: the journal's content so far, including events that could not be written
+            because the disk was full.
+        trackers: the trackers, notified of episodes and finished videos.
+        logs: logs of the episodes' rows.
+        clip_logs: logs of the clips' rows.
+        layouts: layout of the last recording in each of these logs.
+        paces: rate, timestep and stride of the last recording in each of these logs.
+        no_video: a disabled recorder, for episodes without a video.
     """
 
     def __init__(
@@ -112,7 +118,7 @@ class MonitoredRun:
         self._faults: set[tuple[int | None, What, str]] = set()
         self._policy = _policy_facts(options)
         self._statements = options.statements
-        # In the journal, after the first.
+        # Number of journal lines after the first.
         self._lines = 0
         self._provenance = None if options.statements else look_around()
         self._environment_facts = {
@@ -147,17 +153,17 @@ class MonitoredRun:
         )
         self.layouts: dict[SpanLogs, RowLayout] = {}
         self.paces: dict[SpanLogs, Mapping[str, Any]] = {}
-        # Recordings whose ends are not in the journal yet: the disk was full.
+        # Recordings whose ends are not in the journal yet because the disk was full.
         self._late: list[Path] = []
         self.no_video = VideoRecorder(env.frames, enabled=False)
         self._episode: BegunEpisode | None = None
-        # Why videos are drawn live, as far as it was said.
+        # The reasons for drawing videos live that were logged so far.
         self._said: set[str] = set()
 
     # --- the journal -----------------------------------------------------------------
 
     def add(self, entry: JournalEntry) -> None:
-        """Write down a completed episode.
+        """Write a completed episode to the journal.
 
         Raises:
             FileNotWritten: the disk is full.
@@ -168,7 +174,7 @@ class MonitoredRun:
         self.note_provenance()
 
     def note(self, kind: str, facts: Any) -> None:
-        """Write down another event, one of `formats.journal.EVENTS`.
+        """Write another event, one of `formats.journal.EVENTS`, to the journal.
 
         Raises:
             FileNotWritten: the disk is full.
@@ -178,10 +184,10 @@ class MonitoredRun:
         self._write(lambda: self._journal.note(kind, facts))
 
     def note_provenance(self, *, wait: bool = False) -> None:
-        """Write down what the run is made with, once that is known.
+        """Write the run's provenance to the journal, once it is known.
 
         Args:
-            wait: wait for it a little.
+            wait: whether to wait briefly for it.
         """
         if self.events.provenance is None:
             found = self._found(wait=wait)
@@ -191,26 +197,26 @@ class MonitoredRun:
     def tolerates(
         self, what: What, error: BaseException, *, of_episode: bool = True
     ) -> bool:
-        """Note a fault, and tell whether the simulation may go on.
+        """Note a fault and return whether the simulation may continue.
 
         Args:
-            what: could not be recorded.
-            error: why.
-            of_episode: False where it is not the running episode's.
+            what: the part of the recording that failed, such as "video".
+            error: the reason.
+            of_episode: whether the fault belongs to the running episode.
         """
         has_episode = of_episode and self._episode is not None
         episode_id = self.episode.episode_id if has_episode else None
         is_warned = self.options.on_error == WARN
         if is_warned and self.note_fault(what, str(error), episode_id=episode_id):
             of = "" if episode_id is None else f" of episode {episode_id}"
-            logger.warning("Not recorded whole: %s%s. %s", what, of, error)
+            logger.warning("Not completely recorded: %s%s. %s", what, of, error)
         return is_warned
 
     @contextlib.contextmanager
     def tolerating(
         self, what: What, *kinds: type[Exception], of_episode: bool = True
     ) -> Iterator[None]:
-        """Go on after an error of these kinds, where it is tolerated."""
+        """Suppress errors of these kinds if `on_error` tolerates them."""
         try:
             yield
         except kinds as error:
@@ -218,7 +224,7 @@ class MonitoredRun:
                 raise
 
     def note_fault(self, what: What, reason: str, *, episode_id: int | None) -> bool:
-        """Write a fault down; return whether it is a new one."""
+        """Write a fault to the journal; return whether it is new."""
         fault = (episode_id, what, reason)
         if fault in self._faults:
             return False
@@ -228,14 +234,14 @@ class MonitoredRun:
         return True
 
     def submit(self, recording: Path) -> None:
-        """Let a recording be finished, now or when the journal says that it ended."""
+        """Submit a recording to the finisher, once the journal has its end."""
         if self._journal.is_behind:
             self._late.append(recording)
         else:
             self.finisher.submit(recording)
 
     def close_logs(self) -> None:
-        """Write all rows, and what else the logs lack.
+        """Write all remaining rows and facts to the logs.
 
         Raises:
             FileNotWritten: the disk is full; the next call tries again.
@@ -246,7 +252,7 @@ class MonitoredRun:
             self.finisher.submit(self._late.pop(0))
 
     def leave(self) -> None:
-        """Let go of journal and logs as they are; idempotent."""
+        """Release journal and logs as they are. Idempotent."""
         for logs in (self.logs, self.clip_logs):
             logs.release()
         self._journal.close()
@@ -274,12 +280,12 @@ class MonitoredRun:
         return self._episode
 
     def begin(self, episode: BegunEpisode) -> None:
-        """Take note of an episode that begins: faults are its own from here on."""
+        """Begin an episode, to which faults are attributed from now on."""
         self._episode = episode
         self.events.begin(episode.episode_id, chosen=False)
 
     def caption(self) -> Caption:
-        """Return what is written on the frame of this moment."""
+        """Return the caption of the current frame."""
         began, now = self.episode.reset_clock, self.env.clock()
         return Caption(
             episode_id=self.episode.episode_id,
@@ -289,12 +295,12 @@ class MonitoredRun:
         )
 
     def can_be_deferred(self, start: EpisodeStart) -> bool:
-        """Return whether frames can be made from the states that begin with `start`.
+        """Return whether frames can be rendered from the states that follow `start`.
 
-        Why not is said once.
+        If not, each reason is logged once.
 
         Raises:
-            PicturesDiffer, NoPictures: as `check_refusal`.
+            PicturesDiffer, NoPictures: see `check_refusal`.
         """
         refusal = start.refusal
         if refusal is None:
@@ -310,12 +316,12 @@ class MonitoredRun:
     def pending_video(
         self, name: str, recording: str, *, second_name: Mapping[str, str]
     ) -> dict[str, Any]:
-        """Return what a trajectory, or a clip, says of its video.
+        """Return the facts about its video that a trajectory or clip holds.
 
         Args:
-            name: of its file, without the ending.
-            recording: when it is drawn, `DEFERRED` or `LIVE`.
-            second_name: as of `second_name`.
+            name: the video's file name, without extension.
+            recording: when the video is drawn, `DEFERRED` or `LIVE`.
+            second_name: the result of `second_name`.
         """
         options, env = self.options, self.env
         pending: dict[str, Any] = {
@@ -336,11 +342,11 @@ class MonitoredRun:
         return {**pending, **second_name}
 
     def second_name(self, what: str, number: int) -> dict[str, str]:
-        """Return what a video is called besides, for its metadata.
+        """Return a video's second name, for its metadata; empty without `name_prefix`.
 
         Args:
-            what: it begins with, "episode" or "step".
-            number: of that.
+            what: the kind of event that begins the video, "episode" or "step".
+            number: the number of that episode or step.
         """
         prefix = self.options.name_prefix
         if prefix is None:
@@ -348,10 +354,10 @@ class MonitoredRun:
         return {"also_named": f"{prefix}-{what}-{number}.mp4"}
 
     def recording_facts(self, start: EpisodeStart | None) -> dict[str, Any]:
-        """Return what any recording of states says of the running episode.
+        """Return the facts about the running episode for a recording of states.
 
         Args:
-            start: of the states; None where there are none.
+            start: the start of the states; None if there are none.
         """
         episode = self.episode
         return {
@@ -367,7 +373,7 @@ class MonitoredRun:
         }
 
     def live_facts(self) -> dict[str, Any]:
-        """Return what the metadata of a live video says of the running episode."""
+        """Return the facts about the running episode for a live video's metadata."""
         known = self.recording_facts(None)
         video: dict[str, Any] = {"reason": self.env.rendering.reason}
         if self.selection:

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Opening a monitor directory: new, resumed, or emptied by force.
 
-Opening claims an infix, which stands for one monitor from then on: a lock file made
-with `O_EXCL` and held with `flock` while the monitor is open. A lock that is there
-but not held is a dead monitor's.
+Opening claims an infix, which identifies one monitor from then on. The claim is a lock
+file, created with `O_EXCL` and held with `flock` while the monitor is open. A lock file
+that exists but is not held belongs to a dead monitor.
 """
 
 from __future__ import annotations
@@ -38,7 +38,8 @@ from ..results import clear_monitor_files
 from ..results.journal_or_stats import MonitorResults
 from ..results.monitor_files import MonitorFiles, monitors_of
 
-# To record beside monitors that are of the same environment, without a look at them.
+# `resume` value to record next to monitors of the same environment without reading
+# their files.
 JOIN = "join"
 
 
@@ -48,16 +49,17 @@ _monitor_ids = itertools.count()
 
 @dataclass(frozen=True, kw_only=True)
 class Statements:
-    """What of a run can never come out again: given where a run is made again.
+    """The facts of a run that recreating it cannot reproduce; the original's are used.
 
     Attributes:
-        infix: what the names of its files have in the middle; it is not claimed yet.
+        infix: the middle part of its file names, not claimed yet.
         first_episode_id: the number of its first episode.
-        provenance: its provenance; None where that was not known.
-        provenance_after: how many lines the journal had before, after its first.
+        provenance: its provenance; None if unknown.
+        provenance_after: number of journal lines before the provenance, not counting
+            the first line.
         clock: returns the time, in seconds since the epoch.
-        only_counted: episodes without a video keep no trajectory: it is only asked
-            what rewards and ends there were.
+        only_counted: whether episodes without a video keep no trajectory, because only
+            their rewards and ends are compared.
     """
 
     infix: Infix
@@ -70,14 +72,14 @@ class Statements:
 
 @dataclass(frozen=True)
 class OpenDirectory:
-    """A monitor directory with a claim in it.
+    """A monitor directory in which an infix has been claimed.
 
     Attributes:
         path: the directory, absolute.
-        infix: what the claim is for.
+        infix: the claimed infix.
         first_episode_id: the number of the next episode.
-        lock: held until the monitor closes.
-        run: what is known of the run.
+        lock: the lock, held until the monitor closes.
+        run: the run's facts.
     """
 
     path: Path
@@ -97,29 +99,30 @@ def open_directory(
     facts: Mapping[str, Any] = MappingProxyType({}),
     statements: Statements | None = None,
 ) -> OpenDirectory:
-    """Claim a place in `directory`, which is made where it is missing.
+    """Claim an infix in `directory`, creating the directory if it is missing.
 
     Args:
-        directory: where to record.
-        force: delete the monitor files that are there; wins over `resume`.
-        resume: add to the recordings that are there. Episodes are numbered on from
-            the highest number of the monitors with this `uid` that closed or died
-            (without `uid`: of all of them); monitors that are still open do not count.
-            `JOIN` looks at no other monitor's files, however many there are: the caller
-            knows that they are of the same environment, and episodes are numbered
-            from 0.
-        uid: stands in the file names instead of the process id.
-        env_info: `env_id` of the environment, among others.
-        facts: what else is known of the run. It stands in the lock: so much is known of
-            a process that was killed before its journal had a line.
-        statements: of a run that is made again.
+        directory: the monitor directory.
+        force: delete existing monitor files; overrides `resume`.
+        resume: add to existing recordings. Episode numbers continue after the highest
+            number of the monitors with this `uid` that closed or died (without `uid`,
+            of all such monitors); monitors that are still open do not count. `JOIN`
+            reads no other monitor's files, however many there are: the caller knows
+            that they record the same environment, and episodes are numbered from 0.
+        uid: used in file names instead of the process id.
+        env_info: facts about the environment, including its `env_id`.
+        facts: further facts about the run. They are written to the lock file, so they
+            survive even if the process is killed before its journal has a line.
+        statements: the original's facts if a run is being recreated.
 
     Raises:
-        ExistingRecordings: there are recordings, and neither `force` nor `resume`.
-        DirectoryInUse: `force`, and another monitor is recording there.
-        DifferentEnvironment: `resume` over recordings of another environment.
-        DirectoryNotWritable: it cannot be made or written to.
-        InvalidArgument: `uid` makes no file name.
+        ExistingRecordings: the directory has recordings, and neither `force` nor
+            `resume` was given.
+        DirectoryInUse: `force` was given while another monitor is recording there.
+        DifferentEnvironment: `resume` was given, but the recordings are of a different
+            environment.
+        DirectoryNotWritable: the directory cannot be created or written to.
+        InvalidArgument: `uid` cannot be part of a file name.
     """
     wanted_uid = None if uid is None else check_uid(uid)
     # Absolute, so that a later chdir does not scatter the files.
@@ -143,10 +146,10 @@ def open_directory(
 
 @contextlib.contextmanager
 def made_directory(path: Path) -> Iterator[None]:
-    """Make `path` and its parents; remove those made if the block raises.
+    """Create `path` and its parents; remove the created ones if the block raises.
 
     Raises:
-        DirectoryNotWritable: it cannot be made or written to.
+        DirectoryNotWritable: `path` cannot be created or written to.
     """
     try:
         missing = [p for p in (path, *path.parents) if not p.exists()]
@@ -159,7 +162,7 @@ def made_directory(path: Path) -> Iterator[None]:
         yield
     except BaseException:
         for made in missing:
-            # Other files may have come into it meanwhile.
+            # Other files may have been added in the meantime.
             with contextlib.suppress(OSError):
                 made.rmdir()
         raise
@@ -189,7 +192,7 @@ def _recorded_env_ids(path: Path) -> Iterator[str]:
 
 
 def _next_episode_id(path: Path, *, uid: str | None) -> int:
-    """Return the number after the highest of the monitors that are not open."""
+    """Return the next number after the highest one of all monitors that are closed."""
     highest = -1
     for files in monitors_of(path):
         infix = Infix.parse(files.infix)
@@ -201,8 +204,9 @@ def _next_episode_id(path: Path, *, uid: str | None) -> int:
 
 
 def _last_episode_id(files: MonitorFiles) -> int:
-    """Return the highest episode number that a monitor's files speak of; -1 if none."""
-    # Names count too: an episode in flight when a process died has a number.
+    """Return the highest episode number in a monitor's files; -1 if there is none."""
+    # File names count too: an episode that was running when its process died has a
+    # number.
     results = MonitorResults(files)
     return max(
         files.last_episode_id, results.run.last_episode_id, _last_counted(results)
@@ -210,12 +214,13 @@ def _last_episode_id(files: MonitorFiles) -> int:
 
 
 def _last_counted(results: MonitorResults) -> int:
-    """Return the last number that the manifest says or implies."""
+    """Return the last episode number that the manifest states or implies."""
     if results.manifest is None:
         return -1
     if results.manifest.mjrec is not None:
         return int(results.manifest.mjrec.get("next_episode_id") or 0) - 1
-    # Gym's own: its numbers count the resets, which have a type each, from 0.
+    # A manifest written by gym: episodes are numbered from 0 by resets, and each reset
+    # has a type.
     stats = results.saved
     if stats is None:
         return -1
@@ -225,15 +230,16 @@ def _last_counted(results: MonitorResults) -> int:
 def _claim(
     path: Path, *, uid: str | None, run: Mapping[str, Any], looks: bool
 ) -> tuple[Infix, Lock]:
-    """Return an infix that is this monitor's from now on, and its lock.
+    """Claim a new infix for this monitor; return it with its lock.
 
     Args:
         path: the directory.
-        uid: stands in it instead of the process id; then its number follows from the
-            directory, so that names are the same whichever process records.
-        run: what is known of the run.
-        looks: also for stray files with it. Without that, a manifest, a journal or a
-            lock say that it was a monitor's: each monitor leaves one of them.
+        uid: used in the infix instead of the process id. Its number then depends on
+            the directory, so that names are the same in any process.
+        run: the run's facts.
+        looks: whether to look for stray files with the infix, too. Otherwise a
+            manifest, a journal or a lock shows that the infix is taken; each monitor
+            leaves one of them.
     """
     content = json_text.dumps({"pid": os.getpid(), "since": time.time(), "run": run})
     of_directory = itertools.count()
@@ -248,8 +254,8 @@ def _claim(
             continue
         except OSError as error:
             raise DirectoryNotWritable(path, error.strerror) from error
-        # The monitor that had it may have closed, and so unlocked, between the look
-        # at the files and the lock.
+        # The infix's previous monitor may have closed, and so released its lock,
+        # between the first check and taking the lock.
         if not _is_taken(path, infix, besides=lock_name(infix), looks=looks):
             return infix, lock
         lock.release()
@@ -258,8 +264,8 @@ def _claim(
 def _is_taken(
     path: Path, infix: Infix, *, looks: bool, besides: str | None = None
 ) -> bool:
-    # The rare case is a pid or uid that was here before; the manifest, there after
-    # every close, answers most of them without a look at the whole directory.
+    # A pid or uid is rarely used twice. The manifest, which every close leaves, usually
+    # answers this without listing the whole directory.
     if (path / manifest_name(infix)).exists() or (path / journal_name(infix)).exists():
         return True
     return looks and any(

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a monitor was asked for."""
+"""A monitor's options."""
 
 from __future__ import annotations
 
@@ -26,19 +26,19 @@ from .tracking import FinishedEpisode, Tracker
 
 DEFERRED, LIVE, OFF = "deferred", "live", "off"
 RAISE, WARN = "raise", "warn"
-# Not gym's own, which would be taken for a monitor's files.
+# Gym's own prefix is excluded: such files would be mistaken for monitor files.
 _NAME_PREFIX = re.compile(r"(?!openaigym)[A-Za-z0-9_][A-Za-z0-9_.-]{0,99}", re.ASCII)
-# They change what is in files.
+# Options that change the content of files.
 _SWITCHES = ("observations", "annotate", "tiled")
 _MODES = {None: "t", "training": "t", "evaluation": "e"}
 
 
 @dataclass(frozen=True, kw_only=True)
 class RecorderOptions:
-    """What a monitor was asked for; `mjrec.Monitor` says what each means.
+    """A monitor's options; `mjrec.Monitor` describes each of them.
 
     Raises:
-        InvalidArgument: a value cannot be.
+        InvalidArgument: a value is invalid.
     """
 
     video_callable: Callable[[int], Any] | bool | None = None
@@ -66,11 +66,11 @@ class RecorderOptions:
     tiled: bool = False
     trackers: Tracker | Sequence[Tracker] = ()
     policy_file: str | os.PathLike[str] | None = None
-    # Of a row log; vector environments share a budget.
+    # Size of a row log's tail; vector environments share a budget.
     tail_bytes: int = TAIL_BYTES
-    # From which the seeds of episodes follow, where they do.
+    # The seed that the episodes' seeds are derived from, if they are.
     seed: int | None = None
-    # Of a run that is made again.
+    # The original's facts if a run is being recreated.
     statements: Statements | None = None
 
     def __post_init__(self) -> None:
@@ -85,8 +85,8 @@ class RecorderOptions:
                 )
         if not (isinstance(self.resume, bool) or self.resume == JOIN):
             raise InvalidArgument(
-                'resume must be True, False, or "join" to record beside others without '
-                f"a look at them, got {self.resume!r}."
+                'resume must be True, False, or "join" to record next to other '
+                f"monitors without reading their files, got {self.resume!r}."
             )
         check_quality(self.quality)
         if self.render not in (None, DEFERRED, LIVE, OFF):
@@ -98,12 +98,12 @@ class RecorderOptions:
         if workers is not None and (not _is_whole(workers) or workers < 0):
             raise InvalidArgument(
                 "workers must be a whole number of processes, 0 to render nothing now, "
-                f"or None for one for each usable CPU, got {workers!r}."
+                f"or None for one per usable CPU, got {workers!r}."
             )
         if self.on_error not in (RAISE, WARN):
             raise InvalidArgument(
-                'on_error must be "raise", or "warn" to go on without what cannot be '
-                f"recorded, got {self.on_error!r}."
+                'on_error must be "raise", or "warn" to continue when something cannot '
+                f"be recorded, got {self.on_error!r}."
             )
         chosen = self.trajectory_callable
         if not (chosen is None or isinstance(chosen, bool) or callable(chosen)):
@@ -128,8 +128,8 @@ class RecorderOptions:
             check_takes_one(self.step_trigger, "step_trigger", "the number of steps")
             if self.video_callable is not None:
                 raise InvalidArgument(
-                    "step_trigger chooses videos by steps and video_callable by "
-                    "episodes: give one of them."
+                    "step_trigger chooses videos by steps, and video_callable by "
+                    "episodes. Give only one of them."
                 )
         length = self.video_length
         if length is not None and (not _is_whole(length) or length < 1):
@@ -139,17 +139,17 @@ class RecorderOptions:
             )
         if self.has_clips and self.render == OFF:
             raise InvalidArgument(
-                "step_trigger and video_length are about videos, and with "
-                'render="off" there are none: leave one of them out.'
+                "step_trigger and video_length configure videos, but "
+                'render="off" disables videos. Leave one of them out.'
             )
         prefix = self.name_prefix
         if prefix is not None and not (
             isinstance(prefix, str) and _NAME_PREFIX.fullmatch(prefix)
         ):
             raise InvalidArgument(
-                "name_prefix becomes part of file names: it must be 1 to 100 letters, "
-                "digits, '_', '-' and '.', begin with a letter, digit or '_', and not "
-                f"with openaigym, got {prefix!r}."
+                "name_prefix becomes part of file names. It must consist of 1 to 100 "
+                "letters, digits, '_', '-' and '.', begin with a letter, digit or '_', "
+                f"and not begin with openaigym, got {prefix!r}."
             )
 
     def _check_keep(self) -> None:
@@ -158,18 +158,18 @@ class RecorderOptions:
         selection_from(self.keep)
         if self.video_callable is not None:
             raise InvalidArgument(
-                "keep chooses episodes when they have ended and video_callable before "
-                "they begin: give one of them."
+                "keep chooses episodes after they have ended, and video_callable "
+                "before they begin. Give only one of them."
             )
         if self.has_clips:
             raise InvalidArgument(
-                "keep chooses videos of whole episodes, and step_trigger and "
-                "video_length make videos that are counted in steps: give one of them."
+                "keep chooses videos of whole episodes, but step_trigger and "
+                "video_length record clips, counted in steps. Give only one of them."
             )
         if self.render == OFF:
             raise InvalidArgument(
-                "keep chooses which episodes get a video, and with "
-                'render="off" there are none: leave one of them out.'
+                "keep chooses which episodes get a video, but "
+                'render="off" disables videos. Leave one of them out.'
             )
 
     def _check_trackers(self) -> None:
@@ -183,7 +183,8 @@ class RecorderOptions:
                 )
         if len(set(map(id, self.all_trackers))) < len(self.all_trackers):
             raise InvalidArgument(
-                f"A tracker is there twice in {given!r}, and would get all twice."
+                f"The same tracker is twice in {given!r} and would get every call "
+                "twice. Give each tracker once."
             )
 
     def _check_policy_file(self) -> None:
@@ -192,20 +193,20 @@ class RecorderOptions:
             return
         if not isinstance(given, str | os.PathLike) or not Path(given).is_file():
             raise InvalidArgument(
-                "policy_file must be the path of the file in which the policy is, "
-                f"whose sha256 the manifest will say, got {given!r}, which is no file."
+                "policy_file must be the path of the policy's file, whose SHA-256 goes "
+                f"into the manifest, but {given!r} is not a file."
             )
 
     @property
     def clock(self) -> Callable[[], float]:
-        """Returns the time, in seconds since the epoch."""
+        """A function that returns the time, in seconds since the epoch."""
         return time.time if self.statements is None else self.statements.clock
 
     def recorded(self) -> dict[str, Any]:
-        """Return what a journal says of them: those on which other files depend.
+        """Return the options for the journal: those that other files depend on.
 
-        What is the default is left out. Functions go by their names; schedule and rule
-        are said elsewhere.
+        Defaults are left out. Functions are given by name. The schedule and the `keep`
+        rule are recorded elsewhere.
         """
         kept, trigger = self.trajectory_callable, self.step_trigger
         length = self.video_length
@@ -225,12 +226,12 @@ class RecorderOptions:
 
     @property
     def has_clips(self) -> bool:
-        """Whether videos are counted in steps, and not each of one episode."""
+        """Whether videos are clips, counted in steps, instead of whole episodes."""
         return self.step_trigger is not None or self.video_length is not None
 
     @property
     def all_trackers(self) -> tuple[Tracker, ...]:
-        """The trackers, one or several."""
+        """The trackers as a tuple, even if only one was given."""
         if isinstance(self.trackers, Tracker):
             return (self.trackers,)
         return tuple(self.trackers)
@@ -238,12 +239,12 @@ class RecorderOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class RenderingChoice:
-    """When the frames of a run are drawn.
+    """The choice of when a run's frames are drawn.
 
     Attributes:
         mode: `DEFERRED`, `LIVE` or `OFF`.
-        reason: why they are drawn live, where it could be thought otherwise.
-        is_forced: the user asked for it, and anything else is an error.
+        reason: why they are drawn live, if a user might not expect it.
+        is_forced: whether the user requested the mode, so that any other is an error.
     """
 
     mode: str
@@ -252,10 +253,10 @@ class RenderingChoice:
 
 
 def type_of_mode(mode: str | None) -> str:
-    """Return the type of the episodes of a monitor mode: "t" or "e".
+    """Return the episode type of a monitor mode: "t" or "e".
 
     Raises:
-        InvalidArgument: there is no such mode.
+        InvalidArgument: the mode does not exist.
     """
     if mode not in _MODES:
         raise InvalidArgument(

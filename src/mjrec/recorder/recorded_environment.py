@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is recorded, as far as a recorder knows it."""
+"""The recorded environment, as the recorder sees it."""
 
 from __future__ import annotations
 
@@ -18,34 +18,34 @@ if TYPE_CHECKING:
 
 
 class EpisodeFrames(FrameSource, Protocol):
-    """Where the live frames of a run come from."""
+    """A source of a run's live frames."""
 
     def facts(self) -> Mapping[str, Any]:
-        """Return what the metadata of a video says about its frames."""
+        """Return the facts about the frames for a video's metadata."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class RecordedEnvironment:
-    """What is recorded, as far as a recorder knows it.
+    """The recorded environment, as the recorder sees it.
 
     Attributes:
         env_id: the environment's name.
-        env_index: which sub-environment of a vector environment it is; None for an
-            environment of its own.
-        frames: where live frames come from.
-        further_frames: from further cameras, by what the names of their videos have
-            in the end.
+        env_index: index of a sub-environment in a vector environment; None for a single
+            environment.
+        frames: the source of live frames.
+        further_frames: sources of live frames from further cameras, keyed by the
+            endings of their videos' names.
         clock: returns the simulated time in seconds, or None.
-        declared: returns the rate to take where there is no simulated time.
+        declared: returns the rate to use without simulated time.
         rendering: when frames are drawn.
-        cameras: all of them, for JSON, where there are several.
-        states: of its simulation; None where there is none that can be seen.
-        clip_states: the same once more, for videos that are counted in steps: they
-            run beside episodes, and a source has one reader only. None where there
-            are no such videos.
-        environment: what it can be made from again, for the trajectories.
-        view: the cameras and sizes that were asked for, and how the environment is
-            shown by itself, for JSON; what is not said is the default.
+        cameras: all cameras, for JSON, if there are several.
+        states: captures the states of its simulation; None if no simulation is
+            accessible.
+        clip_states: a second capture of the same states, for clips. They overlap with
+            episodes, and a capture can have only one reader. None without clips.
+        environment: the facts needed to recreate it, for the trajectories.
+        view: the requested cameras and sizes, and the environment's own view, for JSON;
+            defaults are left out.
         random_state: returns the state of its random generator, for JSON, or None.
     """
 
@@ -65,41 +65,41 @@ class RecordedEnvironment:
 
     @property
     def further_views(self) -> list[str]:
-        """What the names of further cameras' videos have before their ending."""
+        """The parts of further cameras' video names before the extension."""
         return further_parts(self.cameras) or list(self.further_frames)
 
 
 def check_frames(env: RecordedEnvironment) -> None:
-    """Check that live frames can be had.
+    """Check that live frames are available.
 
     Raises:
-        NoPictures: they cannot.
+        NoPictures: the environment gives no frames.
     """
     if can_give_frames(env.frames):
         return
     why = "" if env.rendering.reason is None else f" ({env.rendering.reason})"
     raise NoPictures(
-        f"Videos were asked for, and {env.env_id} gives no frames{why}: "
+        f"Videos were requested, but {env.env_id} gives no frames{why}: "
         f"{what_is_missing(env.frames)}, or record statistics only with "
         "video_callable=False."
     )
 
 
 def check_refusal(env: RecordedEnvironment, refusal: str) -> None:
-    """Check that videos can be drawn live that cannot be rendered later.
+    """Check that videos that cannot be rendered later can be drawn live.
 
     Args:
-        env: what is recorded.
-        refusal: why they cannot be rendered later.
+        env: the recorded environment.
+        refusal: why the videos cannot be rendered later.
 
     Raises:
-        PicturesDiffer: nothing else was asked for.
-        NoPictures: they cannot be drawn live either.
+        PicturesDiffer: the user requested deferred rendering.
+        NoPictures: the videos cannot be drawn live either.
     """
     if env.rendering.is_forced:
         raise PicturesDiffer(
-            f"The videos of {env.env_id} were to be rendered later, from recorded "
-            f'states, and cannot be: {refusal}. Use render="live".'
+            f"The videos of {env.env_id} cannot be rendered later from recorded "
+            f'states, as requested: {refusal}. Use render="live".'
         )
     if not can_give_frames(env.frames):
         raise NoPictures(
@@ -110,11 +110,11 @@ def check_refusal(env: RecordedEnvironment, refusal: str) -> None:
 
 
 def what_is_missing(frames: FrameSource) -> str:
-    """Return why there are no frames, and what would help."""
+    """Return why there are no frames and how to get them."""
     mode = getattr(frames, "render_mode", None)
     return getattr(
         frames,
         "missing",
-        f"its render_mode is {mode!r}. Make the environment with "
+        f"its render_mode is {mode!r}. Create the environment with "
         'render_mode="rgb_array"',
     )

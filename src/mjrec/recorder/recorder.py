@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The recorder: follows reset, step and close, and fills a monitor directory."""
+"""The recorder: follows reset, step and close calls and fills a monitor directory."""
 
 from __future__ import annotations
 
@@ -48,29 +48,29 @@ logger = logging.getLogger(__name__)
 class Recorder:
     """Drives statistics, journal, trajectories, videos and manifest of one monitor.
 
-    It follows what happens to an environment and never calls it, except for frames and
-    states: `before_reset`, the environment's reset inside `resetting`, `reset`;
-    `before_step`, the environment's step, `step`, or, while there is a `fast` path,
-    what that has instead; `close`. It belongs to the process that made it.
+    It is notified of an environment's calls and does not call the environment, except
+    for frames and states. For a reset, call `before_reset`, reset the environment
+    inside `resetting`, and call `reset`. For a step, call `before_step`, step the
+    environment, and call `step`; while there is a `fast` path, call its functions
+    instead. At the end, call `close`. A recorder belongs to its creating process.
 
     Args:
         directory: the monitor directory.
-        env: what is recorded.
-        options: what was asked for.
-        finisher: makes what finishes recordings, for the directory; None where nothing
-            is to be rendered now.
+        env: the recorded environment.
+        options: the user's options.
+        finisher: creates the finisher for the directory; None if nothing will be
+            rendered now.
 
     Attributes:
         directory: the monitor directory, absolute.
-        infix: what the names of this monitor's files have in the middle.
-        episode_id: the number of the next episode: as in gym, it rises at each reset.
-        run: what all recordings share.
+        infix: the middle part of this monitor's file names.
+        episode_id: the number of the next episode; as in gym, it rises at each reset.
+        run: the state shared by all recordings.
         stats_recorder: counts steps and rewards.
-        closed: nothing is recorded any more.
-        fast: what the next step may be recorded with; None where it needs a closer
-            look.
-        evaluation_facts: returns what the journal's line of an ended episode says of
-            the evaluation that it belongs to; None where it belongs to none.
+        closed: whether recording has ended.
+        fast: the fast path for the next step; None if the step needs the full path.
+        evaluation_facts: returns the facts about its evaluation for an ended episode's
+            journal line; None if the episode belongs to no evaluation.
     """
 
     def __init__(
@@ -90,7 +90,7 @@ class Recorder:
         self._pid = os.getpid()
         self._is_forked = False
         _recorders.add(self)
-        # Why the running episode ends early, once the environment has raised.
+        # Why the running episode ends early, set when the environment raises.
         self._ending: dict[str, Any] | None = None
         self._recording: EpisodeRecording | None = None
         self.closed = False
@@ -154,13 +154,13 @@ class Recorder:
 
     @property
     def video_recorder(self) -> VideoRecorder | DeferredVideo | None:
-        """What records the running episode, or not; None before the first reset."""
+        """The running episode's video recorder; None before the first reset."""
         return None if self._recording is None else self._recording.video
 
     def bundle_trajectories(self) -> None:
-        """Let the trajectories lie in one file, which is written when this closes.
+        """Write all trajectories to one file when the recorder closes.
 
-        It is for a recorder that nothing renders beside.
+        This needs a recorder without background rendering.
         """
         assert isinstance(self.run.finisher, LaterFinisher)
         self.run.finisher.bundles = True
@@ -172,33 +172,33 @@ class Recorder:
             mode: "training", "evaluation", or None for training.
 
         Raises:
-            InvalidArgument: it is something else.
+            InvalidArgument: `mode` is something else.
         """
         self.stats_recorder.type = type_of_mode(mode)
 
     def model_changed(self) -> None:
-        """Note that textures, height fields or meshes were changed in mid-episode."""
+        """Note that textures, height fields or meshes have changed mid-episode."""
         for states in self._states:
             states.model_changed()
 
     def forget_frames(self) -> None:
-        """Let the next episode's frames depend on none that was made before."""
+        """Make the next episode's frames independent of all earlier frames."""
         for states in self._states:
             states.forget_frames()
 
     def resetting(self) -> AbstractContextManager[None]:
-        """Return what to put around the reset of the environment."""
+        """Return a context manager in which to reset the environment."""
         states = self._env.states
         if states is None or self._env.rendering.mode == LIVE:
             return contextlib.nullcontext()
         return states.resetting()
 
     def before_reset(self) -> None:
-        """Check that a reset may be made now, and take what it will overwrite.
+        """Check that a reset is allowed now, and record what it will overwrite.
 
         Raises:
-            ResetNotAllowed: in mid-episode, unless early resets are allowed.
-            Error: in a process forked from the one that made the recorder.
+            ResetNotAllowed: the episode is not over, and early resets are not allowed.
+            Error: the process was forked from the one that created the recorder.
         """
         self.check_process()
         self.fast = None
@@ -216,16 +216,17 @@ class Recorder:
     ) -> None:
         """Begin an episode; the environment has just been reset.
 
-        A reset before any step of the running episode keeps its number and replaces
-        its frame. One in mid-episode ends that episode's video, marked incomplete.
+        A reset before the running episode's first step keeps the episode's number and
+        replaces its frame. A reset during an episode ends that episode's video, which
+        is marked as incomplete.
 
         Args:
             seed: the seed given to the environment's reset.
-            options: the options given to it.
-            observation: what it returned.
+            options: the options given to the environment's reset.
+            observation: the observation that the reset returned.
 
         Raises:
-            PicturesDiffer: rendering was to be deferred, and cannot be.
+            PicturesDiffer: deferred rendering was requested but is impossible.
         """
         if self._is_unbegun():
             self.episode_id -= 1
@@ -247,7 +248,7 @@ class Recorder:
             )
         )
         self.episode_id += 1
-        # That of the episode before is over, whatever the schedule raises.
+        # The previous episode's recording is over, even if the schedule raises.
         recording = EpisodeRecording(self.run, on_frame_error=self.note_error)
         self._recording = recording
         try:
@@ -255,7 +256,7 @@ class Recorder:
         except Exception as error:
             if not self.run.tolerates("video", error):
                 raise
-            # Where it is only the first frame, states are recorded all the same.
+            # If only the first frame failed, states are still recorded.
             if recording.live is not None:
                 recording.live.give_up(str(error))
         if self._clips is None:
@@ -265,7 +266,7 @@ class Recorder:
                 self._write_results()
 
     def note_event(self, kind: str, facts: Any) -> None:
-        """Write an event of an evaluation into the journal; see `formats.journal`.
+        """Write an evaluation's event to the journal; see `formats.journal`.
 
         Raises:
             FileNotWritten: the disk is full.
@@ -273,22 +274,22 @@ class Recorder:
         self.run.note(kind, facts)
 
     def note_error(self, error: BaseException) -> None:
-        """Note that the environment's step or reset has raised, or its user has.
+        """Note an exception raised by the environment's step or reset, or by its user.
 
-        The running episode, if there is one, is marked with it, unless a later step
-        succeeds. A reset is then allowed in any case. Nothing more is taken of the
-        environment's state, which may be half of a step.
+        The running episode, if any, is marked with the error, unless a later step
+        succeeds. A reset is always allowed afterwards. The environment's state is no
+        longer recorded, because it may be in the middle of a step.
         """
         self.fast = None
         if self.stats_recorder.done is False and self._ending is None:
             self._ending = ending(error)
 
     def before_step(self, action: Any = None) -> None:
-        """Check that a step may be taken now, and note its action.
+        """Check that a step is allowed now, and note its action.
 
         Raises:
-            ResetNeeded: before the first reset, or after the end of an episode.
-            Error: in a process forked from the one that made the recorder.
+            ResetNeeded: there has been no reset yet, or the episode is over.
+            Error: the process was forked from the one that created the recorder.
         """
         self.check_process()
         self.stats_recorder.before_step()
@@ -311,13 +312,13 @@ class Recorder:
 
         Args:
             reward: a number or an array of one element.
-            terminated: the task ended the episode.
-            truncated: a limit from outside the task ended it.
-            frame: False where the environment has reset itself already, and its
-                frame belongs to the next episode.
-            observation: what the step returned.
-            success: at the end of an episode, what the environment says of it; None
-                where it says nothing.
+            terminated: whether the task ended the episode.
+            truncated: whether a limit outside the task ended it.
+            frame: False if the environment has already reset itself, so that its frame
+                belongs to the next episode.
+            observation: the observation that the step returned.
+            success: at the end of an episode, whether the environment reports a
+                success; None if it does not report that.
         """
         reward = reward_to_float(reward)
         flags = {"terminated": bool(terminated), "truncated": bool(truncated)}
@@ -329,7 +330,7 @@ class Recorder:
         failures = _Failures()
         is_counted = False
         try:
-            # First of all: what is counted has a row, if it can have one.
+            # The row comes first, so that a counted step has a row if it can have one.
             if fast is not None and frame:
                 is_counted = fast.step(reward, **flags)
             if states is not None and not is_counted:
@@ -343,7 +344,7 @@ class Recorder:
         except Error as error:
             failures.note(error)
         except BaseException as error:
-            # A signal's handler has raised: this step is not recorded.
+            # A signal handler has raised, so this step is not recorded.
             self.note_error(error)
             raise
         if is_counted:
@@ -368,11 +369,11 @@ class Recorder:
     def finish(self, on_progress: Callable[[Any], None] = lambda _: None) -> None:
         """End the running episode, and wait until all videos are rendered.
 
-        Trajectories get their final form here where nothing renders. To be called
-        before `close`, which waits for nothing.
+        Without background rendering, this writes the trajectories in their final form.
+        Call it before `close`, which waits for nothing.
 
         Args:
-            on_progress: called while it waits.
+            on_progress: called with the progress while waiting.
 
         Raises:
             EncoderError: the running video could not be finished.
@@ -386,12 +387,12 @@ class Recorder:
             self.run.finisher.wait(on_progress)
 
     def close(self) -> None:
-        """End the episode, write statistics and manifest, and let go. Idempotent.
+        """End the episode, write statistics and manifest, and close. Idempotent.
 
-        Nothing is rendered any more: what is not rendered yet stays pending. An
-        episode that is not over is no part of the statistics; its video is kept,
-        marked incomplete. Where it is interrupted (Ctrl-C), the recorder is closed
-        all the same: files stay as SIGKILL leaves them, and recovery completes them.
+        Rendering stops; videos that are not rendered yet stay pending. An unfinished
+        episode is left out of the statistics; its video is kept and marked as
+        incomplete. If `close` is interrupted (Ctrl-C), the recorder is closed anyway:
+        the files stay as SIGKILL would leave them, and recovery completes them.
 
         Raises:
             EncoderError: the video could not be finished; the rest is written.
@@ -412,20 +413,20 @@ class Recorder:
         logger.info("Finished writing results. They are in %s.", self.directory)
 
     def failures(self) -> Mapping[str, str]:
-        """Return why videos could not be rendered, by their names."""
+        """Return the reasons why videos could not be rendered, keyed by their names."""
         return self.run.finisher.failures
 
     def check_process(self) -> None:
-        """Raise `Error` in a process forked from the one that made the recorder."""
+        """Raise `Error` in a process forked from the one that created the recorder."""
         if self._is_forked:
             raise Error(
-                f"This monitor belongs to process {self._pid}, and this is "
+                f"This monitor belongs to process {self._pid}, but this is process "
                 f"{os.getpid()}, forked from it. Two processes cannot write the same "
-                "files: make the monitor inside the process that uses it."
+                "files. Create the monitor inside the process that uses it."
             )
 
     def _is_unbegun(self) -> bool:
-        """Whether the running episode has had its reset only."""
+        """Return whether the running episode has had no step yet."""
         stats = self.stats_recorder
         return stats.done is False and stats.steps == 0 and self._ending is None
 
@@ -448,7 +449,7 @@ class Recorder:
         )
 
     def _take_last_frame(self) -> None:
-        """Take the frame of the running episode's last step, if it was left out."""
+        """Take the running episode's last frame if it was left out."""
         is_running = self.stats_recorder.done is False and self._ending is None
         recording = self._recording
         if is_running and recording is not None and not recording.is_over:
@@ -462,7 +463,7 @@ class Recorder:
         flags: dict[str, bool],
         frame: bool,
     ) -> None:
-        """Take the frames of a step that are drawn live, and those of a clip."""
+        """Take a step's live frames, and the clip's frame."""
         live = None if self._recording is None else self._recording.live
         if live is not None:
             with failures:
@@ -472,10 +473,10 @@ class Recorder:
                 clips.step(reward, **flags, has_frame=frame)
 
     def _cut_episode(self, reason: str) -> None:
-        """End the running episode, if there is one, before it is complete.
+        """End the running episode, if any, as incomplete.
 
         Args:
-            reason: why, where nothing was raised.
+            reason: the reason to give if no exception was raised.
         """
         if self._recording is not None and not self._recording.is_over:
             failures = _Failures()
@@ -490,30 +491,30 @@ class Recorder:
         failures: _Failures,
         take: Callable[[], None] = lambda: None,
     ) -> None:
-        """End what is recorded of an episode, and hand it on or hold it.
+        """End an episode's recording, and submit, hold or drop it.
 
         Args:
-            facts: of its end.
-            episode: the episode; None where it is not complete.
-            failures: of all that is done here.
-            take: takes its last frames.
+            facts: the facts about the episode's end.
+            episode: the episode; None if it is not complete.
+            failures: collects the errors raised here.
+            take: takes the episode's last frames.
         """
         recording, kept = self._recording, self._kept
         if recording is None:
             return
-        # Once, also where it is interrupted: recovery completes what is left of it.
+        # Only once, even if this is interrupted: recovery completes the rest.
         recording.is_over = True
         if not self._choice.is_scheduled:
-            # What a schedule has said is final.
+            # A schedule's decision is final.
             kept = None
         standing = Standing.CHOSEN
         if kept is not None:
             standing = kept.judge(recording.episode_id, episode)
         try:
-            # Without its model an episode that a kill leaves is worth nothing.
+            # After a kill, an episode without its model would be useless.
             for states in self._states:
                 states.settle()
-            # Before all that is drawn, so that no failing video can lose the episode.
+            # Before any drawing, so that a failing video cannot lose the episode.
             with failures:
                 self._journal_end(recording, facts, episode, standing)
             take()
@@ -535,7 +536,8 @@ class Recorder:
                     kept.settle()
         except BaseException:
             recording.leave()
-            # It may go on to the last row there, and the next one is another.
+            # The span may now reach to the log's last row, so the next episode needs a
+            # new log.
             self.run.logs.release()
             raise
         if episode is not None:
@@ -586,7 +588,7 @@ class Recorder:
             self.run.add(JournalEntry(**known))
 
     def _end_recordings(self) -> None:
-        """End whatever runs; what fails stops nothing else. Idempotent."""
+        """End all running recordings, even if some of them fail. Idempotent."""
         self.fast = None
         failures = _Failures()
         with failures:
@@ -608,11 +610,12 @@ class Recorder:
     def finish_models(self) -> None:
         """Wait until every model is stored.
 
-        A trajectory without its model is worth nothing, and what stores it may end with
-        the process.
+        A trajectory without its model is useless, and the thread that stores models may
+        end with the process.
 
         Raises:
-            FileNotWritten: one could not be, and that is not tolerated.
+            FileNotWritten: a model could not be stored, and `on_error` does not
+                tolerate that.
         """
         failures = _Failures()
         for states in self._states:
@@ -625,7 +628,7 @@ class Recorder:
 
     @contextlib.contextmanager
     def _leaving_if_interrupted(self) -> Iterator[None]:
-        """Let go of everything where it is interrupted; errors are the caller's."""
+        """Release all files if the block is interrupted; errors propagate."""
         try:
             yield
         except Exception:
@@ -633,14 +636,14 @@ class Recorder:
         except BaseException:
             self._leave()
             logger.warning(
-                "The recording was interrupted while it closed. What is there is "
-                "completed by: mjrec recover %s",
+                "The recording was interrupted while it was closing. To complete it, "
+                "run: mjrec recover %s",
                 self.directory,
             )
             raise
 
     def _leave(self) -> None:
-        """Let go of all files as they are, as the end of this process would."""
+        """Release all files as they are, as the end of this process would."""
         self.closed = self.stats_recorder.closed = True
         self.run.finisher.stop()
         for each in (self._recording, self._clips):
@@ -650,7 +653,7 @@ class Recorder:
         self._place.lock.release()
 
     def _say_what_is_left(self, pending: int) -> None:
-        """Name the command for what is not rendered or finished."""
+        """Log the command that renders or finishes the rest."""
         if pending:
             videos = "video" if pending == 1 else "videos"
             logger.warning(
@@ -665,20 +668,20 @@ class Recorder:
             )
 
     def _write_last_results(self) -> int:
-        """Write what the run amounts to; return how many videos are pending."""
+        """Write the run's final results; return the number of pending videos."""
         self.run.note_provenance(wait=True)
         if self._kept is not None:
             self.run.note("keep", self._kept.details())
         self.run.note("closed", {"next_episode_id": self.episode_id})
         for name, why in self.failures().items():
-            # Most were written down by the process that has failed.
+            # Usually the failed process has already recorded the reason.
             video = self.directory / self._video_of(name)
             if video.suffix == ".mp4" and reason_of(video) is None:
                 note_failure(video, why)
         return self._write_results()
 
     def _video_of(self, name: str) -> str:
-        """Return the name of the video of a recording, or of a video."""
+        """Return the video's name, given the name of a recording or of the video."""
         for video, clip in self.run.events.clips.items():
             if clip.get("clip") == name:
                 return video
@@ -700,7 +703,7 @@ class Recorder:
 
 
 class _Failures:
-    """Inside it an error stops nothing else; the first is raised when all is done."""
+    """Collects errors inside `with` blocks; `raise_first` raises the first one."""
 
     def __init__(self) -> None:
         self._first: Exception | None = None
@@ -721,7 +724,7 @@ class _Failures:
             raise self._first
 
 
-# Asking the system for the process's number at every step takes as long as counting it.
+# Calling os.getpid() at every step would take as long as counting the step.
 _recorders: weakref.WeakSet[Recorder] = weakref.WeakSet()
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is recorded of one episode: its states, its videos, or nothing."""
+"""Recording one episode: its states, its videos, or nothing."""
 
 from __future__ import annotations
 
@@ -22,20 +22,20 @@ if TYPE_CHECKING:
 
 
 class EpisodeRecording:
-    """Records one episode, from its reset to its end, and knows what is left of it.
+    """Records one episode, from its reset to its end, and then keeps or drops it.
 
     Args:
         run: the monitored run.
-        on_frame_error: called with an error that is raised while a frame of a step
-            is drawn live: it may be the environment's own.
+        on_frame_error: called with an error that is raised while a step's frame is
+            drawn live. It may come from the environment itself.
 
     Attributes:
-        episode_id: its number.
-        video: records it (or not), live or for later.
-        states: records its states; None where they are not recorded.
-        live: draws its videos while it runs; None where that is not so.
-        stays: the states are kept also where the video is not.
-        is_over: it has ended.
+        episode_id: the episode's number.
+        video: the video recorder, live or deferred; disabled if there is no video.
+        states: records the states; None if they are not recorded.
+        live: draws the videos live; None if none are drawn live.
+        stays: whether the states are kept even if the video is not.
+        is_over: whether the episode has ended.
     """
 
     def __init__(
@@ -51,12 +51,12 @@ class EpisodeRecording:
         self.stays = self.is_over = False
         self._run = run
         self._on_frame_error = on_frame_error
-        # What the log says of the video; None where there is none.
+        # The log's facts about the video; None if there is no video.
         self._pending_video: Mapping[str, Any] | None = None
 
     @property
     def mode(self) -> str | None:
-        """`DEFERRED` or `LIVE`; None where the episode gets no video of its own."""
+        """`DEFERRED` or `LIVE`; None if the episode gets no video of its own."""
         if self.live is not None:
             return LIVE
         return DEFERRED if isinstance(self.video, DeferredVideo) else None
@@ -67,15 +67,15 @@ class EpisodeRecording:
         """Record the reset.
 
         Args:
-            observation: what it returned.
-            wants_video: the episode gets a video.
-            keeps: its trajectory is kept.
-            stays: it is kept also where its video is not.
+            observation: the reset's observation.
+            wants_video: whether the episode gets a video.
+            keeps: whether its trajectory is kept.
+            stays: whether the trajectory is kept even if the video is dropped.
         """
         run, capture = self._run, self._run.env.states
         deferred = wants_video and run.env.rendering.mode == DEFERRED
         if deferred:
-            # What draws begins while the model is looked at.
+            # The finisher starts up while the model is inspected.
             run.finisher.expect(
                 run.logs.path_of(trajectory_prefix(run.infix, self.episode_id))
             )
@@ -109,7 +109,7 @@ class EpisodeRecording:
                 live.begin()
 
     def fast_path(self) -> FastPath | None:
-        """Return the fast path of the coming steps, if there is one."""
+        """Return the fast path for the next steps, or None if there is none."""
         if self.live is not None:
             return None
         if self.states is None:
@@ -117,34 +117,34 @@ class EpisodeRecording:
         return self.states.fast_path()
 
     def take_last(self) -> None:
-        """Take the frame of the last step, if it was left out."""
+        """Take the last step's frame if it was left out."""
         if self.states is not None:
             self.states.take_frame()
         if self.live is not None:
             self.live.take_last()
 
     def discard(self) -> None:
-        """Leave nothing."""
+        """Discard everything recorded of the episode."""
         if self.live is not None:
             self.live.discard()
             self.live = None
         if self.states is not None:
-            # On a full disk it is said later.
+            # A full disk is reported by a later write.
             with contextlib.suppress(FileNotWritten):
                 self.states.drop()
             self.states = None
 
     def leave(self) -> None:
-        """Let go of the live videos as they are: recovery finishes them."""
+        """Release the live videos as they are; recovery finishes them."""
         if self.live is not None:
             self.live.leave()
 
     def end(self, facts: Mapping[str, Any], *, end_time: float) -> None:
-        """Write what is known of the end, and finish live videos.
+        """Write the final facts, and finish live videos.
 
         Args:
-            facts: of the episode's end.
-            end_time: in seconds since the epoch.
+            facts: the facts about the episode's end.
+            end_time: the time of the end, in seconds since the epoch.
         """
         stats = self._run.stats
         known = {**facts, "length": stats.steps, "reward": stats.rewards}
@@ -157,27 +157,27 @@ class EpisodeRecording:
                 self.live.end(known)
 
     def hand_on(self) -> None:
-        """Let the videos be reported, drawn, and the trajectory be finished."""
+        """Submit the recording to the finisher, and its videos to the trackers."""
         self.expect()
         if self.states is not None:
             self.states.submit()
 
     def expect(self) -> None:
-        """Let the videos be reported once they are there."""
+        """Have the videos reported to the trackers once they exist."""
         if self.mode is not None and self._run.trackers:
             self._run.trackers.expect(Path(str(self.video.path)))
         if self.live is not None:
             self.live.name_again()
 
     def choose(self, selection: Mapping[str, Any]) -> None:
-        """Keep the video of an episode that has ended before it was chosen.
+        """Keep the video of an episode that was chosen after it had ended.
 
         Args:
-            selection: what is said of the choice.
+            selection: the facts about the choice.
 
         Raises:
-            FileNotWritten: the disk is too full to say so; it is handed on all the
-                same.
+            FileNotWritten: the disk is too full to record the choice; the recording is
+                submitted anyway.
         """
         try:
             if self.live is not None:
@@ -189,12 +189,12 @@ class EpisodeRecording:
             self.hand_on()
 
     def drop(self) -> None:
-        """Leave no video of an episode that has ended, nor states that do not stay.
+        """Drop the video of an ended episode, and its states unless `stays` is set.
 
         Raises:
-            DirectoryNotWritable: they cannot be removed.
-            FileNotWritten: the disk is too full to say of states that stay that there
-                will be no video.
+            DirectoryNotWritable: the files cannot be removed.
+            FileNotWritten: the states stay, but the disk is too full to record that
+                their video was dropped.
         """
         if self.live is not None:
             self.live.remove()
@@ -219,7 +219,7 @@ class EpisodeRecording:
             "video": self._pending_video,
         }
         if self._pending_video is None and run.env.rendering.mode == DEFERRED:
-            # For those who choose later, among the episodes of several monitors.
+            # For a later choice among the episodes of several monitors.
             facts["possible_video"] = run.pending_video(name, DEFERRED, second_name={})
         is_candidate = bool(run.selection) and self._pending_video is not None
         if run.selection:
@@ -234,6 +234,6 @@ class EpisodeRecording:
             start=start,
             max_fps=run.options.max_fps,
             observation=observation if run.options.observations else None,
-            # It may be dropped without the others.
+            # A candidate may be dropped separately from the other episodes.
             is_alone=is_candidate,
         )

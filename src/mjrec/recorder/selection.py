@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Choosing episodes as they end: `Monitor(..., keep=...)`.
 
-A selection gets every finished episode, one after the other, and says of each how it
-stands. It knows nothing of files.
+A selection is given every finished episode in turn and decides which ones are chosen,
+dropped, or still candidates. It knows nothing about files.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from .tracking import FinishedEpisode
 
 
 class Standing(enum.Enum):
-    """How an episode stands.
+    """The state of an episode in a selection.
 
     Attributes:
-        CHOSEN: it gets its video, for good.
+        CHOSEN: the episode gets a video; final.
         CANDIDATE: later episodes, or the end of the run, decide.
-        DROPPED: it gets none, for good.
+        DROPPED: the episode gets no video; final.
     """
 
     CHOSEN = "chosen"
@@ -36,19 +36,22 @@ class Standing(enum.Enum):
 class Selection:
     """Chooses among the finished episodes of one run.
 
-    It is a schedule too: of every episode that may be chosen when it has ended.
+    It is also a schedule that includes every episode that may be chosen at its end.
 
     Args:
-        name: of the rule, as the manifest has it.
-        choose: returns the numbers of the chosen among given episodes; None where only
-            failures are chosen.
-        holds_all: it is asked once, at the end. Else it is asked after each episode,
-            and what it does not choose among some it does not choose among more.
-        most_failures: how many failures are chosen besides, as they end; None is all.
+        name: the rule's name in the manifest.
+        choose: returns the numbers of the chosen episodes among those given; None if
+            only failures are chosen.
+        holds_all: whether `choose` is called only once, at the end. Otherwise it is
+            called after each episode; an episode that it once rejects must stay
+            rejected when more episodes are added.
+        most_failures: maximum number of failures that are chosen in addition, as they
+            end; None for all.
 
     Attributes:
-        name, holds_all: as given.
-        finished: how many episodes it got.
+        name: the rule's name in the manifest.
+        holds_all: whether the choice is made only at the end.
+        finished: number of episodes added.
     """
 
     def __init__(
@@ -60,7 +63,7 @@ class Selection:
         most_failures: int | None = 0,
     ) -> None:
         self.name, self.holds_all = name, holds_all
-        # Under which a schedule is written into the manifest.
+        # The name under which the manifest lists a schedule.
         self.__qualname__ = f"keep:{name}"
         self.finished = 0
         self._choose = choose
@@ -72,17 +75,18 @@ class Selection:
         self._chosen: set[int] = set()
 
     def facts(self) -> dict[str, Any]:
-        """Return what a run says of it."""
+        """Return the selection's facts for the journal."""
         return {"rule": self.name}
 
     def __call__(self, episode_id: int) -> bool:
-        """Return whether an episode is to be recorded, as if it got a video."""
+        """Return whether to record an episode as if it got a video."""
         return self._choose is not None or self._has_room
 
     def add(self, episode: FinishedEpisode) -> None:
-        """Take note of an episode; their numbers rise. Of the same one it counts once.
+        """Add a finished episode.
 
-        A candidate that has fallen out never comes back.
+        Episodes must come in ascending order; one that was already added is ignored. A
+        candidate that has been dropped never returns.
         """
         number = episode.episode_id
         if number <= self._last_id:
@@ -100,7 +104,7 @@ class Selection:
             self._candidates = {n: e for n, e in self._candidates.items() if n in best}
 
     def standing(self, episode_id: int) -> Standing:
-        """Return how an episode stands that it got."""
+        """Return the standing of an episode that was added."""
         if episode_id in self._chosen:
             return Standing.CHOSEN
         is_candidate = episode_id in self._candidates
@@ -108,20 +112,20 @@ class Selection:
 
     @property
     def undecided(self) -> int:
-        """How many episodes are candidates."""
+        """Number of candidates."""
         return len(self._candidates.keys() - self._chosen)
 
     @property
     def chosen(self) -> list[int]:
-        """The numbers of those that are chosen, rising."""
+        """Numbers of the chosen episodes, in ascending order."""
         return sorted(self._chosen)
 
     def close(self) -> None:
-        """Decide about all candidates: there are no more episodes. Idempotent.
+        """Decide about all candidates; no more episodes will come. Idempotent.
 
         Raises:
             InvalidArgument: the user's function raised, or did not return numbers of
-                finished episodes. Nothing is decided then.
+                finished episodes. In that case nothing is decided.
         """
         if self._choose is not None and not self._is_closed:
             self._chosen.update(self._choose([*self._candidates.values()]))
@@ -135,15 +139,16 @@ class Selection:
 
 
 def selection_from(keep: object) -> Selection:
-    """Return a new selection by the rule that `keep` names or is.
+    """Return a new selection for a `keep` argument.
 
     Args:
-        keep: a rule, see `keep_rules`, or a function from the finished episodes to the
-            numbers of the chosen.
+        keep: a rule (see `keep_rules`), or a function from the finished episodes to the
+            numbers of the chosen ones.
 
     Raises:
-        UnknownName: there is no such rule.
-        InvalidArgument: it is neither text nor a function, or names a part twice.
+        UnknownName: the rule does not exist.
+        InvalidArgument: `keep` is neither a string nor a function, or names a part
+            twice.
     """
     if callable(keep):
         check_takes_one(keep, "keep", "the sequence of finished episodes")
@@ -151,8 +156,8 @@ def selection_from(keep: object) -> Selection:
         return Selection(name, functools.partial(_ask, keep, name), holds_all=True)
     if not isinstance(keep, str):
         raise InvalidArgument(
-            f"keep must be one of {', '.join(RULES)}, or a function from the finished "
-            f"episodes to the numbers of those to keep, got {keep!r}."
+            f"keep must be one of {', '.join(RULES)}, or a function that takes the "
+            f"finished episodes and returns the numbers to keep, got {keep!r}."
         )
     rule = keep_rule(keep, RULES)
     ranked = [part for part in rule.parts if part.role != "failure"]
@@ -174,29 +179,29 @@ def _ask(
     name: str,
     episodes: Sequence[FinishedEpisode],
 ) -> frozenset[int]:
-    """Return what a user's function chooses, checked."""
+    """Call a user's function and check the numbers that it returns."""
     try:
         numbers = frozenset(map(_number, function(tuple(episodes))))
     except Exception as error:
         raise InvalidArgument(
             f"keep={name} could not choose among {len(episodes)} finished episodes: "
             f"{type(error).__name__}: {error}. It must return the numbers (episode_id) "
-            "of those to keep."
+            "of the episodes to keep."
         ) from error
     known = [each.episode_id for each in episodes]
     unknown = sorted(numbers.difference(known))
     if unknown:
         raise InvalidArgument(
-            f"keep={name} returned {_listed(unknown)}, and no finished episode has "
-            f"that number: there are {_listed(known)}."
+            f"keep={name} returned {_listed(unknown)}, but no finished episode has "
+            f"that number. The finished episodes are {_listed(known)}."
         )
     return numbers
 
 
 def _number(value: Any) -> int:
     if isinstance(value, bool):
-        # Most likely a list of yes and no, which would name the episodes 0 and 1.
-        raise TypeError(f"{value} is no number of an episode")
+        # Most likely a list of flags, which would be taken for episodes 0 and 1.
+        raise TypeError(f"{value} is not an episode number")
     return operator.index(value)
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The states of an episode, or of a clip's part that is of one: a row a step."""
+"""Recording the states of an episode, or of one part of a clip, one row per step."""
 
 from __future__ import annotations
 
@@ -30,33 +30,32 @@ logger = logging.getLogger(__name__)
 
 
 class StateRecorder:
-    """Records the states of an episode, or of a part of one: a row a step.
+    """Records the states of an episode, or of a part of one, one row per step.
 
-    Its first row is that of the reset. Until it is known what an action is and how long
-    a step takes, which the first step tells, that row waits in memory. Frames are steps
-    0, n, 2n ... where n is the smallest stride that keeps `max_fps`, and always the
-    last one.
+    The first row is the reset's. It waits in memory until the first step shows what an
+    action looks like and how long a step takes. Frames are taken at steps 0, n, 2n ...,
+    where n is the smallest stride that respects `max_fps`, and always at the last step.
 
-    What goes wrong ends here. Where no frame can be made any more, the frames end
-    and the states go on. Where nothing can be written any more, the recording ends
-    there: an error, unless `on_error` has it that the simulation goes on.
+    Errors are handled here. If no more frames can be made, the frames end and the
+    states continue. If nothing can be written any more, the recording ends there; this
+    raises an error unless `on_error` lets the simulation continue.
 
     Args:
         run: the monitored run.
-        name: of the file that it becomes, without suffix.
-        logs: where its rows go.
-        what: is lost where they cannot be written.
-        facts: what is known at its beginning.
-        capture: takes states; None where there is no simulation that can be seen.
-        start: what `capture.begin_episode` returned.
-        max_fps: the most frames per second that are wanted; None for every step.
-        observation: of the reset; None where observations are not recorded.
-        has_actions: actions are recorded.
-        is_alone: it may be deleted alone: it gets a log of its own.
+        name: name of the resulting file, without suffix.
+        logs: the logs that its rows are written to.
+        what: the part of the run that is lost if rows cannot be written, for messages.
+        facts: the facts known at the beginning.
+        capture: captures states; None if no simulation is accessible.
+        start: the value that `capture.begin_episode` returned.
+        max_fps: maximum frames per second; None takes a frame at every step.
+        observation: the reset's observation; None if observations are not recorded.
+        has_actions: whether actions are recorded.
+        is_alone: whether it may be deleted separately; it then gets its own log.
 
     Attributes:
-        is_stopped: nothing more is recorded, after an error.
-        broken_reason: why there are no frames any more; None while there are.
+        is_stopped: whether recording has stopped after an error.
+        broken_reason: why no more frames are taken; None while they are.
     """
 
     def __init__(
@@ -93,7 +92,7 @@ class StateRecorder:
         self._span: SpanWriter | None = None
         self._fast: FastPath | None = None
         self._irregular: set[str] = set()
-        # From which step on actions were given as what.
+        # Pairs of a step and the dtype of the actions from that step on.
         self._action_dtypes: list[list[Any]] = []
         self._observation = None if observation is None else step_array(observation)
         self._first_observation = None
@@ -114,39 +113,39 @@ class StateRecorder:
         if has_actions and last is not None:
             self._use_action(last.action)
         if self._pace is not None and (not has_actions or self._action is not None):
-            # Most likely all is as it was. Where it cannot be written, the first step
-            # says so.
+            # Most likely nothing has changed since the last recording. If the row
+            # cannot be written, the first step reports it.
             with contextlib.suppress(FileNotWritten):
                 self._begin(self._pace)
 
     @property
     def path(self) -> Path:
-        """The file that it becomes."""
+        """The resulting file."""
         return self._logs.path_of(self._name)
 
     @property
     def is_there(self) -> bool:
-        """Whether the log has something of it."""
+        """Whether the log has any of its rows."""
         return self._span is not None
 
     @property
     def steps(self) -> int:
-        """How many steps were recorded."""
+        """Number of recorded steps."""
         return 0 if self._span is None else self._span.steps
 
     @property
     def frame_count(self) -> int:
-        """How many snapshots were taken."""
+        """Number of snapshots taken."""
         return 0 if self._span is None else self._span.frame_count
 
     def before_step(self, action: Any) -> None:
-        """Note the action of the coming step, which the environment may overwrite."""
+        """Copy the next step's action, because the environment may overwrite it."""
         if self.is_stopped or not self._has_actions:
             return
         if self._action is not None and self._action.set(action):
             return
         if self.steps == 0:
-            # Unlike those of the episode before: the rows will be others.
+            # The previous episode's actions were different, so the row layout changes.
             self._take_back()
             self._use_action(action_array(action))
             if self._action is not None and self._action.set(action):
@@ -166,22 +165,22 @@ class StateRecorder:
         is_last: bool = False,
         has_frame: bool = True,
     ) -> None:
-        """Record what the environment is like after a step.
+        """Record the environment after a step.
 
-        Where there is no state to be had, the step is in the log without one.
+        If no state is available, the step is logged without one.
 
         Args:
-            reward: of the step.
-            terminated: the task ended the episode.
-            truncated: a limit from outside the task ended it.
-            observation: after the step; only where observations are recorded.
-            is_last: it is the last one, and gets a frame.
-            has_frame: False where the environment has reset itself already: its
-                state is the next episode's.
+            reward: the step's reward.
+            terminated: whether the task ended the episode.
+            truncated: whether a limit outside the task ended it.
+            observation: the observation after the step, if observations are recorded.
+            is_last: whether this is the last step, which always gets a frame.
+            has_frame: False if the environment has already reset itself, so that its
+                state belongs to the next episode.
 
         Raises:
-            FileNotWritten: the disk is full, and that is not tolerated. The step was
-                not recorded, and all before it is kept.
+            FileNotWritten: the disk is full, and `on_error` does not tolerate that.
+                The step was not recorded; everything before it is kept.
         """
 
         def take_row() -> None:
@@ -195,7 +194,7 @@ class StateRecorder:
                 if has_frame and (is_last or number % self._stride == 0):
                     is_frame = self._write_snapshot(span, slot, number)
             finally:
-                # Whatever was raised: a missing step would be the end of the log.
+                # Even after an exception: a reader stops at the first missing step.
                 self._write_arrays(span, slot)
                 span.commit(
                     number,
@@ -208,10 +207,10 @@ class StateRecorder:
         self._try(take_row)
 
     def take_frame(self) -> None:
-        """Take the snapshot of this moment, unless there is one of it already.
+        """Take a snapshot now, unless the current step already has one.
 
         Raises:
-            FileNotWritten: the disk is full, and that is not tolerated.
+            FileNotWritten: the disk is full, and `on_error` does not tolerate that.
         """
 
         def take() -> None:
@@ -224,7 +223,7 @@ class StateRecorder:
         self._try(take)
 
     def fast_path(self) -> FastPath | None:
-        """Return the fast path, if there is one."""
+        """Return the fast path, or None if it cannot be used."""
         if self.is_stopped or not self._takes_frames or self._observation is not None:
             return None
         if self._fast is None and self._span is not None:
@@ -232,7 +231,7 @@ class StateRecorder:
         return self._fast
 
     def end_frames(self, reason: str) -> None:
-        """Take no more snapshots, and say why."""
+        """Stop taking snapshots and log the reason."""
         self._takes_frames = False
         self._break(reason)
         logger.warning(
@@ -240,13 +239,13 @@ class StateRecorder:
         )
 
     def note(self, **facts: Any) -> None:
-        """Add to its facts; on a full disk they wait for what is said next."""
+        """Add facts. If the disk is full, they are written with the next ones."""
         self._facts = {**self._facts, **facts}
         with contextlib.suppress(FileNotWritten):
             self.amend(facts)
 
     def amend(self, facts: Mapping[str, Any]) -> None:
-        """Add to its facts, also after its end.
+        """Add facts, even after the recording has ended.
 
         Raises:
             FileNotWritten: the disk is full.
@@ -255,17 +254,17 @@ class StateRecorder:
             self._span.note(facts)
 
     def end(self, facts: Mapping[str, Any]) -> None:
-        """Write what is known of its end.
+        """End the recording and write the final facts.
 
         Raises:
-            FileNotWritten: the disk is full, and that is not tolerated; it is said as
-                soon as there is room.
+            FileNotWritten: the disk is full, and `on_error` does not tolerate that.
+                The facts are written as soon as there is room.
         """
-        # It holds the log's memory.
+        # The fast path keeps the log's memory alive.
         self._fast = None
         try:
             if self._span is None and not self.is_stopped:
-                # No step was taken; there is the reset.
+                # No step was taken, so only the reset is recorded.
                 self._begin(_pace(self._run.env.declared(), None, self._max_fps))
             if self._span is not None:
                 self._span.end(facts)
@@ -275,17 +274,17 @@ class StateRecorder:
                 raise
 
     def submit(self, recording: Path | None = None) -> None:
-        """Hand it on to what finishes it, after its end.
+        """Submit the ended recording to the finisher.
 
         Args:
-            recording: the clip that it is the last part of, if it is one.
+            recording: the clip that this is the last part of, if any.
         """
-        # Else the disk was too full for a single row: there is no video to come.
+        # Without a span the disk was too full for a single row: no video will come.
         if self._span is not None or recording is not None:
             self._run.submit(recording or self.path)
 
     def drop(self) -> None:
-        """Give up its rows, also after its end.
+        """Discard its rows, even after the recording has ended.
 
         Raises:
             FileNotWritten: the disk is full.
@@ -294,10 +293,10 @@ class StateRecorder:
             self._span.drop()
 
     def _take_back(self) -> None:
-        """Give up the row of the reset; the first step will write it anew."""
+        """Discard the reset's row; the first step will write it again."""
         self._fast = None
         if self._span is not None:
-            # On a full disk it is said later.
+            # A full disk is reported by a later write.
             with contextlib.suppress(FileNotWritten):
                 self._span.drop()
             self._span = None
@@ -334,7 +333,7 @@ class StateRecorder:
         )
 
     def _settled(self) -> SpanWriter:
-        """Return where the coming row goes, after what the first step has told."""
+        """Return the span for the next row, begun or corrected at the first step."""
         if self._span is not None and self.steps:
             return self._span
         pace = self._measured_pace()
@@ -352,7 +351,7 @@ class StateRecorder:
         return 1 if self._pace is None else int(self._pace["stride"])
 
     def _begin(self, pace: Mapping[str, Any]) -> None:
-        """Write the row of the reset."""
+        """Begin the span and write the reset's row."""
         self._run.paces[self._logs] = self._pace = pace
         layout = self._layout = self._new_layout()
         facts = {**self._facts, **self._parts(), **pace}
@@ -379,12 +378,12 @@ class StateRecorder:
             span.commit(0, is_frame=self._takes_frames)
             self._span = span
         except BaseException:
-            # Without its first frame its video would show nothing.
+            # A video without its first frame would show nothing.
             span.drop()
             raise
 
     def _new_layout(self) -> RowLayout:
-        """Return what the rows consist of; that of the last recording, if it fits."""
+        """Return the row layout, reusing the last recording's if it still fits."""
         start, action = self._start, self._action
         kinds = (
             self._state,
@@ -398,7 +397,7 @@ class StateRecorder:
             return last
         state, snapshot, _, observation, start_words = kinds
         words = None
-        # Of another size the last word would have what stands behind it in memory.
+        # With any other size the last word would include the memory after the action.
         if start_words is not None and action is not None and action.size % 8 == 0:
             words = np.concatenate([start_words, words_of([action.values])])
         dtype = row_dtype(
@@ -422,12 +421,12 @@ class StateRecorder:
         try:
             self._capture.capture_state(state)
         except PicturesDiffer:
-            # It is another simulation from here on.
+            # The environment has switched to a different simulation.
             self._capture = None
             raise
 
     def _write_snapshot(self, span: SpanWriter, slot: int, number: int) -> bool:
-        """Write the snapshot of this moment, and what has changed; tell whether so."""
+        """Write the changed fields and a snapshot; return whether one was written."""
         capture = self._capture
         if capture is None:
             return False
@@ -448,7 +447,7 @@ class StateRecorder:
             columns["observation"][slot] = self._observation.values
 
     def _parts(self) -> dict[str, Any]:
-        """Return what dictionaries were made into one vector from."""
+        """Return names and shapes of the arrays that were joined into one vector."""
         arrays = {"action": self._action, "observation": self._observation}
         return {
             f"{name}_parts": [
@@ -476,15 +475,15 @@ class StateRecorder:
             self._irregular.add(what)
             self.note(**{f"irregular_{what}_from": self.steps})
             logger.warning(
-                "%s: from step %d on the %s are not like those before and are recorded "
-                "as zeros.",
+                "%s: from step %d on, the %s have a different type or shape and are "
+                "recorded as zeros.",
                 self.path.name,
                 self.steps,
                 what,
             )
 
     def _measured_pace(self) -> Mapping[str, Any]:
-        """Return the time of a step, measured over the first one, and the stride."""
+        """Return the rate, the first step's measured time, and the frame stride."""
         began, now = self._first_time, self._run.env.clock()
         if began is None or now is None or now <= began:
             return _pace(self._run.env.declared(), None, self._max_fps)
@@ -502,15 +501,15 @@ def _pace(
 
 
 def _is_same(one: object, other: object) -> bool:
-    # Two dtypes are compared member by member, and nearly always they are one.
+    # Comparing two dtypes field by field is slow, and they are nearly always identical.
     return one is other or (isinstance(one, np.dtype) and one == other)
 
 
-# NumPy composes the name anew each time.
+# Cached because NumPy builds the name on each access.
 _dtype_name = functools.lru_cache(maxsize=16)(lambda dtype: str(dtype.name))
 
 
-# Of the same few steps in each episode; fractions take Python long.
+# Cached because fractions are slow and the same few values recur in each episode.
 @functools.lru_cache(maxsize=64)
 def _measured(seconds: float, max_fps: float | Fraction | None) -> Mapping[str, Any]:
     rate = rate_from_timestep(seconds)
@@ -522,20 +521,20 @@ def _words(kind: np.dtype[Any] | None) -> int:
 
 
 class DeferredVideo:
-    """Stands where a `VideoRecorder` stands when frames are drawn live.
+    """A video that is rendered later; it takes the place of a `VideoRecorder`.
 
-    Its frames are recorded snapshots. The files come when they are rendered, which the
-    monitor's `close` waits for.
+    Its frames are recorded snapshots. Its files are written when the video is rendered,
+    which the monitor's `close` waits for.
 
     Args:
-        directory: of the video.
-        name: of the video, without extension.
-        states: of the episode.
+        directory: the video's directory.
+        name: the video's name, without extension.
+        states: the episode's states.
 
     Attributes:
-        path: the video, once it is rendered.
-        metadata_path: its metadata, likewise.
-        enabled: True.
+        path: the video, once rendered.
+        metadata_path: the video's metadata file, once rendered.
+        enabled: always True.
     """
 
     enabled = True
@@ -548,12 +547,12 @@ class DeferredVideo:
 
     @property
     def broken(self) -> bool:
-        """Whether no more frames could be taken; those before are rendered."""
+        """Whether frame recording ended early; earlier frames are still rendered."""
         return self._states.broken_reason is not None
 
     @property
     def functional(self) -> bool:
-        """Whether frames are (or were) recorded: not broken."""
+        """Whether frames are (or were) recorded, the opposite of `broken`."""
         return not self.broken
 
     @property
@@ -563,10 +562,10 @@ class DeferredVideo:
 
     @property
     def empty(self) -> bool:
-        """Whether there is no frame."""
+        """Whether no frame has been recorded."""
         return self.frame_count == 0
 
     @property
     def finished(self) -> bool:
-        """Whether the video has been rendered and is there, whole."""
+        """Whether the video has been rendered completely and exists."""
         return Path(self.path).exists() and Path(self.metadata_path).exists()

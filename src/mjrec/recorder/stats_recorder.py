@@ -25,25 +25,26 @@ class StatsRecorder:
     in the statistics.
 
     Args:
-        directory: of the statistics file. It must exist at `flush` or `close`.
+        directory: the statistics file's directory. It must exist at `flush` or `close`.
         file_prefix: the file is `<file_prefix>.stats.json`.
-        autoreset: the environment starts a new episode in the step that ends the last.
+        autoreset: whether the environment starts a new episode in the step that ends
+            the last one.
         env_id: the environment's name, for messages.
-        allow_early_reset: a reset in the middle of an episode drops it instead of
-            raising `ResetNotAllowed`.
+        allow_early_reset: whether a reset in the middle of an episode drops the episode
+            instead of raising `ResetNotAllowed`.
 
     Attributes:
         initial_reset_timestamp: wall-clock seconds since the epoch, just before the
             first reset. None before it.
         timestamps: wall-clock time at the end of each complete episode.
-        episode_lengths: steps of each complete episode.
-        episode_rewards: sum of rewards of each complete episode, in float64, in step
-            order.
+        episode_lengths: number of steps of each complete episode.
+        episode_rewards: sum of rewards of each complete episode, added in float64 in
+            step order.
         episode_types: "t" (training) or "e" (evaluation) of each complete episode.
-        steps: steps of the running episode. None before the first reset.
-        rewards: its sum of rewards. None before the first reset.
-        done: whether it is over. None before the first reset.
-        total_steps: all steps, including incomplete episodes.
+        steps: number of steps of the running episode. None before the first reset.
+        rewards: sum of rewards of the running episode. None before the first reset.
+        done: whether the running episode is over. None before the first reset.
+        total_steps: number of all steps, including those of incomplete episodes.
         closed: whether `close` was called.
         path: the statistics file.
     """
@@ -91,7 +92,7 @@ class StatsRecorder:
     def type(self, value: str) -> None:
         if value not in _TYPES:
             raise InvalidArgument(
-                f'An episode\'s type is "t" (training) or "e" (evaluation), got '
+                f'An episode\'s type must be "t" (training) or "e" (evaluation), got '
                 f"{value!r}."
             )
         self._type = value
@@ -105,7 +106,7 @@ class StatsRecorder:
         """Check that a step may be taken.
 
         Raises:
-            ResetNeeded: there was no reset yet, or the episode is over.
+            ResetNeeded: there has been no reset yet, or the episode is over.
             ClosedError: the recorder is closed.
         """
         if self.done is False and not self.closed:
@@ -142,8 +143,8 @@ class StatsRecorder:
         return bool(done)
 
     def count(self, reward: float, done: bool) -> None:
-        """Count a step like `after_step`, but never start another episode."""
-        assert self.steps is not None  # before_step has seen to it
+        """Count a step like `after_step`, but never start a new episode."""
+        assert self.steps is not None  # before_step has checked it
         assert self.rewards is not None
         self.rewards += reward
         self.steps += 1
@@ -155,11 +156,12 @@ class StatsRecorder:
     def before_reset(
         self, *, after_error: bool = False, now: float | None = None
     ) -> None:
-        """Check that a reset may be made.
+        """Check that a reset is allowed.
 
         Args:
-            after_error: the environment has raised, so that there is no other way on.
-            now: the time, where the caller has read the clock already.
+            after_error: whether the environment has raised, so that a reset is the only
+                way to continue.
+            now: the time, if the caller has already read the clock.
 
         Raises:
             ResetNotAllowed: the episode has begun and is not over.
@@ -170,9 +172,9 @@ class StatsRecorder:
         if self.done is False and self.steps and not allowed:
             raise ResetNotAllowed(
                 f"reset() was called on {self._environment} after {self.steps} steps "
-                "of an episode that is not over. Go on until terminated or truncated "
-                "is true, or allow it with allow_early_reset=True; the episode is then "
-                "no part of the statistics."
+                "of an episode that is not over. Continue until terminated or "
+                "truncated is true, or allow it with allow_early_reset=True, which "
+                "leaves the episode out of the statistics."
             )
         if self.initial_reset_timestamp is None:
             self.initial_reset_timestamp = self.clock() if now is None else now
@@ -185,7 +187,7 @@ class StatsRecorder:
         self._episode_type = self._type
 
     def save_complete(self) -> None:
-        """Append the running episode, as complete, to the statistics."""
+        """Append the running episode to the statistics as complete."""
         assert self.steps is not None
         assert self.rewards is not None
         self.episode_lengths.append(self.steps)
@@ -194,17 +196,17 @@ class StatsRecorder:
         self.timestamps.append(self.clock())
 
     def close(self) -> None:
-        """Write the statistics file and end. A second call does nothing."""
+        """Write the statistics file and close. A second call does nothing."""
         self.flush()
         self.closed = True
 
     def flush(self) -> None:
-        """Write the statistics file; nothing once closed."""
+        """Write the statistics file, unless the recorder is closed."""
         if not self.closed:
             write_stats_file(Path(self.path), self.stats())
 
     def stats(self) -> StatsFile:
-        """Return what the file holds, as of now."""
+        """Return the current content of the statistics file."""
         return StatsFile(
             initial_reset_timestamp=self.initial_reset_timestamp,
             timestamps=tuple(self.timestamps),
@@ -219,7 +221,7 @@ class StatsRecorder:
 
     def _check_open(self) -> None:
         if self.closed:
-            raise ClosedError(f"The statistics {self.path} are closed.")
+            raise ClosedError(f"The statistics recorder of {self.path} is closed.")
 
 
 def reward_to_float(reward: Any) -> float:
@@ -229,14 +231,14 @@ def reward_to_float(reward: Any) -> float:
         reward: a number, a NumPy scalar or an array of one element.
 
     Raises:
-        InvalidArgument: it is something else.
+        InvalidArgument: `reward` is something else.
     """
-    if isinstance(reward, float):  # as NumPy's float64 is
+    if isinstance(reward, float):  # includes NumPy's float64
         return float(reward)
     array = np.asarray(reward)
     if array.dtype.kind not in "biuf" or array.size != 1:
         raise InvalidArgument(
             f"A reward must be one number, got {reward!r}. An environment with several "
-            "rewards needs a wrapper that makes one number of them."
+            "rewards needs a wrapper that combines them into one number."
         )
     return float(array.item())

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Actions and observations as arrays of one kind, and the rows that hold them."""
+"""Arrays for actions and observations, and the layout of rows."""
 
 from __future__ import annotations
 
@@ -11,21 +11,21 @@ from numpy.typing import NDArray
 
 _ARRAY = np.ndarray
 
-# What every value of a kind fits into exactly: people give float32 to an environment
-# in one step and float64 in the next.
+# Dtypes that hold every value of a kind exactly, because users may pass float32 in one
+# step and float64 in the next.
 _WIDEST = {"f": np.dtype("<f8"), "i": np.dtype("<i8"), "b": np.dtype("<i8")}
 
 
 class StepArray:
-    """Memory for an array that comes with every step.
+    """A buffer for an array that comes with every step.
 
     Attributes:
         kind: dtype and shape, as a dtype.
-        values: the array that was set last; always the same memory.
-        parts: the names and shapes of a dictionary's arrays, which lie one behind the
-            other; None for a plain array.
-        given: the dtype of the array that was set last, as it came; None before the
-            first one, and for dictionaries.
+        values: the values set last; always the same memory.
+        parts: names and shapes of a dictionary's arrays, which are stored one after
+            another; None for a plain array.
+        given: the original dtype of the array set last; None before the first one, and
+            for dictionaries.
         on_other_dtype: called when `given` has changed.
     """
 
@@ -39,25 +39,26 @@ class StepArray:
         self.parts = parts
         self.values: NDArray[Any] = np.zeros(shape, dtype)
         self._shape = self.values.shape
-        # The next one's is usually the same.
+        # The next array usually has the same dtype.
         self.given: np.dtype[Any] | None = None
         self.on_other_dtype: Callable[[], object] = lambda: None
-        # What goes in without a loss: integers into floats, and not the other way.
+        # The kinds that can be stored: integers fit into floats, but not vice versa.
         self._kinds = "fiub" if dtype.kind == "f" else "iub"
         if dtype.kind == "u":
             self._kinds = "u"
 
     @property
     def size(self) -> int:
-        """The bytes of one."""
+        """Size of the array in bytes."""
         return self.values.nbytes
 
     def set(self, value: Any) -> bool:
-        """Take over `value`; return False, and hold zeros, where it is of another kind.
+        """Copy `value` into the buffer; if it does not fit, zero it and return False.
 
-        An environment may take what a file cannot hold; recording does not stop it.
+        An environment may accept values that a file cannot hold; recording must not
+        prevent that.
         """
-        # The usual case, at every step.
+        # The usual case.
         if (
             type(value) is _ARRAY
             and value.dtype is self.given
@@ -85,23 +86,23 @@ class StepArray:
             raise KeyError(*value.keys() ^ self.parts.keys())
         arrays = [np.asarray(value[name], np.float64) for name in self.parts]
         if [array.shape for array in arrays] != list(self.parts.values()):
-            raise ValueError("an array has another shape than before")
+            raise ValueError("an array has a different shape than before")
         return np.concatenate([array.reshape(-1) for array in arrays])
 
 
 def step_array(example: Any) -> StepArray | None:
-    """Return memory for arrays like `example`; None where it is nothing like an array.
+    """Return a buffer for arrays like `example`; None if `example` is not an array.
 
-    Floats are kept as float64 and integers as int64, whatever their width, so that
-    each value is kept exactly; a larger array of another width (a frame) keeps its
-    own. A dictionary of arrays becomes one float64 vector.
+    Floats are stored as float64, and signed integers and bools as int64, so every value
+    is kept exactly. Unsigned integers (such as frames) keep their dtype. A dictionary
+    of arrays becomes one float64 vector.
     """
     if isinstance(example, Mapping):
         return _of_mapping(example)
     try:
         array = np.asarray(example)
     except ValueError:
-        # Arrays of several lengths.
+        # A ragged sequence.
         return None
     if array.dtype.kind not in "fiub":
         return None
@@ -110,10 +111,11 @@ def step_array(example: Any) -> StepArray | None:
 
 
 def action_array(example: Any) -> StepArray | None:
-    """Return memory for actions like `example`; None where it is nothing like an array.
+    """Return a buffer for actions like `example`; None if `example` is not an array.
 
-    As `step_array`, but for arrays of integers, which become float64: who begins
-    with `[0, 0]` may go on with `[0.5, 0.1]`. A single integer is a choice and stays.
+    It is like `step_array`, except that arrays of signed integers become float64,
+    because `[0, 0]` may be followed by `[0.5, 0.1]`. A single integer is a discrete
+    action and stays an integer.
     """
     if isinstance(example, list | tuple | np.ndarray):
         array = step_array(example)
@@ -136,15 +138,17 @@ def _of_mapping(example: Mapping[str, Any]) -> StepArray | None:
 
 
 class RowLayout(NamedTuple):
-    """What rows consist of. The next recording's are usually the same.
+    """The layout of rows. The next recording usually has the same one.
 
     Attributes:
-        state, snapshot: what is taken of the simulation.
-        action: memory for actions.
+        state: dtype of the simulation state.
+        snapshot: dtype of the snapshot.
+        action: buffer for actions.
         observation: dtype and shape of an observation.
-        start_words: where state and snapshot lie in memory, if they can be gathered.
-        dtype: of a row.
-        words: where all of a row but its head lies, if it can be gathered.
+        start_words: memory locations of state and snapshot, if they can be gathered.
+        dtype: dtype of a row.
+        words: memory locations of a row's content after its head, if it can be
+            gathered.
     """
 
     state: np.dtype[Any] | None

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Experiment trackers: they are notified of finished episodes and videos.
+"""Experiment trackers, which are notified of finished episodes and videos.
 
-A tracker is called in the process of the simulation, between two steps, and so should
-be quick. It is given facts and names of files, never frames.
+A tracker is called in the simulation's process, between two steps, so it should return
+quickly. It is given facts and file names, never frames.
 """
 
 from __future__ import annotations
@@ -45,22 +45,22 @@ class Run:
 
 @dataclass(frozen=True, kw_only=True)
 class FinishedEpisode:
-    """An episode that is over.
+    """A finished episode.
 
     Attributes:
-        episode_id: its number.
+        episode_id: the episode's number.
         length: number of steps.
         reward: sum of the rewards.
         type: `"t"` for training, `"e"` for evaluation.
-        terminated: the task ended it.
-        truncated: a limit outside the task ended it.
-        success: `info["is_success"]` or `info["success"]` of the last step. None
-            without either.
-        seed: as given to `reset`.
-        options: as given to `reset`.
+        terminated: whether the task ended the episode.
+        truncated: whether a limit outside the task ended it.
+        success: `info["is_success"]` or `info["success"]` of the last step; None if
+            both are missing.
+        seed: the seed given to `reset`.
+        options: the options given to `reset`.
         start_time: wall clock just before the reset, in seconds since the epoch.
-        end_time: wall clock after the last step.
-        total_steps: steps of the run so far, including unfinished episodes.
+        end_time: wall clock after the last step, in seconds since the epoch.
+        total_steps: number of steps of the run so far, including unfinished episodes.
     """
 
     episode_id: int
@@ -82,12 +82,12 @@ class FinishedVideo:
     """A finished video.
 
     Attributes:
-        path: the file.
-        metadata_path: its metadata, JSON.
-        episode_id: of its episode, or of the one in which it starts.
-        view: as in the file name: the name of a further camera, or `tiled`; empty for
+        path: the video file.
+        metadata_path: its metadata file (JSON).
+        episode_id: number of its episode, or of the episode in which it starts.
+        view: the view in the file name: a further camera's name, or `tiled`; empty for
             the first camera.
-        episode: its episode. None if that is not over or was not completed.
+        episode: its episode; None if the episode is not over or was not completed.
     """
 
     path: Path
@@ -98,7 +98,7 @@ class FinishedVideo:
 
 
 class Tracker:
-    """Follows what a monitor records; for `mjrec.Monitor(..., trackers=...)`.
+    """Base class for experiment trackers, for `mjrec.Monitor(..., trackers=...)`.
 
     Subclass it and override methods; each does nothing by default. One tracker can
     serve several runs at once, such as those of a vector environment: each call names
@@ -115,7 +115,7 @@ class Tracker:
     def video(self, run: Run, video: FinishedVideo) -> None:
         """Called when a video is finished.
 
-        Deferred videos finish beside the simulation and are reported at the end of the
+        Deferred videos are finished in the background and reported at the end of the
         next episode, or in `close`.
         """
 
@@ -126,14 +126,14 @@ class Tracker:
 class Trackers:
     """The trackers of one run.
 
-    One that raises is not called again: an experiment tracker that has lost its server
-    is no reason to lose a simulation.
+    A tracker that raises is not called again, so that a tracker that has lost its
+    server does not stop the simulation.
 
     Args:
-        run: what they are notified of.
-        trackers: all of them.
-        on_fault: called with the class name of one that has raised, what, and the
-            number of the episode that was reported, or None.
+        run: the run that is reported to the trackers.
+        trackers: the trackers.
+        on_fault: called when a tracker has raised, with its class name, the error, and
+            the number of the reported episode or None.
     """
 
     def __init__(
@@ -146,14 +146,14 @@ class Trackers:
         self._run = run
         self._trackers: Sequence[Tracker] = tuple(trackers)
         self._on_fault = on_fault
-        # Of episodes and clips, the first video of each.
+        # The first video of each episode or clip.
         self._awaited: dict[Path, None] = {}
-        # Of episodes whose videos are still to come.
+        # Episodes whose videos may still come.
         self._episodes: dict[int, FinishedEpisode] = {}
         self._notify(None, "begin")
 
     def __bool__(self) -> bool:
-        """Whether there is any."""
+        """Whether there are any trackers."""
         return bool(self._trackers)
 
     def expect(self, video: Path) -> None:
@@ -162,11 +162,11 @@ class Trackers:
             self._awaited[video] = None
 
     def episode(self, episode: FinishedEpisode, *, has_video: bool) -> None:
-        """Report an episode that has just ended, and what is finished by now.
+        """Report an episode that has just ended, and all videos finished by now.
 
         Args:
             episode: the episode.
-            has_video: whether a video of it may come.
+            has_video: whether the episode may get a video.
         """
         if self._trackers:
             if has_video:
@@ -175,13 +175,13 @@ class Trackers:
             self._report_videos()
 
     def end(self) -> None:
-        """Report the end of the run; none is called after it."""
+        """Report the end of the run. No tracker is called after that."""
         self._report_videos()
         self._notify(None, "end")
         self._trackers = ()
 
     def _report_videos(self) -> None:
-        # A video counts as soon as its metadata is there, which is written last.
+        # A video is done once its metadata exists, which is written last.
         done = [video for video in self._awaited if is_done(video)]
         for video in done:
             del self._awaited[video]
@@ -204,10 +204,10 @@ class Trackers:
                 getattr(tracker, what)(self._run, *facts)
             except Exception as error:  # a user's tracker may do anything
                 name = type(tracker).__name__
-                logger.exception("%s has failed and is notified no more.", name)
+                logger.exception("%s failed and will not be notified again.", name)
                 others = (each for each in self._trackers if each is not tracker)
                 self._trackers = tuple(others)
                 self._on_fault(name, error, episode_id)
-                # So that it lets go of what it holds open, as far as it still can.
+                # Give it a chance to release its resources.
                 with contextlib.suppress(Exception):
                     tracker.end(self._run)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One video of one environment, frame by frame, with its metadata."""
+"""Recording one video of one environment, frame by frame, with its metadata."""
 
 from __future__ import annotations
 
@@ -30,21 +30,21 @@ _TEXT_MODES = ("ansi", "ansi_list")
 
 
 class FrameSource(Protocol):
-    """What a video is taken from: an environment, or what stands for one."""
+    """A source of frames: an environment or a stand-in for one."""
 
     @property
     def render_mode(self) -> str | None:
-        """What `render` gives: `rgb_array`, `rgb_array_list`, `ansi` or `ansi_list`.
+        """The render mode: `rgb_array`, `rgb_array_list`, `ansi` or `ansi_list`.
 
-        With any other there are no frames.
+        Any other mode gives no frames.
         """
 
     def render(self) -> Any:
-        """Return the frame of this moment, or the list of those since the last."""
+        """Return the current frame, or the list of frames since the last call."""
 
 
 def can_give_frames(source: object) -> bool:
-    """Return whether `source` has a render mode that a video can be made of."""
+    """Return whether `source` has a render mode that a video can be made from."""
     return getattr(source, "render_mode", None) in (*_IMAGE_MODES, *_TEXT_MODES)
 
 
@@ -52,36 +52,36 @@ class VideoRecorder:
     """Records `env.render()`, one frame per `capture_frame`, with gym's interface.
 
     Images become an mp4 (see `VideoWriter`), text an asciicast version 1 (`.json`). The
-    rate is real time: the simulated time between the first two captures of a MuJoCo
-    environment, else the rate that `env` declares. `close` finishes the file and writes
-    `<path without extension>.meta.json`. Until then a hidden note describes the
-    unfinished mp4 for `mjrec.recover`.
+    video plays in real time: the rate follows from the simulated time between the first
+    two captures of a MuJoCo environment; for others it is the rate that `env` declares.
+    `close` finishes the file and writes `<path without extension>.meta.json`. Until
+    then a hidden file describes the unfinished mp4 for `mjrec.recover`.
 
-    A bad frame (None, or another size or type than the first) ends the video: the
+    A bad frame (None, or a different size or type than the first) ends the video: the
     frames so far stay as a playable file, `broken` is set, and a warning and the
-    metadata say so.
+    metadata report it.
 
     Args:
         env: has `render_mode` and `render()`. If its render mode gives no frames, the
             recorder is not enabled and does nothing.
         path: the video, ending in `.mp4`, or `.json` for text. Without `path` and
-            `base_path`, a file in a new temporary directory.
-        metadata: first entries of the metadata file. It is copied.
-        enabled: False makes a recorder that does nothing.
+            `base_path`, a file in a new temporary directory is used.
+        metadata: first entries of the metadata file; copied.
+        enabled: False creates a recorder that does nothing.
         base_path: the path without extension, instead of `path`.
         fps: frames per second of the file, instead of real time.
-        max_fps: most frames per second. Of `rgb_array` frames every n-th is taken, and
-            the last, see `capture_last`. Other render modes keep all.
-        frame_hashes: also write the `.framehash` of an image video.
-        clock: returns the simulated time in seconds, or None without one.
+        max_fps: maximum frames per second. In the `rgb_array` mode every n-th frame is
+            taken, and the last one (see `capture_last`). Other render modes keep all.
+        frame_hashes: whether to write a `.framehash` file next to an image video.
+        clock: returns the simulated time in seconds, or None if there is none.
         declared: returns the rate to use without simulated time.
-        facts: returns more metadata, once there is a frame.
-        strict: images that show nothing (black, one colour, no movement) make `close`
-            raise; else they are a warning.
+        facts: returns additional metadata, once there is a frame.
+        strict: whether `close` raises if the images show nothing (all black, one
+            colour, no movement). Otherwise it logs a warning.
         caption: returns the text to write on the current frame, or None.
 
     Raises:
-        MissingDependency: captions need Pillow.
+        MissingDependency: captions were requested, but Pillow is not installed.
         InvalidArgument: both `path` and `base_path` are given, or the extension is
             wrong.
 
@@ -90,8 +90,8 @@ class VideoRecorder:
         metadata_path: the metadata file. None if not enabled.
         metadata: the content of the metadata file so far.
         enabled: whether it records.
-        broken: a bad frame or a failed encoder ended the video early.
-        finished: the video is complete under its name; known after `close`.
+        broken: whether a bad frame or a failed encoder ended the video early.
+        finished: whether the video exists and is complete; known after `close`.
         closed: whether `close` or `discard` was called.
     """
 
@@ -122,7 +122,7 @@ class VideoRecorder:
         self.metadata = dict(metadata or {})
         mode = getattr(env, "render_mode", None)
         self.ansi_mode = mode in _TEXT_MODES
-        # Of one image a step, some need not be drawn.
+        # With one image per step, some need not be drawn.
         self._may_leave_out = mode == "rgb_array"
         self._caption = caption
         self._clock = clock or (lambda: simulation_time(env))
@@ -134,7 +134,7 @@ class VideoRecorder:
         self._frame_hashes = frame_hashes
         self._sink: VideoSink | None = None
         self._size: tuple[int, int] | None = None
-        # Frames wait here until the second capture tells the rate.
+        # Frames wait here until the rate is known, at the second capture.
         self._waiting: list[tuple[Frame | str, Caption | None]] = []
         self._captures = 0
         self._first: tuple[int, float | None] | None = None
@@ -151,7 +151,7 @@ class VideoRecorder:
                     mode,
                 )
             return
-        # Absolute, so that a later chdir does not part the video from its metadata.
+        # Absolute, so that a later chdir does not separate video and metadata.
         self.path = str(Path(self._path_of(path, base_path)).absolute())
         self.metadata_path = str(Path(self.path).with_suffix(".meta.json"))
         self.metadata["content_type"] = (
@@ -165,7 +165,7 @@ class VideoRecorder:
 
     @property
     def empty(self) -> bool:
-        """Whether there is no frame: none came, or the encoder lost them."""
+        """Whether it has no frames: none were captured, or the encoder lost them."""
         return self._steps.total == 0
 
     @property
@@ -174,17 +174,17 @@ class VideoRecorder:
         return self._steps.total
 
     def capture_frame(self) -> None:
-        """Record what `env.render()` gives now.
+        """Record the current result of `env.render()`.
 
-        Does nothing if the recorder is not functional or is closed. Exceptions of
-        `env.render()` pass.
+        Does nothing if the recorder is closed or not functional. Exceptions raised by
+        `env.render()` propagate.
 
         Raises:
             EncoderError: ffmpeg failed; the recorder is then broken.
         """
         if not self.functional or self.closed:
             return
-        # Counted also where `render` raises: frames belong to steps.
+        # Counted even if `render` raises, because frames belong to steps.
         step, self._captures = self._captures, self._captures + 1
         if self._may_leave_out:
             with self._abandoning():
@@ -193,17 +193,17 @@ class VideoRecorder:
             self._capture(step)
 
     def capture_last(self) -> None:
-        """Record the frame of the last step, if `max_fps` left it out.
+        """Record the last step's frame if `max_fps` left it out.
 
-        Call it at the end of an episode, before the environment continues. Raises what
-        `capture_frame` raises.
+        Call it at the end of an episode, before the next reset or step. It raises the
+        same errors as `capture_frame`.
         """
         step = self._captures - 1
         if self.functional and not self.closed and step > self._last_taken >= 0:
             self._capture(step)
 
     def give_up(self, reason: str) -> None:
-        """Take no more frames, and say why; those that were taken stay."""
+        """Stop taking frames and log the reason; keep the frames taken so far."""
         if not self.functional:
             return
         self.broken = True
@@ -218,12 +218,13 @@ class VideoRecorder:
     def close(self) -> None:
         """Finish the video and write its metadata. A second call does nothing.
 
-        Without a frame there is no video, and the metadata says `empty`. If Ctrl-C
-        interrupts it, the next call continues.
+        Without frames no video is written, and the metadata has `empty`. If Ctrl-C
+        interrupts the call, the next call continues.
 
         Raises:
-            EncoderError: ffmpeg failed; the metadata is written all the same.
-            BlankVideo: with `strict`; the video and its metadata exist.
+            EncoderError: ffmpeg failed; the metadata is written anyway.
+            BlankVideo: `strict` is set and the video shows nothing. The video and its
+                metadata exist.
         """
         if self.closed:
             return
@@ -241,13 +242,13 @@ class VideoRecorder:
             self._sink.blank.judge(self._sink.path, strict=self._strict)
 
     def leave(self) -> None:
-        """Let go of the files as SIGKILL would; recovery finishes the video."""
+        """Release the files as SIGKILL would; recovery finishes the video."""
         if not self.closed and self._sink is not None:
             self._sink.leave()
         self.closed = True
 
     def discard(self) -> None:
-        """End without a video and without metadata."""
+        """Discard the video and write no metadata."""
         if not self.closed:
             self.closed = True
             self._drop_frames()
@@ -280,8 +281,8 @@ class VideoRecorder:
         if Path(path).suffix != extension:
             kind = "text, an asciicast" if self.ansi_mode else "images, an mp4"
             raise InvalidArgument(
-                f"With render_mode={self.env.render_mode!r} the recording is {kind}: "
-                f"its path must end in {extension}, got {os.fspath(path)!r}."
+                f"With render_mode={self.env.render_mode!r} the recording is {kind}, "
+                f"so its path must end in {extension}, got {os.fspath(path)!r}."
             )
         return os.fspath(path)
 
@@ -314,7 +315,7 @@ class VideoRecorder:
             self._waiting.append((taken, caption))
 
     def _settle_rate(self, step: int, frames: int) -> None:
-        """Open the video, once there are frames of two steps to time it by."""
+        """Open the video, once frames of two steps show the time of a step."""
         if self._sink is not None or self._first is None:
             return
         self._timestep = _time_of_a_step(self._first, (step, self._clock()))
@@ -343,7 +344,7 @@ class VideoRecorder:
         self._waiting.clear()
 
     def _note(self) -> tuple[Mapping[str, Any], Mapping[str, Any]]:
-        """Return what an unfinished file is, for the finder of one."""
+        """Return metadata and timing that describe the unfinished video."""
         timing = {**self._timing(), "frames_per_step": self._frames_per_step}
         return {**self.metadata, **self._facts()}, timing
 
@@ -358,7 +359,7 @@ class VideoRecorder:
 
     @contextlib.contextmanager
     def _abandoning(self) -> Iterator[None]:
-        """End the video at a bad frame; leave none of it where its encoder fails."""
+        """End the video at a bad frame; delete it if any other error occurs."""
         try:
             yield
         except InvalidFrame as error:
@@ -404,7 +405,7 @@ class VideoRecorder:
 def _time_of_a_step(
     earlier: tuple[int, float | None], later: tuple[int, float | None]
 ) -> Fraction | None:
-    """Return the seconds between two steps, by what the clock showed at two others."""
+    """Return the duration of a step, from two pairs of a step and its clock time."""
     (first, start), (last, end) = earlier, later
     if start is None or end is None or end <= start:
         return None
@@ -415,14 +416,14 @@ _DEFAULT_RATE = Fraction(30)
 
 
 def declared_rate(env: object) -> Fraction:
-    """Return the frames per second that an environment says it has.
+    """Return the frames per second that an environment declares.
 
-    The control timestep of a dm_control environment, `dt` of a MuJoCo environment of
-    Gymnasium, else `render_fps` of the metadata; 30, with a warning, where nothing is
-    said of what can be drawn.
+    This is based on the control timestep of a dm_control environment, on `dt` of a
+    Gymnasium MuJoCo environment, and otherwise on `render_fps` in the metadata. The
+    default is 30, with a warning if the environment can be drawn.
 
     Raises:
-        InvalidArgument: `render_fps` is no rate.
+        InvalidArgument: `render_fps` is not a valid rate.
     """
     timestep = _declared_timestep(env)
     if timestep:
@@ -433,8 +434,8 @@ def declared_rate(env: object) -> Fraction:
     can_be_drawn = getattr(env, "render_mode", None) is not None
     if can_be_drawn or simulation_in(env) is not None:
         logger.warning(
-            "%s does not say how fast its videos are to play (no control timestep, no "
-            "render_fps): %d frames a second are taken. Give fps= to choose.",
+            "%s does not declare a frame rate (no control timestep, no render_fps). "
+            "Its videos use %d frames per second; set fps= to choose another rate.",
             type(env).__name__,
             _DEFAULT_RATE,
         )

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Recorded episodes in three dimensions, in a browser: replay pages, the live view."""
+"""3D views of recorded episodes in a browser: replay pages and the live view."""

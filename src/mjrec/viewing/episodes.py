@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which episodes of a directory have recorded states."""
+"""Finding the episodes of a directory that have recorded states."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ _SHOWN = 10
 
 
 def recorded_episodes(directory: Path) -> list[Path]:
-    """Return the trajectories of a monitor directory, finished or in flight.
+    """Return a monitor directory's trajectories, finished or in flight.
 
-    They come monitor after monitor, in the order of their numbers.
+    They are grouped by monitor and sorted by episode number.
     """
     return [
         path
@@ -25,35 +25,40 @@ def recorded_episodes(directory: Path) -> list[Path]:
 
 
 def trajectory_in(target: Path, episode: int | None) -> Path:
-    """Return the trajectory that is meant: a file, or an episode of a directory.
+    """Return the chosen trajectory: a file, or an episode of a directory.
 
     Args:
         target: the file or the directory.
-        episode: the number; None for the last that is recorded.
+        episode: the episode's number; None for the last recorded one. Must be None if
+            `target` is a file.
 
     Raises:
-        InvalidArgument: there is none of that number, or there are several.
+        InvalidArgument: no episode, or more than one, has that number; the directory
+            has no recorded states; or `episode` was given with a file.
     """
     if not target.is_dir():
         if episode is not None:
             raise InvalidArgument(
-                f"{target} is one episode: leave --episode out, or name its directory."
+                f"{target} is a single episode. Leave --episode out, or name its "
+                "directory."
             )
         return target
     found = recorded_episodes(target)
     if not found:
         where = where_recordings_are(target)
-        raise InvalidArgument(f"{target} holds no recorded states. {where}")
+        raise InvalidArgument(f"{target} contains no recorded states. {where}")
     if episode is None:
         return found[-1]
     those = [path for path in found if episode_of(path.name) == episode]
     if not those:
         known = sorted({str(episode_of(path.name)) for path in found}, key=int)
         raise InvalidArgument(
-            f"No states of episode {episode} are recorded in {target}. Recorded: "
+            f"{target} has no recorded states of episode {episode}. Recorded episodes: "
             f"{', '.join(known[:_SHOWN])}{' ...' if len(known) > _SHOWN else ''}."
         )
     if len(those) > 1:
         names = ", ".join(path.name for path in those[:_SHOWN])
-        raise InvalidArgument(f"Several monitors have episode {episode}: name {names}.")
+        raise InvalidArgument(
+            f"Several monitors have an episode {episode}. Name one of {names}."
+        )
     return those[0]

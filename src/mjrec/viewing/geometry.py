@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a shape looks like: a MuJoCo geom or site as a mesh with a colour or a texture.
+"""Meshes for MuJoCo geoms, sites, skins and flexes, with colours or textures.
 
-mjviser makes the meshes of primitives, height fields and sites. The rest is done here:
-normals and texture coordinates of meshes, cube textures, planes as the model has them,
-colours as MuJoCo's visualiser mixes them.
+mjviser creates the meshes of primitives, height fields and sites. This module adds the
+rest: normals and texture coordinates of meshes, cube textures, planes of the model's
+size, and colours as mixed by MuJoCo's visualiser.
 """
 
 from __future__ import annotations
@@ -38,13 +38,13 @@ _COLOUR_ROLES = (
     mujoco.mjtTextureRole.mjTEXROLE_RGB,
     mujoco.mjtTextureRole.mjTEXROLE_RGBA,
 )
-# How far an infinite plane goes, in sizes of the model.
+# Half size of an infinite plane, in units of the model's extent.
 _HORIZON = 30.0
 _SHARP = 0.6  # radians between faces that make an edge
 _GAMMA = 2.2
 
-# For each side of a cube texture, in OpenGL's order: the axis that looks at it, and the
-# axes that give s and t, with signs.
+# For each side of a cube texture, in OpenGL's order: the axis that points at it, and
+# the axes of s and t, each with its sign.
 _SIDES = (
     ((0, 1), (2, -1), (1, -1)),
     ((0, -1), (2, 1), (1, -1)),
@@ -56,12 +56,13 @@ _SIDES = (
 
 
 def mesh_of(model: mujoco.MjModel, shape: Shape) -> trimesh.Trimesh:
-    """Return a shape in its own frame, with its colour or texture.
+    """Return a shape's mesh in its own frame, with its colour or texture.
 
     Args:
-        model: of the shape.
-        shape: a geom or a site; anything else is a cylinder of radius 1 and half
-            length 1, or an ellipsoid, which its scale brings to size.
+        model: the model that the shape belongs to.
+        shape: a geom or a site. Anything else becomes a unit mesh, which its scale
+            brings to size: an icosphere of radius 1, a box of half size 1, or a
+            cylinder of radius 1 and half length 1.
     """
     if shape.object_type == _SITE:
         return _coloured(_smoothed(create_site_mesh(model, shape.object_id)), shape)
@@ -89,7 +90,10 @@ def mesh_of(model: mujoco.MjModel, shape: Shape) -> trimesh.Trimesh:
 
 
 def soft_mesh(model: mujoco.MjModel, shape: Shape) -> trimesh.Trimesh:
-    """Return a skin in its resting pose, or a flex; a state moves its vertices."""
+    """Return the mesh of a skin in its resting pose, or of a flex.
+
+    Its vertices are moved by each state.
+    """
     index = shape.object_id
     if shape.geom_type == _FLEX:
         return _coloured(_flex_mesh(model, index), shape)
@@ -105,11 +109,11 @@ def soft_mesh(model: mujoco.MjModel, shape: Shape) -> trimesh.Trimesh:
 
 
 def skin_weights(model: mujoco.MjModel, skin: int) -> dict[str, NDArray[Any]]:
-    """Return how bones move a skin's vertices.
+    """Return the weights with which bones move a skin's vertices.
 
     Returns:
-        `bind`, `(bones, 7)`, each bone's resting pose; `counts`, how many vertices it
-        moves; `ids` and `weights` of these vertices, bone after bone.
+        `bind`, `(bones, 7)`, each bone's resting pose; `counts`, the number of vertices
+        that each bone moves; `ids` and `weights` of these vertices, bone after bone.
     """
     bones = slice(
         model.skin_boneadr[skin], model.skin_boneadr[skin] + model.skin_bonenum[skin]
@@ -127,20 +131,20 @@ def skin_weights(model: mujoco.MjModel, skin: int) -> dict[str, NDArray[Any]]:
 
 
 def linear(rgba: Any) -> list[float]:
-    """Return a colour as the page takes it: its lighting is linear, unlike MuJoCo's."""
+    """Return a colour for the page, whose lighting is linear, unlike MuJoCo's."""
     red, green, blue, alpha = (float(channel) for channel in rgba)
     return [*(max(0.0, c) ** _GAMMA for c in (red, green, blue)), alpha]
 
 
 def sky(model: mujoco.MjModel) -> NDArray[np.uint8] | None:
-    """Return the model's sky as a narrow image, from top to bottom, if it has one."""
+    """Return the model's sky as a narrow image, top to bottom; None without a sky."""
     kinds = model.tex_type.tolist()
     if int(mujoco.mjtTexture.mjTEXTURE_SKYBOX) not in kinds:
         return None
     texture = kinds.index(int(mujoco.mjtTexture.mjTEXTURE_SKYBOX))
     pixels = np.asarray(_image(model, texture))
     width = pixels.shape[1]
-    # The third side from the end is one that stands upright.
+    # The second side from the end is an upright one.
     side = pixels[-2 * width : -width] if len(pixels) == 6 * width else pixels
     column = side.mean(axis=1, keepdims=True).astype(np.uint8)
     return np.repeat(column, 2, axis=1)
@@ -159,7 +163,7 @@ def _coloured(
 def _textured(
     mesh: trimesh.Trimesh, uv: NDArray[Any], image: Image.Image, shape: Shape
 ) -> trimesh.Trimesh:
-    # glTF counts from the top of an image, trimesh from its bottom.
+    # glTF's texture origin is the top of the image, trimesh's is the bottom.
     flipped = image.transpose(Image.Transpose.FLIP_TOP_BOTTOM)
     mesh.visual = TextureVisuals(
         uv=uv, material=_material(np.array(shape.rgba), baseColorTexture=flipped)
@@ -206,8 +210,8 @@ def _asset_mesh(
 ) -> tuple[trimesh.Trimesh, NDArray[Any] | None]:
     """Return a mesh, and its texture coordinates if it has any.
 
-    A vertex with two normals or texture coordinates becomes two: the page computes its
-    own normals, and edges stay sharp.
+    Vertices are split by normal and texture coordinate, because the page computes its
+    own normals and would otherwise smooth sharp edges.
     """
     vertices = _part(model.mesh_vert, model.mesh_vertadr, model.mesh_vertnum, mesh)
     parts = [model.mesh_face, model.mesh_facenormal]
@@ -227,7 +231,7 @@ def _asset_mesh(
 
 
 def _flex_mesh(model: mujoco.MjModel, flex: int) -> trimesh.Trimesh:
-    """Return the triangles of a surface, or of a volume's outside."""
+    """Return the triangles of a 2D flex, or of a 3D flex's shell."""
     first, count = model.flex_vertadr[flex], model.flex_vertnum[flex]
     if model.flex_dim[flex] == 2:
         begin, size = model.flex_elemdataadr[flex], 3 * model.flex_elemnum[flex]
@@ -235,14 +239,14 @@ def _flex_mesh(model: mujoco.MjModel, flex: int) -> trimesh.Trimesh:
     else:
         begin, size = model.flex_shelldataadr[flex], 3 * model.flex_shellnum[flex]
         faces = model.flex_shell[begin : begin + size].reshape(-1, 3)
-    # From both sides, as a cloth is seen.
+    # A cloth is visible from both sides.
     faces = np.vstack([faces, faces[:, ::-1]]) if model.flex_dim[flex] == 2 else faces
     vertices = model.flex_vert[first : first + count]
     return trimesh.Trimesh(vertices, faces, process=False)
 
 
 def _plane(model: mujoco.MjModel, shape: Shape, texture: int | None) -> trimesh.Trimesh:
-    """Return a plane of the size that it has; an infinite one up to the horizon."""
+    """Return a plane of the model's size; an infinite one extends to the horizon."""
     size = model.geom_size[shape.object_id][:2]
     is_infinite = size <= 0
     half = np.where(is_infinite, _HORIZON * max(1.0, model.stat.extent), size)
@@ -253,8 +257,8 @@ def _plane(model: mujoco.MjModel, shape: Shape, texture: int | None) -> trimesh.
         return _coloured(mesh, shape)
     material = int(model.geom_matid[shape.object_id])
     repeat = model.mat_texrepeat[material].astype(float)
-    # Half of it is as long as half of the plane, or as a unit of length. It begins at
-    # the upper left corner; that of an infinite plane in the middle.
+    # Half of the texture spans half of the plane, or one unit of length. It starts at
+    # the upper left corner, or at the middle of an infinite plane.
     per_length = is_infinite | bool(model.mat_texuniform[material])
     length = np.where(per_length, 1.0, half)
     begin = np.where(is_infinite, 0.0, half * [-1, 1])
@@ -263,7 +267,7 @@ def _plane(model: mujoco.MjModel, shape: Shape, texture: int | None) -> trimesh.
 
 
 def _smoothed(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
-    """Return a mesh whose edges stay sharp, and whose round parts look round."""
+    """Return a mesh with smooth round parts and sharp edges."""
     made: trimesh.Trimesh = trimesh.graph.smooth_shade(
         mesh, angle=_SHARP, facet_minarea=None
     )
@@ -278,9 +282,9 @@ def _unit_square(vertices: NDArray[Any]) -> NDArray[np.float64]:
 
 
 def _on_cube(mesh: trimesh.Trimesh) -> tuple[trimesh.Trimesh, NDArray[np.float64]]:
-    """Return a mesh that a cube texture is laid around, and texture coordinates.
+    """Return a mesh split for a cube texture, and its texture coordinates.
 
-    The six sides of the texture stand one below the other in one frame.
+    The six sides of the texture are stacked vertically in one image.
     """
     extents = np.maximum(mesh.extents / 2, 1e-9)
     directions = mesh.vertices / extents

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A look at a run while it goes on: a read-only server of pages, for this machine.
+"""The live view: a local, read-only web server that shows a run in progress.
 
-It reads journal and row logs as any other reader does, and at a low priority. The
-monitor does not know of it. A page asks for what is new, and waits several times as
-long as the answer took.
+It reads the journal and row logs like any other reader, at a low priority, and the
+monitor does not notice it. A page polls for new states. Between requests it waits
+several times as long as the last answer took.
 """
 
 from __future__ import annotations
@@ -36,14 +36,14 @@ from .replay import ending_of, motion_chunk, replay_page
 
 _ADDRESS = "127.0.0.1"
 _NICENESS = 10
-# What one answer holds; a page asks again for the rest.
+# Limits of one answer; a page asks again for the rest.
 _MOST_STATES = 500
 _MOST_EPISODES = 200
 _MOST_POINTS = 1000
 
 
 class LiveView:
-    """Serves a directory's episodes to browsers of this machine.
+    """A web server that shows a directory's episodes to browsers on this machine.
 
     ::
 
@@ -52,15 +52,15 @@ class LiveView:
             view.serve()  # until Ctrl-C, or `close` in another thread
 
     Args:
-        directory: of one or more monitors.
-        port: to listen at; any that is free, if 0.
-        trust_models: as of `load_trajectory`.
+        directory: a directory with one or more monitors.
+        port: the port to listen on; 0 for any free port.
+        trust_models: see `load_trajectory`.
 
     Attributes:
-        url: of the page, with the token without which nothing is answered.
+        url: the page's URL. It includes a token; requests without it are refused.
 
     Raises:
-        InvalidArgument: there is no such directory, or the port is taken.
+        InvalidArgument: the directory does not exist, or the port cannot be used.
     """
 
     def __init__(
@@ -72,26 +72,26 @@ class LiveView:
     ) -> None:
         path = Path(directory)
         if not path.is_dir():
-            raise InvalidArgument(f"There is no directory {path}.")
+            raise InvalidArgument(f"The directory {path} does not exist.")
         self._token = secrets.token_urlsafe(24)
         self._answers = _Answers(path, trust_models=trust_models)
         try:
             self._server = ThreadingHTTPServer((_ADDRESS, port), self._handler())
         except OSError as error:
             raise InvalidArgument(
-                f"Port {port} cannot be used ({error.strerror}): leave it out, and a "
-                "free one is taken."
+                f"Port {port} cannot be used ({error.strerror}). Leave it out to use "
+                "any free port."
             ) from error
         self._server.daemon_threads = True
         at = f"http://{_ADDRESS}:{self._server.server_port}"
         self.url = f"{at}/?token={self._token}"
 
     def serve(self) -> None:
-        """Answer until `close` is called, or Ctrl-C comes."""
+        """Answer requests until `close` is called or Ctrl-C is pressed."""
         self._server.serve_forever(poll_interval=0.1)
 
     def close(self) -> None:
-        """Stop answering. Idempotent."""
+        """Stop answering requests. Idempotent."""
         self._server.shutdown()
         self._server.server_close()
 
@@ -119,10 +119,10 @@ class LiveView:
                     self.send_error(HTTPStatus.NOT_FOUND)
                     return
                 except (Error, OSError) as error:
-                    # A file may go while it is read: the page asks again.
+                    # A file may disappear while it is read; the page asks again.
                     kind, body = "application/json", json.dumps({"error": str(error)})
                 with contextlib.suppress(ConnectionError):
-                    # A browser may have left meanwhile.
+                    # The browser may have disconnected in the meantime.
                     self._send(kind, body.encode())
 
             def _send(self, kind: str, body: bytes) -> None:
@@ -135,20 +135,20 @@ class LiveView:
                 self.wfile.write(body)
 
             def log_message(self, format: str, *args: Any) -> None:
-                # Addresses hold the token.
+                # Nothing is logged, because request URLs contain the token.
                 pass
 
         return Handler
 
 
 def be_nice() -> None:
-    """Let everything else of this machine go first."""
+    """Lower this process's priority below everything else on this machine."""
     os.nice(_NICENESS)
 
 
 @dataclass
 class _Shown:
-    """The episode that was asked for last."""
+    """The episode that was requested last, and the next state of its stage."""
 
     path: Path
     stage: Stage
@@ -156,7 +156,10 @@ class _Shown:
 
 
 class _Answers:
-    """What pages are answered. MuJoCo's objects are used by one thread at a time."""
+    """Answers to the pages' requests.
+
+    A lock ensures that only one thread at a time uses MuJoCo's objects.
+    """
 
     def __init__(self, directory: Path, *, trust_models: bool) -> None:
         self._directory = directory
@@ -170,10 +173,10 @@ class _Answers:
         }
 
     def to(self, path: str, asked: dict[str, str]) -> tuple[str, str]:
-        """Return the media type and the text of an answer.
+        """Return the media type and the body of an answer.
 
         Raises:
-            KeyError: there is no such page or episode.
+            KeyError: the page or episode does not exist.
         """
         answer = self._pages[path]
         with self._lock:
@@ -184,7 +187,7 @@ class _Answers:
         path = self._path(asked["episode"]) if "episode" in asked else None
         try:
             if not paths:
-                raise InvalidArgument("No episode is recorded yet.")
+                raise InvalidArgument("No episode has been recorded yet.")
             path = path or paths[-1]
             trajectory, stage = self._load(path)
         except Error as error:
@@ -239,10 +242,10 @@ class _Answers:
         return known[name]
 
     def _load(self, path: Path, first: int = 0) -> tuple[Trajectory, Stage]:
-        """Return a trajectory, and a stage for its states from `first` on."""
+        """Return a trajectory, and a stage for its states starting at `first`."""
         trajectory, shown = load_trajectory(path, trust_models=self._trust_models), None
         if self._shown is not None and self._shown.path == path:
-            # A stage goes through the states in their order.
+            # A stage can only move forward through the states.
             shown = self._shown if 0 < self._shown.next <= first else None
         self._shown = shown or _Shown(path, Stage(trajectory))
         self._shown.next = first + 1
@@ -250,7 +253,7 @@ class _Answers:
 
 
 def _scene_id(trajectory: Trajectory, stage: Stage) -> str:
-    """Return what two episodes have in common if one page can show both."""
+    """Return an id that is equal for episodes that the same page can show."""
     shapes = [(s.name, s.geom_type) for s in (*stage.shapes, *stage.soft)]
     parts = json.dumps([trajectory.facts.get("model"), shapes], sort_keys=True)
     return hashlib.sha256(parts.encode()).hexdigest()[:16]
@@ -263,6 +266,6 @@ def _number(value: float) -> float | None:
 _WAITING = (
     '<!doctype html><html lang="en"><head><meta charset="utf-8">'
     '<meta http-equiv="refresh" content="2"><title>mjrec view</title></head><body>'
-    "<p>{} This page looks again every two seconds.</p>"
+    "<p>{} This page reloads every two seconds.</p>"
     "</body></html>"
 )

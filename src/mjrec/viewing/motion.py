@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How everything that is drawn moves: places and colours in each recorded state.
+"""The motion of all drawn shapes: poses and colours in each recorded state.
 
-MuJoCo's own visualiser chooses what is drawn, with the options of the recorded
-environment. So hidden groups, tendons and sites are those of its videos.
+MuJoCo's own visualiser selects the shapes, with the recorded environment's options. So
+the same groups, tendons and sites are hidden as in its videos.
 """
 
 from __future__ import annotations
@@ -33,14 +33,14 @@ _SKIN, _FLEX = int(mujoco.mjtGeom.mjGEOM_SKIN), int(mujoco.mjtGeom.mjGEOM_FLEX)
 
 @dataclass(frozen=True)
 class Shape:
-    """Something that is drawn.
+    """A drawn object.
 
     Attributes:
-        name: of its node in the page's scene: `/geom/3`.
-        object_type: `mjtObj`: a geom, a site, a tendon.
-        object_id: of the object in the model.
-        geom_type: `mjtGeom`.
-        rgba: as MuJoCo's visualiser gives it, materials included.
+        name: name of its node in the page's scene, such as `/geom/3`.
+        object_type: the object's `mjtObj`, such as a geom, site or tendon.
+        object_id: the object's id in the model.
+        geom_type: the shape's `mjtGeom`.
+        rgba: colour from MuJoCo's visualiser, materials included.
     """
 
     name: str
@@ -57,19 +57,22 @@ class Shape:
 
 @dataclass(frozen=True, kw_only=True)
 class Motion:
-    """N states of a recorded episode, as a page shows them.
+    """N states of a recorded episode, in the form that a page shows.
 
     Attributes:
-        steps: `(N,)`, after how many steps each state was reached.
-        time: `(N,)`, in seconds of simulated time.
-        rewards: `(N,)`, of the step that led to the state; 0 for the reset.
-        returns: `(N,)`, the sum of rewards up to the state.
-        vertices: `(N, vertices, 3)` of flexible bodies, by name.
-        poses: `(N, 7)` by the name of a shape or bone: position and quaternion (wxyz).
-        scales: `(N, 3)` for shapes that change size; zero where one is not there.
-        cameras: `(N, cameras, 7)`, the model's cameras, looking along their -z.
-        target: `(N, 3)`, what the tracking camera follows.
-        colours: changes: the index of a state, the name of a shape, RGBA from then on.
+        steps: `(N,)`, number of steps before each state.
+        time: `(N,)`, simulated time in seconds; the step numbers if it is unknown.
+        rewards: `(N,)`, reward of the step that led to the state; 0 for the reset.
+        returns: `(N,)`, sum of the rewards up to the state.
+        vertices: `(N, vertices, 3)`, vertices of flexible bodies, keyed by name.
+        poses: `(N, 7)`, position and quaternion (wxyz), keyed by the name of a shape or
+            bone.
+        scales: `(N, 3)`, scales of shapes that change size; zero while a shape is
+            absent.
+        cameras: `(N, cameras, 7)`, poses of the model's cameras, which look along -z.
+        target: `(N, 3)`, the point that the tracking camera follows.
+        colours: colour changes: index of the state, name of the shape, and RGBA from
+            that state on.
     """
 
     steps: NDArray[np.int64]
@@ -95,24 +98,26 @@ class _Frames:
 
 
 class Stage:
-    """A model in one recorded state after the other, and what is drawn of it.
+    """A model that is moved through recorded states, and its drawn shapes.
 
-    Used on one thread. States are asked for in their order.
+    It must be used on one thread, and states must be requested in ascending order.
 
     Args:
-        trajectory: of the model and of the options to draw it with.
+        trajectory: the trajectory with the model and the options to draw it with.
 
     Attributes:
-        model: as it was in the state that was last asked for.
-        data: its data, likewise.
-        shapes: what is drawn in all states, in MuJoCo's order.
-        passing: what was drawn in some states, with a size of its own in each: tendons.
+        model: the model, as in the last requested state.
+        data: the model's data, as in the last requested state.
+        shapes: shapes that are drawn in all states, in MuJoCo's order.
+        passing: shapes seen in only some states, with a different size in each, such as
+            tendons.
         soft: skins and flexible bodies.
-        notes: what cannot be shown.
-        view: where the recorded camera is at first, what it looks at, and its `fovy`.
+        notes: notes on what cannot be shown.
+        view: the recorded camera's initial position, the point it looks at, and its
+            `fovy`.
 
     Raises:
-        UnreadableFile, UntrustedModel: as of `Trajectory.model`.
+        UnreadableFile, UntrustedModel: see `Trajectory.model`.
     """
 
     def __init__(self, trajectory: Trajectory) -> None:
@@ -124,7 +129,7 @@ class Stage:
         self._scene = mujoco.MjvScene(self.model, maxgeom=_MOST_GEOMS)
         self._changes_seen = 0
         with open_vetted_trajectory(trajectory.path) as reader:
-            # Of the camera and the options; the model has them already.
+            # This is for the camera and the options; the model has its fields already.
             self._change_model(reader, 0)
         self._enter(trajectory, 0)
         drawn = list(self._drawn())
@@ -139,14 +144,14 @@ class Stage:
         lines = [s for s in self.soft if s.geom_type == _FLEX and self._is_line(s)]
         if lines:
             self.soft = [shape for shape in self.soft if shape not in lines]
-            self.notes.append("Flexible bodies of one dimension are not shown.")
+            self.notes.append("One-dimensional flexible bodies are not shown.")
         if self._scene.ngeom > len(drawn):
             self.notes.append("Labels, contacts and other marks are not shown.")
         self._tracked = _tracked_body(self.model)
 
     @property
     def camera_number(self) -> int | None:
-        """The model's camera that the recorded videos are seen from; None if none."""
+        """Index of the fixed camera of the recorded videos; None for other cameras."""
         is_fixed = self._camera.type == int(mujoco.mjtCamera.mjCAMERA_FIXED)
         return int(self._camera.fixedcamid) if is_fixed else None
 
@@ -163,24 +168,26 @@ class Stage:
 
     @property
     def everything(self) -> list[Shape]:
-        """All that is ever drawn."""
+        """All shapes seen so far."""
         return [*self.shapes, *self.passing.values(), *self.soft]
 
     def bones_of(self, skin: int) -> list[int]:
-        """Return the bodies that are the bones of a skin, in its order."""
+        """Return the bodies that are a skin's bones, in the skin's order."""
         first, count = self.model.skin_boneadr[skin], self.model.skin_bonenum[skin]
         bodies: list[int] = self.model.skin_bonebodyid[first : first + count].tolist()
         return bodies
 
     def motion(self, trajectory: Trajectory, steps: NDArray[np.int64]) -> Motion:
-        """Return how everything moves in some states of the same episode.
+        """Return the motion of all shapes in some states of the same episode.
 
         Args:
-            trajectory: with these states; it may have grown since.
-            steps: `(N,)`, their numbers, ascending, none before one that was asked for.
+            trajectory: the trajectory with these states; it may have grown since the
+                stage was created.
+            steps: `(N,)`, ascending indices of the states, not before any state that
+                was requested earlier.
 
         Raises:
-            UnreadableFile: the file is gone or damaged.
+            UnreadableFile: the file is missing or damaged.
         """
         frames, model, data = _Frames(), self.model, self.data
         geoms = [s.object_id for s in self.shapes if s.object_type == _GEOM]
@@ -254,7 +261,7 @@ class Stage:
             trajectory.set_state(self.data, step)
         except InvalidArgument as error:
             raise UnreadableFile(trajectory.path, error) from error
-        # What follows from positions, without contacts.
+        # Computes what depends on positions only, without contacts.
         mujoco.mj_kinematics(self.model, self.data)
         mujoco.mj_comPos(self.model, self.data)
         mujoco.mj_camlight(self.model, self.data)
@@ -262,7 +269,7 @@ class Stage:
         mujoco.mj_tendon(self.model, self.data)
 
     def _change_model(self, reader: TrajectoryReader, step: int) -> bool:
-        """Make the model what it was after `step`; tell whether anything changed."""
+        """Apply the model changes up to `step`; return whether there were any."""
         before = self._changes_seen
         while self._changes_seen < reader.change_count:
             change = reader.read_change(self._changes_seen)
@@ -282,7 +289,7 @@ class Stage:
         self._enter(trajectory, step)
         drawn = {_name(geom): _rgba(geom) for geom in self._drawn()}
         for name, before in self._rgba.items():
-            # What is wholly transparent is not drawn.
+            # A fully transparent shape is not drawn.
             rgba = drawn.get(name, (*before[:3], 0.0))
             if rgba != before:
                 self._rgba[name] = rgba
@@ -322,9 +329,9 @@ def _recorded_view(
     try:
         view = view_from_facts(scene)
         check_camera(model, view.camera)
-    # Not all that NumPy and the bindings refuse is looked for.
+    # NumPy and the bindings reject more than is checked explicitly.
     except (AttributeError, TypeError, ValueError, OverflowError) as error:
-        raise UnreadableFile(trajectory.path, f"of its scene: {error}") from error
+        raise UnreadableFile(trajectory.path, f"its scene: {error}") from error
     return view.camera, view.option
 
 
@@ -351,12 +358,12 @@ def _shape(geom: Any, name: str | None = None) -> Shape:
 def _places(
     positions: NDArray[Any], matrices: NDArray[Any], wanted: list[int]
 ) -> NDArray[np.float64]:
-    """Return `(wanted, 12)`: positions and rotation matrices."""
+    """Return positions and rotation matrices of the wanted objects, `(wanted, 12)`."""
     return np.hstack([positions[wanted], matrices[wanted].reshape(-1, 9)])
 
 
 def _quaternions(placed: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return `(..., 7)`, position and quaternion, of `(..., 12)`."""
+    """Convert `(..., 12)` positions and matrices to `(..., 7)` with quaternions."""
     poses = np.empty((*placed.shape[:-1], 7))
     poses[..., :3] = placed[..., :3]
     for matrix, out in zip(
@@ -367,6 +374,6 @@ def _quaternions(placed: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _tracked_body(model: mujoco.MjModel) -> int:
-    """Return the first body that moves, with all that hangs on it; else the world."""
+    """Return the root of the first moving body's tree; the world if nothing moves."""
     moving = np.flatnonzero(model.body_weldid != 0)
     return int(model.body_rootid[moving[0]]) if len(moving) else 0

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A replay: one HTML file that shows a recorded episode from every side, offline.
+"""Replay pages: one HTML file that shows a recorded episode in 3D, offline.
 
-viser draws the scene. This page adds the recorded states and its own controls, because
-viser's player knows no rewards, cameras, steps or places in the URL.
+viser draws the scene. The page adds the recorded states and its own controls, because
+viser's player does not support rewards, cameras, steps or positions in the URL.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from .scene import scene_page
 
 _LOG = logging.getLogger(__name__)
 _COMPRESSION = 6
-# Nothing is loaded from anywhere: scripts and frames are in the page.
+# Nothing is loaded from elsewhere: scripts and frames are part of the page.
 _POLICY = (
     "default-src 'none'; script-src 'unsafe-inline' 'unsafe-eval' blob: data:; "
     "style-src 'unsafe-inline'; img-src data: blob:; font-src data:; "
@@ -42,13 +42,13 @@ _POLICY = (
 
 @dataclass(frozen=True)
 class Replay:
-    """What was written.
+    """A replay page that was written.
 
     Attributes:
-        path: of the page.
-        states: how many it shows.
-        size: in bytes.
-        notes: what it does not show.
+        path: the page.
+        states: number of states that it shows.
+        size: size in bytes.
+        notes: notes on what the page does not show.
     """
 
     path: Path
@@ -63,22 +63,22 @@ def write_replay(
     *,
     max_fps: float | None = None,
 ) -> Replay:
-    """Write a page that shows a recorded episode in three dimensions.
+    """Write a page that shows a recorded episode in 3D.
 
-    It is one file, which needs no network. It shows the geometry that the videos show,
-    in all recorded states, from any side and from the model's cameras, with rewards. It
-    is a view of the recorded states, and no evidence of its own.
+    The page is a single file and needs no network. It shows the same geometry as the
+    videos, in all recorded states, from any direction and from the model's cameras,
+    with rewards. It is only a view of the recorded states and not separate evidence.
 
     Args:
-        trajectory: as `load_trajectory` returns it.
-        path: of the page; a file that is there is replaced.
-        max_fps: the most states per second of simulated time; all, if None.
+        trajectory: the episode, from `load_trajectory`.
+        path: the page to write; an existing file is replaced.
+        max_fps: maximum number of states per second of simulated time; None for all.
 
     Raises:
-        InvalidArgument: `max_fps` is no rate.
+        InvalidArgument: `max_fps` is not a valid rate.
         MissingDependency: viser or mjviser is not installed.
         UnreadableFile: the file is damaged, or was recorded without a simulation.
-        UntrustedModel: as of `Trajectory.model`.
+        UntrustedModel: see `Trajectory.model`.
         FileNotWritten: the disk is full.
     """
     stage = Stage(trajectory)
@@ -96,9 +96,10 @@ def write_replay(
 
 
 def shown_steps(trajectory: Trajectory, max_fps: float | None) -> NDArray[np.int64]:
-    """Return which states are shown: each n-th, and the last.
+    """Return the indices of the states to show: every n-th and the last.
 
-    One that holds NaN is not: the environment had gone on, or the simulation diverged.
+    States with NaN are skipped: the environment had already reset itself, or the
+    simulation diverged.
     """
     count, time = len(trajectory.states), trajectory.time
     stride = 1
@@ -122,10 +123,10 @@ def replay_page(
     """Return a page that shows a motion.
 
     Args:
-        trajectory: whose states these are.
-        stage: of its model.
-        motion: some states of it.
-        additions: to what the page's script is given.
+        trajectory: the trajectory that the states belong to.
+        stage: the stage with its model.
+        motion: the states to show.
+        additions: additional data for the page's script; given for live pages only.
     """
     about = {**_about(trajectory, stage, motion), **(additions or {})}
     connect = "'self'" if additions else ""
@@ -144,7 +145,7 @@ def replay_page(
     controls = _file("replay.html").format(
         cameras=options, notes=notes, title=html.escape(about["title"])
     )
-    # A script ends at the first `</`, wherever it stands.
+    # A script element ends at the first `</`, even inside a string.
     data = json.dumps(about, allow_nan=False).replace("<", "\\u003c")
     body = (
         f'{controls}<script type="application/json" id="replay-data">{data}</script>'
@@ -153,21 +154,21 @@ def replay_page(
     if additions:
         body += f"<script>{_file('live.js')}</script>"
     scene = scene_page(stage, motion)
-    # Our title and policy come first, ours being the ones that count.
+    # Our title and policy come first, so that they take precedence.
     begin, _, rest = scene.partition("<head>")
     before_end, end, after = rest.rpartition("</body>")
     return f"{begin}<head>{head}{before_end}{body}{end}{after}"
 
 
 def motion_chunk(motion: Motion, *, keep_all: bool = False) -> dict[str, Any]:
-    """Return a motion as the page's script reads it.
+    """Return a motion in the form that the page's script reads.
 
-    A row is a state, in float32: step, time, reward and return; the tracking camera's
-    target; cameras; poses; scales; vertices.
+    Each row is one state, in float32: step, time, reward and return; the tracking
+    camera's target; cameras; poses; scales; vertices.
 
     Args:
         motion: the states.
-        keep_all: also what does not move in any of them, which is left out otherwise.
+        keep_all: whether to include objects that do not move in any of the states.
     """
     still = {
         name
@@ -245,7 +246,7 @@ def _about(trajectory: Trajectory, stage: Stage, motion: Motion) -> dict[str, An
 
 
 def ending_of(trajectory: Trajectory) -> str:
-    """Return how an episode ended, in a word or two."""
+    """Return a short description of how an episode ended."""
     for flags, word in (
         (trajectory.terminated, "terminated"),
         (trajectory.truncated, "truncated"),

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A model as a scene of viser, and that as a page."""
+"""A model as a viser scene, exported to an HTML page."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ _TRANSPARENT = 0.999
 
 
 def scene_page(stage: Stage, motion: Motion) -> str:
-    """Return a page of HTML with everything that a stage has, in its first state."""
-    # viser reports on its server, which nothing ever connects to.
+    """Return an HTML page with all shapes of a stage, in the motion's first state."""
+    # viser prints a report about its server, which nothing ever connects to.
     with contextlib.redirect_stdout(io.StringIO()):
         server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
         try:
@@ -35,7 +35,7 @@ def _fill(scene: viser.SceneApi, stage: Stage, motion: Motion) -> None:
     scene.set_background_image(sky(model))
     for shape in stage.soft:
         mesh = soft_mesh(model, shape)
-        # Without normals of MuJoCo's, its own shadow would fall on it in stripes.
+        # Without MuJoCo's normals, its own shadow would show as stripes on it.
         scene.add_mesh_trimesh(shape.name, mesh, receive_shadow=False)
     for shape in (*stage.shapes, *stage.passing.values()):
         pose = motion.poses[shape.name][0]

@@ -1,4 +1,4 @@
-// Follows a run: asks the server for new states, lists episodes, draws their returns.
+// Follows a run: polls the server for new states, lists episodes, draws their returns.
 "use strict";
 (() => {
   const about = JSON.parse(document.getElementById("replay-data").textContent);
@@ -79,7 +79,7 @@
     canvas.setAttribute("aria-label", `Returns of ${returns.length} episodes${range}`);
   }
 
-  // After an answer the next question waits several times as long as it took.
+  // The next request waits several times as long as the last answer took.
   async function forever(question, pause) {
     for (;;) {
       const begin = performance.now();

@@ -1,13 +1,13 @@
-// Plays recorded states in viser's scene: it moves viser's nodes, and has controls of
-// its own. viser shows `__viserMutable` for tests of pages; what is used of it is read
-// back by tests of ours.
+// Plays recorded states in viser's scene: it moves viser's nodes and adds its own
+// controls. viser exposes `__viserMutable` for page tests; our tests read back the parts
+// of it that are used here.
 "use strict";
 (() => {
   const about = JSON.parse(document.getElementById("replay-data").textContent);
   const element = (id) => document.getElementById(id);
-  const frames = []; // one for each state: views of the chunks' arrays
+  const frames = []; // one per state: views of the chunks' arrays
   const colours = new Map(); // by name: [[state, [r, g, b, a]], ...]
-  const shown = new Map(); // by name: the colour that its node has
+  const shown = new Map(); // by name: the node's current colour
   let current = 0, playing = false, clock = 0, followed = null, viewer = null;
   const free = { position: null };
 
@@ -77,7 +77,7 @@
     viewer.requestRender();
   }
 
-  // The vertices of a node's mesh, as its geometry holds them.
+  // The geometry of a node's mesh, which holds its vertices.
   function geometryOf(name) {
     let found = null;
     viewer.nodeRefFromName[name]?.traverse((part) => {
@@ -95,7 +95,7 @@
     geometry.computeVertexNormals();
   }
 
-  // Linear blend skinning, as MuJoCo does it, with all weights: viser has four a vertex.
+  // Linear blend skinning with all weights, like MuJoCo: viser allows four per vertex.
   function bend(name, frame) {
     const skin = about.skins[name], geometry = geometryOf(name);
     if (!geometry) return;
@@ -144,7 +144,7 @@
 
   // --- Cameras -----------------------------------------------------------------
 
-  // MuJoCo's z is up, and three.js' y: viser turns the root of its scene.
+  // z is up in MuJoCo and y in three.js, so viser rotates the root of its scene.
   const turned = (vector) => rotated(viewer.nodePoseData[""].wxyz, vector);
 
   function rotated([w, x, y, z], [a, b, c]) {
@@ -277,7 +277,7 @@
 
   let before = performance.now();
   function tick(now) {
-    // A machine that draws slowly plays slowly, and does not jump to the end.
+    // On a slow machine the replay slows down instead of jumping to the end.
     const seconds = Math.min(0.25, (now - before) / 1000);
     before = now;
     if (playing) {
@@ -369,7 +369,7 @@
     addEventListener("hashchange", restore);
   }
 
-  // --- Another episode, and more of it: for live.js --------------------------------
+  // --- Loading an episode, and more of its states: for live.js ---------------------
 
   function begin({ rgba, start }) {
     frames.length = 0;
