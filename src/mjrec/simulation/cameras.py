@@ -132,8 +132,8 @@ def tracking_camera(model: Any) -> str | int | None:
 
     This is the first camera that follows the centre of mass of a body's subtree
     (`mode="trackcom"`). If there is none, it is the first that follows a body
-    (`mode="track"`) of something that can travel, that is, hangs on a free or sliding
-    joint in the world. An arm with a fixed base cannot travel, and a camera that
+    (`mode="track"`) of something that can travel, because a free or sliding joint
+    connects it to the world. An arm with a fixed base cannot travel, and a camera that
     follows its hand is a close-up.
 
     Returns:

@@ -69,7 +69,7 @@ class EpisodeStart:
 
 
 class Capture:
-    """Captures the states of a simulation, episode by episode. Needs no OpenGL.
+    """A recorder of a simulation's states, episode by episode. Needs no OpenGL.
 
     The simulation is only read. Whatever does not change between captures is cached, so
     that a capture takes microseconds. Changes are found by comparing memory.
@@ -257,7 +257,7 @@ class Capture:
         view: SceneView,
         fields: Iterable[str],
     ) -> _Frames:
-        """Return the frames of the episode, reusing the last ones if possible."""
+        """Return the episode's source of snapshots, the last one if it still fits."""
         stored.looks.follow(view)
         key = (
             *(data._address, id(view.camera), id(view.option), view.max_geom),
@@ -342,7 +342,7 @@ class _StoredModel:
 
 
 class _Frames:
-    """Takes snapshots of one simulation in one view, and checks whether they suffice.
+    """A source of snapshots of one simulation in one view. Checks that they suffice.
 
     If each frame influences the next one, it also keeps track of this influence: an
     infinite plane is drawn around the camera of the previous frame, and a camera that

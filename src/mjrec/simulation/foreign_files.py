@@ -1,13 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """A limited process that handles untrusted files. This module is its program.
 
-A few kilobytes of HDF5 can claim any amount of memory, the same data under a million
-names can take any amount of time, and a damaged file may crash or hang the HDF5
-library. One line of MJCF can ask for a body replicated a billion times. So if this user
-has not recorded into a trajectory's directory (`model_trust`), such a process reads the
-whole trajectory once before it is read here. All model sources are compiled in such a
-process too. This takes half a second; the user's own trajectories and models cost
-nothing.
+A few kilobytes of HDF5 can claim any amount of memory. The same data under a million
+names can take any amount of time. A damaged file may crash or hang the HDF5 library.
+One line of MJCF can ask for a body replicated a billion times.
+
+So if this user has not recorded into a trajectory's directory (`model_trust`), such a
+process reads the whole trajectory once before it is read here. All model sources are
+compiled in such a process too. This takes half a second; the user's own trajectories
+and models cost nothing.
 
 Logs of recordings in flight are not compressed, so they hold no more than their size.
 """

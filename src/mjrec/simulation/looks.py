@@ -37,11 +37,11 @@ _Arrays = list[tuple[str, NDArray[Any]]]
 
 
 class Looks:
-    """Remembers a model and a view, and finds which of their fields have changed.
+    """The remembered fields of a model and a view, to find which have changed.
 
-    At a reset all fields of the model are compared, between resets only those that
-    each frame is drawn from, not textures and meshes, which must be uploaded to the
-    graphics card. The model is only read, and is kept alive.
+    At a reset all fields of the model are compared. Between resets only those are
+    compared that each frame is drawn from. These exclude textures and meshes, which
+    must be uploaded to the graphics card. The model is only read, and is kept alive.
 
     Args:
         model: the model, as it is stored now.

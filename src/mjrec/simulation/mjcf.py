@@ -45,7 +45,7 @@ def load_mjcf(path: Path) -> mujoco.MjModel:
 
 
 class MjcfSimulation:
-    """Simulates a model in whole physics steps, at 60 frames per simulated second.
+    """A simulation in whole physics steps, at 60 frames per simulated second.
 
     Frame k is taken after the whole number of steps that comes closest to k/60 seconds.
     With a timestep of 0.01, frames are 2, 1, 2, 2, 1, 2 ... steps apart, never more

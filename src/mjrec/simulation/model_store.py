@@ -62,7 +62,7 @@ class _Job(NamedTuple):
 
 
 class ModelStore:
-    """Stores models next to recordings, in a background thread.
+    """A store of models next to recordings, written in a background thread.
 
     Files appear complete or not at all, and an existing one is never rewritten. So any
     number of processes may store into one directory.

@@ -3,7 +3,7 @@
 
 The arrays of an `MjData` keep their addresses for as long as it lives, and so do our
 own. `WORDS` presents the whole memory of this process as one long array of 64-bit
-words, so a row can be gathered with `WORDS.take(index, None, out, "clip")`, at a tenth
+words. With it a row is gathered by `WORDS.take(index, None, out, "clip")`, at a tenth
 of the cost of copying each array. Only the words of an index are ever touched.
 """
 

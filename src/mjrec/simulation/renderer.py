@@ -212,7 +212,7 @@ class Canvas:
 
 
 class SceneRenderer:
-    """Draws the frames of a simulation, byte for byte those of `mujoco.Renderer`.
+    """A renderer whose frames are those of `mujoco.Renderer`, byte for byte.
 
     It does not disturb anything else that draws on the caller's thread, and modifies
     neither the model nor the data.

@@ -27,7 +27,7 @@ _DYNAMIC = int(mujoco.mjtCatBit.mjCAT_DYNAMIC)
 
 
 class SnapshotSource:
-    """Takes snapshots of one `MjData`.
+    """A source of snapshots of one `MjData`.
 
     Args:
         model: the model; kept alive, like the data.
@@ -78,9 +78,9 @@ class TendonColours:
     """The colours in which a model's tendons are drawn.
 
     MuJoCo blends the colour of a spatial tendon at its limit with the colour of
-    constraints, weighted by the strength of the limit, unless the tendon has a material
-    or a colour of its own. The strength is not kept after the step, so the resulting
-    colour is recorded. It is read from a scene that holds only the tendons.
+    constraints, weighted by the strength of the limit. Tendons with a material or a
+    colour of their own are not blended. The strength is not kept after the step, so the
+    resulting colour is recorded. It is read from a scene that holds only the tendons.
 
     Attributes:
         rgba: `(ntendon, 4) float32`, set by the last `update`; always the same array.

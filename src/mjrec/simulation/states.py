@@ -208,10 +208,10 @@ def turns_by_rk4(model: mujoco.MjModel) -> bool:
 
 
 class PreservedState:
-    """Restores a simulation after a block.
+    """The state of a simulation, preserved over a block.
 
-    All of the data is restored, and the fields of the model that place, size and colour
-    sites, geoms and bodies. The arrays keep their addresses.
+    After the block all of the data is restored, and the fields of the model that place,
+    size and colour sites, geoms and bodies. The arrays keep their addresses.
     """
 
     def __init__(self) -> None:
