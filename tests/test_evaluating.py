@@ -544,7 +544,7 @@ WRONG = [
     ({"tasks": []}, InvalidArgument, "needs a task"),
     ({"policy": "no_such_module:x"}, UnknownName, "no_such_module"),
     ({"policy": "broken_policy:x"}, PolicyError, "name 'undefined' is not defined"),
-    ({"policy": 3}, PolicyError, "neither callable"),
+    ({"policy": 3}, PolicyError, "neither can be called"),
     ({"policy": lambda o, f=sys.stdout: f}, PolicyError, "module:name"),
     ({"episodes": 0}, InvalidArgument, "episodes"),
     ({"seeds": [1, 1], "num_seeds": None}, InvalidArgument, "each once"),
