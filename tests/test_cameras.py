@@ -85,7 +85,7 @@ def test_a_free_camera():
         ("", r"front, side\..*-1"),
         (-2, r"number -2\b.* from -1 .* to 2"),
         (3, r"number 3\b.* from -1 .* to 2"),
-        *((other, "A camera is a name, a number or") for other in (True, 0.0, None)),
+        *((other, "must be a name, a number or") for other in (True, 0.0, None)),
     ],
 )
 def test_an_unknown_camera_names_those_there_are(camera, said):

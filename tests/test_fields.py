@@ -59,14 +59,14 @@ def test_what_was_read_can_be_set_in_another_model(model):
         ("site_pos", np.zeros((2, 3)), r"shape \(1, 3\) here"),
         ("opt.timestep", np.zeros(2), r"shape \(\) here"),
         ("site_pos", np.array([["a", "b", "c"]]), "belongs to another model"),
-        ("geom_dataid", np.array([7]), "what the model consists of"),
-        ("geom_type", np.array([7]), "what the model consists of"),
+        ("geom_dataid", np.array([7]), "part of the model's structure"),
+        ("geom_type", np.array([7]), "part of the model's structure"),
         ("geom_matid", np.array([2]), "indices from -1 to 1"),
         ("geom_matid", np.array([-2]), "indices from -1 to 1"),
         ("geom_matid", np.array([np.nan]), "whole numbers"),
         ("vis.quality.shadowsize", np.array(np.nan), "whole numbers"),
         ("vis.quality.shadowsize", np.array(2**40), "cannot be 1099511627776"),
-        ("option.label", np.array(1 << 30), "has to be from 0 to"),
+        ("option.label", np.array(1 << 30), "must be from 0 to"),
     ],
 )
 def test_what_cannot_be_set_is_refused(model, name, value, words):

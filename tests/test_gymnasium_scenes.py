@@ -200,7 +200,7 @@ def test_a_renderer_of_another_model_is_a_momentary_obstacle():
     env = make()
     scene = scene_of(env)
     env.unwrapped.model = mujoco.MjModel.from_xml_path(env.unwrapped.fullpath)
-    assert "another model" in str(scene.obstacle())
+    assert "does not draw the model" in str(scene.obstacle())
 
 
 def test_camera_that_was_asked_for():

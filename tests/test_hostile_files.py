@@ -377,8 +377,8 @@ HUGE = npy("{'descr': '<f8', 'fortran_order': False, 'shape': (1099511627776,)}"
 ZIP: dict[str, dict[str, bytes]] = {
     "more memory than": {"fields/geom_rgba.npy": HUGE},
     "expected 4 bytes": {"fields/geom_rgba.npy": b"\x93NUMPY\x03\0"},
-    "a file called": {"source/../../x": b""},
-    "no plain relative path": {"source//tmp/x": b""},
+    "a file named": {"source/../../x": b""},
+    "not a plain relative path": {"source//tmp/x": b""},
     "nested too deeply": {"contents.json": b"[" * 100_000},
     "other": {"contents.json": b'{"format": 1, "main": "other"}'},
     "dict": {"contents.json": b'{"format": 1, "main": {}}'},
@@ -413,7 +413,7 @@ HARMS: list[tuple[str, Harm, str]] = [
         ("spans", functools.partial(beginning_with, head(rows)), said)
         for said, rows in ROWS.items()
     ),
-    ("spans", functools.partial(beginning_with, b"[" * 10**7 + b"\n"), "does not say"),
+    ("spans", functools.partial(beginning_with, b"[" * 10**7 + b"\n"), "does not name"),
     *(
         (".looks", functools.partial(with_change, header), "change of the model")
         for header in CHANGES
@@ -426,7 +426,7 @@ HARMS: list[tuple[str, Harm, str]] = [
     (
         "zip",
         lambda path: put_zip({MAIN: SPHERE.encode()}, path, again=(MAIN,)),
-        "is no XML",
+        "is not XML",
     ),
     *(("zip", functools.partial(put_zip, {MAIN: xml.encode()}), "") for xml in MJCF),
 ]
@@ -575,7 +575,7 @@ def test_a_compiled_model_has_the_name_of_its_content(
     other = path.rename(path.with_name("openaigym.model.0123456789abcdef.mjb.gz"))
     facts = {**facts_of(directory), "mjb": other.name}
     (directory / "facts.json").write_text(json.dumps(facts))
-    assert "not what was recorded" in inspector.refuses("model", other)
+    assert "not the recorded model" in inspector.refuses("model", other)
 
 
 FOR_EVER = INSIDE % '<replicate count="100000000"><geom size="1"/></replicate>'

@@ -241,7 +241,7 @@ def foreign(directory, members):
 @parametrize(
     ("name", "value", "said"),
     [
-        ("geom_bodyid", np.array([10**6], np.int32), "not set from"),
+        ("geom_bodyid", np.array([10**6], np.int32), "set from"),
         ("opt.__class__", np.zeros(()), "no model field"),
         ("geom_rgba", np.array([[None] * 4]), "Object arrays cannot be loaded"),
         ("geom_rgba", np.zeros((9, 4), np.float32), "another model"),
@@ -284,10 +284,10 @@ def test_facts_cannot_name_a_file_elsewhere(directory, name):
     """Only a model's name, in the recording's directory, where it may be missing."""
     facts = stored(directory, sphere())
     (directory / facts["mjb"]).unlink()
-    with pytest.raises(UnreadableFile, match="copy it from the recorded"):
+    with pytest.raises(UnreadableFile, match="copy it from the directory"):
         load_model(directory, facts)
     for kind in ("mjb", "xml"):
-        with pytest.raises(UnreadableFile, match="which is no name"):
+        with pytest.raises(UnreadableFile, match="which is not a valid name"):
             load_model(directory, {**facts, kind: name})
 
 

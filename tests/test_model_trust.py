@@ -186,7 +186,7 @@ def test_a_list_that_others_may_have_written_is_not_used(
     assert path.lstat().st_ino == left.st_ino
     [warned] = caplog.messages
     assert str(path.parent) in warned or "symbolic links" in warned
-    assert "remove it" in warned
+    assert "delete it" in warned
     # Nor the other place; then there is no list, and a model needs a word.
     spoil(fallback_in(tmp_path))
     note_models([digest_of(3)])
@@ -248,7 +248,7 @@ def test_mujoco_never_sees_what_nobody_vouches_for(directory, monkeypatch, said)
     assert error.value.path == path
     for way_out in ("--trust-models", "trust_models=True", "MJREC_TRUST_MODELS=1"):
         assert way_out in str(error.value)
-    with pytest.raises(UnreadableFile, match="not what was recorded"):
+    with pytest.raises(UnreadableFile, match="not the recorded model"):
         load_model(directory, {**crafted, "sha256": facts["sha256"]})
 
 
@@ -276,7 +276,7 @@ def test_trust_is_said_by_an_argument_or_a_variable(directory, tmp_path, monkeyp
     monkeypatch.setenv(TRUST_VARIABLE, "1")
     assert load_model(directory, facts).ngeom == 1
     (directory / facts["mjb"]).write_bytes(gzip.compress(bytes(facts["bytes"])))
-    with pytest.raises(UnreadableFile, match="not what was recorded"):
+    with pytest.raises(UnreadableFile, match="not the recorded model"):
         load_model(directory, facts)
 
 

@@ -140,7 +140,7 @@ def test_dm_envs_actions_are_drawn_within_their_bounds():
     assert (zero["half"], zero["parts"][0]) == (5, 0)
     assert zero["endless"].tolist() == [0, 0]
     strings = SimpleNamespace(action_spec=lambda: specs.StringArray(()))
-    with pytest.raises(mjrec.PolicyError, match="actions that are numbers"):
+    with pytest.raises(mjrec.PolicyError, match="numeric actions"):
         load_policy("random", strings)
 
 
@@ -188,7 +188,7 @@ def test_what_is_no_action_is_refused(write, space, action):
     write("action = None\ndef policy(observation):\n    return action\n")
     policy = load("policy", acting_in(space))
     sys.modules["mjrec_test_policy"].action = action
-    with pytest.raises(mjrec.PolicyError, match="must give an action of ") as caught:
+    with pytest.raises(mjrec.PolicyError, match="must return an action of ") as caught:
         policy(None)
     assert str(space) in str(caught.value)
     assert repr(action) in str(caught.value)
@@ -275,9 +275,9 @@ REFUSED = [
     ),
     ("import no_such_module\n", "f", mjrec.PolicyError, "no_such_module"),
     ("def f(o:\n", "f", mjrec.PolicyError, r"SyntaxError.*line 1\)\.$"),
-    ("number = 3\n", "number", mjrec.PolicyError, "3, which neither"),
-    ("number = 3\n", "number()", mjrec.PolicyError, "Leave the parentheses away"),
-    ("def f(env): return 3\n", "f()", mjrec.PolicyError, "3, which neither"),
+    ("number = 3\n", "number", mjrec.PolicyError, "3, which is neither"),
+    ("number = 3\n", "number()", mjrec.PolicyError, "Remove the parentheses"),
+    ("def f(env): return 3\n", "f()", mjrec.PolicyError, "3, which is neither"),
 ]
 
 
@@ -323,5 +323,5 @@ def test_an_object_is_a_policy_as_what_a_name_names():
     assert policy_from(lambda _: [0.5, 0], "half", BOX)(None) == [0.5, 0]
     assert policy_from(Still, "Still", BOX, {"value": 1})(None).tolist() == [1, 1]
     assert policy_from(Still(BOX), "Still", BOX)(None).tolist() == [0, 0]
-    with pytest.raises(mjrec.PolicyError, match="mine gives 3"):
+    with pytest.raises(mjrec.PolicyError, match="mine is 3"):
         policy_from(3, "mine", BOX)

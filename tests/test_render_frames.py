@@ -84,11 +84,11 @@ def test_another_view_takes_the_place_of_the_recorded_one(ride, kind):
 
 WRONG = [
     ({"camera": "top"}, UnknownName, r"no camera 'top'.*side, rider"),
-    ({"camera": 1.5}, InvalidArgument, "camera is a name"),
+    ({"camera": 1.5}, InvalidArgument, "camera must be a name"),
     ({"camera": {"distance": "far"}}, InvalidArgument, "distance is a number"),
     ({"width": 0}, InvalidArgument, "width must be"),
     ({"height": 20000}, InvalidArgument, "height must be"),
-    ({"camera": 7}, InvalidArgument, "no camera number 7"),
+    ({"camera": 7}, InvalidArgument, "Camera number 7 does not exist"),
     ({"quality": "low"}, UnknownName, "no quality 'low'"),
     ({"workers": 0}, InvalidArgument, "workers must be"),
 ]

@@ -206,7 +206,7 @@ WRONG = [
     ({"height": -1}, InvalidArgument, "height"),
     ({"quality": "low"}, UnknownName, "draft"),
     ({"max_fps": 0}, InvalidArgument, "fps"),
-    ({"camera": 1.5}, InvalidArgument, "A camera is a name"),
+    ({"camera": 1.5}, InvalidArgument, "A camera must be a name"),
     ({"camera": {"zoom": 1}}, UnknownName, "distance"),
     ({"out": f"{VIDEO}.mp4"}, InvalidArgument, "name of a recorded video"),
     ({"engine": "spark"}, UnknownName, "slurm"),

@@ -278,7 +278,7 @@ def test_a_frame_beyond_the_driver_is_refused(table, monkeypatch):
         limit[:] = 64
 
     monkeypatch.setattr(gl_context.raw_opengl(), "glGetIntegerv", tell)
-    with pytest.raises(InvalidArgument, match=r"70x50 pixels is larger.*64x64"):
+    with pytest.raises(InvalidArgument, match=r"70x50 pixels is too large.*64x64"):
         SceneRenderer(table[0], **SIZE)
 
 

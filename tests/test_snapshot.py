@@ -175,19 +175,19 @@ def test_a_restored_snapshot_gives_the_same_scene(xml):
 @pytest.mark.parametrize(
     ("name", "value", "words"),
     [
-        ("ten_wrapadr", 10**8, "run over points"),
-        ("ten_wrapadr", -1, "run over points"),
-        ("ten_wrapadr", 2**31 - 1, "run over points"),
-        ("ten_wrapnum", 10**8, "run over points"),
-        ("ten_wrapnum", -5, "run over points"),
-        ("wrap_obj", 10**8, "holds geoms"),
-        ("wrap_obj", -3, "holds geoms"),
+        ("ten_wrapadr", 10**8, "use points up to"),
+        ("ten_wrapadr", -1, "use points up to"),
+        ("ten_wrapadr", 2**31 - 1, "use points up to"),
+        ("ten_wrapnum", 10**8, "use points up to"),
+        ("ten_wrapnum", -5, "use points up to"),
+        ("wrap_obj", 10**8, "but it holds values"),
+        ("wrap_obj", -3, "but it holds values"),
         # It would become some index.
         ("ten_wrapadr", np.full(4, np.nan), "ten_wrapadr is .*f8"),
         ("geom_xpos", np.zeros((1, 3)), "belong to another model or version"),
-        ("qpos", np.zeros(1), "which no frame needs"),
-        ("__class__", np.zeros(1), "which no frame needs"),
-        ("geom_xpos", None, "hold no geom_xpos"),
+        ("qpos", np.zeros(1), "which is not used for drawing"),
+        ("__class__", np.zeros(1), "which is not used for drawing"),
+        ("geom_xpos", None, "lack geom_xpos"),
     ],
 )
 def test_a_snapshot_that_cannot_be_is_refused(name, value, words):

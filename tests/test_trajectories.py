@@ -196,13 +196,13 @@ def test_a_recording_without_a_simulation_has_no_model(tmp_path):
     assert trajectory.rewards.tolist() == [2.5]
     assert trajectory.time is None
     assert trajectory.actions is None
-    with pytest.raises(UnreadableFile, match="without a MuJoCo simulation"):
+    with pytest.raises(UnreadableFile, match="no MuJoCo simulation"):
         trajectory.model()
 
 
 def test_a_directory_is_answered_with_what_is_in_it(tmp_path):
     """The names that could have been meant."""
-    with pytest.raises(InvalidArgument, match="holds no trajectories"):
+    with pytest.raises(InvalidArgument, match="without trajectories"):
         mjrec.load_trajectory(tmp_path)
     name = Recording(tmp_path, model_of("heap")).path.name
     with pytest.raises(InvalidArgument, match=f"Name one of .*: {name}\\."):

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From a name to an environment, and what is known about its frames."""
+"""Creation of environments from names, and facts about their frames."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The actions of an environment, as a space: drawn, zero, and checked."""
+"""The actions of an environment, as a space: sampling, zero and checking."""
 
 from __future__ import annotations
 
@@ -14,23 +14,24 @@ from numpy.typing import NDArray
 
 from ..errors import PolicyError
 
-# One of dm_env's, or a dictionary, list or tuple of such, however deep.
+# A dm_env spec, or a dictionary, list or tuple of specs, nested to any depth.
 _Spec: TypeAlias = Any
 
-# dm_control says 1e10 (mjMAXVAL) for actuators without limits.
+# dm_control's bound (mjMAXVAL) for actuators without limits.
 _ENDLESS = 1e10
 
 
 def action_space(environment: Any) -> Space[Any]:
-    """Return the space of an environment's actions, from which may be drawn.
+    """Return the space of an environment's actions, for sampling.
 
-    It is a copy: drawing here and drawing there do not disturb each other.
+    It is a copy, so sampling from it does not affect sampling from the environment's.
 
     Args:
-        environment: of Gymnasium or dm_env. A list of specs becomes a `Tuple`.
+        environment: a Gymnasium or dm_env environment. A list of specs becomes a
+            `Tuple`.
 
     Raises:
-        PolicyError: it takes actions that are no numbers.
+        PolicyError: the environment's actions are not numbers.
     """
     if not callable(getattr(environment, "action_spec", None)):
         own: Space[Any] = copy.deepcopy(environment.action_space)
@@ -39,15 +40,15 @@ def action_space(environment: Any) -> Space[Any]:
 
 
 def sampler(space: Space[Any]) -> Callable[[], Any]:
-    """Return what draws as `space.sample` does, and the same actions.
+    """Return a function that samples the same actions as `space.sample`, but faster.
 
-    That of a `Box` takes half as long as a step of HalfCheetah: it sorts the bounds
-    anew each time. Where all are finite a tenth of the time is enough.
+    `Box.sample` takes half as long as a step of HalfCheetah, because it sorts the
+    bounds again each time. If all bounds are finite, a tenth of the time is enough.
     """
     if type(space) is not spaces.Box or not (space.shape and space.is_bounded()):
         return space.sample
     if space.dtype.kind != "f":
-        # Whole numbers are rounded, and up to the upper bound.
+        # Integers are rounded, and include the upper bound.
         return space.sample
     shape, dtype = space.shape, space.dtype
     low, high = space.low.astype(np.float64), space.high.astype(np.float64)
@@ -63,10 +64,10 @@ def sampler(space: Space[Any]) -> Callable[[], Any]:
 
 
 def zero(space: Space[Any]) -> Any:
-    """Return the action nearest to zero.
+    """Return the action closest to zero.
 
     Raises:
-        PolicyError: the space has no such thing.
+        PolicyError: zero is not defined for the space.
     """
     match space:
         case spaces.Box():
@@ -82,25 +83,25 @@ def zero(space: Space[Any]) -> Any:
             return {name: zero(part) for name, part in space.spaces.items()}
         case spaces.Tuple():
             return tuple(zero(part) for part in space.spaces)
-    raise PolicyError(f'The policy "zero" knows no zero of the action space {space}.')
+    raise PolicyError(f'The policy "zero" does not support the action space {space}.')
 
 
 def checked(space: Space[Any], action: Any) -> Any:
-    """Return an action as the environment takes it.
+    """Return an action in the form that the environment takes.
 
-    Numbers of a `Box` may be of any type and out of its bounds, which the environments
-    clip themselves, but must be finite and of its shape. The members of a `Discrete`
-    space may be NumPy's, of one element, and become `int`.
+    Values of a `Box` may have any numeric type and exceed its bounds, which the
+    environments clip themselves, but must be finite and have its shape. Members of a
+    `Discrete` space may be NumPy arrays with one element, and become `int`.
 
     Raises:
-        PolicyError: it is no action.
+        PolicyError: the action is invalid.
     """
     try:
         return _taken(space, action)
-    # Some spaces raise anything for what is nothing like one of their members.
+    # Some spaces raise arbitrary errors for values unlike their members.
     except Exception:
         raise PolicyError(
-            f"The policy must give an action of {space}, got {action!r}."
+            f"The policy must return an action of {space}, got {action!r}."
         ) from None
 
 
@@ -113,12 +114,12 @@ def _space_of(spec: _Spec) -> Space[Any]:
         return spaces.Discrete(int(spec.num_values))
     if np.dtype(spec.dtype).kind not in "fiu":
         raise PolicyError(
-            f"Policies are known for actions that are numbers, not for {spec!r}."
+            f"Policies are supported only for numeric actions, not for {spec!r}."
         )
     low = np.broadcast_to(getattr(spec, "minimum", -np.inf), spec.shape)
     high = np.broadcast_to(getattr(spec, "maximum", np.inf), spec.shape)
     with warnings.catch_warnings():
-        # That bounds lose digits as numbers of the spec's own type.
+        # Ignore the warning that the bounds lose precision in the spec's own type.
         warnings.simplefilter("ignore")
         return spaces.Box(
             np.where(low <= -_ENDLESS, -np.inf, low),
@@ -131,7 +132,7 @@ def _space_of(spec: _Spec) -> Space[Any]:
 def _taken(space: Space[Any], action: Any) -> Any:
     match space:
         case spaces.Box():
-            # A ValueError where lists are of unequal lengths.
+            # Raises ValueError for lists of unequal lengths.
             array = np.asarray(action)
             if array.dtype.kind not in "fiub" or array.shape != space.shape:
                 raise ValueError(action)

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Resets of dm_control environments without OpenGL.
+"""Resetting dm_control environments without OpenGL.
 
-Some tasks (quadruped-escape, the rodent's bowl) make a new terrain in each reset and
-upload it to the rendering context; asking whether there is a context makes one. Where
-there is none there is nothing to upload to: a context that is made later begins with
-the terrain of its time.
+Some tasks (quadruped-escape, the rodent's bowl) create a new terrain in each reset and
+upload it to the rendering context. Even checking for a context creates one. Without a
+context there is nothing to upload to: one created later starts with the current
+terrain.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ _UPLOADS = ("mjr_uploadHField", "mjr_uploadTexture", "mjr_uploadMesh")
 
 
 class ContextsOnDemand:
-    """Keeps the resets of an environment from making a context to upload to.
+    """A guard against contexts that resets would create only to upload to them.
 
     Args:
-        env: an environment with dm_control's `physics`, which may be another one after
-            each reset.
+        env: an environment with dm_control's `physics`, which may be replaced by each
+            reset.
     """
 
     def __init__(self, env: Any) -> None:
@@ -34,16 +34,16 @@ class ContextsOnDemand:
 
     @contextlib.contextmanager
     def resetting(self) -> Iterator[None]:
-        """Return what to put around a reset.
+        """Return a context manager to reset the environment in.
 
-        A physics without contexts has something in their place in the block, which
-        makes real ones as soon as anything is drawn. Afterwards, also after an error,
-        the physics is as it was.
+        In the block, a physics without contexts has a substitute, which creates real
+        ones as soon as anything is drawn. Afterwards, even after an error, the physics
+        is as it was.
         """
         self._is_resetting = True
-        # A physics which the reset itself compiles is met in time.
+        # If the reset compiles a new physics, this hook gets it in time.
         if not self._hooked and hasattr(self._env, "add_extra_hook"):
-            # Composer has no way to take one out again; it does nothing but in resets.
+            # Composer cannot remove a hook, but it does nothing outside of resets.
             self._env.add_extra_hook("after_compile", self._stand_in)
             self._hooked = True
         self._stand_in(self._env.physics)
@@ -52,7 +52,7 @@ class ContextsOnDemand:
         finally:
             self._is_resetting = False
             while self._replaced:
-                # Composer's are weak references to what a compilation has freed.
+                # Composer's physics are weak references, which may have expired.
                 with contextlib.suppress(ReferenceError):
                     self._replaced.pop().take_out()
 
@@ -64,24 +64,24 @@ class ContextsOnDemand:
 
 
 class _Contexts:
-    """Stands for the contexts of a physics, and for each of them, until one draws."""
+    """A substitute for a physics's contexts, and for each of them, until one draws."""
 
     def __init__(self, physics: Any) -> None:
         self._physics = physics
         self.gl = self.mujoco = self.ptr = self
 
     def take_out(self) -> None:
-        """Leave the physics without contexts, unless it has real ones by now."""
+        """Leave the physics without contexts, unless it now has real ones."""
         if self._physics._contexts is self:
             self._physics._contexts = None
 
     @contextlib.contextmanager
     def make_current(self) -> Iterator[_Contexts]:
-        """Give what calls functions."""
+        """Yield an object that calls functions."""
         yield self
 
     def call(self, function: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
-        """Call what is to run where the contexts are, unless it is an upload."""
+        """Call a function in the real contexts, unless it is an upload."""
         if getattr(function, "__name__", None) in _UPLOADS:
             return None
         self.take_out()
@@ -91,4 +91,4 @@ class _Contexts:
             return context.call(function, *own, **kwargs)
 
     def free(self) -> None:
-        """Do nothing: there is none."""
+        """Do nothing: there is no context."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Tasks of the dm_control suite by their names."""
+"""Tasks of the dm_control suite, created by name."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _ARGUMENTS = ("task_kwargs", "environment_kwargs", "visualize_reward")
 
 
 def tasks_of(domain: str) -> Sequence[str]:
-    """Return the tasks that the installed suite has of a domain."""
+    """Return the tasks of a domain in the installed suite."""
     tasks: Sequence[str] = suite.TASKS_BY_DOMAIN.get(domain, ())
     return tasks
 
@@ -36,29 +36,28 @@ def tasks_of(domain: str) -> Sequence[str]:
 def make_dm_control(domain: str, task: str, options: EnvironmentOptions) -> Any:
     """Return a task of the suite.
 
-    Camera and size belong to each frame, not to the environment. Episodes end after
-    `max_steps`, or after 1000 steps where the task has
-    no time limit.
+    The camera and the size belong to each frame, not to the environment. Episodes end
+    after `max_steps`, or after 1000 steps if the task has no time limit.
 
     Args:
         domain: for example `cheetah`.
         task: for example `run`.
-        options: `kwargs` are those of `suite.load`, `{"task_kwargs": {...},
-            "environment_kwargs": {...}, "visualize_reward": true}`. `seed` seeds what
-            a task draws when it is made, such as the springs of `lqr`, unless
-            `task_kwargs` has a `random` of its own.
+        options: the options. `kwargs` are those of `suite.load`, `{"task_kwargs":
+            {...}, "environment_kwargs": {...}, "visualize_reward": true}`. `seed` seeds
+            random choices made when a task is created, such as the springs of `lqr`,
+            unless `task_kwargs` has its own `random`.
 
     Raises:
-        UnknownName: there is no such domain or task, or argument.
+        UnknownName: the domain, task or argument does not exist.
         MissingDependency: this dm_control does not work with this mujoco.
-        EnvironmentNotMade: making it failed otherwise; the cause is kept.
+        EnvironmentNotMade: creating it failed for another reason; the cause is kept.
     """
     if domain not in suite.TASKS_BY_DOMAIN:
         raise UnknownName(
             "dm_control domain",
             domain,
             suite.TASKS_BY_DOMAIN,
-            hint="An environment is named dm_control/<domain>-<task>.",
+            hint="A dm_control environment's name is dm_control/<domain>-<task>.",
         )
     if task not in tasks_of(domain):
         raise UnknownName(f"task of dm_control's {domain}", task, tasks_of(domain))
@@ -76,20 +75,21 @@ def make_dm_control(domain: str, task: str, options: EnvironmentOptions) -> Any:
 def load_task(
     name: DmControlName, kwargs: Mapping[str, Any] | None, *, limit: int | None = None
 ) -> Any:
-    """Return a task as `suite.load` makes it.
+    """Return a task, created by `suite.load`.
 
     Args:
-        name: of the task.
-        kwargs: of `suite.load`; None where a recording does not know them: then neither
-            does a recording of what is returned.
-        limit: ends an episode as truncated, where the task does not end it before.
+        name: the task's name.
+        kwargs: arguments for `suite.load`; None if a recording does not have them. Then
+            recordings of the returned environment do not have them either.
+        limit: number of steps after which an episode ends as truncated, unless the task
+            ends it before.
     """
     environment = suite.load(name.domain, name.task, **(kwargs or {}))
     if kwargs is not None:
-        # Nothing in an environment says with which arguments it was made.
+        # An environment does not keep the arguments that it was created with.
         setattr(environment.task, MADE_WITH, kwargs)
     if limit is not None:
-        # Nothing public tells, or sets, the limit that a task's time makes.
+        # There is no public way to read or set a task's limit in steps.
         environment._step_limit = min(limit, environment._step_limit)
     return environment
 
@@ -98,11 +98,11 @@ class DmControlEnvironment(NamedEnvironment):
     """A task of the suite.
 
     Args:
-        name: of the task.
-        options: how it is made; camera and size are what the monitor is to be given.
+        name: the task's name.
+        options: the options; the camera and size are passed to the monitor.
 
     Raises:
-        Error: of `make_dm_control`; or the model has no such camera.
+        Error: see `make_dm_control`; or the model has no such camera.
     """
 
     def __init__(self, name: DmControlName, options: EnvironmentOptions) -> None:
@@ -126,19 +126,19 @@ class DmControlEnvironment(NamedEnvironment):
 
     @property
     def draws_when_made(self) -> bool:
-        """Whether its model depends on the seed that it was made with."""
+        """Whether its model depends on the seed it was created with."""
         return self._draws_when_made
 
     def begin(self, around: Any, seeds: EpisodeSeeds, seed: int | None) -> Any:
         """Reset.
 
         dm_env's `reset` takes no seed. dm_control's tasks draw all their random numbers
-        from one `RandomState`, which is seeded in place, because what else holds it
-        must see the same. A monitor gets the seed for its metadata.
+        from one `RandomState`. It is seeded in place, because other objects share it. A
+        monitor gets the seed for its metadata.
 
-        An environment that was made with this seed and never reset is as
-        `suite.load(..., task_kwargs={"random": seed})` made it: what it drew then stays
-        drawn, and it was not seeded for this episode.
+        If the environment was created with this seed and never reset, it is used just
+        as `suite.load(..., task_kwargs={"random": seed})` created it: random choices
+        made then are kept, and it is not seeded for this episode.
         """
         if not self._was_reset and seed == self._made_with:
             seed = None
@@ -150,7 +150,7 @@ class DmControlEnvironment(NamedEnvironment):
         return around.reset().observation
 
     def step(self, around: Any, action: Any) -> Step:
-        """Step, and return what that gave."""
+        """Take a step, and return its result."""
         timestep = around.step(action)
         return Step(
             timestep.observation,
@@ -160,7 +160,7 @@ class DmControlEnvironment(NamedEnvironment):
         )
 
     def scenes(self) -> Scenes:
-        """Return what is known of its frames and its states."""
+        """Return how its states are recorded and its frames drawn."""
         return dm_control_scenes(self.environment)
 
     def _generator(self) -> Any:
@@ -168,7 +168,7 @@ class DmControlEnvironment(NamedEnvironment):
 
 
 def _is_fresh(generator: Any, seed: Any) -> bool:
-    """Return whether a generator, made with a seed, has drawn nothing."""
+    """Return whether a generator, created with a seed, has not been used yet."""
     states = (each.get_state() for each in (generator, np.random.RandomState(seed)))
     return all(map(np.array_equal, *states))
 
@@ -182,5 +182,5 @@ def _arguments(kwargs: Mapping[str, Any]) -> dict[str, Any]:
                 _ARGUMENTS,
                 hint='For example {"task_kwargs": {"time_limit": 5}}.',
             )
-    # suite.load takes None for both, and so may the person who asks.
+    # suite.load accepts None for task_kwargs, so users may pass it.
     return {**kwargs, "task_kwargs": kwargs.get("task_kwargs") or {}}

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The states of a dm_control environment, and the frames that follow from them."""
+"""The states of a dm_control environment, and the frames drawn from them."""
 
 from __future__ import annotations
 
@@ -41,23 +41,23 @@ from .scenes import (
 from .wrapping import around_dm_env
 
 _SUITE = "dm_control/"
-# What a task of the suite that was made here is given: `suite.load`'s other arguments.
+# The attribute of a suite task created here that holds `suite.load`'s other arguments.
 MADE_WITH = "_mjrec_made_with"
 
-# Asked at every captured step. It is dm_control's own, which belongs to one model.
+# Read at every captured step. It is dm_control's object, which belongs to one model.
 _DATA = attrgetter("physics.data")
 
-# Of frames that `physics.render()` does not draw.
+# For frames that `physics.render()` does not draw.
 _MAX_GEOM = 10000
 
 
 _NOT_BY_PHYSICS = (
-    "physics.render() draws no frame from an MjvCamera, nor one that is larger than "
-    "the model's offscreen buffer; such frames are drawn from recorded states and "
-    "never live. Leave render= out"
+    "physics.render() cannot draw from an MjvCamera, nor draw frames larger than the "
+    "model's offscreen buffer; such frames are drawn from recorded states, never live. "
+    "Leave out render="
 )
 
-# The size of `physics.render()` where none is asked for.
+# The default size of `physics.render()`.
 _HEIGHT, _WIDTH = 240, 320
 
 
@@ -71,20 +71,20 @@ def dm_control_scenes(
 ) -> Scenes:
     """Return how the states of a dm_control environment are recorded.
 
+    The frames are those of `physics.render()`, or, if it cannot draw them (see
+    `_drawn_by_physics`), frames of the same scene.
+
     Args:
         env: an environment with dm_control's `physics`.
-        camera: a name or number, or an `MjvCamera`; None is dm_control's default, the
+        camera: a name, a number or an `MjvCamera`; None for dm_control's default, the
             free camera.
-        height: in pixels; None is 240, dm_control's default.
-        width: in pixels; None is 320, likewise.
-        env_id: `dm_control/<domain>-<task>`, of a task of the suite.
-
-    The frames are those of `physics.render()`, or where that draws no such frame
-    (see `_drawn_by_physics`) those of the same scene.
+        height: height in pixels; None for dm_control's default, 240.
+        width: width in pixels; None for dm_control's default, 320.
+        env_id: `dm_control/<domain>-<task>` for a task of the suite.
 
     Raises:
         UnknownName: the model has no such camera.
-        InvalidArgument: a camera number, or a size, that cannot be.
+        InvalidArgument: the camera's number or the size is invalid.
     """
     height, width = _frame_size(height, width)
     by_physics = _drawn_by_physics(env.physics, camera, height, width)
@@ -116,21 +116,21 @@ def dm_control_frames(
     height: int | None = None,
     width: int | None = None,
 ) -> PhysicsFrames | NoFrameSource:
-    """Return the source of a dm_control environment's frames.
+    """Return the source of a dm_control environment's live frames.
+
+    The frames are those of `physics.render()`. Frames that it cannot draw, larger than
+    the model's offscreen buffer or from an `MjvCamera`, are not drawn live.
 
     Args:
         env: an environment with dm_control's `physics`.
-        camera: a name or number; None is dm_control's default, the free camera.
-        height: in pixels; None is 240, dm_control's default.
-        width: in pixels; None is 320, likewise.
-
-    The frames are those of `physics.render()`. What that cannot draw is not drawn
-    live: a frame larger than the model's offscreen buffer, and one from an
-    `MjvCamera`.
+        camera: a name, a number or an `MjvCamera`; None for dm_control's default, the
+            free camera.
+        height: height in pixels; None for dm_control's default, 240.
+        width: width in pixels; None for dm_control's default, 320.
 
     Raises:
         UnknownName: the model has no such camera.
-        InvalidArgument: a number or a size that cannot be.
+        InvalidArgument: the camera's number or the size is invalid.
     """
     height, width = _frame_size(height, width)
     if camera is not None:
@@ -141,8 +141,8 @@ def dm_control_frames(
 
 
 def generator_of(env: Any) -> Any:
-    """Return what an environment draws its random numbers from; None for nothing."""
-    # Of the suite's tasks, and of composer's environments.
+    """Return the generator of an environment's random numbers, or None."""
+    # The first place is for the suite's tasks, the second for composer's environments.
     for holder, name in ((getattr(env, "task", None), "random"), (env, "random_state")):
         found = getattr(holder, name, None)
         if isinstance(found, np.random.RandomState):
@@ -151,13 +151,13 @@ def generator_of(env: Any) -> Any:
 
 
 class PhysicsFrames:
-    """The frames that `physics.render()` gives.
+    """The frames that `physics.render()` returns.
 
     Args:
-        env: the environment; its physics may be another one at each call.
-        camera: a name or number; None is the free camera.
-        height: in pixels.
-        width: in pixels.
+        env: the environment; its physics may be replaced between calls.
+        camera: a name or number; None for the free camera.
+        height: height in pixels.
+        width: width in pixels.
     """
 
     render_mode = "rgb_array"
@@ -169,13 +169,13 @@ class PhysicsFrames:
         self._width = width
 
     def render(self) -> Any:
-        """Return the frame of this moment, `(height, width, 3) uint8`."""
+        """Return the current frame, `(height, width, 3) uint8`."""
         return self._env.physics.render(
             height=self._height, width=self._width, camera_id=self._camera
         )
 
     def facts(self) -> dict[str, Any]:
-        """Return what the metadata of a video says about its frames."""
+        """Return the facts about the frames for a video's metadata."""
         physics = self._env.physics
         facts: dict[str, Any] = {
             "pictures": "env.render",
@@ -191,10 +191,10 @@ class _PhysicsScene:
     """The scene as `physics.render()` shows it.
 
     Args:
-        env: the environment; its physics may be another one at each call.
-        camera: a name or number, or an `MjvCamera`.
+        env: the environment; its physics may be replaced between calls.
+        camera: a name, a number or an `MjvCamera`.
         size: `(height, width)` in pixels.
-        by_physics: whether it is `physics.render()` that draws such frames.
+        by_physics: whether `physics.render()` can draw such frames.
     """
 
     def __init__(
@@ -205,14 +205,14 @@ class _PhysicsScene:
         self._size = size
         self._by_physics = by_physics
         self._option = option_without_rangefinder()
-        # When it was last asked what is shown.
+        # The data when the view was last requested.
         self._data: Any = None
-        # Whether the camera was put in its place since.
+        # Whether the camera has been placed since then.
         self._is_placed = False
         self._start(env.physics.model)
 
     def __call__(self) -> SceneView:
-        """Return what is shown from here on; `at_frame` keeps it up to date."""
+        """Return the view from now on; `at_frame` keeps it up to date."""
         model = self._env.physics.model
         if raw_model(model) is not self._model:
             self._start(model)
@@ -221,18 +221,18 @@ class _PhysicsScene:
         return self._view
 
     def at_frame(self, capture: Callable[[], None]) -> None:
-        """Call `capture` with the view as a frame of this moment has it."""
+        """Call `capture` with the view updated to the current frame's."""
         if self._camera == FREE_CAMERA:
-            # It moves with the model's fields.
+            # The free camera moves with the model's fields.
             place_free_camera(self._model, self._view.camera)
         self._is_placed = True
         capture()
 
     def is_unmoved(self) -> bool:
-        """Return quickly whether nothing is other than at the frame before.
+        """Return quickly whether the view is surely the same as at the last frame.
 
-        But for what is in model, camera and option: it is the same simulation as when
-        it was asked what is shown.
+        Changes in the model, the camera and the option are not checked. It is true if
+        the simulation is the same as when the view was last requested.
         """
         return self._is_placed and _DATA(self._env) is self._data
 
@@ -243,7 +243,7 @@ class _PhysicsScene:
             camera=resolve_camera(self._model, self._camera),
             option=self._option,
             max_geom=_max_geom(model) if self._by_physics else _MAX_GEOM,
-            # Each `physics.render()` makes one.
+            # Each `physics.render()` creates a new scene.
             fresh=self._by_physics,
             height=height,
             width=width,
@@ -252,10 +252,10 @@ class _PhysicsScene:
 
 
 def _frame_size(height: int | None, width: int | None) -> tuple[int, int]:
-    """Return `(height, width)` with dm_control's default for what is None.
+    """Return `(height, width)`, with dm_control's defaults in place of None.
 
     Raises:
-        InvalidArgument: a size that cannot be.
+        InvalidArgument: the size is invalid.
     """
     return check_size(
         _HEIGHT if height is None else height, _WIDTH if width is None else width
@@ -263,19 +263,19 @@ def _frame_size(height: int | None, width: int | None) -> tuple[int, int]:
 
 
 def _drawn_by_physics(physics: Any, camera: Any, height: int, width: int) -> bool:
-    """Return whether `physics.render()` draws such frames."""
+    """Return whether `physics.render()` can draw such frames."""
     buffer = physics.model.vis.global_
     named = camera is None or isinstance(camera, str | int)
     return bool(named and height <= buffer.offheight and width <= buffer.offwidth)
 
 
 def _max_geom(model: Any) -> int:
-    # What dm_control chooses is known only to its scenes.
+    # dm_control's own choice can only be found out from its scenes.
     return int(wrapper.MjvScene(model).maxgeom)
 
 
 def _obstacle(physics: Any) -> str | None:
-    # Composer's is a weak proxy, whose own class says nothing.
+    # Composer's physics is a weak proxy, whose type is not the physics's class.
     kind = physics.__class__
     if has_own_method(physics, "render"):
         return f"the physics {class_name(kind)} overrides render()"
@@ -285,7 +285,7 @@ def _obstacle(physics: Any) -> str | None:
 
 
 def _authored(env: Any) -> AuthoredModel | None:
-    """Return the MJCF that composer, or the suite, has compiled."""
+    """Return the MJCF that composer or the suite compiled, or None."""
     task = getattr(env, "task", None)
     root = getattr(task, "root_entity", None)
     if root is None:
@@ -296,18 +296,18 @@ def _authored(env: Any) -> AuthoredModel | None:
 
 
 def _authored_of_suite(task: Any) -> AuthoredModel | None:
-    """Return what a task's module says that its domain's models are made from.
+    """Return the sources of a domain's models, from the task's module, or None.
 
-    A task keeps nothing of it, and may have changed it before it was compiled.
-    Storing it compiles it, and checks that it makes this model.
+    A task does not keep its model's sources, and may have changed them before
+    compiling. Storing the sources compiles them and checks that they give this model.
     """
     name = type(task).__module__
     domain = sys.modules.get(name) if name.startswith("dm_control.suite.") else None
     sources = getattr(domain, "get_model_and_assets", None)
     try:
-        text, assets = sources()  # type: ignore[misc]  # None is a TypeError, too
+        text, assets = sources()  # type: ignore[misc]  # None raises TypeError, too
     except TypeError:
-        # Of some domains there are as many models as numbers: swimmers, stacks.
+        # Some domains have a different model for each number: swimmers, stacks.
         return None
     return AuthoredModel("model.xml", {"model.xml": _bytes(text), **_all_bytes(assets)})
 

@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From the seed of a run to the seeds of one episode, and of a process.
+"""Derivation of an episode's seeds from the seed of its run.
 
-The recipe, to be redone by hand::
+To reproduce them by hand::
 
     words = numpy.random.SeedSequence([seed, episode]).generate_state(3)
     environment, actions, policy = (int(word) >> 1 for word in words)
 
-Each word is 32 bits; its lowest bit is dropped, because some of the generators that
-are seeded with it take no more than 31. An episode's seeds depend on nothing but the
-two numbers, so any episode can be recorded again without those before it.
+Each word has 32 bits. Its lowest bit is dropped, because some of the generators that
+are seeded with it accept only 31. An episode's seeds depend only on these two numbers,
+so any episode can be reproduced without the ones before it.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ import numpy as np
 
 from ..errors import InvalidArgument
 
-# SeedSequence cuts larger numbers into words of 32 bits and pads with zeros, so that
-# [2**32 + 5, 0] and [5, 1] would be the same episode.
+# SeedSequence splits larger numbers into 32-bit words and pads with zeros, so
+# [2**32 + 5, 0] and [5, 1] would give the same episode.
 _LIMIT = 2**32
 
 
@@ -31,9 +31,9 @@ class EpisodeSeeds:
     """The three seeds of an episode, each from 0 to 2**31 - 1.
 
     Attributes:
-        environment: of the environment's own randomness.
-        actions: of the sampling of actions.
-        policy: of the policy's own randomness.
+        environment: seed for the environment's own randomness.
+        actions: seed for the sampling of actions.
+        policy: seed for the policy's own randomness.
     """
 
     environment: int
@@ -42,14 +42,14 @@ class EpisodeSeeds:
 
 
 def episode_seeds(seed: int, episode: int) -> EpisodeSeeds:
-    """Return the seeds of one episode of a run; the module says how they are made.
+    """Return the seeds of one episode of a run; the module explains the derivation.
 
     Args:
-        seed: of the run.
-        episode: its number, from 0.
+        seed: the run's seed.
+        episode: the episode's number, from 0.
 
     Raises:
-        InvalidArgument: one is not a whole number from 0 to 2**32 - 1.
+        InvalidArgument: an argument is not a whole number from 0 to 2**32 - 1.
     """
     entropy = [_checked("seed", seed), _checked("episode", episode)]
     words = np.random.SeedSequence(entropy).generate_state(3)
@@ -58,13 +58,13 @@ def episode_seeds(seed: int, episode: int) -> EpisodeSeeds:
 
 
 def seed_global_generators(seed: int) -> None:
-    """Seed Python's, NumPy's and, where it is loaded, PyTorch's generators.
+    """Seed the generators of Python, NumPy and, if it is loaded, PyTorch.
 
-    Policies draw from them (`numpy.random.uniform`, dropout) without knowing of any
-    seed. For processes of our own only: in a user's they are the user's.
+    Policies draw from them (`numpy.random.uniform`, dropout) without knowing about any
+    seed. Only for processes that mjrec starts: a user's process has its own seeds.
 
     Args:
-        seed: from 0 to 2**32 - 1.
+        seed: the seed, from 0 to 2**32 - 1.
     """
     random.seed(seed)
     np.random.seed(seed)

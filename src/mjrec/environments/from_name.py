@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From a name to an environment of whichever framework the name means.
+"""Creation of an environment of any framework from its name.
 
-Each framework is loaded only where one of its environments is asked for: choose the GL
-backend before.
+A framework is loaded only when one of its environments is created. So choose the GL
+backend first.
 """
 
 from __future__ import annotations
@@ -24,18 +24,18 @@ from .names import (
 def environment_from_name(
     name: str | EnvironmentName, options: EnvironmentOptions | None = None
 ) -> NamedEnvironment:
-    """Return the environment that `name` means.
+    """Return the environment with the given name.
 
-    Where it cannot be drawn it is made without frames, and says why.
+    If it cannot be drawn, it is created without frames, and `not_drawn` says why.
 
     Args:
         name: see `parse_environment_name`.
-        options: how it is made; the defaults, if None.
+        options: the options; None for the defaults.
 
     Raises:
-        UnknownName, InvalidArgument: the name, or an option, means nothing.
-        MissingDependency: the framework is not installed, or something else is not.
-        EnvironmentNotMade, UnreadableFile: making it failed; the cause is kept.
+        UnknownName, InvalidArgument: the name or an option is invalid.
+        MissingDependency: the framework or another dependency is not installed.
+        EnvironmentNotMade, UnreadableFile: creating it failed; the cause is kept.
     """
     if isinstance(name, str):
         name = parse_environment_name(name)

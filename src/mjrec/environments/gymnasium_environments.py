@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Gymnasium environments by their ids, with the frames that were asked for."""
+"""Gymnasium environments, created by id, with the requested frames."""
 
 from __future__ import annotations
 
@@ -30,41 +30,42 @@ from .named_environment import EnvironmentOptions, NamedEnvironment, Step
 from .names import working_directory_importable
 from .scenes import Scenes
 
-# What records as a video, before what records as text.
+# Render modes for videos, then for text recordings.
 _PREFERRED_MODES = ("rgb_array", "ansi")
 
-# The extra that draws each family of Gymnasium's own environments, by pygame.
+# The extra with pygame that each family of Gymnasium's own environments is drawn with.
 _PYGAME_EXTRAS = {
     "gymnasium.envs.box2d": "box2d",
     "gymnasium.envs.classic_control": "classic-control",
     "gymnasium.envs.toy_text": "toy-text",
 }
 
-# Arguments with which a person has chosen the view.
+# Arguments with which a user chooses the view.
 _VIEW_ARGUMENTS = ("camera_name", "camera_id", "default_camera_config")
 
 
 def make_gymnasium(env_id: str, options: EnvironmentOptions) -> gymnasium.Env[Any, Any]:
-    """Return what `gymnasium.make` makes of an id, ready to be recorded.
+    """Return an environment created by `gymnasium.make`, ready to be recorded.
 
-    With frames the render mode is `rgb_array`, or `ansi` where the environment has
-    only text. A MuJoCo environment shows its model's tracking camera where there is
-    one and nothing else was asked for, because the default camera of Gymnasium 1.4
-    stays where it is and the robot leaves the frame. The environment's own time
-    limit is lowered to `max_steps`, or is 1000 steps where it has none.
+    With frames, the render mode is `rgb_array`, or `ansi` if the environment has only
+    text. A MuJoCo environment shows its model's tracking camera, if it has one and no
+    other view was requested. The default camera of Gymnasium 1.4 does not move, so the
+    robot leaves its frame. The environment's own time limit is lowered to
+    `max_steps`; if it has none, its limit is `max_steps`, or 1000 steps by default.
 
     Args:
-        env_id: as `gymnasium.make` takes it: `HalfCheetah-v5`, `HalfCheetah` (the
-            latest version) or `module:Id` (the module is imported first).
-        options: `kwargs` go to `gymnasium.make`.
+        env_id: the id, as `gymnasium.make` takes it: `HalfCheetah-v5`, `HalfCheetah`
+            (the latest version) or `module:Id` (the module is imported first).
+        options: the options; `kwargs` go to `gymnasium.make`.
 
     Raises:
-        UnknownName: there is no such id, camera or render mode.
-        InvalidArgument: a camera or size for an environment that takes none.
+        UnknownName: the id, camera or render mode does not exist.
+        InvalidArgument: a camera or size is given, but the environment takes none.
         NoPictures: the environment draws nothing that can be recorded.
-        MissingDependency: something that it needs is not installed.
-        EnvironmentNotMade: making it failed otherwise; the cause is kept.
+        MissingDependency: a dependency is not installed.
+        EnvironmentNotMade: creating it failed for another reason; the cause is kept.
     """
+    # The module of `module:Id` may be in the working directory, as a policy's may.
     # The module of `module:Id` may lie in the working directory, as a policy's may.
     here = working_directory_importable() if ":" in env_id else contextlib.nullcontext()
     with here:
@@ -72,11 +73,11 @@ def make_gymnasium(env_id: str, options: EnvironmentOptions) -> gymnasium.Env[An
 
 
 class GymnasiumEnvironment(NamedEnvironment):
-    """One of Gymnasium's environments.
+    """A Gymnasium environment.
 
     Args:
-        environment: as `make_gymnasium` made it, or an MJCF file's.
-        not_drawn: why it was made without frames though they were asked for.
+        environment: an environment from `make_gymnasium`, or an MJCF file's.
+        not_drawn: why it was created without frames although they were requested.
     """
 
     def __init__(
@@ -85,7 +86,7 @@ class GymnasiumEnvironment(NamedEnvironment):
         *,
         not_drawn: Error | None = None,
     ) -> None:
-        # Environments that are made from names always have one, and a limit.
+        # Environments created from names always have a spec and a limit.
         spec: Any = environment.spec
         super().__init__(
             environment,
@@ -95,16 +96,16 @@ class GymnasiumEnvironment(NamedEnvironment):
         )
 
     def begin(self, around: Any, seeds: EpisodeSeeds, seed: int | None) -> Any:
-        """Reset; a policy may draw from the action space, which is seeded, too."""
+        """Reset. This also seeds the action space: a policy may sample from it."""
         around.action_space.seed(seeds.actions)
         return around.reset(seed=seed)[0]
 
     def step(self, around: Any, action: Any) -> Step:
-        """Step, and return what that gave."""
+        """Take a step, and return its result."""
         return Step(*around.step(action)[:4])
 
     def scenes(self) -> Scenes:
-        """Return what is known of its frames and its states."""
+        """Return how its states are recorded and its frames drawn."""
         return gymnasium_scenes(self.environment)
 
 
@@ -120,7 +121,7 @@ def _make_known(
 
 
 def _own_limit(spec: registration.EnvSpec, kwargs: Mapping[str, Any]) -> int | None:
-    # gymnasium.make's own word for the limit, -1 for none.
+    # gymnasium.make's own argument for the limit; -1 means none.
     limit = kwargs.get("max_episode_steps", spec.max_episode_steps)
     if limit in (None, -1):
         return None
@@ -143,8 +144,8 @@ def _spec(env_id: str) -> registration.EnvSpec:
             "Gymnasium environment",
             name,
             registration.registry,
-            hint="A package that registers its environments when it is imported is "
-            "named before a colon (gymnasium_robotics:FetchReach-v4); other names are "
+            hint="If a package registers its environments on import, put its name "
+            "before a colon (gymnasium_robotics:FetchReach-v4). Other names are "
             "dm_control/<domain>-<task> and paths of MJCF files.",
         )
     return spec
@@ -156,8 +157,8 @@ def _import_registering_module(module: str, env_id: str) -> None:
     except Exception as error:
         raise EnvironmentNotMade(
             env_id,
-            f"importing the module {module!r} gave {_what_was_raised(error)}",
-            hint="It must be installed, or lie in the working directory.",
+            f"importing the module {module!r} raised {_what_was_raised(error)}",
+            hint="It must be installed, or be in the working directory.",
         ) from error
 
 
@@ -170,7 +171,7 @@ def _make(
 
 @contextlib.contextmanager
 def _failures_of(env_id: str) -> Iterator[None]:
-    """Turn whatever third-party code raises into one error of ours."""
+    """Turn exceptions in third-party code into one of our errors."""
     try:
         yield
     except Error:
@@ -192,7 +193,7 @@ def _missing_dependency(env_id: str, error: Exception) -> Error:
 def _what_was_raised(error: Exception) -> str:
     if str(error):
         return f"{type(error).__name__}: {error}"
-    # A bare assertion says nothing but where it stands.
+    # A bare assertion has no message, so give its place.
     place = traceback.extract_tb(error.__traceback__)[-1]
     return f"{type(error).__name__} in {place.filename}, line {place.lineno}"
 
@@ -204,18 +205,18 @@ def _render_mode(spec: registration.EnvSpec, kwargs: Mapping[str, Any]) -> str:
             raise EnvironmentNotMade(spec.id, "only its vectorised form is registered")
         if isinstance(creator, str):
             creator = registration.load_env_creator(creator)
-    # A function has none, and on a wrapper's class it is a property.
+    # A function has no metadata, and on a wrapper's class it is a property.
     metadata = getattr(creator, "metadata", None)
     modes = metadata.get("render_modes") if isinstance(metadata, dict) else None
     if "render_mode" in kwargs:
         mode = kwargs["render_mode"]
         if mode in (None, "human"):
-            raise _not_drawn(spec.id, f"render_mode={mode!r} was asked for")
-        # Gymnasium itself collects the frames of `rgb_array` into `rgb_array_list`.
+            raise _not_drawn(spec.id, f"render_mode={mode!r} was requested")
+        # Gymnasium itself collects the frames of `rgb_array` for `rgb_array_list`.
         if modes is not None and str(mode).removesuffix("_list") not in modes:
             raise UnknownName(f"render mode of {spec.id}", mode, modes)
     else:
-        # What says nothing is asked for frames.
+        # If the modes are unknown, request frames.
         there = _PREFERRED_MODES if modes is None else modes
         mode = next((each for each in _PREFERRED_MODES if each in there), None)
         if mode is None:
@@ -228,14 +229,14 @@ def _render_mode(spec: registration.EnvSpec, kwargs: Mapping[str, Any]) -> str:
 
 def _not_drawn(env_id: str, why: str) -> NoPictures:
     return NoPictures(
-        f"There is nothing to record of {env_id}: {why}, and a video needs "
-        '"rgb_array", a text recording "ansi". Record it without videos (schedule '
+        f"{env_id} cannot be recorded: {why}, but a video needs "
+        '"rgb_array", and a text recording "ansi". Record it without videos (schedule '
         '"none"), or choose another environment.'
     )
 
 
 def _check_pygame(env_id: str, extra: str, *, has_text: bool) -> None:
-    """Say before the first episode what would fail at its first frame."""
+    """Raise before the first episode if pygame is missing, not at the first frame."""
     if importlib.util.find_spec("pygame") is None:
         text_instead = ' (or record its text: --env-kwargs \'{"render_mode": "ansi"}\')'
         raise MissingDependency(
@@ -251,7 +252,7 @@ def _make_drawn(
     env = _make_sized(spec, kwargs, options.size)
     try:
         if env.render_mode is None:
-            raise _not_drawn(spec.id, "it took no render mode")
+            raise _not_drawn(spec.id, "it ignored render_mode")
         _choose_camera(env, spec.id, kwargs, options.camera)
     except BaseException:
         env.close()
@@ -275,8 +276,8 @@ def _make_sized(
         if not any(text in str(error.__cause__) for text in unknown):
             raise
         raise InvalidArgument(
-            f"{spec.id} takes no size: its frames have the size that it chooses. "
-            "Only MuJoCo environments can be given one."
+            f"{spec.id} takes no size: it chooses the size of its frames itself. "
+            "Only MuJoCo environments take a size."
         ) from error.__cause__
 
 
@@ -286,9 +287,9 @@ def _choose_camera(
     kwargs: Mapping[str, Any],
     asked: str | int | None,
 ) -> None:
-    """Let a MuJoCo environment show the camera that was asked for, or one that tracks.
+    """Set a MuJoCo environment's camera to the requested one, or one that tracks.
 
-    Set on its renderer: Gymnasium-Robotics' environments take no camera themselves.
+    It is set on the renderer: Gymnasium-Robotics' environments take no camera argument.
     """
     chosen = [name for name in _VIEW_ARGUMENTS if name in kwargs]
     if asked is None and chosen:
@@ -307,11 +308,11 @@ def _choose_camera(
                 "environment."
             )
         return
-    # Not at the top: an environment that has no use for MuJoCo must not load it.
+    # Not imported at the top: an environment without MuJoCo must not load it.
     from ..simulation import cameras
 
-    # An environment that shows one of its model's cameras has made its own choice, and
-    # Gymnasium before 1.4 has followed the robot.
+    # An environment that shows one of its model's cameras has chosen it itself. Before
+    # 1.4, Gymnasium followed the robot.
     if asked is None and renderer.camera_id == cameras.FREE_CAMERA:
         asked = cameras.tracking_camera(simulated.model)
     if asked is not None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where the frames of a Gymnasium environment come from."""
+"""The sources of a Gymnasium environment's frames."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from ..simulation.find_simulation import simulation_in
 from .scenes import NoFrameSource, simulation_below
 
 _ANOTHER_VIEW = (
-    "camera, height and width ask for another frame than render() gives, which is "
-    "drawn from recorded states and never live. Make the environment with them "
-    "(camera_name=, height=, width=), or leave render= out"
+    "with camera, height or width the frames differ from those of render(), and are "
+    "drawn from recorded states, never live. Create the environment with them "
+    "(camera_name=, height=, width=), or leave out render="
 )
 
 
@@ -27,33 +27,35 @@ def gymnasium_frames(
     height: int | None = None,
     width: int | None = None,
 ) -> EnvironmentFrames | NoFrameSource:
-    """Return the source of an environment's live frames, which is `env.render()`.
+    """Return the source of an environment's live frames, `env.render()`.
+
+    If camera, height or width is given, there are no live frames: workers draw the
+    frames from states.
 
     Args:
-        env: the environment as the user wrapped it.
-        camera: a name or number, or an `MjvCamera`; None is the one that the
+        env: the environment, as the user wrapped it.
+        camera: a name, a number or an `MjvCamera`; None for the camera that the
             environment itself shows.
-        height: in pixels; None is the environment's own.
-        width: likewise.
-
-    With one of the three there are no live frames: workers draw from states.
+        height: height in pixels; None for the environment's own.
+        width: width in pixels; None for the environment's own.
 
     Raises:
         UnknownName: the model has no such camera.
-        InvalidArgument: camera, height or width for what is no MuJoCo environment.
+        InvalidArgument: camera, height or width is given, but the environment has no
+            MuJoCo simulation.
     """
     if camera is None and height is None and width is None:
         return EnvironmentFrames(env)
     simulated = simulation_below(env)
     if simulated is None:
         raise InvalidArgument(
-            "camera, height and width choose among the frames of a MuJoCo "
-            f"environment, and {env} has no MuJoCo model and data. Make the "
-            "environment itself with the camera and size that the videos are to have."
+            "camera, height and width require a MuJoCo environment, but "
+            f"{env} has no MuJoCo model and data. Create the environment itself with "
+            "the camera and size that the videos should have."
         )
     if camera is not None:
-        # Loaded where there is a simulation, and so mujoco, already: importing mujoco
-        # settles its OpenGL backend, which is not ours to do for a CartPole.
+        # Imported only here, where mujoco is already loaded. Its import chooses an
+        # OpenGL backend, which must not happen for an environment without MuJoCo.
         from ..simulation.cameras import resolve_camera
 
         resolve_camera(simulated.model, camera)
@@ -61,10 +63,10 @@ def gymnasium_frames(
 
 
 class EnvironmentFrames:
-    """The frames that `env.render()` gives.
+    """The frames that `env.render()` returns.
 
     Args:
-        env: the environment as the user wrapped it.
+        env: the environment, as the user wrapped it.
     """
 
     def __init__(self, env: gymnasium.Env[Any, Any]) -> None:
@@ -78,7 +80,7 @@ class EnvironmentFrames:
         return self._env.render_mode
 
     def render(self) -> Any:
-        """Return the frame of this moment, or the list of those not seen yet."""
+        """Return the current frame, or a list of the frames not returned before."""
         with _own_context(self._env):
             rendered: Any = self._env.render()
         if self._keeps_frames and isinstance(rendered, list):
@@ -86,11 +88,11 @@ class EnvironmentFrames:
         return rendered
 
     def facts(self) -> dict[str, Any]:
-        """Return what the metadata of a video says about its frames."""
+        """Return the facts about the frames for a video's metadata."""
         facts: dict[str, Any] = {"pictures": "env.render", "quality": "full"}
         own_facts = getattr(self._env.unwrapped, "frame_facts", None)
         if own_facts is not None:
-            # An environment of ours knows better than a look from outside.
+            # Our own environments know more than can be found out from outside.
             return {**facts, **own_facts()}
         simulated = simulation_in(self._env)
         viewer = getattr(_renderer(self._env), "viewer", None)
@@ -104,23 +106,23 @@ class EnvironmentFrames:
         return facts
 
     def _new_ones(self, frames: list[Any]) -> list[Any]:
-        # A list that did not grow was emptied by a reset.
+        # If the list did not grow, a reset has emptied it.
         first = self._seen if len(frames) > self._seen else 0
         self._seen = len(frames)
         return frames[first:]
 
 
 def close_environment(env: gymnasium.Env[Any, Any]) -> None:
-    """Close an environment, and first free what lies in its OpenGL contexts."""
+    """Close an environment, after freeing everything in its OpenGL contexts."""
     free_viewers(env)
     env.close()
 
 
 def free_viewers(env: gymnasium.Env[Any, Any]) -> None:
-    """Free what lies in an environment's OpenGL contexts; it is to be closed next.
+    """Free everything in an environment's OpenGL contexts, just before it is closed.
 
-    Gymnasium leaves that to the garbage collector, which frees it in whichever context
-    is current then, and so blackens another viewer's frames.
+    Gymnasium leaves this to the garbage collector, which frees it in whichever context
+    is current then, and so turns another viewer's frames black.
     """
     for viewer in getattr(_renderer(env), "_viewers", {}).values():
         with _current(viewer):
@@ -130,11 +132,11 @@ def free_viewers(env: gymnasium.Env[Any, Any]) -> None:
 
 @contextlib.contextmanager
 def _own_context(env: gymnasium.Env[Any, Any]) -> Iterator[None]:
-    """Make the context that Gymnasium draws with current, for the block.
+    """Make the context that Gymnasium draws with current in the block.
 
-    Gymnasium itself does so only when it makes the context: of two environments that
-    take turns, one would be drawn with the other's meshes and textures, or not at all.
-    The context that was current before is current again afterwards.
+    Gymnasium itself does this only when it creates the context. If two environments
+    alternated, one would be drawn with the other's meshes and textures, or not at all.
+    The previous context is current again after the block.
     """
     renderer = _renderer(env)
     if renderer is None:
@@ -146,7 +148,7 @@ def _own_context(env: gymnasium.Env[Any, Any]) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _current(viewer: Any) -> Iterator[None]:
-    """Make a viewer's context current, if there is a viewer; then what was before."""
+    """Make a viewer's context current, if there is a viewer; restore it afterwards."""
     from ..simulation.gl_context import context_kept
 
     with context_kept():
@@ -156,11 +158,11 @@ def _current(viewer: Any) -> Iterator[None]:
 
 
 def _renderer(env: gymnasium.Env[Any, Any]) -> Any:
-    """Return what Gymnasium draws a MuJoCo environment with; None for others."""
+    """Return Gymnasium's renderer of a MuJoCo environment; None for others."""
     return getattr(simulation_in(env), "mujoco_renderer", None)
 
 
 def _keeps_frames(env: gymnasium.Env[Any, Any]) -> bool:
-    """Return whether `render` gives all frames every time, old ones too."""
-    # What gymnasium.wrappers.RenderCollection(pop_frames=False) does.
+    """Return whether `render` returns all frames every time, including old ones."""
+    # gymnasium.wrappers.RenderCollection(pop_frames=False) does this.
     return env.has_wrapper_attr("pop_frames") and not env.get_wrapper_attr("pop_frames")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The states of a Gymnasium environment, and whether its frames follow from them."""
+"""The states of a Gymnasium environment, and whether they determine its frames."""
 
 from __future__ import annotations
 
@@ -32,12 +32,12 @@ _MUJOCO_ENV = ("gymnasium.envs.mujoco.mujoco_env", "MujocoEnv.render")
 _RENDERING = "gymnasium.envs.mujoco.mujoco_rendering"
 _RENDERER = (_RENDERING, "MujocoRenderer.render")
 
-# Of Gymnasium-Robotics, which is not imported: its environments exist only where it
-# is loaded.
+# A package in Gymnasium-Robotics. It is not imported: its environments exist only if it
+# is already loaded.
 _MAZES = "gymnasium_robotics.envs.maze"
 
-# Environments whose `render` is that of an environment inside them: the module, the
-# function, and the attribute with what is inside.
+# Environments whose `render` is that of an inner environment: the module, the function,
+# and the attribute that holds the inner environment.
 _DELEGATING = (
     (f"{_MAZES}.point_maze", "PointMazeEnv.render", "point_env"),
     (f"{_MAZES}.ant_maze_v3", "AntMazeEnv.render", "ant_env"),
@@ -52,8 +52,8 @@ _DELEGATING = (
 
 _ROBOT_ENV = "gymnasium_robotics.envs.robot_env"
 
-# Wrappers whose `render` gives what it gets. RecordVideo's does so for single
-# frames; array conversion changes what holds the numbers, not the numbers.
+# Wrappers whose `render` passes on the frame unchanged. RecordVideo does so for single
+# frames; array conversion changes the array type, not the values.
 _PASSING_ON = (
     ("gymnasium.core", "Wrapper.render"),
     ("gymnasium.wrappers.common", "OrderEnforcing.render"),
@@ -72,25 +72,25 @@ def gymnasium_scenes(
 ) -> Scenes:
     """Return how the states of a Gymnasium environment are recorded.
 
-    Args:
-        env: the environment as the user wrapped it.
-        camera: a name or number, or an `MjvCamera`; None is the one that the
-            environment itself shows.
-        height: in pixels; None is the environment's own.
-        width: likewise.
+    Without camera, height and width, the frames are those of `env.render()`, and
+    anything that overrides `render` is an obstacle. If one of them is given, the frames
+    show only the scene, never what a wrapper draws on top.
 
-    With none of the three the frames are those of `env.render()`, and what overrides
-    `render` is an obstacle. With one of them the frames are of the scene, and
-    nothing that a wrapper draws on top is in them, live or later.
+    Args:
+        env: the environment, as the user wrapped it.
+        camera: a name, a number or an `MjvCamera`; None for the camera that the
+            environment itself shows.
+        height: height in pixels; None for the environment's own.
+        width: width in pixels; None for the environment's own.
 
     Raises:
         UnknownName: the model has no such camera.
-        InvalidArgument: a camera number, or a size, that cannot be.
+        InvalidArgument: the camera's number or the size is invalid.
     """
     view = {"camera": camera, "height": height, "width": width}
     own_view = any(asked is not None for asked in view.values())
     base: Any = env.unwrapped
-    # An environment of ours knows itself.
+    # Our own environments describe themselves.
     own = getattr(type(base), "mjrec_scenes", None)
     scenes = own(base, **view) if own else _scenes(env, base, view)
     obstacle = None if own_view else _override_above(env) or scenes.obstacle
@@ -101,9 +101,9 @@ def gymnasium_scenes(
 
 
 def own_camera(env: gymnasium.Env[Any, Any]) -> int | str | None:
-    """Return the camera that an environment shows by itself; None for a free one.
+    """Return the camera that an environment itself shows; None for a free one.
 
-    It may be another one than its arguments say: who made it may have chosen another.
+    It may differ from the environment's arguments, because it can be changed later.
     """
     shown = drawn_part(env.unwrapped)
     chosen = getattr(getattr(shown, "mujoco_renderer", shown), "camera_id", None)
@@ -113,7 +113,7 @@ def own_camera(env: gymnasium.Env[Any, Any]) -> int | str | None:
 
 
 def set_own_camera(env: gymnasium.Env[Any, Any], camera: int | str) -> None:
-    """Let an environment show a camera by itself, as `own_camera` returns it."""
+    """Set the camera that an environment itself shows, as from `own_camera`."""
     shown = drawn_part(env.unwrapped)
     if has_own_scenes(shown):
         shown.camera = camera
@@ -122,12 +122,12 @@ def set_own_camera(env: gymnasium.Env[Any, Any], camera: int | str) -> None:
 
 
 def has_own_scenes(base: Any) -> bool:
-    """Return whether an environment is one of ours, which knows itself."""
+    """Return whether an environment is one of ours, which describe themselves."""
     return hasattr(type(base), "mjrec_scenes")
 
 
 def drawn_part(base: Any) -> Any:
-    """Return the environment that a maze or a kitchen shows; others show themselves.
+    """Return the inner environment that a maze or kitchen shows, or `base` itself.
 
     Args:
         base: an environment without its wrappers.
@@ -151,7 +151,7 @@ def _scenes(env: gymnasium.Env[Any, Any], base: Any, view: dict[str, Any]) -> Sc
 
 
 def _override_above(env: gymnasium.Env[Any, Any]) -> str | None:
-    """Return which wrapper of an environment does not show what is inside it."""
+    """Return why a wrapper changes the frames of the environment inside, or None."""
     mode = env.render_mode
     while isinstance(env, gymnasium.Wrapper):
         if has_own_method(env, "render"):
@@ -165,7 +165,7 @@ def _override_above(env: gymnasium.Env[Any, Any]) -> str | None:
 
 
 def _obstacle(base: Any, shown: Any) -> str | None:
-    """Return why an environment without wrappers does not show just its simulation."""
+    """Return why an unwrapped environment shows more than its simulation, or None."""
     for part in (base, shown):
         if has_own_method(part, "render"):
             return f"the environment {class_name(type(part))} overrides render()"
@@ -181,7 +181,7 @@ def _wrong_mode(mode: str | None) -> str | None:
     if mode in (None, "rgb_array"):
         return None
     return (
-        f"its render_mode is {mode!r}, and only the frames of 'rgb_array' follow "
+        f"its render_mode is {mode!r}, and only frames of 'rgb_array' can be drawn "
         "from states"
     )
 
@@ -195,8 +195,8 @@ def _foreign_renderer(renderer: Any) -> str | None:
 
 
 def _states(simulated: Any, view: dict[str, Any]) -> Capture:
-    # Loaded where there is a simulation, and so mujoco, already: importing mujoco
-    # settles its OpenGL backend, which is not ours to do for a CartPole.
+    # Imported only here, where mujoco is already loaded. Its import chooses an OpenGL
+    # backend, which must not happen for an environment without MuJoCo.
     from ..simulation.capture import Capture
     from .viewer_scene import ViewerScene
 
@@ -223,33 +223,33 @@ def _at_frame(
 
 
 def _is_robot(drawn: Any) -> bool:
-    """Return whether an environment shows itself as Gymnasium-Robotics' robots do."""
+    """Return whether an environment renders like Gymnasium-Robotics' robots."""
     render = getattr(type(drawn), "render", None)
     return is_defined_by(render, _ROBOT_ENV, "MujocoRobotEnv.render")
 
 
 def frame_moment(drawn: Any) -> Callable[[Callable[[], None]], None] | None:
-    """Return what makes the moment at which an environment draws itself.
+    """Return a function to capture the moment at which an environment draws itself.
 
-    Fetch's and the hand's environments move their goal's markers, and call
-    `mj_forward`, in each `render`; so a frame changes what happens afterwards. What
-    is returned calls `render` with something else in the place of what draws, and puts
-    the simulation back afterwards: the frame is the one that `render` gives, and the
-    episode is the one without rendering.
+    The Fetch and hand environments move their goal markers, and call `mj_forward`, in
+    each `render`, so a frame affects what happens afterwards. The returned function
+    calls `render`, replacing only the drawing itself, then restores the simulation. So
+    the frame is the one that `render` gives, and the episode is the same as without
+    rendering.
 
     Args:
         drawn: an environment without its wrappers.
 
     Returns:
-        A function that calls its argument in that moment; None where there is no such
-        moment, because drawing the environment changes nothing.
+        A function that calls its argument at that moment; None if it is not needed,
+        because drawing the environment changes nothing.
     """
     callback = getattr(type(drawn), "_render_callback", None)
     if not _is_robot(drawn) or is_defined_by(
         callback, _ROBOT_ENV, "BaseRobotEnv._render_callback"
     ):
         return None
-    # Loaded where there is a simulation, and so mujoco, already.
+    # Imported only here, where mujoco is already loaded.
     from ..simulation.states import PreservedState
 
     simulation = PreservedState()
@@ -266,8 +266,8 @@ def frame_moment(drawn: Any) -> Callable[[Callable[[], None]], None] | None:
 
 @contextlib.contextmanager
 def _drawing_instead(renderer: Any, capture: Callable[[], None]) -> Iterator[None]:
-    """Let `renderer.render` call `capture`, for the block, and draw nothing."""
-    # On the object, where it hides the class's own until it is deleted.
+    """Make `renderer.render` call `capture` in the block, and draw nothing."""
+    # Set on the instance, where it hides the class's method until it is deleted.
     renderer.render = lambda *_args, **_kwargs: capture()
     try:
         yield
@@ -283,7 +283,7 @@ def _authored(simulated: Any) -> AuthoredModel | None:
 
 
 def _environment(base: gymnasium.Env[Any, Any]) -> dict[str, Any] | None:
-    # The innermost environment has the spec itself; wrappers copy it.
+    # Only the innermost environment has its own spec; wrappers copy it.
     if base.spec is None:
         return None
     return {
@@ -294,13 +294,13 @@ def _environment(base: gymnasium.Env[Any, Any]) -> dict[str, Any] | None:
 
 
 def random_state(base: Any) -> Any:
-    """Return the state of an environment's generator, and of one inside it.
+    """Return the state of an environment's generator, and of its inner environment's.
 
     Args:
         base: an environment without its wrappers.
     """
     shown = drawn_part(base)
-    # Gymnasium's own property would make one.
+    # Gymnasium's public property would create a generator.
     own = generator_state(base._np_random)
     if shown is base:
         return own

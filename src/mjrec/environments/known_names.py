@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The names of the environments that are installed, for sets of tasks and patterns.
+"""The names of the installed environments, for task sets and patterns.
 
-Frameworks are asked in a process of their own, `python -m
-mjrec.environments.known_names`: dm_control chooses its way of drawing when it is
-imported, and what only wants to know names shall not choose for its process.
+Frameworks are queried in a separate process, `python -m
+mjrec.environments.known_names`. dm_control chooses its rendering backend on import, and
+a query for names must not make that choice for the calling process.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ _VERSION = re.compile(r"-v([0-9]+)$", re.ASCII)
 _SUITE = "dm_control"
 _GYMNASIUM = "gymnasium"
 
-# The tasks of `lqr` and the like are slow to import on a busy machine; more is a hang.
+# On a busy machine importing tasks such as `lqr` is slow; anything longer is a hang.
 _TIMEOUT_S = 300
 
 
 def suite_tasks(tag: str) -> tuple[str, ...]:
-    """Return the names `dm_control/<domain>-<task>` of a part of the suite, sorted.
+    """Return the sorted names `dm_control/<domain>-<task>` of a part of the suite.
 
     Args:
         tag: `benchmarking`, `easy`, `hard`, `extra`, or `all`.
@@ -38,7 +38,7 @@ def suite_tasks(tag: str) -> tuple[str, ...]:
     Raises:
         MissingDependency: dm_control is not installed, or does not work with this
             mujoco.
-        EnvironmentNotMade: importing it failed otherwise.
+        EnvironmentNotMade: importing dm_control failed for another reason.
     """
     answer = _ask(_SUITE, tag)
     if "names" in answer:
@@ -50,7 +50,8 @@ def gymnasium_ids(module: str | None = None) -> tuple[str, ...]:
     """Return the ids in Gymnasium's registry.
 
     Args:
-        module: that registers environments when it is imported; then only its ids.
+        module: a module that registers environments on import. If given, only its ids
+            are returned.
 
     Raises:
         EnvironmentNotMade: the module cannot be imported.
@@ -60,20 +61,20 @@ def gymnasium_ids(module: str | None = None) -> tuple[str, ...]:
         return tuple(answer["names"])
     raise EnvironmentNotMade(
         f"{module}:" if module else "the list of Gymnasium's environments",
-        f"importing gave {answer.get('kind')}: {answer.get('text')}",
-        hint="It must be installed, or lie in the working directory.",
+        f"importing it raised {answer.get('kind')}: {answer.get('text')}",
+        hint="It must be installed, or be in the working directory.",
     )
 
 
 def mujoco_ids() -> tuple[str, ...]:
-    """Return the ids of Gymnasium's own MuJoCo environments, the newest of each."""
+    """Return the newest versions of Gymnasium's own MuJoCo environments."""
     return tuple(newest_versions(gymnasium_ids("gymnasium.envs.mujoco")).values())
 
 
 def newest_versions(env_ids: Iterable[str]) -> dict[str, str]:
-    """Return the newest of the ids that differ in their version, by what is before it.
+    """Return the newest version of each id, by the id without its version.
 
-    One without a version is its own newest.
+    An id without a version is kept only if it has no versioned sibling.
     """
     newest: dict[str, str] = {}
     for env_id in sorted(env_ids, key=version_of):
@@ -82,28 +83,28 @@ def newest_versions(env_ids: Iterable[str]) -> dict[str, str]:
 
 
 def version_of(env_id: str) -> int:
-    """Return the version at the end of an id; -1 for one without."""
+    """Return the version at the end of an id; -1 if it has none."""
     match = _VERSION.search(env_id)
     return int(match[1]) if match else -1
 
 
 def dm_control_failure(name: str, error: Exception) -> Error:
-    """Return the error for what importing dm_control, or loading a task, raised.
+    """Return the error for an exception from importing dm_control or loading a task.
 
     Args:
-        name: of the environment.
-        error: what was raised.
+        name: the environment's name.
+        error: the exception.
     """
     missing = error.name if isinstance(error, ModuleNotFoundError) else None
     if missing in ("dm_control", "dm_env"):
         return MissingDependency(
             "dm_control", purpose=name, install='pip install "mjrec[dm-control]"'
         )
-    # dm_control 1.0.50 reads fields of MuJoCo's structures that mujoco 4 lacks.
+    # dm_control 1.0.50 reads fields of MuJoCo's structs that mujoco 4 does not have.
     if re.search(r"Mj(Model|Data)\b.* has no attribute", str(error)):
         dm_control, mujoco = map(importlib.metadata.version, ("dm-control", "mujoco"))
         return MissingDependency(
-            "a mujoco that it knows (below version 4)",
+            "a compatible mujoco (below version 4)",
             purpose=f"{name}: dm_control {dm_control} does not work with mujoco "
             f"{mujoco} ({error}) and",
             install='pip install "mujoco<4"',
@@ -112,8 +113,8 @@ def dm_control_failure(name: str, error: Exception) -> Error:
 
 
 def _ask(*arguments: str) -> dict[str, Any]:
-    """Return what a process says of itself: `names`, or the error's `kind`, `text`."""
-    # Names need no OpenGL; without a display, GLFW would complain.
+    """Return a child process's answer: `names`, or an error's `kind` and `text`."""
+    # Names need no OpenGL, and GLFW would complain without a display.
     environ = {**os.environ, "MUJOCO_GL": "disabled"}
     with Child(__name__, *arguments, environ=environ) as child:
         for answer in child.messages(_TIMEOUT_S):
@@ -123,7 +124,7 @@ def _ask(*arguments: str) -> dict[str, Any]:
 
 
 def _as_raised(answer: dict[str, Any]) -> Exception:
-    """Return an error like the one that the process met."""
+    """Return an error like the one that the child process raised."""
     text = str(answer.get("text"))
     if answer.get("kind") == ModuleNotFoundError.__name__:
         return ModuleNotFoundError(text, name=answer.get("name"))
@@ -146,10 +147,10 @@ def _names(framework: str, what: str) -> list[str]:
 
     if not what:
         return list(registration.registry)
-    # The working directory may hold it, as it may hold a policy.
-    sys.path.append(os.getcwd())  # noqa: PTH109  sys.path holds texts
+    # The module may be in the working directory, as a policy may.
+    sys.path.append(os.getcwd())  # noqa: PTH109  sys.path holds strings
     found = _ids_registered_by(what)
-    # Gymnasium itself has loaded its own before.
+    # Gymnasium has already loaded its own modules, so their entry points are compared.
     below = (f"{what}.", f"{what}:")
     return [
         env_id
@@ -159,7 +160,7 @@ def _names(framework: str, what: str) -> list[str]:
 
 
 def _ids_registered_by(module: str) -> set[str]:
-    """Import a module, and return the ids that it registers, and no other module."""
+    """Import a module, and return the ids that this module itself registers."""
     import gymnasium
     from gymnasium.envs import registration
 
@@ -169,7 +170,7 @@ def _ids_registered_by(module: str) -> set[str]:
     def noting(*args: Any, **kwargs: Any) -> None:
         before = dict(registration.registry)
         register(*args, **kwargs)
-        # A module that imports another one has not registered what that one does.
+        # Ids that are registered by modules that it imports do not count.
         if f"{_module_being_imported()}.".startswith(f"{module}."):
             after = registration.registry.items()
             registered.update(key for key, spec in after if before.get(key) is not spec)

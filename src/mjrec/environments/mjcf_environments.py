@@ -34,19 +34,20 @@ def make_mjcf(
     """Return the environment of an MJCF file; episodes end after `max_steps`.
 
     Args:
-        path: of the file.
-        options: `kwargs` must be empty: all there is to say stands in the file.
-        model: where the file was compiled already; it need not be there then.
+        path: the file.
+        options: the options; `kwargs` must be empty, because the file defines
+            everything else.
+        model: the file's compiled model, if available; then the file need not exist.
 
     Raises:
-        UnreadableFile: MuJoCo refuses the file.
+        UnreadableFile: MuJoCo rejects the file.
         UnknownName: the model has no such camera.
-        InvalidArgument: a camera number or argument that cannot be.
+        InvalidArgument: the camera's number or an argument is invalid.
     """
     if options.kwargs:
         raise InvalidArgument(
-            f"An MJCF file takes no more arguments, got {dict(options.kwargs)}: all "
-            "there is to say about the simulation stands in the file."
+            f"An MJCF file takes no more arguments, got {dict(options.kwargs)}. "
+            "The file itself defines the whole simulation."
         )
     environment = MjcfEnvironment(
         path,
@@ -59,42 +60,42 @@ def make_mjcf(
 
 
 class MjcfEnvironment(gymnasium.Env[NDArray[np.float64], NDArray[np.float64]]):
-    """Simulates an MJCF model, driven by its controls.
+    """An environment that simulates an MJCF model, driven by its controls.
 
     An observation is `[qpos, qvel, act]`, `(nq + nv + na,) float64`. An action is
-    `ctrl`, `(nu,) float64`, within the actuators' ranges; MuJoCo clamps what is
-    outside, and a model without actuators takes actions of shape `(0,)`. A step
-    advances the simulation to the next sixtieth of a second, see `MjcfSimulation`.
-    Every reset is the model's initial state, whatever the seed: nothing here is random.
-    Rewards are 0. An episode is terminated only where the simulation becomes unstable;
-    `info["unstable"]` then says why, and the last frame and observation are those
+    `ctrl`, `(nu,) float64`, within the actuators' ranges. MuJoCo clamps values outside,
+    and a model without actuators takes actions of shape `(0,)`. A step advances the
+    simulation to the next sixtieth of a second, see `MjcfSimulation`. Every reset goes
+    to the model's initial state, whatever the seed: nothing here is random. Rewards are
+    0. An episode is terminated only if the simulation becomes unstable. Then
+    `info["unstable"]` gives the reason, and the last frame and observation are those
     before it happened.
 
     `metadata["render_fps"]` is the frame rate, 60 unless the timestep is longer than
-    1/60 of a second, and `control_timestep()` is one over it. The model and its data
-    are `simulation.model` and `simulation.data`: they are not attributes of the
-    environment itself, because the time between two frames, measured by the data's
-    clock, is by up to one timestep longer or shorter than a frame lasts.
+    1/60 second, and `control_timestep()` is one over it. The model and its data are
+    `simulation.model` and `simulation.data`. They are not attributes of the environment
+    itself, because the time between two frames, measured by the data's clock, may
+    differ from the duration of a frame by up to one timestep.
 
     Args:
-        path: of the MJCF file.
+        path: the MJCF file.
         render_mode: `"rgb_array"`, or None for no frames and no OpenGL.
-        camera: a name or number; None is the camera that tracks the robot, else the
-            first, else the free one.
-        height: of the frames, in pixels.
-        width: likewise.
-        model: where the file was compiled already.
+        camera: a name or number; None for the camera that tracks the robot, or the
+            first one, or the free one.
+        height: height of the frames in pixels.
+        width: width of the frames in pixels.
+        model: the file's compiled model, if available.
 
     Raises:
-        UnreadableFile: MuJoCo refuses the file.
+        UnreadableFile: MuJoCo rejects the file.
         UnknownName: the model has no such camera.
-        InvalidArgument: a camera, size or render mode that cannot be.
+        InvalidArgument: the camera's number, the size or the render mode is invalid.
 
     Attributes:
-        path: of the MJCF file.
-        camera: that is shown.
-        height: of the frames, in pixels.
-        width: likewise.
+        path: the MJCF file.
+        camera: the camera shown.
+        height: height of the frames in pixels.
+        width: width of the frames in pixels.
     """
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 60}  # noqa: RUF012  Gymnasium's own declaration
@@ -130,13 +131,13 @@ class MjcfEnvironment(gymnasium.Env[NDArray[np.float64], NDArray[np.float64]]):
         self.action_space = gymnasium.spaces.Box(low, high, (model.nu,), np.float64)
 
     def control_timestep(self) -> float:
-        """Return the seconds of simulated time that a frame lasts."""
+        """Return the duration of a frame in simulated seconds."""
         return float(1 / self._frame_rate)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[NDArray[np.float64], dict[str, Any]]:
-        """Go to the model's initial state; `options` are not used."""
+        """Reset to the model's initial state; `options` are not used."""
         super().reset(seed=seed)
         self.simulation.reset()
         return self.simulation.state(), {}
@@ -147,14 +148,14 @@ class MjcfEnvironment(gymnasium.Env[NDArray[np.float64], NDArray[np.float64]]):
         """Simulate one frame.
 
         Raises:
-            InvalidArgument: the action has another shape, or is not finite.
+            InvalidArgument: the action has the wrong shape, or is not finite.
         """
         trouble = self.simulation.advance(self._checked(action))
         info = {} if trouble is None else {"unstable": trouble}
         return self.simulation.state(), 0.0, trouble is not None, False, info
 
     def render(self) -> Frame:
-        """Return the frame of this moment, `(height, width, 3) uint8`.
+        """Return the current frame, `(height, width, 3) uint8`.
 
         Raises:
             NoPictures: the render mode is None.
@@ -162,7 +163,7 @@ class MjcfEnvironment(gymnasium.Env[NDArray[np.float64], NDArray[np.float64]]):
         """
         if self.render_mode is None:
             raise NoPictures(
-                'Make the environment with render_mode="rgb_array" to render it.'
+                'Create the environment with render_mode="rgb_array" to render it.'
             )
         if self._renderer is None:
             self._renderer = SceneRenderer(
@@ -174,7 +175,7 @@ class MjcfEnvironment(gymnasium.Env[NDArray[np.float64], NDArray[np.float64]]):
         return self._renderer.render(self.simulation.data)
 
     def frame_facts(self) -> dict[str, Any]:
-        """Return what the metadata of a video says about the frames."""
+        """Return the facts about the frames for a video's metadata."""
         facts = {"camera": camera_label(self.simulation.model, self.camera)}
         if self._renderer is None:
             return facts
@@ -183,7 +184,7 @@ class MjcfEnvironment(gymnasium.Env[NDArray[np.float64], NDArray[np.float64]]):
     def mjrec_scenes(
         self, *, camera: Any, height: int | None, width: int | None
     ) -> Scenes:
-        """Return how its states are recorded, from which its frames always follow."""
+        """Return how its states are recorded, from which frames can be drawn."""
         simulation = self.simulation
         scene = ViewerScene(
             simulation,
@@ -208,19 +209,19 @@ class MjcfEnvironment(gymnasium.Env[NDArray[np.float64], NDArray[np.float64]]):
             environment={
                 "framework": "mjcf",
                 "id": self.spec.id if self.spec else None,
-                # All else there is to say stands in the file.
+                # The file defines everything else.
                 "kwargs": {
                     name: side
                     for name, side in (("height", self.height), ("width", self.width))
                     if side != _SIDE
                 },
             },
-            # Nothing in it is random.
+            # Nothing here is random.
             random_state=lambda: generator_state(self._np_random),
         )
 
     def close(self) -> None:
-        """Close the renderer; idempotent."""
+        """Close the renderer. Idempotent."""
         if self._renderer is not None:
             self._renderer.close()
             self._renderer = None
@@ -244,11 +245,11 @@ def _plain(rate: Fraction) -> int | float:
 
 
 def _spec(path: Path) -> EnvSpec:
-    """Return what names the environment in recordings: `mjcf/<file name>`.
+    """Return the spec that names the environment in recordings: `mjcf/<file name>`.
 
-    It is not registered: no environment is made from a name in a recording.
+    It is not registered: no environment is created from a name in a recording.
     """
-    # What Gymnasium's syntax of ids lacks.
+    # Characters that Gymnasium's ids cannot have.
     name = re.sub(r"[^\w.-]", "_", path.stem)
     return EnvSpec(
         id=f"mjcf/{name}",

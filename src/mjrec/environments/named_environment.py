@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""An environment that was asked for by its name: how it is made, and how it is run."""
+"""An environment that was requested by name: its options, and how to run it."""
 
 from __future__ import annotations
 
@@ -20,21 +20,22 @@ DEFAULT_MAX_STEPS = 1000
 
 @dataclass(frozen=True, kw_only=True)
 class EnvironmentOptions:
-    """How an environment is made.
+    """Options for creating an environment.
 
     Attributes:
-        camera: a camera's name or number; None is the model's tracking camera where
-            there is one.
-        height: of the frames, in pixels; None is the environment's own.
-        width: likewise.
-        max_steps: ends an episode as truncated. Where the environment has a limit of
-            its own, the smaller one wins; where it has none, None is 1000.
+        camera: a camera's name or number; None for the model's tracking camera, if it
+            has one.
+        height: height of the frames in pixels; None for the environment's own.
+        width: width of the frames in pixels; None for the environment's own.
+        max_steps: number of steps after which an episode ends as truncated. If the
+            environment has its own limit, the smaller one applies. If both are missing,
+            the limit is 1000.
         frames: whether the environment will be drawn.
-        seed: of the run, for what an environment draws once, when it is made.
-        kwargs: more arguments, in the form that the kind of environment takes.
+        seed: the run's seed, for anything drawn when the environment is created.
+        kwargs: more arguments, in the form that this kind of environment takes.
 
     Raises:
-        InvalidArgument: a value that cannot be.
+        InvalidArgument: a value is invalid.
     """
 
     camera: str | int | None = None
@@ -46,7 +47,7 @@ class EnvironmentOptions:
     kwargs: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        # The side that is not asked for is the environment's own, and fits.
+        # A side that is None is the environment's own, and valid.
         check_size(
             1 if self.height is None else self.height,
             1 if self.width is None else self.width,
@@ -60,7 +61,7 @@ class EnvironmentOptions:
 
     @property
     def size(self) -> dict[str, int]:
-        """The sides that are asked for, by name."""
+        """The requested `height` and `width`, leaving out those that are None."""
         sides = {"height": self.height, "width": self.width}
         return {name: side for name, side in sides.items() if side is not None}
 
@@ -68,8 +69,7 @@ class EnvironmentOptions:
         """Return the number of steps after which an episode ends.
 
         Args:
-            own: the limit that the environment has by itself; None or infinity if it
-                has none.
+            own: the environment's own limit; None or infinity if it has none.
         """
         limits = [limit for limit in (own, self.max_steps) if limit is not None]
         smallest = min(limits, default=np.inf)
@@ -77,7 +77,7 @@ class EnvironmentOptions:
 
 
 class Step(NamedTuple):
-    """What a step gave."""
+    """The result of a step."""
 
     observation: Any
     reward: float
@@ -86,30 +86,30 @@ class Step(NamedTuple):
 
 
 def is_terminated(timestep: Any) -> bool:
-    """Return whether the task itself ended the episode: LAST with a discount of 0."""
+    """Return whether the task itself ended the episode: LAST with discount 0."""
     return bool(timestep.last() and not timestep.discount)
 
 
 def is_truncated(timestep: Any) -> bool:
-    """Return whether a limit from outside ended the episode.
+    """Return whether an external limit ended the episode.
 
-    That is LAST with another discount than 0: rewards would have followed.
+    This is LAST with a nonzero discount: more rewards would have followed.
     """
     return bool(timestep.last() and timestep.discount)
 
 
 class NamedEnvironment(abc.ABC):
-    """An environment, and how its episodes are run whatever its framework.
+    """An environment of any framework, with a common way to run episodes.
 
-    `around` is the environment, or a wrapper of it such as a monitor.
+    In the methods, `around` is the environment or a wrapper of it, such as a monitor.
 
     Args:
         environment: a `gymnasium.Env` or a `dm_env.Environment`.
         env_id: its name in recordings.
-        step_limit: after how many steps its episodes end.
-        view: `camera`, `height` and `width` as far as the monitor is to be given them;
-            empty where the environment itself shows what was asked for.
-        not_drawn: why it cannot be drawn though frames were asked for.
+        step_limit: number of steps after which its episodes end.
+        view: the `camera`, `height` and `width` to pass to the monitor; empty if the
+            environment itself shows the requested view.
+        not_drawn: why it cannot be drawn although frames were requested.
     """
 
     def __init__(
@@ -129,11 +129,11 @@ class NamedEnvironment(abc.ABC):
 
     @property
     def draws_when_made(self) -> bool:
-        """Whether its model depends on the seed that it was made with."""
+        """Whether its model depends on the seed it was created with."""
         return False
 
     def begin_episode(self, around: Any, seeds: EpisodeSeeds) -> Any:
-        """Reset to an episode's seeds, and return the first observation."""
+        """Reset with an episode's seeds, and return the first observation."""
         return self.begin(around, seeds, seeds.environment)
 
     @abc.abstractmethod
@@ -142,19 +142,20 @@ class NamedEnvironment(abc.ABC):
 
         Args:
             around: the environment, or a wrapper of it.
-            seeds: of the episode; what draws its actions is seeded with them.
-            seed: of the environment's randomness from here on; None lets it go on.
+            seeds: the episode's seeds; its source of actions is seeded with them.
+            seed: the seed for the environment's randomness from now on; None to
+                continue without seeding.
         """
 
     @abc.abstractmethod
     def step(self, around: Any, action: Any) -> Step:
-        """Step, and return what that gave."""
+        """Take a step, and return its result."""
 
     @abc.abstractmethod
     def scenes(self) -> Scenes:
-        """Return what is known of its frames and its states."""
+        """Return how its states are recorded and its frames drawn."""
 
     def can_be_deferred(self) -> bool:
-        """Return whether what it shows can be drawn from its states."""
+        """Return whether its frames can be drawn from its states."""
         scenes = self.scenes()
         return scenes.states is not None and scenes.obstacle is None

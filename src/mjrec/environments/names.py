@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a person names: environments in three ways, and modules nearby."""
+"""Names that users give: of environments, in three forms, and of local modules."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class GymnasiumName:
     """An environment in Gymnasium's registry.
 
     Attributes:
-        env_id: as `gymnasium.make` takes it, also `module:Id`.
+        env_id: the id, as `gymnasium.make` takes it, including `module:Id`.
     """
 
     env_id: str
@@ -51,7 +51,7 @@ class MjcfName:
     """A model in a file.
 
     Attributes:
-        path: of the MJCF file.
+        path: the MJCF file.
     """
 
     path: Path
@@ -64,21 +64,21 @@ EnvironmentName: TypeAlias = GymnasiumName | DmControlName | MjcfName
 
 
 def parse_environment_name(text: str) -> EnvironmentName:
-    """Return what `text` names, without looking whether it can be made.
+    """Return the environment named by `text`, without checking that it can be created.
 
-    `dm_control/<domain>-<task>` is a task of the dm_control suite; a name that ends in
-    `.xml` or `.mjcf` is a file, which must be there; all else is a Gymnasium id.
+    `dm_control/<domain>-<task>` is a task of the dm_control suite. A name that ends in
+    `.xml` or `.mjcf` is a file, which must exist. Everything else is a Gymnasium id.
 
     Raises:
-        UnknownName: there is no such file.
+        UnknownName: the file does not exist.
         InvalidArgument: the name is empty, lacks its task, or is a file of another
-            kind.
+            type.
     """
     if not text.strip():
         raise InvalidArgument(
-            "An environment needs a name: a Gymnasium id (HalfCheetah-v5), "
+            "An environment's name must be a Gymnasium id (HalfCheetah-v5), "
             "dm_control/<domain>-<task> (dm_control/cheetah-run) or the path of an "
-            "MJCF file (robot.xml)."
+            "MJCF file (robot.xml). It is empty."
         )
     if text.startswith(_DM_CONTROL):
         return _dm_control_name(text)
@@ -87,17 +87,17 @@ def parse_environment_name(text: str) -> EnvironmentName:
         return _mjcf_name(path)
     if path.is_file():
         raise InvalidArgument(
-            f"{text} is a file, and an MJCF file's name ends in .xml or .mjcf."
+            f"{text} is a file, but an MJCF file's name must end in .xml or .mjcf."
         )
     return GymnasiumName(text)
 
 
 def _dm_control_name(text: str) -> DmControlName:
-    # Domains and tasks are Python names: they have underscores and no hyphens.
+    # Domains and tasks are Python names, with underscores but without hyphens.
     domain, hyphen, task = text.removeprefix(_DM_CONTROL).partition("-")
     if not (domain and hyphen and task):
         raise InvalidArgument(
-            "A dm_control environment is named dm_control/<domain>-<task>, for "
+            "A dm_control environment's name must be dm_control/<domain>-<task>, for "
             f"example dm_control/cheetah-run, got {text!r}."
         )
     return DmControlName(domain, task)
@@ -118,12 +118,12 @@ def _mjcf_name(path: Path) -> MjcfName:
 
 @contextlib.contextmanager
 def working_directory_importable() -> Iterator[None]:
-    """Let modules in the working directory be imported, before installed ones."""
+    """Make modules in the working directory importable, before installed ones."""
     directory = str(Path.cwd())
     sys.path.insert(0, directory)
     try:
         yield
     finally:
-        # What was imported may have changed the list itself.
+        # Imported code may itself have changed the list.
         with contextlib.suppress(ValueError):
             sys.path.remove(directory)

@@ -1,20 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Policies: what chooses the actions of an episode.
+"""Policies, which choose the actions of an episode.
 
 =================  ==================================================================
-`random`           each action is drawn from the environment's actions
-`zero`             each action is zero, or as near to it as the bounds allow
-`module:name`      an object with `predict` (Stable-Baselines3) or a function is the
-                   policy; a class is built with the environment and then is one of
+`random`           each action is sampled from the action space
+`zero`             each action is zero, or as close to it as the bounds allow
+`module:name`      an object with `predict` (Stable-Baselines3) or a function; a
+                   class is called with the environment to create one of these
+`module:name()`    a function that is called with the environment and returns one of
                    these
-`module:name()`    is called with the environment and returns one of these
 `model.zip`        a file: see `policy_files`
 =================  ==================================================================
 
-A policy is called with the observation, for dm_env that of the time step, and returns
-an action. If it has a `reset`, that is called with a seed at the start of each episode.
-The generators that a process shares (`random`, `numpy.random`, PyTorch's) are seeded
-with the same.
+A policy is called with the observation (with dm_env, the time step's observation) and
+returns an action. If it has a `reset`, this is called with a seed at the start of each
+episode. The global generators of the process (`random`, `numpy.random`, PyTorch's) are
+seeded with the same seed.
 """
 
 from __future__ import annotations
@@ -42,22 +42,22 @@ logger = logging.getLogger(__name__)
 
 _BUILT_IN = ("random", "zero")
 _FORMS = (
-    "Or give module:name (a class, a function or an object of yours), module:name(), "
+    "Or give module:name (a class, a function or an object), module:name(), "
     "or a file (model.zip of Stable-Baselines3, .pt of TorchScript, .onnx)."
 )
 _NONE: Final[Mapping[str, Any]] = MappingProxyType({})
 
 
 class Policy:
-    """What chooses the actions in one environment.
+    """A policy for one environment. This class implements the built-in ones.
 
     Args:
-        environment: the Gymnasium or dm_env environment that is to be acted in.
+        environment: the Gymnasium or dm_env environment to act in.
         name: `random` or `zero`.
     """
 
     def __init__(self, environment: Any, name: str) -> None:
-        # Not at the top: it loads Gymnasium.
+        # Not imported at the top, because it loads Gymnasium.
         from . import actions
 
         self._space = actions.action_space(environment)
@@ -66,37 +66,37 @@ class Policy:
         self._checked = actions.checked
 
     def reset(self, seeds: EpisodeSeeds) -> None:
-        """Prepare for an episode that has these seeds; before its first action."""
+        """Prepare for an episode with these seeds, before its first action."""
         self._space.seed(seeds.actions)
 
     def __call__(self, observation: Any) -> Any:
-        """Return the action at an observation, checked.
+        """Return the action for an observation, checked.
 
         Raises:
-            PolicyError: the policy raised, or gave something that is no action.
+            PolicyError: the policy raised an exception, or returned an invalid action.
         """
         if self._zero is None:
             return self._draw()
-        # Environments may keep, or write into, the action that they are given.
+        # Environments may keep the action that they are given, or write into it.
         return copy.deepcopy(self._zero)
 
 
 class _ForeignPolicy(Policy):
-    """Guards a policy of the user's: names what raises, checks what it gives."""
+    """A user's policy, whose exceptions name it and whose actions are checked."""
 
     def __init__(self, environment: Any, name: str, chosen: Any) -> None:
         super().__init__(environment, name)
         self._name = name
         self._reset = getattr(chosen, "reset", None)
-        # A policy of Stable-Baselines3 is a torch module too, and callable.
+        # A Stable-Baselines3 policy is also a torch module, and so callable.
         if callable(getattr(chosen, "predict", None)):
             self._choose: Callable[[Any], Any] = _Predictor(chosen)
         elif callable(chosen):
             self._choose = chosen
         else:
             raise PolicyError(
-                f"The policy {name} gives {chosen!r}, which neither can be called nor "
-                "has predict()."
+                f"The policy {name} is {chosen!r}, which is neither callable nor has "
+                "predict()."
             )
 
     def reset(self, seeds: EpisodeSeeds) -> None:
@@ -113,17 +113,17 @@ class _ForeignPolicy(Policy):
 
 
 class _Predictor:
-    """Calls `predict` as Stable-Baselines3 defines it, for one environment.
+    """A function that calls a Stable-Baselines3 `predict`, for one environment.
 
-    Recurrent policies get back the state that they returned, and learn which
-    observation is the first of its episode; an argument that a `predict` does not take
-    is left out.
+    Recurrent policies receive the state that they returned last, and whether the
+    observation is the first of its episode. Arguments that a `predict` does not accept
+    are left out.
     """
 
     def __init__(self, predictor: Any) -> None:
         self._predict = predictor.predict
         parameters = inspect.signature(self._predict).parameters
-        # The first one is the observation, whatever it is called: `state`, for example.
+        # The first parameter is the observation, whatever its name, even `state`.
         self._taken = set(list(parameters)[1:])
         if any(p.kind is p.VAR_KEYWORD for p in parameters.values()):
             self._taken = {"state", "episode_start", "deterministic"}
@@ -151,22 +151,22 @@ class _Predictor:
 def load_policy(
     text: str, environment: Any, kwargs: Mapping[str, Any] = _NONE
 ) -> Policy:
-    """Return the policy that `text` names; the module says what it may name.
+    """Return the policy that `text` names; the module docstring lists the forms.
 
     The working directory is importable while this runs. A policy that imports more
-    from there later on needs `working_directory_importable` around its use.
+    modules from there later must be used inside `working_directory_importable`.
 
     Args:
         text: `random`, `zero`, `module:name`, `module:name()` or a file.
-        environment: the Gymnasium or dm_env environment that is to be acted in.
-        kwargs: more arguments for what is built or called, or for reading the file.
+        environment: the Gymnasium or dm_env environment to act in.
+        kwargs: more arguments for calling a class or function, or for reading a file.
 
     Raises:
-        UnknownName: there is no such policy, module, name in it, or file.
-        InvalidArgument: `kwargs` for what takes none.
-        PolicyError: importing, reading or building it raised, which is kept as the
-            cause, or what it names is no policy.
-        MissingDependency: what reads such a file is not installed.
+        UnknownName: the policy, the module, the name in it or the file does not exist.
+        InvalidArgument: `kwargs` is given, but this kind of policy takes no arguments.
+        PolicyError: importing, reading or building the policy raised an exception,
+            which is kept as the cause, or the result is not a policy.
+        MissingDependency: the package that reads such a file is not installed.
     """
     if text in _BUILT_IN:
         _check_no_arguments(text, kwargs)
@@ -186,19 +186,19 @@ def policy_from(
     environment: Any,
     kwargs: Mapping[str, Any] = _NONE,
 ) -> Policy:
-    """Return the policy that an object is, as `load_policy` treats `module:name`.
+    """Return a policy made from an object, as `load_policy` does for `module:name`.
 
     Args:
-        chosen: an object with `predict`, a function, or a class, which is built with
-            the environment and then is one of these.
-        name: what messages call it. Where it ends in `()`, `chosen` is called too.
-        environment: the Gymnasium or dm_env environment that is to be acted in.
-        kwargs: more arguments for a class.
+        chosen: an object with `predict`, a function, or a class, which is called with
+            the environment to create one of these.
+        name: the policy's name in messages. If it ends in `()`, `chosen` is called too.
+        environment: the Gymnasium or dm_env environment to act in.
+        kwargs: more arguments for calling `chosen`.
 
     Raises:
-        InvalidArgument: `kwargs` for what is not built.
-        PolicyError: building it raised, which is kept as the cause, or it is no
-            policy.
+        InvalidArgument: `kwargs` is given, but `chosen` is not called.
+        PolicyError: building the policy raised an exception, which is kept as the
+            cause, or the result is not a policy.
     """
     if inspect.isclass(chosen) or name.endswith("()"):
         with _failures_named(f"Building the policy {name} with the environment"):
@@ -209,13 +209,13 @@ def policy_from(
 
 
 def policy_file(text: str) -> Path | None:
-    """Return the file that a policy, which is loaded, comes from.
+    """Return the file that a loaded policy comes from.
 
     Args:
-        text: as given to `load_policy`.
+        text: the name that was passed to `load_policy`.
 
     Returns:
-        None for the built-in ones, and for modules that are in no file.
+        The file; None for built-in policies and for modules without a file.
     """
     if ":" not in text:
         return file_of_policy(text)
@@ -227,21 +227,21 @@ def policy_file(text: str) -> Path | None:
 def _check_no_arguments(name: str, kwargs: Mapping[str, Any]) -> None:
     if kwargs:
         raise InvalidArgument(
-            f"The policy {name} takes no arguments, got {dict(kwargs)}: a class, a "
-            "module:name() and a file take some."
+            f"The policy {name} takes no arguments, got {dict(kwargs)}. Only a class, "
+            "module:name() and a file take arguments."
         )
 
 
 def _found(text: str) -> tuple[Any, str]:
-    """Return the object that `text` names, and the text."""
+    """Return the object that `text` names, and `text`."""
     module_name, colon, name = text.partition(":")
     if not (module_name and colon and name.removesuffix("()")):
         raise UnknownName("policy", text, _BUILT_IN, hint=_FORMS)
     found = _find(_import(module_name, text), name.removesuffix("()"))
     if name.endswith("()") and not callable(found):
         raise PolicyError(
-            f"The policy {text} is to be called, and {name[:-2]} is {found!r}, which "
-            f"cannot be. Leave the parentheses away: {text[:-2]}."
+            f"The policy {text} must be callable, but {name[:-2]} is {found!r}. "
+            f"Remove the parentheses: {text[:-2]}."
         )
     return found, text
 
@@ -251,7 +251,7 @@ def _import(module_name: str, text: str) -> ModuleType:
         try:
             return importlib.import_module(module_name)
         except ModuleNotFoundError as error:
-            # What it imports itself may be missing, too.
+            # A module that it imports itself may be missing, too.
             if not f"{module_name}.".startswith(f"{error.name}."):
                 raise
             raise UnknownName(
@@ -260,7 +260,7 @@ def _import(module_name: str, text: str) -> ModuleType:
                 sorted(
                     p.stem for p in Path.cwd().glob("*.py") if p.stem.isidentifier()
                 ),
-                hint=f"Looked in {Path.cwd()} and among what is installed.",
+                hint=f"Looked in {Path.cwd()} and in the installed packages.",
             ) from error
 
 
@@ -274,27 +274,27 @@ def _find(module: ModuleType, name: str) -> Any:
 
 
 def _offered(module: ModuleType) -> list[str]:
-    """Return the names of what a module has that could be a policy."""
+    """Return the names of a module's objects that could be policies."""
     return sorted(
         name
         for name, value in vars(module).items()
         if not name.startswith("_")
         and (callable(value) or hasattr(value, "predict"))
-        # Not what it imported itself; an object of a foreign class is its own.
+        # Leave out what it imported itself. Instances of imported classes are its own.
         and getattr(value, "__module__", module.__name__) == module.__name__
     )
 
 
 @contextlib.contextmanager
 def _failures_named(*what: str) -> Iterator[None]:
-    """Turn what third-party code raises into one error of ours, with its place."""
+    """Turn exceptions in third-party code into a PolicyError with their place."""
     try:
         yield
     except Error:
         raise
     except Exception as error:
         text = f"{''.join(what)} raised {type(error).__name__}: {error}"
-        # A syntax error says itself where it is.
+        # A syntax error's message includes its place.
         if not isinstance(error, SyntaxError):
             place = traceback.extract_tb(error.__traceback__)[-1]
             text += f" ({place.filename}, line {place.lineno})"
@@ -306,7 +306,7 @@ _logged: set[tuple[object, ...]] = set()
 
 
 def _log_traceback(error: BaseException, *where: object) -> None:
-    """Log where third-party code raised, once for each place."""
+    """Log the traceback of an exception in third-party code, once for each place."""
     if (type(error), *where) not in _logged:
         _logged.add((type(error), *where))
         own = error.__traceback__

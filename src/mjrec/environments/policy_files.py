@@ -2,18 +2,17 @@
 """Policies in files.
 
 =================  ==================================================================
-`.zip`             what `model.save()` of Stable-Baselines3 wrote. It acts as
-                   `predict` does: without noise, within the bounds of its actions, a
-                   recurrent one with its state
-`.pt` `.pth`       TorchScript, of `torch.jit.save`: gets a float32 tensor of the shape
-`.torchscript`     (1, n), and the first row of what it returns is the action
-`.pt2`             likewise, of `torch.export.save`
-`.onnx`            likewise, run by onnxruntime on the CPU
+`.zip`             written by `model.save()` of Stable-Baselines3. It acts as with
+                   `predict`: without noise, within the bounds of its actions, and
+                   with its state if it is recurrent
+`.pt` `.pth`       TorchScript, written by `torch.jit.save`: takes a float32 tensor of
+`.torchscript`     shape (1, n); the first row of its output is the action
+`.pt2`             the same, written by `torch.export.save`
+`.onnx`            the same, run by onnxruntime on the CPU
 =================  ==================================================================
 
-An observation of several parts is put end to end where the file takes one array.
-Reading a model.zip, or TorchScript, runs what is in it: they are for files that you
-trust.
+An observation with several parts is concatenated if the file takes a single array.
+Reading a model.zip or TorchScript runs code in it, so read only files that you trust.
 """
 
 from __future__ import annotations
@@ -30,10 +29,10 @@ from ..errors import MissingDependency, PolicyError, UnknownName
 
 
 def file_of_policy(text: str) -> Path | None:
-    """Return the file that a policy's name is; None for a name of another kind.
+    """Return the file that a policy's name refers to; None if it is not a file name.
 
     Raises:
-        UnknownName: it is that of a file, and there is none.
+        UnknownName: the name is a file name, but the file does not exist.
     """
     path = Path(text).expanduser()
     if path.suffix not in _READERS:
@@ -41,7 +40,7 @@ def file_of_policy(text: str) -> Path | None:
     if not path.is_file():
         folder = path.parent
         raise UnknownName(
-            "file with a policy",
+            "policy file",
             text,
             sorted(str(p) for p in folder.glob("*") if p.suffix in _READERS),
             hint=f"Looked in {folder.absolute()}.",
@@ -50,22 +49,22 @@ def file_of_policy(text: str) -> Path | None:
 
 
 def policy_in_file(path: Path, environment: Any, **kwargs: Any) -> Any:
-    """Return the policy that a file holds: a function, or something with `predict`.
+    """Return the policy in a file: a function, or an object with `predict`.
 
     Args:
-        path: as `file_of_policy` gave it.
-        environment: that is to be acted in.
-        **kwargs: `device`, of a model.zip or TorchScript: `"cpu"` if not given.
+        path: the file, see `file_of_policy`.
+        environment: the environment to act in.
+        **kwargs: `device`, for a model.zip or TorchScript; `"cpu"` by default.
 
     Raises:
-        MissingDependency: what reads such a file is not installed.
-        PolicyError: it holds something else.
+        MissingDependency: the package that reads such a file is not installed.
+        PolicyError: the file holds something else.
     """
     return _READERS[path.suffix](path, environment, **kwargs)
 
 
 class _Model:
-    """A policy of Stable-Baselines3, as the part of an algorithm that acts."""
+    """A Stable-Baselines3 policy: the part of an algorithm that acts."""
 
     def __init__(self, policy: Any) -> None:
         self._policy = policy
@@ -73,7 +72,7 @@ class _Model:
     def predict(
         self, observation: Any, state: Any, episode_start: Any, deterministic: bool
     ) -> Any:
-        """Return the action, and the state that comes next."""
+        """Return the action and the next state."""
         space = self._policy.observation_space
         given: Any
         if hasattr(space, "spaces"):
@@ -88,14 +87,14 @@ class _Model:
 
 def _stable_baselines3(path: Path, _environment: Any, *, device: str = "cpu") -> _Model:
     saving = _library("stable_baselines3.common.save_util", path)
-    # What only learning uses may be functions that another Python has pickled.
+    # Arguments that only learning uses may be functions pickled by another Python.
     of_learning = {"learning_rate": 0.0, "lr_schedule": None, "clip_range": None}
     data, weights, _ = saving.load_from_zip_file(
         path, device=device, custom_objects=of_learning
     )
     if not data or "policy_class" not in data:
         raise PolicyError(
-            f"The policy {path} is no model of Stable-Baselines3: write one with "
+            f"The policy {path} is not a model of Stable-Baselines3. Write one with "
             "model.save()."
         )
     arguments = {k: v for k, v in data["policy_kwargs"].items() if k != "device"}
@@ -120,9 +119,9 @@ def _torch(
             module = torch.jit.load(path, map_location=device).eval()
     except RuntimeError as error:
         raise PolicyError(
-            f"The policy {path} holds no network: write it with torch.jit.trace("
-            "network, observation).save(path), or torch.export.save. Weights alone do "
-            "not say which network they are of."
+            f"The policy {path} does not hold a network. Write it with torch.jit.trace("
+            "network, observation).save(path), or torch.export.save: weights alone do "
+            "not define a network."
         ) from error
 
     def outputs(row: NDArray[np.float32]) -> Any:
@@ -144,8 +143,8 @@ def _onnx(path: Path, environment: Any) -> Callable[[Any], Any]:
 def _network(
     outputs: Callable[[NDArray[np.float32]], Any], environment: Any
 ) -> Callable[[Any], Any]:
-    """Return what acts as a network says whose outputs have a row for each input."""
-    # Not at the top: it loads Gymnasium.
+    """Return a policy that acts with a network, which maps rows to rows."""
+    # Not imported at the top, because it loads Gymnasium.
     from .actions import action_space
 
     space: Any = action_space(environment)
@@ -159,7 +158,7 @@ def _network(
 
 
 def _row(observation: Any) -> NDArray[np.float32]:
-    """Return the numbers of an observation, end to end."""
+    """Return the numbers of an observation, concatenated."""
     parts = observation.values() if isinstance(observation, Mapping) else [observation]
     return np.concatenate([np.ravel(part) for part in parts]).astype(np.float32)
 

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From what a recording says of its environment to that environment, or to a refusal.
+"""Recreating the environment of a recording, or refusing to.
 
-A recording may come from anybody, and making an environment runs its code. So nothing
-that a recording names is imported: an environment is made only where its id stands in
-the installed registry already, as one of Gymnasium's own, of Gymnasium-Robotics or of
-dm_control's suite, with arguments that are plain values within bounds and name no file.
-Wrappers are Gymnasium's own, with such arguments. The reader may trust further ids, one
-by one.
+A recording may come from a stranger, and creating an environment runs its code. So
+nothing that a recording names is imported. An environment is created only if its id is
+already in the installed registry, as one of Gymnasium's own, of Gymnasium-Robotics or
+of dm_control's suite. Its arguments must be plain values within bounds and name no
+files. Wrappers must be Gymnasium's own, with such arguments. The reader may trust more
+ids, one by one.
 """
 
 from __future__ import annotations
@@ -35,24 +35,24 @@ from .scenes import (
 )
 from .stand_ins import StandIn, stand_ins
 
-# Where the registry's entry points of what is trusted without asking lie.
+# Packages of the registry's entry points that are trusted by default.
 _TRUSTED = (
     *("gymnasium.envs.mujoco", "gymnasium.envs.classic_control"),
     *("gymnasium.envs.toy_text", "gymnasium_robotics"),
 )
 _ROBOTICS = "gymnasium_robotics"
 
-# gymnasium.make's own arguments, which are no environment's.
+# Arguments of gymnasium.make itself, not of an environment.
 _MAKE = frozenset(("id", "vector_kwargs", "disable_env_checker", "max_episode_steps"))
 
-# A word: no path, no name of a file, nothing with an extension.
+# A plain word: not a path or a file name, nothing with an extension.
 _WORD = re.compile(r"[A-Za-z0-9_ -]{0,64}", re.ASCII)
 _FILES = re.compile(r"(xml|model|mesh|asset|file|path|texture)", re.IGNORECASE)
 _RENDER_MODES = (None, "rgb_array", "rgb_array_list", "ansi", "depth_array")
 _MOST_VALUES = 10_000
 _LARGEST = 1e9
-# Of a count of anything that takes memory or time: frames, frames skipped, stacks.
-# A suite task's `random` is a seed.
+# Limit of a number that takes memory or time: frames, skipped frames, stacks. It does
+# not apply to a suite task's `random`, which is a seed.
 _LARGEST_COUNT = 10_000
 
 _SUITE_NAME = re.compile(r"dm_control/(\w{1,50})-(\w{1,50})")
@@ -60,13 +60,13 @@ _SUITE_ARGUMENTS = ("task_kwargs", "environment_kwargs", "visualize_reward")
 
 
 class NotRecreated(Exception):
-    """An environment is not made again.
+    """An environment cannot be recreated.
 
-    Its text is a clause that says why, and what to do.
+    The message is a clause that gives the reason and a remedy.
 
     Args:
         reason: the clause.
-        excuse: "environment", or "wrappers": what the reader does not have.
+        excuse: "environment" or "wrappers": the part that the reader does not have.
     """
 
     def __init__(self, reason: str, *, excuse: str = "environment") -> None:
@@ -76,12 +76,12 @@ class NotRecreated(Exception):
 
 @dataclass(frozen=True, kw_only=True)
 class Recreated:
-    """An environment that was made again.
+    """A recreated environment.
 
     Attributes:
         environment: a `gymnasium.Env` or a `dm_env.Environment`.
-        is_dm_env: it is the latter.
-        stand_in: takes recorded steps, where wrappers are not here; None else.
+        is_dm_env: whether it is a `dm_env.Environment`.
+        stand_in: replays recorded steps if wrappers are not available; otherwise None.
     """
 
     environment: Any
@@ -89,16 +89,16 @@ class Recreated:
     stand_in: StandIn | None = None
 
     def random_state(self) -> Any:
-        """Return the state of its random generators now, as a recording has it."""
+        """Return the current state of its random generators, as in recordings."""
         if self.is_dm_env:
             return generator_state(self._dm_generator())
         return random_state(self.environment.unwrapped)
 
     def set_random_state(self, state: Any) -> None:
-        """Put its random generators into a recorded state.
+        """Set the state of its random generators to a recorded one.
 
         Raises:
-            NotRecreated: it is no state of theirs.
+            NotRecreated: the state does not fit the generators.
         """
         try:
             if self.is_dm_env:
@@ -111,26 +111,27 @@ class Recreated:
                     set_generator_state(holder.np_random, parts[part])
         except Exception as error:
             raise NotRecreated(
-                f"its random state is none of the environment's: {error!s:.100}"
+                f"its random state does not fit the environment: {error!s:.100}"
             ) from error
 
     def seed(self, seed: int) -> None:
-        """Seed dm_control's generator; Gymnasium's is seeded by the reset."""
+        """Seed dm_control's generator; for Gymnasium, `reset` does this."""
         self._dm_generator().seed(seed)
 
     def warnings(self) -> dict[str, int]:
-        """Return how often MuJoCo has warned since its data was reset."""
+        """Return the number of MuJoCo's warnings since its data was reset, by kind."""
         simulated = simulation_below(self.environment)
         if simulated is None:
             return {}
-        from ..simulation.warnings import warning_counts  # It loads MuJoCo.
+        from ..simulation.warnings import warning_counts  # This loads MuJoCo.
 
         return warning_counts(simulated)
 
     def seed_behind(self, state: Any) -> int | None:
-        """Return the seed that a generator was just made with; None for none.
+        """Return the seed that a generator has just been created with, or None.
 
-        Of dm_control's: NumPy's legacy generator has its seed as its first word.
+        Only for dm_control: NumPy's legacy generator starts with its seed as the first
+        word.
         """
         key = state.get("state", {}).get("key") if isinstance(state, Mapping) else None
         if not self.is_dm_env or not isinstance(key, list) or not key:
@@ -142,23 +143,23 @@ class Recreated:
         return seed if fresh == state else None
 
     def enter(self, state: NDArray[Any], observation: Any) -> Any:
-        """Put Gymnasium's simulation into a recorded state; return its observation.
+        """Set Gymnasium's simulation to a recorded state; return its observation.
 
         Args:
             state: a row of a trajectory's states.
-            observation: that it gave before.
+            observation: the observation to return if a new one cannot be computed.
         """
         self.put_into(state)
         observe = getattr(self.environment.unwrapped, "_get_obs", None)
         return observation if observe is None else observe()
 
     def put_into(self, state: NDArray[Any]) -> None:
-        """Put the simulation into a recorded state, unless it is not known.
+        """Set the simulation to a recorded state, unless the state is unknown.
 
         Args:
-            state: a row of a trajectory's states.
+            state: a row of a trajectory's states; NaN if unknown.
         """
-        from ..simulation.states import enter_state  # It loads MuJoCo.
+        from ..simulation.states import enter_state  # This loads MuJoCo.
 
         simulated = simulation_below(self.environment)
         row = state.view(np.float64).reshape(-1)
@@ -167,8 +168,8 @@ class Recreated:
             enter_state(simulated.model, simulated.data, parts, row)
 
     def turns_by_rk4(self) -> bool:
-        """Return whether MuJoCo 4 steps its model unlike MuJoCo 3, on purpose."""
-        from ..simulation.states import turns_by_rk4  # It loads MuJoCo.
+        """Return whether MuJoCo 4 deliberately steps its model unlike MuJoCo 3."""
+        from ..simulation.states import turns_by_rk4  # This loads MuJoCo.
 
         simulated = simulation_below(self.environment)
         return simulated is not None and turns_by_rk4(simulated.model)
@@ -189,15 +190,15 @@ def recreate(
     """Return the environment of a recording.
 
     Args:
-        recorded: `framework`, `id`, `kwargs`, `wrappers` and so on, of the journal.
-        own_camera: that the environment showed by itself, where that was set after it
-            was made.
-        trust: further ids that the reader has named, `Id` or `module:Id`. The module
-            is the reader's word, never the recording's.
-        mjcf: the author's MJCF file and its model, of an environment made from one.
+        recorded: `framework`, `id`, `kwargs`, `wrappers` and so on, from the journal.
+        own_camera: the camera that the environment itself showed, if it was set after
+            creation.
+        trust: more ids that the reader trusts, `Id` or `module:Id`. The module must
+            come from the reader, never from the recording.
+        mjcf: the author's MJCF file and its model, for an environment made from one.
 
     Raises:
-        NotRecreated: the rule of trust forbids it, or it cannot be made here.
+        NotRecreated: the environment is not trusted, or cannot be created here.
     """
     env_id, kwargs = recorded.get("id"), recorded.get("kwargs")
     limit = recorded.get("max_episode_steps")
@@ -205,10 +206,10 @@ def recreate(
         limit is None or (type(limit) is int and 0 < limit <= _LARGEST)
     ):
         raise NotRecreated(
-            f"what it says of its environment cannot be: {recorded!r:.200}"
+            f"its description of the environment is invalid: {recorded!r:.200}"
         )
     if not isinstance(kwargs, Mapping | None):
-        raise NotRecreated(f"its arguments cannot be {kwargs!r:.100}")
+        raise NotRecreated(f"its arguments are invalid: {kwargs!r:.100}")
     match recorded.get("framework"):
         case "gymnasium":
             env = _gymnasium(env_id, kwargs, limit, trust)
@@ -219,7 +220,7 @@ def recreate(
         case "mjcf" if mjcf is not None:
             env = _mjcf(*mjcf, kwargs or {}, limit)
         case _:
-            raise NotRecreated("what its model was made from is not in the archive")
+            raise NotRecreated("its model's sources are not in the archive")
     with _failures(env_id):
         if own_camera is not None:
             set_own_camera(env, own_camera)
@@ -227,16 +228,16 @@ def recreate(
 
 
 def checked_options(options: Any) -> dict[str, Any] | None:
-    """Return the options of a reset, which are plain values.
+    """Return the options of a reset, if they are plain values.
 
     Raises:
-        NotRecreated: they are more than that.
+        NotRecreated: the options are not plain values.
     """
     if options is None:
         return None
     if not isinstance(options, Mapping) or not _are_plain(options):
         raise NotRecreated(
-            f"the options of a reset ({options!r:.100}) are more than plain values"
+            f"the options of a reset ({options!r:.100}) are not plain values"
         )
     return dict(options)
 
@@ -251,26 +252,26 @@ def _gymnasium(
     entry_point = _entry_point(env_id)
     if trusted is None and not any(_is_below(entry_point, each) for each in _TRUSTED):
         raise NotRecreated(
-            f"would run code from the archive: {env_id!r:.100} is none of the "
+            f"it would run code from the archive: {env_id!r:.100} is not one of the "
             "environments of Gymnasium, Gymnasium-Robotics or dm_control that are "
-            f"installed here. If you trust it: --trust {env_id:.100}"
+            f"installed here. If you trust it, use --trust {env_id:.100}"
         )
     if kwargs is None:
         raise NotRecreated(
-            "it was made with arguments that a recording cannot hold, and so cannot "
-            "be made again"
+            "it was created with arguments that a recording cannot hold, so it cannot "
+            "be recreated"
         )
     for name, value in kwargs.items():
         is_shown = name != "render_mode" or value in _RENDER_MODES
         if name in _MAKE or not is_shown or not _is_plain_item(name, value):
             raise NotRecreated(
-                f"its argument {name!r:.80} ({value!r:.80}) is more than a plain "
+                f"its argument {name!r:.80} ({value!r:.80}) is not a plain "
                 "value within bounds, or names a file"
             )
     with _failures(env_id):
         return gymnasium.make(
             trusted or env_id,
-            # gymnasium.make's word for no limit.
+            # gymnasium.make's value for no limit.
             max_episode_steps=-1 if limit is None else limit,
             disable_env_checker=True,
             **kwargs,
@@ -278,7 +279,7 @@ def _gymnasium(
 
 
 def _wrapped(env: gymnasium.Env[Any, Any], recorded: Mapping[str, Any]) -> Recreated:
-    """Return an environment in the wrappers of a recording, or in stand-ins."""
+    """Return an environment inside a recording's wrappers, or inside stand-ins."""
     names = [str(name) for name in recorded.get("wrappers") or ()]
     arguments = recorded.get("wrapper_arguments") or [None] * len(names)
     if len(arguments) != len(names):
@@ -296,7 +297,7 @@ def _wrapped(env: gymnasium.Env[Any, Any], recorded: Mapping[str, Any]) -> Recre
 
 
 def _known_wrapper(name: str, given: Any) -> Callable[..., Any] | None:
-    """Return Gymnasium's own wrapper of a name, if its arguments are plain."""
+    """Return Gymnasium's wrapper with this name, if its arguments are plain."""
     kind = getattr(gymnasium.wrappers, name.rpartition(".")[2], None)
     if not isinstance(kind, type) or class_name(kind) != name:
         return None
@@ -306,7 +307,7 @@ def _known_wrapper(name: str, given: Any) -> Callable[..., Any] | None:
 
 def _wrappers_refused(names: Any) -> NotRecreated:
     return NotRecreated(
-        "wrappers stood between the monitor and the environment that are none of "
+        "there were wrappers between the monitor and the environment that are not "
         f"Gymnasium's own with plain arguments: {', '.join(map(str, names)):.300}; put "
         "Monitor around the environment itself, and wrappers around the monitor",
         excuse="wrappers",
@@ -316,7 +317,7 @@ def _wrappers_refused(names: Any) -> NotRecreated:
 def _mjcf(
     path: Path, model: Any, kwargs: Mapping[str, Any], limit: int | None
 ) -> gymnasium.Env[Any, Any]:
-    # It loads MuJoCo.
+    # Not imported at the top, because it loads MuJoCo.
     from .mjcf_environments import MjcfEnvironment
 
     with _failures(path.stem):
@@ -331,14 +332,14 @@ def _dm_control(
     name = _suite_name(env_id)
     if name is None:
         raise NotRecreated(
-            f"{env_id!r:.100} is no task of the installed dm_control's suite, or "
-            'that does not work here: pip install "mjrec[dm-control]"'
+            f"{env_id!r:.100} is not a task of the installed dm_control suite, or "
+            'dm_control does not work here: pip install "mjrec[dm-control]"'
         )
     for key, value in (kwargs or {}).items():
         parts = value if isinstance(value, Mapping) else {key: value}
         if key not in _SUITE_ARGUMENTS or not _are_plain(parts):
             raise NotRecreated(
-                f"its argument {key!r:.80} ({value!r:.80}) is more than plain values "
+                f"its argument {key!r:.80} ({value!r:.80}) is not a plain value "
                 "within bounds"
             )
     from .dm_control_environments import load_task
@@ -347,8 +348,8 @@ def _dm_control(
         task_kwargs = (kwargs or {}).get("task_kwargs") or {}
         if name.domain == "lqr" and "random" not in task_kwargs:
             raise NotRecreated(
-                f"{name} draws its model at random when it is made, and from which "
-                "seed is not recorded"
+                f"{name} chooses its model at random when it is created, and the seed "
+                "for this is not recorded"
             )
         env = load_task(name, kwargs, limit=limit)
         return Recreated(environment=env, is_dm_env=True)
@@ -385,10 +386,10 @@ def _is_plain(value: Any, left: list[int]) -> bool:
 
 
 def _entry_point(env_id: str) -> Any:
-    """Return where the installed registry says that an id's environment is defined."""
+    """Return the entry point of an id in the installed registry, or None."""
     spec = registration.registry.get(env_id)
     if spec is None and importlib.util.find_spec(_ROBOTICS) is not None:
-        # It registers its environments when it is imported; its name is ours.
+        # It registers its environments on import; this name comes from us.
         with contextlib.suppress(Exception):
             importlib.import_module(_ROBOTICS)
         spec = registration.registry.get(env_id)
@@ -401,8 +402,8 @@ def _is_below(entry_point: Any, package: str) -> bool:
 
 
 def _suite_name(env_id: str) -> DmControlName | None:
-    """Return the name of a task that the installed suite has; None for another."""
-    # Where dm_control does not work none of its names is one that is installed.
+    """Return the name of a task in the installed suite; None if it has no such task."""
+    # If dm_control does not work, none of its tasks counts as installed.
     with contextlib.suppress(Exception):
         from .dm_control_environments import tasks_of
 
@@ -414,7 +415,7 @@ def _suite_name(env_id: str) -> DmControlName | None:
 
 @contextlib.contextmanager
 def _failures(what: str) -> Iterator[None]:
-    """Turn whatever an environment's own code raises into a reason."""
+    """Turn any exception in an environment's own code into a reason."""
     try:
         yield
     except NotRecreated:

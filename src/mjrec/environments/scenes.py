@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a monitor needs to know of an environment to record its states and frames."""
+"""Facts about an environment that a monitor needs to record its states and frames."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from ..simulation.find_simulation import simulation_in
 if TYPE_CHECKING:
     from ..simulation.capture import Capture
 
-# How an environment is shown, on which no state and no reward depends.
+# Arguments that affect only how an environment is shown, not its states or rewards.
 VIEW_ARGUMENTS: Final = frozenset(
     (
         *("render_mode", "camera_name", "camera_id", "default_camera_config"),
@@ -29,18 +29,19 @@ _MOST_CHARACTERS = 400
 
 @dataclass(frozen=True, kw_only=True)
 class Scenes:
-    """How an environment's states are recorded, and whether frames follow from them.
+    """The recording of an environment's states, and whether they determine its frames.
 
     Attributes:
-        states: takes them down; None where no MuJoCo simulation can be seen.
-        obstacle: why what the environment shows cannot be drawn from its states, as a
-            clause that names the class that overrides; None where nothing but a lack
-            of states is in the way.
-        environment: what it takes to make the environment again: `framework`
-            (`"gymnasium"`, `"dm_control"` or `"mjcf"`), `id` and `kwargs` (None where
-            they are unknown, or more than JSON can hold); None where it has no name.
-        random_state: returns the state of the environment's random generators now, as
-            JSON can hold it; None where there is none yet. It makes none.
+        states: captures the states; None if no MuJoCo simulation was found.
+        obstacle: why frames of the environment cannot be drawn from its states, as a
+            clause that names the overriding class; None if there is no reason apart
+            from missing states.
+        environment: the facts needed to recreate the environment: `framework`
+            (`"gymnasium"`, `"dm_control"` or `"mjcf"`), `id` and `kwargs` (None if they
+            are unknown, or JSON cannot represent them); None if it has no name.
+        random_state: returns the current state of the environment's random generators,
+            as JSON-compatible values; None if there is no generator yet. It does not
+            create one.
     """
 
     states: Capture | None = None
@@ -50,10 +51,10 @@ class Scenes:
 
 
 class NoFrameSource:
-    """Stands for the frames of an environment that cannot be drawn live.
+    """The missing frames of an environment that cannot be drawn live.
 
     Args:
-        missing: what the environment lacks, and what to do about it.
+        missing: what the environment lacks, and a remedy.
     """
 
     render_mode = None
@@ -62,40 +63,41 @@ class NoFrameSource:
         self.missing = missing
 
     def render(self) -> None:
-        """Return None: there is no frame."""
+        """Return None, because there is no frame."""
 
     def facts(self) -> dict[str, Any]:
-        """Return nothing: there is no video."""
+        """Return an empty dict, because there is no video."""
         return {}
 
 
 def simulation_below(env: Any) -> Any:
-    """Return what has the MuJoCo model and data of an environment; None for nothing.
+    """Return the object with an environment's MuJoCo model and data, or None.
 
-    An environment of ours keeps them in an object of its own.
+    Our own environments keep them in a separate object.
     """
     base = getattr(env, "unwrapped", env)
     return simulation_in(base) or simulation_in(getattr(base, "simulation", None))
 
 
 def new_warnings(before: Mapping[str, int], after: Mapping[str, int]) -> dict[str, int]:
-    """Return which of MuJoCo's warnings have come, of two `warning_counts`."""
-    # An unstable simulation may be set back, and its counts with it.
+    """Return MuJoCo's new warnings by kind, given `warning_counts` before and after."""
+    # MuJoCo may reset an unstable simulation, and the counts with it.
     counts = {name: n - before.get(name, 0) for name, n in after.items()}
     counts = {name: n if n >= 0 else after[name] for name, n in counts.items()}
     return {name: n for name, n in counts.items() if n}
 
 
 def is_defined_by(function: object, module: str, qualified_name: str) -> bool:
-    """Return whether a function is the one that a module's own source defines.
+    """Return whether a function is the one defined in a module's own source.
 
-    What was put in its place (a function of that name from elsewhere, also under a
-    decorator that copies names) is not.
+    A replacement is not, even if it has the same name, or a decorator copied the name.
 
     Args:
-        function: a function, or anything.
-        module: its full name. It is not imported: what is in use is loaded.
-        qualified_name: of the function in it, for example `Wrapper.render`.
+        function: a function, or any other object.
+        module: the module's full name. It is not imported: if it is in use, it is
+            loaded.
+        qualified_name: the function's qualified name in the module, for example
+            `Wrapper.render`.
     """
     loaded = sys.modules.get(module)
     code = getattr(function, "__code__", None)
@@ -107,17 +109,17 @@ def is_defined_by(function: object, module: str, qualified_name: str) -> bool:
 
 
 def has_own_method(instance: Any, name: str) -> bool:
-    """Return whether an object has a method itself that its class has otherwise.
+    """Return whether an object has its own method in place of its class's.
 
-    Asks not for `__dict__`: an object that was asked for it once finds each of its
-    attributes several times as slowly ever after (CPython 3.11 and 3.12), which adds
-    2 % to the instructions of a HalfCheetah step.
+    This does not use `__dict__`: in CPython 3.11 and 3.12, reading it once makes every
+    later access to the object's attributes several times slower. This adds 2 % to the
+    instructions of a HalfCheetah step.
     """
     own = getattr(instance, name, None)
     of_class = getattr(instance.__class__, name, None)
     if own is of_class:
         return False
-    # What a weak reference stands for is not to be had from it.
+    # A weak proxy does not give access to the object itself.
     is_stand_in = type(instance) in weakref.ProxyTypes
     is_bound = is_stand_in or getattr(own, "__self__", None) is instance
     function = getattr(own, "__func__", None)
@@ -125,7 +127,7 @@ def has_own_method(instance: Any, name: str) -> bool:
 
 
 def overriding_class(kind: type, name: str) -> str:
-    """Return the full name of the class that gives `kind` its method `name`."""
+    """Return the full name of the class that defines the method `name` of `kind`."""
     return class_name(next((k for k in kind.__mro__ if name in vars(k)), kind))
 
 
@@ -135,7 +137,7 @@ def class_name(kind: type) -> str:
 
 
 def generator_state(generator: Any) -> Any:
-    """Return the state of one of NumPy's random generators, as JSON can hold it.
+    """Return the state of a NumPy random generator, as JSON-compatible values.
 
     Args:
         generator: a `Generator`, a `RandomState`, or None, whose state is None.
@@ -148,10 +150,10 @@ def generator_state(generator: Any) -> Any:
 
 
 def set_generator_state(generator: Any, state: Any) -> None:
-    """Put one of NumPy's random generators into a state that `generator_state` gave.
+    """Set a NumPy random generator to a state that `generator_state` returned.
 
     Raises:
-        Exception: it is no state of such a generator.
+        Exception: the state does not fit the generator.
     """
     if isinstance(generator, np.random.RandomState):
         generator.set_state(_arrays(state))
@@ -160,9 +162,9 @@ def set_generator_state(generator: Any, state: Any) -> None:
 
 
 def plain_arguments(arguments: Mapping[str, Any]) -> dict[str, Any] | None:
-    """Return arguments as JSON can hold them; None if one of them is more than that.
+    """Return arguments as JSON-compatible values; None if that is impossible.
 
-    Tuples become lists, and NumPy's scalars the numbers that they hold.
+    Tuples become lists, and NumPy scalars become plain numbers.
     """
     try:
         return {_text(name): _plain(value) for name, value in arguments.items()}
@@ -171,13 +173,13 @@ def plain_arguments(arguments: Mapping[str, Any]) -> dict[str, Any] | None:
 
 
 def shown_arguments(kwargs: Any) -> str:
-    """Return `name=value, ...` of what an environment was made with.
+    """Return the arguments that an environment was created with, as `name=value, ...`.
 
     Args:
-        kwargs: as a recording has them; they may be anything.
+        kwargs: the arguments from a recording; any value is accepted.
 
     Returns:
-        "" where there are none but for how it is shown.
+        The arguments; "" if there are none except those that affect only the view.
     """
     if not isinstance(kwargs, Mapping):
         return ""
@@ -192,14 +194,14 @@ def shown_arguments(kwargs: Any) -> str:
 
 
 def _lists(value: Any) -> Any:
-    """Return `value` with lists and plain numbers for NumPy's."""
+    """Return `value` with NumPy arrays and scalars converted to lists and numbers."""
     if isinstance(value, dict):
         return {name: _lists(item) for name, item in value.items()}
     return value.tolist() if isinstance(value, np.ndarray | np.generic) else value
 
 
 def _arrays(state: Any) -> Any:
-    """Return a random state as NumPy takes it: with arrays for lists."""
+    """Return a random state in NumPy's form, with lists converted to arrays."""
     if isinstance(state, Mapping):
         return {name: _arrays(value) for name, value in state.items()}
     return np.array(state, dtype=np.uint64) if isinstance(state, list) else state

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What stands in for wrappers that are not here, where a recording is played again.
+"""Substitutes for wrappers that are not available when a recording is replayed.
 
-The simulation underneath is stepped with the recorded controls in place of what a
-wrapper made of an action. Its own rewards and ends count, unless others are recorded:
-those may be the wrapper's, and are handed on and counted. So are actions that are not
-the controls: nothing says that they led to these.
+The simulation underneath is stepped with the recorded controls instead of the wrapper's
+output for an action. Its own rewards and ends of episodes are used, unless the recorded
+ones differ: these may come from the wrapper, so they are passed on and counted. Actions
+that differ from the controls are counted too: nothing proves that they led to them.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True, kw_only=True)
 class RecordedSteps:
-    """The steps of an episode as they are recorded.
+    """The recorded steps of an episode.
 
     Attributes:
-        controls: of each step.
-        rewards: likewise, as all of them.
-        terminated: likewise.
-        truncated: likewise.
+        controls: the controls of each step.
+        rewards: the reward of each step.
+        terminated: whether each step terminated the episode.
+        truncated: whether each step truncated the episode.
     """
 
     controls: NDArray[np.float64]
@@ -37,11 +37,11 @@ class RecordedSteps:
 
 
 class StandIn(gymnasium.Wrapper[Any, Any, Any, Any]):
-    """Steps an environment with recorded controls.
+    """A wrapper that steps an environment with recorded controls.
 
     Attributes:
-        differing: of how many steps of this episode another reward or end is recorded.
-        translated: in how many the action is not what was controlled.
+        differing: number of steps of this episode whose recorded reward or end differs.
+        translated: number of steps whose action differs from the controls.
     """
 
     differing = translated = 0
@@ -49,14 +49,14 @@ class StandIn(gymnasium.Wrapper[Any, Any, Any, Any]):
     _taken = 0
 
     def begin(self, steps: RecordedSteps) -> None:
-        """Take the recorded steps of the episode that has just begun."""
+        """Start the replay of an episode that has just been reset."""
         self._steps, self._taken = steps, 0
         self.differing = self.translated = 0
 
     def step(
         self, action: Any
     ) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
-        """Take the next recorded step, whatever the action."""
+        """Take the next recorded step, ignoring the action."""
         steps, taken = self._steps, self._taken
         if steps is None:
             return self.env.step(action)
@@ -81,15 +81,15 @@ def stand_ins(
     names: Sequence[str],
     arguments: Sequence[Mapping[str, Any] | None],
 ) -> tuple[gymnasium.Env[Any, Any], StandIn]:
-    """Return an environment with a stand-in around it, and others of these names.
+    """Return an environment inside a stand-in and placeholders with the given names.
 
     Args:
         env: the environment.
-        names: of the classes of the wrappers, outermost first.
-        arguments: of each, as a recording has them.
+        names: class names of the wrappers, outermost first.
+        arguments: the recorded arguments of each wrapper.
 
     Returns:
-        The outermost, and the one that is to be told of the steps.
+        The outermost wrapper, and the stand-in to call `begin` on.
     """
     around: Any = env
     first: StandIn | None = None
@@ -98,7 +98,7 @@ def stand_ins(
         bases: tuple[type, ...] = (gymnasium.Wrapper,) if first else (StandIn,)
         if given is not None:
             bases = (*bases, RecordConstructorArgs)
-        # A recording says the name of its class, which is compared.
+        # The class must have the recorded name, because it will be compared.
         around = type(qualified, bases, {"__module__": module})(around)
         if given is not None:
             around._saved_kwargs = dict(given)

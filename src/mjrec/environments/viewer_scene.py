@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The scene that Gymnasium's off-screen viewer shows, whether there is one or not.
+"""The scene that Gymnasium's off-screen viewer shows, even before it is created.
 
-Imports mujoco, by way of the simulation: load it only where there is a simulation.
+Imports mujoco through `simulation`, so load this module only if there is a simulation.
 """
 
 from __future__ import annotations
@@ -26,35 +26,35 @@ from .scenes import class_name, has_own_method, is_defined_by
 _MODE = "rgb_array"
 _RENDERING = "gymnasium.envs.mujoco.mujoco_rendering"
 
-# Gymnasium's default, for environments that do not say.
+# Gymnasium's default, for environments that do not specify a size.
 _SIDE = 480
 
-# Of our own renderer, where the environment has none.
+# Our own renderer's limit, if the environment has no renderer.
 _MAX_GEOM = 10000
 
-# What is looked at at every captured step: one call each, and one comparison of all.
+# Read at every captured step, with one call each, then compared all at once.
 _OF_SIMULATION = attrgetter("mujoco_renderer", "model", "data")
 _OF_RENDERER = attrgetter("model", "camera_id", "_viewers")
 _NO_VIEWERS: dict[str, Any] = {}
 
 
 class ViewerScene:
-    """What an environment's viewer shows.
+    """The scene shown by an environment's viewer.
 
-    Where the environment has a viewer for `rgb_array`, that is the viewer's own camera
-    and options, whatever the user makes of them. Until then it is what a viewer made
-    at the first frame would show, for as long as the environment keeps its renderer.
+    If the environment has a viewer for `rgb_array`, this is the viewer's own camera and
+    options, including the user's changes. Until then it is what a viewer created at the
+    first frame would show, for as long as the environment keeps its renderer.
 
     Args:
-        simulated: has MuJoCo's `model` and `data` and, if it is one of Gymnasium's
-            environments, `mujoco_renderer`.
-        camera: a name or number, or an `MjvCamera`; None is the environment's own.
-        height: in pixels; None is the environment's own.
-        width: likewise.
+        simulated: an object with MuJoCo's `model` and `data` and, if it is a Gymnasium
+            environment, `mujoco_renderer`.
+        camera: a name, a number or an `MjvCamera`; None for the environment's own.
+        height: height in pixels; None for the environment's own.
+        width: width in pixels; None for the environment's own.
 
     Raises:
         UnknownName: the model has no such camera.
-        InvalidArgument: a camera number, or a size, that cannot be.
+        InvalidArgument: the camera's number or the size is invalid.
     """
 
     def __init__(
@@ -68,14 +68,14 @@ class ViewerScene:
             _own_side(simulated, "width") if width is None else width,
         )
         own = FREE_CAMERA if camera is None else camera
-        # The same objects for good, because they are watched.
+        # These objects are never replaced, because they are watched for changes.
         self._camera = resolve_camera(simulated.model, own)
         self._option = viewer_option()
         self._labelled: tuple[Any, Any] | None = None
         self._start()
 
     def __call__(self) -> SceneView:
-        """Return what is shown from here on; `at_frame` keeps it up to date."""
+        """Return the view from now on; `at_frame` keeps it up to date."""
         self._update()
         self._data = self._simulated.data
         self._note_unmoved()
@@ -90,25 +90,25 @@ class ViewerScene:
         )
 
     def at_frame(self, capture: Callable[[], None]) -> None:
-        """Call `capture` with the view as a frame of this moment has it."""
+        """Call `capture` with the view updated to the current frame's."""
         self._update()
         self._is_settled = True
         self._note_unmoved()
         capture()
 
     def forget(self) -> None:
-        """Go by the next frame as if it were the first.
+        """Treat the next frame as if it were the first.
 
-        A viewer that the environment has already stays as it is.
+        A viewer that the environment already has is left as it is.
         """
         self._start()
 
     def is_unmoved(self) -> bool:
-        """Return quickly whether nothing is other than at the frame before.
+        """Return quickly whether the view is surely the same as at the last frame.
 
-        As far as that is sure without a closer look, and as far as it does not follow
-        from what is in model, camera and option: it is the same simulation as when it
-        was asked what is shown, and there is no viewer that anybody could have touched.
+        Changes in the model, the camera and the option are not checked. It is true if
+        the simulation is the same as when the view was returned, and there is no viewer
+        that the user could have changed.
         """
         unmoved = self._unmoved
         return unmoved is not None and unmoved == (
@@ -117,14 +117,14 @@ class ViewerScene:
         )
 
     def obstacle(self) -> str | None:
-        """Return why the viewer's frame of this moment would show something else."""
+        """Return why the viewer's current frame would show something else, or None."""
         renderer, viewer = self._renderer, self._viewer()
         if renderer is not None and renderer.model is not self._simulated.model:
-            return "the renderer draws another model than the environment simulates"
+            return "the renderer does not draw the model that the environment simulates"
         return None if viewer is None else _addition(viewer, self._new_flags)
 
     def _label(self) -> str | int | dict[str, Any]:
-        """Return what metadata calls the camera, which takes a while to find out."""
+        """Return the metadata's label for the camera; cached, because it is slow."""
         asked = self._camera if self._asked is None else self._asked
         seen = (self._model, asked, *_pose(self._camera))
         if self._labelled is None or self._labelled[0] != seen:
@@ -137,12 +137,12 @@ class ViewerScene:
         self._new_flags = new_scene_flags(self._model)
         self._is_settled = False
         self._camera_id: int | None = None
-        # What `is_unmoved` compares with; None where a closer look is needed.
+        # The values that `is_unmoved` expects; None if it must return false.
         self._unmoved: tuple[tuple[Any, ...], tuple[Any, ...]] | None = None
         flags = getattr(self._renderer, "_vopt", None)
         copy_members(viewer_option(flags), self._option)
         if self._asked is not None:
-            # Another model may have the name elsewhere.
+            # In another model the name may have a different number.
             camera = resolve_camera(self._model, self._asked)
             copy_members(camera, self._camera)
 
@@ -165,7 +165,7 @@ class ViewerScene:
         if self._asked is None and renderer is not None:
             self._update_own_camera(viewer)
         elif self._asked is None or self._asked == FREE_CAMERA:
-            # It moves with the model's fields.
+            # The free camera moves with the model's fields.
             place_free_camera(self._model, self._camera)
 
     def _update_own_camera(self, viewer: Any) -> None:
@@ -183,7 +183,7 @@ class ViewerScene:
         select_camera(self._camera, self._camera_id)
 
     def _viewer(self) -> Any:
-        # Other modes' viewers have cameras of their own.
+        # The viewers of other render modes have their own cameras.
         viewers = getattr(self._renderer, "_viewers", None)
         return viewers.get(_MODE) if viewers else None
 
@@ -203,7 +203,7 @@ def _own_side(simulated: Any, name: str) -> int:
 
 
 def _addition(viewer: Any, new_flags: bytes) -> str | None:
-    """Return what a viewer shows besides the scene; None for nothing."""
+    """Return what a viewer shows in addition to the scene, or None."""
     if viewer._markers:
         return "markers were added to the viewer"
     if viewer._overlays:

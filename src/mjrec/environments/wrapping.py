@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What stands between a monitor and the environment that it records.
+"""The wrappers between a monitor and the environment that it records.
 
-An action that was recorded above a wrapper need not be what the environment got, so
-recreating the environment takes its wrappers.
+An action recorded above a wrapper may differ from what the environment received, so
+recreating the environment includes recreating its wrappers.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from gymnasium.utils import RecordConstructorArgs
 
 from .scenes import class_name, plain_arguments
 
-# They hand actions, rewards and the ends of episodes on as they are. `TimeLimit` does
-# not, and is told apart, by its number.
+# Wrappers that pass on actions, rewards and episode ends unchanged. `TimeLimit` does
+# not, but it is recorded separately, as a number.
 _TRANSPARENT = frozenset(
     {
         "gymnasium.wrappers.common.OrderEnforcing",
@@ -29,20 +29,21 @@ _TRANSPARENT = frozenset(
         "mjrec.monitors.gymnasium_monitor.GymnasiumMonitor",
     }
 )
-# Where dm_env's wrappers, and dm_control's, keep what they wrap.
+# Attributes in which dm_env's and dm_control's wrappers keep what they wrap.
 _INSIDE = ("_env", "_environment", "environment")
 
 
 def around_gymnasium(env: gymnasium.Env[Any, Any]) -> dict[str, Any]:
-    """Return what is around the innermost environment.
+    """Return the wrappers and the step limit around the innermost environment.
 
     Args:
-        env: as the user wrapped it.
+        env: the environment, as the user wrapped it.
 
     Returns:
-        `wrappers`, the full names of the classes of wrappers, outermost first, that may
-        change what goes through them, where there are any the `wrapper_arguments` of
-        each, and `max_episode_steps`, the least limit of a `TimeLimit`, or None.
+        `wrappers`, the full class names of the wrappers that may change what passes
+        through them, outermost first; `wrapper_arguments`, the arguments of each, if
+        there are any wrappers; and `max_episode_steps`, the lowest limit of a
+        `TimeLimit`, or None.
     """
     layers: list[Any] = []
     while isinstance(env, gymnasium.Wrapper):
@@ -55,11 +56,11 @@ def around_gymnasium(env: gymnasium.Env[Any, Any]) -> dict[str, Any]:
 
 
 def around_dm_env(env: Any) -> dict[str, Any]:
-    """Return the same of a dm_env environment; limits are dm_control's own.
+    """Return the same facts about a dm_env environment. Limits are dm_control's own.
 
-    What a wrapper keeps under a name of its own is not found, and then the wrapper
-    counts as the environment; `wrappers` names it all the same, because it is none of
-    dm_control's environments.
+    An inner environment in an attribute of unknown name is not found. Then the wrapper
+    counts as the environment, but is still listed in `wrappers`, because it is not one
+    of dm_control's environments.
     """
     layers: list[Any] = []
     while not _is_innermost(env):
@@ -84,9 +85,9 @@ def _changing(layers: Iterable[Any]) -> list[Any]:
 
 
 def _arguments_of(wrapper: Any) -> dict[str, Any] | None:
-    """Return what a wrapper of Gymnasium's was made with; None where it keeps it not.
+    """Return the arguments of a Gymnasium wrapper; None if it does not keep them.
 
-    None also where an argument is more than JSON can hold, a function for instance.
+    The result is also None if JSON cannot represent an argument, such as a function.
     """
     saved = getattr(wrapper, "_saved_kwargs", None)
     if not isinstance(wrapper, RecordConstructorArgs) or saved is None:
@@ -106,9 +107,9 @@ def _is_innermost(env: Any) -> bool:
 
 
 def _own(env: Any, name: str) -> Any:
-    """Return an attribute that an object has, without asking what it wraps.
+    """Return an attribute of an object itself, without consulting what it wraps.
 
-    Not by its `__dict__`, for the reason that `has_own_method` gives.
+    Its `__dict__` is not used, for the reason given in `has_own_method`.
     """
     try:
         return object.__getattribute__(env, name)

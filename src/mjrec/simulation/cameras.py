@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which camera is meant: a name, a number or an `MjvCamera`, and what a model has.
+"""Cameras, given by name, by number or as an `MjvCamera`, and the cameras of a model.
 
-Every function takes MuJoCo's own objects or a wrapper that holds one as `.ptr`, as
+Every function takes MuJoCo's own objects or wrappers that hold one as `.ptr`, as
 dm_control's do.
 """
 
@@ -19,8 +19,8 @@ Camera: TypeAlias = "str | int | mujoco.MjvCamera"
 
 FREE_CAMERA = -1
 
-# Plain integers, because since mujoco 3.12 a member of a MuJoCo enumeration is not
-# equal to the NumPy integer of its value.
+# Plain integers, because since mujoco 3.12 a member of a MuJoCo enum is not equal to
+# the NumPy integer with the same value.
 _TRACK = int(mujoco.mjtCamLight.mjCAMLIGHT_TRACK)
 _PLANE = int(mujoco.mjtGeom.mjGEOM_PLANE)
 _TRACKCOM = int(mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM)
@@ -34,7 +34,7 @@ def raw_model(model: Any) -> mujoco.MjModel:
     """Return the `mujoco.MjModel` that `model` is or holds as `.ptr`.
 
     Raises:
-        InvalidArgument: there is none.
+        InvalidArgument: `model` is neither a model nor a wrapper of one.
     """
     return _unwrapped(model, mujoco.MjModel)
 
@@ -43,32 +43,33 @@ def raw_data(data: Any) -> mujoco.MjData:
     """Return the `mujoco.MjData` that `data` is or holds as `.ptr`.
 
     Raises:
-        InvalidArgument: there is none.
+        InvalidArgument: `data` is neither an `MjData` nor a wrapper of one.
     """
     return _unwrapped(data, mujoco.MjData)
 
 
 def camera_names(model: Any) -> list[str]:
-    """Return the names of the model's cameras in its order, without the nameless."""
+    """Return the names of the model's cameras in order, leaving out unnamed ones."""
     model = raw_model(model)
     names = (model.camera(index).name for index in range(model.ncam))
     return [name for name in names if name]
 
 
 def resolve_camera(model: Any, camera: Camera | Mapping[str, Any]) -> mujoco.MjvCamera:
-    """Return the camera that is meant, ready for `mjv_updateScene`.
+    """Return a camera, ready for `mjv_updateScene`.
 
     Args:
         model: the model that the camera belongs to.
-        camera: the name or number of one of the model's cameras, -1 for the free
-            camera in the place that the model gives it, the public members of an
-            `MjvCamera` by their names (those left out are MuJoCo's default), or an
-            `MjvCamera`, which is given back as it is.
+        camera: the name or number of one of the model's cameras; -1 for the free
+            camera at the model's default pose; a mapping with values for the public
+            members of an `MjvCamera` by name (the others keep MuJoCo's defaults); or
+            an `MjvCamera`, which is returned unchanged.
 
     Raises:
-        UnknownName: the model has no camera of that name, or there is no such member.
-        InvalidArgument: it has no camera of that number, or `camera` is none of these,
-            or its members follow something that the model lacks.
+        UnknownName: the model has no camera of that name, or `MjvCamera` has no such
+            member.
+        InvalidArgument: the model has no camera of that number, `camera` has the wrong
+            type, or its members refer to something that is not in the model.
     """
     model = raw_model(model)
     if isinstance(camera, mujoco.MjvCamera):
@@ -92,10 +93,10 @@ def resolve_camera(model: Any, camera: Camera | Mapping[str, Any]) -> mujoco.Mjv
 
 
 def check_camera(model: mujoco.MjModel, camera: mujoco.MjvCamera) -> None:
-    """Check that what a camera follows, or is fixed to, is in the model.
+    """Check that the body or camera that a camera is attached to is in the model.
 
     Raises:
-        InvalidArgument: it is not, or there is no such kind of camera.
+        InvalidArgument: the model does not have it, or the camera's type is invalid.
     """
     fixed, tracking = (
         mujoco.mjtCamera.mjCAMERA_FIXED,
@@ -115,13 +116,13 @@ def check_camera(model: mujoco.MjModel, camera: mujoco.MjvCamera) -> None:
     what, count = numbered[kind]
     if not 0 <= (number := getattr(camera, what)) < count:
         raise InvalidArgument(
-            f"A camera's {what} is {number}, and this model has {count} of these: 0 to "
-            f"{count - 1}."
+            f"A camera's {what} is {number}, but this model has {count} of these. Use "
+            f"0 to {count - 1}."
         )
 
 
 def is_tracking(camera: object) -> bool:
-    """Return whether each frame moves a camera, a part of the way to a body."""
+    """Return whether a camera moves part of the way to a body in each frame."""
     tracking = int(mujoco.mjtCamera.mjCAMERA_TRACKING)
     return isinstance(camera, mujoco.MjvCamera) and int(camera.type) == tracking
 
@@ -129,13 +130,15 @@ def is_tracking(camera: object) -> bool:
 def tracking_camera(model: Any) -> str | int | None:
     """Return the camera of the model that follows its robot, if it has one.
 
-    The first that follows the centre of mass of a body's subtree (`mode="trackcom"`);
-    else the first that follows a body (`mode="track"`) of something that can travel,
-    which is what hangs on a free or a sliding joint in the world. An arm with a fixed
-    base cannot, and a camera that follows its hand is a close-up.
+    This is the first camera that follows the centre of mass of a body's subtree
+    (`mode="trackcom"`). If there is none, it is the first that follows a body
+    (`mode="track"`) of something that can travel, because a free or sliding joint
+    connects it to the world. An arm with a fixed base cannot travel, and a camera that
+    follows its hand is a close-up.
 
     Returns:
-        Its name, or its number if it has none; None if no camera follows the robot.
+        The camera's name, or its number if unnamed; None if no camera follows the
+        robot.
     """
     model = raw_model(model)
     modes = model.cam_mode.tolist()
@@ -150,13 +153,13 @@ def tracking_camera(model: Any) -> str | int | None:
 
 
 def default_camera(model: Any) -> str | int:
-    """Return the camera that follows the robot, else the first, else the free one.
+    """Return the camera that follows the robot, or the first one, or the free one.
 
-    Robots leave the frame of a camera that does not follow them. Where none follows,
-    the author's first camera knows more of the scene than MuJoCo's free one.
+    Robots leave the frame of a camera that does not follow them. If no camera follows,
+    the author's first camera suits the scene better than MuJoCo's free one.
 
     Returns:
-        A name, or a number for a camera that has no name; -1 is the free camera.
+        The camera's name, or its number if unnamed; -1 is the free camera.
     """
     tracking = tracking_camera(model)
     if tracking is not None:
@@ -166,11 +169,11 @@ def default_camera(model: Any) -> str | int:
 
 
 def camera_label(model: mujoco.MjModel, camera: Any) -> str | int | dict[str, Any]:
-    """Return a camera as metadata says it: a name, a number, or a free camera's pose.
+    """Return a camera for the metadata: a name, a number or a free camera's pose.
 
     Args:
-        model: has the camera.
-        camera: as `resolve_camera` takes it.
+        model: the model that has the camera.
+        camera: see `resolve_camera`.
     """
     if isinstance(camera, str):
         return camera
@@ -192,12 +195,12 @@ def camera_label(model: mujoco.MjModel, camera: Any) -> str | int | dict[str, An
 
 
 def _name_of(model: mujoco.MjModel, number: int) -> str | int:
-    """Return a camera's name, or its number where it has none."""
+    """Return a camera's name, or its number if it has no name."""
     return number if number < 0 else model.camera(number).name or number
 
 
 def has_infinite_plane(model: mujoco.MjModel) -> bool:
-    """Return whether a plane has no end: it is drawn around the cameras."""
+    """Return whether the model has an infinite plane, drawn around the cameras."""
     planes = model.geom_size[model.geom_type == _PLANE]
     return bool((planes[:, :2] <= 0).any())
 
@@ -213,7 +216,7 @@ def _unwrapped(holder: object, kind: type) -> Any:
         if isinstance(candidate, kind):
             return candidate
     raise InvalidArgument(
-        f"A mujoco.{kind.__name__}, or dm_control's wrapper of one, is needed, got "
+        f"Expected a mujoco.{kind.__name__} or dm_control's wrapper of one, got "
         f"{type(holder).__module__}.{type(holder).__qualname__}."
     )
 
@@ -221,7 +224,7 @@ def _unwrapped(holder: object, kind: type) -> Any:
 def _camera_index(model: mujoco.MjModel, camera: object) -> int:
     if isinstance(camera, str):
         kind = int(mujoco.mjtObj.mjOBJ_CAMERA)
-        # An empty name would find the first nameless camera.
+        # An empty name would match the first unnamed camera.
         index = mujoco.mj_name2id(model, kind, camera) if camera else -1
         if index < 0:
             hint = "Or give -1, the free camera."
@@ -229,12 +232,12 @@ def _camera_index(model: mujoco.MjModel, camera: object) -> int:
         return int(index)
     if isinstance(camera, bool) or not isinstance(camera, int | np.integer):
         raise InvalidArgument(
-            "A camera is a name, a number or a mujoco.MjvCamera, got "
+            "A camera must be a name, a number or a mujoco.MjvCamera, got "
             f"{camera!r} of type {type(camera).__name__}."
         )
     if not FREE_CAMERA <= camera < model.ncam:
         raise InvalidArgument(
-            f"There is no camera number {camera}: this model has {model.ncam} cameras. "
-            f"Give a number from -1 (the free camera) to {model.ncam - 1}."
+            f"Camera number {camera} does not exist: this model has {model.ncam} "
+            f"cameras. Use a number from -1 (the free camera) to {model.ncam - 1}."
         )
     return int(camera)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The states of a MuJoCo simulation inside an environment, ready to be recorded."""
+"""Capturing the states of the MuJoCo simulation inside an environment."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from .view import SceneView
 T = TypeVar("T")
 
 
-# Fields of a model that `snapshot_dtype` looks at, which environments leave alone.
+# Fields of a model that `snapshot_dtype` depends on. Environments rarely change them.
 _SETTLING_THE_KIND = (
     *("tendon_limited", "tendon_matid", "tendon_plasticadr"),
     "sensor_",
@@ -39,22 +39,23 @@ _SETTLING_THE_KIND = (
 
 @dataclass(frozen=True, kw_only=True)
 class EpisodeStart:
-    """What is known of a simulation when an episode begins.
+    """The facts about a simulation at the start of an episode.
 
     Attributes:
-        state: what a state consists of.
-        snapshot: what frames are drawn from; None where `refusal` says why there are
-            none.
-        model: where the model is stored, for the facts of a trajectory.
-        scene: how it is shown, likewise; None where there are no snapshots.
-        model_fields: what is other than in the stored model.
-        refusal: why no frame can be drawn from snapshots of this model; None where it
-            can, which was checked.
-        words: state and snapshot in `memory.WORDS`, from which rows can be gathered
-            while `is_current`; None where each moment needs a closer look.
-        is_current: tells that nothing but the state is other than at the capture
-            before, which is usual: the memory then holds this moment, until the
-            environment is called again. It keeps the words alive.
+        state: the dtype of a state.
+        snapshot: the dtype of a snapshot, from which frames are drawn; None if
+            `refusal` is set.
+        model: the stored model's facts, for the trajectory.
+        scene: the scene's facts, for the trajectory; None without snapshots.
+        model_fields: the fields that differ from the stored model.
+        refusal: why no frame can be drawn from snapshots of this model; None if frames
+            can be drawn, which has been checked.
+        words: the indices into `raw_memory.WORDS` with which rows of state and snapshot
+            can be gathered while `is_current`; None if each capture must check for
+            changes.
+        is_current: returns whether only the state has changed since the last capture,
+            the usual case. The memory then holds the current state until the
+            environment is called again. This function keeps the memory alive.
     """
 
     state: np.dtype[Any]
@@ -68,26 +69,26 @@ class EpisodeStart:
 
 
 class Capture:
-    """Takes down the states of a simulation, episode by episode. Needs no OpenGL.
+    """A recorder of a simulation's states, episode by episode. Needs no OpenGL.
 
-    The simulation is only read. What does not change between captures is kept, so that
-    a capture takes microseconds; what has changed is found by comparing memory.
+    The simulation is only read. Whatever does not change between captures is cached, so
+    that a capture takes microseconds. Changes are found by comparing memory.
 
     Args:
-        simulation: returns the model and the data of this moment, MuJoCo's own or
-            dm_control's. The model may be another one after a reset.
-        view: returns how the scene is shown; asked when an episode begins. The camera
-            and the option in it are watched: they may be the environment's own.
-        at_frame: calls what it is given in the moment at which the environment would
-            draw, and then puts everything back; None where any moment is as good.
-        resetting: returns what to put around a reset.
-        authored: returns what the model was made from, where that is known.
-        obstacle: returns why the frame of this moment cannot be made from the state,
-            or None.
-        is_unmoved: tells, faster than the others do, that simulation and view are as
-            when `view` was asked, and nothing stands in the way: no other is then
-            called. What is in model, camera and option is looked at besides.
-        forget: lets the view be again as if nothing had been shown.
+        simulation: returns the current model and data, MuJoCo's own or dm_control's.
+            The model may be a different one after a reset.
+        view: returns the view of the scene; called when an episode begins. Its camera
+            and option are watched for changes: they may be the environment's own.
+        at_frame: calls its argument at the moment at which the environment would draw,
+            then restores everything; None if any moment will do.
+        resetting: returns a context manager to run each reset in.
+        authored: returns the model's sources, or None if unknown.
+        obstacle: returns why the current frame cannot be drawn from the state, or None.
+        is_unmoved: a fast check that the simulation and the view are as they were when
+            `view` was called and that no obstacle exists. If it returns true, the other
+            functions are not called; the model, the camera and the option are still
+            compared.
+        forget: resets the view as if nothing had been shown yet.
     """
 
     def __init__(
@@ -115,22 +116,22 @@ class Capture:
         self._frames: _Frames | None = None
         self._refusal: str | None = None
         self._looks_at_everything = False
-        # Whether only the state has changed since the last capture, and what ends that.
+        # Whether only the state has changed since the last capture, and how to end it.
         self._is_current: Callable[[], bool] = _never
         self._look_closely: Callable[[], None] = lambda: None
-        # As `simulation` gave them last; they may be dm_control's wrappers.
+        # As last returned by `simulation`; they may be dm_control's wrappers.
         self._seen: tuple[Any, Any] = (None, None)
 
     def open(self, directory: Path) -> None:
-        """Store models in `directory` from here on."""
+        """Store models in `directory` from now on."""
         self._store = ModelStore(directory)
         self._stored = self._frames = None
 
     def begin_episode(self) -> EpisodeStart:
-        """Return what is there now, just after a reset.
+        """Return the facts about the simulation just after a reset.
 
-        A model that was not seen before is stored; of one that was, the fields that
-        are other than then are returned.
+        A new model is stored. For a known one, the fields that have changed since it
+        was stored are included.
         """
         self._seen = self._simulation()
         data = raw_data(self._seen[1])
@@ -157,10 +158,10 @@ class Capture:
         )
 
     def capture_state(self, out: NDArray[np.float64]) -> None:
-        """Write the state of this moment into `out`, `(state_length,)`.
+        """Write the current state into `out`, `(state_length,)`.
 
         Raises:
-            PicturesDiffer: the environment has gone over to another model.
+            PicturesDiffer: the environment has switched to another model.
         """
         stored, frames = self._followed()
         mujoco.mj_getState(stored.model, frames.data, out, STATE_SPEC)
@@ -168,21 +169,21 @@ class Capture:
     def capture_snapshot(
         self, out: NDArray[np.uint64]
     ) -> Mapping[str, NDArray[Any]] | None:
-        """Write what a frame of this moment is drawn from into `out`.
+        """Write a snapshot, from which the current frame can be drawn, into `out`.
 
         Args:
-            out: all of its words.
+            out: the words to write, all of which are set.
 
         Returns:
-            Model and view fields that are other than at the capture before, or at the
-            beginning of the episode; None, which is usual, where all are the same.
+            Model and view fields that have changed since the last capture, or since
+            the start of the episode; None, the usual case, if none have changed.
 
         Raises:
-            PicturesDiffer: the frame of this moment cannot be made from a snapshot,
-                which was possible when the episode began.
+            PicturesDiffer: the current frame cannot be drawn from a snapshot, although
+                this was possible when the episode began.
         """
         if self._frames is not None and self._is_current():
-            # The usual case, in half the time of the others.
+            # The usual case takes half the time of the others.
             self._frames.source.take(out)
             return None
         _, frames = self._followed()
@@ -192,21 +193,21 @@ class Capture:
         return self._at_moment(lambda: self._captured(frames, out))
 
     def changed_fields(self) -> Mapping[str, NDArray[Any]] | None:
-        """Return what of the model is other than at the capture before."""
+        """Return the model's fields that have changed since the last capture."""
         changed = self._changed() or {}
         own = {k: v for k, v in changed.items() if not k.startswith(VIEW_PREFIXES)}
         return own or None
 
     def model_changed(self) -> None:
-        """Note that anything in the model may be another; the next capture looks."""
+        """Note that anything in the model may have changed; the next capture checks."""
         self._looks_at_everything = True
         self._look_closely()
 
     def forget_frames(self) -> None:
-        """Let the next episode's frames depend on none that was made before.
+        """Make the next episode's frames independent of all previous frames.
 
-        To be called between episodes. Cameras that are placed at the first frame, or
-        that each frame moves, are as in a simulation that has just been made.
+        Call it between episodes. Cameras that are placed at the first frame, or that
+        each frame moves, are as in a new simulation.
         """
         self._forget()
         self._frames = None
@@ -214,7 +215,7 @@ class Capture:
             self._stored.scene = None
 
     def settle(self) -> None:
-        """Wait until every model is stored, or could not be: `finish` says so."""
+        """Wait until every model is stored or has failed; `finish` reports failures."""
         if self._store is not None:
             self._store.settle()
 
@@ -222,13 +223,13 @@ class Capture:
         """Wait until every model is stored.
 
         Raises:
-            FileNotWritten: one could not be.
+            FileNotWritten: a model could not be stored.
         """
         if self._store is not None:
             self._store.finish()
 
     def close(self) -> None:
-        """Let go of model and data; idempotent. What waits is still stored."""
+        """Release the model and data. Idempotent. Waiting models are still stored."""
         if self._store is not None:
             self._store.leave()
         self._look_closely()
@@ -238,7 +239,7 @@ class Capture:
     def _stored_model(
         self, model: mujoco.MjModel
     ) -> tuple[_StoredModel, dict[str, NDArray[Any]]]:
-        """Return the model as stored, and what of it is other than that now."""
+        """Return the stored model, and the fields that have changed since."""
         if self._stored is not None and self._stored.looks.is_of(model):
             fields = self._stored.looks.since_stored()
             if all(map(is_settable, fields)):
@@ -256,13 +257,13 @@ class Capture:
         view: SceneView,
         fields: Iterable[str],
     ) -> _Frames:
-        """Return what takes the episode's snapshots: if it can be, that of before."""
+        """Return the episode's source of snapshots, the last one if it still fits."""
         stored.looks.follow(view)
         key = (
             *(data._address, id(view.camera), id(view.option), view.max_geom),
             *(view.fresh, view.height, view.width, view.label),
             stored.looks.view_bytes(),
-            # Then a snapshot may need others, and nothing is equal to this.
+            # Then a snapshot may need other arrays; a new object never compares equal.
             object() if any(n.startswith(_SETTLING_THE_KIND) for n in fields) else 0,
         )
         if self._frames is None or self._frames.key != key:
@@ -270,13 +271,13 @@ class Capture:
         return self._frames
 
     def _watch(self, looks: Looks, is_unmoved: Callable[[], bool]) -> None:
-        """Let `is_current` tell whether view and model are as at the last capture."""
+        """Set `is_current` to check whether only the state has changed."""
         seen, present = [*looks.seen], [*looks.present]
         self._is_current = lambda: seen == present and is_unmoved()
         self._look_closely = seen.clear
 
     def _at_moment(self, do: Callable[[], T]) -> T:
-        """Return what `do` returns in the moment when a frame would be drawn."""
+        """Return the result of `do`, called at the moment a frame would be drawn."""
         results: list[T] = []
         self._at_frame(lambda: results.append(do()))
         return results[-1]
@@ -301,20 +302,20 @@ class Capture:
         fixed = [name for name in changed or () if not is_settable(name)]
         if fixed:
             raise _differs(
-                f"{', '.join(fixed)} of the model has changed in mid-episode, which "
-                "changes what the model consists of"
+                f"{', '.join(fixed)} of the model changed in mid-episode, and with it "
+                "the model's structure"
             )
         return changed
 
     def _followed(self) -> tuple[_StoredModel, _Frames]:
-        """Take note of other objects in mid-episode."""
+        """Return the stored model and its frames, following a change of objects."""
         model, data = self._simulation()
         stored, frames = self._stored, self._frames
         if stored is None or frames is None:
             raise _not_begun()
         if model is not self._seen[0] or data is not self._seen[1]:
             if not stored.looks.is_of(raw_model(model)):
-                raise _differs("the environment has gone over to another model")
+                raise _differs("the environment has switched to another model")
             self._look_closely()
             frames = self._frames = _Frames(stored, raw_data(data), frames.view, None)
             self._seen = (model, data)
@@ -322,12 +323,13 @@ class Capture:
 
 
 class _StoredModel:
-    """A model that is stored, and what is known of it.
+    """A stored model and what was found out about it.
 
     Attributes:
-        scene: where each frame leaves its two cameras; None before the first.
-        sound: with which visual options (as bytes), and with which fields other than
-            stored, a snapshot was found to suffice.
+        scene: a scene with the two cameras as the last frame left them; None before the
+            first frame.
+        sound: the visual options (as bytes) and the changed fields with which a
+            snapshot was found to suffice.
     """
 
     def __init__(self, model: mujoco.MjModel, facts: dict[str, Any]) -> None:
@@ -340,19 +342,19 @@ class _StoredModel:
 
 
 class _Frames:
-    """Takes snapshots of one simulation in one view, and tells whether they suffice.
+    """A source of snapshots of one simulation in one view. Checks that they suffice.
 
-    Where a frame has an influence on the next one, it follows what each leaves behind:
-    an infinite plane is drawn around the camera of the frame before, and a camera that
-    tracks a body goes a fifth of the way to it in each frame. Positions are those that
-    MuJoCo computes, without any drawing.
+    If each frame influences the next one, it also keeps track of this influence: an
+    infinite plane is drawn around the camera of the previous frame, and a camera that
+    tracks a body moves a fifth of the way to it in each frame. MuJoCo computes these
+    positions without drawing.
 
     Attributes:
-        key: what it depends on.
-        kind: of the snapshots.
-        source: of the snapshots themselves.
-        words: of a row, where it can be gathered.
-        scene: has the cameras; None where no frame has an influence on the next.
+        key: everything that this object depends on, for comparison.
+        kind: the snapshots' dtype.
+        source: the source of the snapshots.
+        words: the indices of a row's words; None if a row cannot be gathered.
+        scene: holds the cameras; None if no frame influences the next.
     """
 
     def __init__(
@@ -374,7 +376,7 @@ class _Frames:
             self.scene = stored.scene or mujoco.MjvScene(model, maxgeom=1)
 
     def facts(self) -> dict[str, Any]:
-        """Return the facts of the scene, and what the frame before left in it."""
+        """Return the facts of the scene, including what the last frame left in it."""
         facts = {**self._facts}
         before = self._stored.scene
         if self.scene is not None and not self.view.fresh and before is not None:
@@ -387,17 +389,17 @@ class _Frames:
     def is_sound(self, fields: Iterable[str]) -> bool:
         """Return whether a snapshot was found to suffice with these fields changed.
 
-        That is checked of the first frame, and again of the first one that has a
-        visual option, or a changed field of the model, that none before it had.
+        This is checked for the first frame, and again for the first frame with a new
+        visual option or a newly changed field of the model.
         """
         return self._stored.sound.issuperset(self._looks(fields))
 
     def objection(self, fields: Iterable[str], row: Any) -> str | None:
-        """Say why frames of this moment cannot be drawn from snapshots.
+        """Return why the current frame cannot be drawn from a snapshot, or None.
 
         Args:
-            fields: of model and option, that have changed.
-            row: the snapshot of this moment.
+            fields: names of the model's and the option's changed fields.
+            row: the current snapshot.
         """
         stored, option = self._stored, self.view.option
         reason = needs_constraints(stored.model, option)
@@ -407,19 +409,19 @@ class _Frames:
         missing = {*needed} - {*(self.kind.names or ())}
         if missing:
             return (
-                f"it now needs {', '.join(sorted(missing))} as well, which the "
-                "recording of this episode was not begun with"
+                f"it now also needs {', '.join(sorted(missing))}, which the "
+                "recording of this episode does not hold"
             )
         found = scene_difference(stored.model, self.data, row, self.view)
         if found is not None:
-            return f"drawn from its snapshot the scene is another one: {found}"
+            return f"the scene drawn from its snapshot differs: {found}"
         stored.sound.update(self._looks(fields))
         return None
 
     def drawn(
         self, changed: dict[str, NDArray[Any]] | None
     ) -> dict[str, NDArray[Any]] | None:
-        """Let the cameras move as a frame moves them, and add that to what changed."""
+        """Move the cameras as drawing a frame does, and add this to the changes."""
         if any(name.startswith(VIEW_PREFIXES) for name in changed or ()):
             self._follow_camera()
         if self.scene is None:
@@ -437,7 +439,7 @@ class _Frames:
         return [self._stored.looks.option_bytes(), *fields]
 
     def _follow_camera(self) -> None:
-        # Moved as frames move it; the environment's own stays where it is.
+        # A copy that moves as frames move it; the environment's own stays unchanged.
         self._camera = copy.copy(self.view.camera)
         self._lookat = self._camera.lookat.tolist()
 
@@ -454,4 +456,4 @@ def _differs(reason: str) -> PicturesDiffer:
 
 
 def _not_begun() -> ClosedError:
-    return ClosedError("No episode is recorded: call begin_episode() first.")
+    return ClosedError("No episode is being recorded. Call begin_episode() first.")

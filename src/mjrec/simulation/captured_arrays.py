@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which arrays of a simulation a snapshot holds: what a frame is drawn from.
+"""The arrays of a simulation that a snapshot holds, from which a frame is drawn.
 
-They are some twenty of the hundred and more arrays of `MjData`, and do not follow from
-the state (`states`) alone: after a step they belong to the state before its last
-substep, and environments move things just before they draw.
+They are about 20 of the more than 100 arrays of `MjData`. The state (`states`) alone
+does not determine them: after a step they belong to the state before the last substep,
+and environments move things just before they draw.
 """
 
 from __future__ import annotations
@@ -18,32 +18,32 @@ from .raw_memory import address_of
 
 _JOINT_WRAP = int(mujoco.mjtWrap.mjWRAP_JOINT)
 
-# Not an array of `MjData`: the colours that tendons have in the frame. They are
-# restored into the model's array of this name.
+# Not an array of `MjData`: the colours of the tendons in the frame. They are restored
+# into the model's array of this name.
 TENDON_RGBA = "tendon_rgba"
 
-# What any camera may need with MuJoCo's default option, wherever there is any of it.
+# Arrays that any camera may need with MuJoCo's default option, if they are not empty.
 ALWAYS = (
     *("geom_xpos", "geom_xmat", "site_xpos", "site_xmat", "cam_xpos", "cam_xmat"),
     *("light_xpos", "light_xdir", "subtree_com", "flexvert_xpos"),
     *("ten_wrapadr", "ten_wrapnum", "ten_length", "wrap_obj", "wrap_xpos"),
 )
 _FOR_SKINS = ("xpos", "xquat")
-# What flags, frames and labels that are off by default may need besides.
+# Additional arrays for flags, frames and labels that are off by default.
 _FOR_OPTIONS = (
     *("xpos", "xmat", "xipos", "ximat", "xanchor", "xaxis", "ctrl", "act"),
     *("eq_active", "xfrc_applied", "bvh_active", "bvh_aabb_dyn"),
 )
 
-# Nothing else is put into data from a file.
+# Nothing else is ever written from a file into an `MjData`.
 SNAPSHOT_ARRAYS = frozenset(
     (*ALWAYS, *_FOR_SKINS, *_FOR_OPTIONS, "sensordata", "plastic")
 )
 
-# Read from the constraints of a step, which cannot be put into fresh data.
+# These are drawn from the constraints of a step, which a new `MjData` cannot be given.
 _CONSTRAINT_FLAGS = ("mjVIS_CONTACTPOINT", "mjVIS_CONTACTFORCE", "mjVIS_CONTACTSPLIT")
 
-# Sensors whose reading is drawn: as rays.
+# Sensors whose readings are drawn, as rays.
 _DRAWN_SENSORS = ("mjSENS_RANGEFINDER", "mjSENS_GEOMFROMTO")
 
 
@@ -52,20 +52,20 @@ def snapshot_dtype(
     data: mujoco.MjData,
     option: mujoco.MjvOption | None = None,
 ) -> np.dtype[Any]:
-    """Return what of a simulation's data a snapshot holds.
+    """Return the dtype of a snapshot of a simulation's data.
 
-    Everything that the default option and any camera needs, and what `option` needs
-    besides, as far as the model has any of it.
+    It has all non-empty arrays that the default option needs with any camera, and
+    those that `option` needs in addition.
 
     Args:
         model: the model.
         data: its data.
-        option: how it is shown; None is MuJoCo's default.
+        option: the visual options of the frames; None for MuJoCo's default.
     """
     names = set(ALWAYS)
     if model.nskin:
         names.update(_FOR_SKINS)
-    # Of tendons whose spring can yield, which mujoco 4 brought.
+    # For tendons whose springs can yield, new in mujoco 4.
     if (getattr(model, "tendon_plasticadr", np.empty(0)) >= 0).any():
         names.add("plastic")
     # Not `np.isin`, whose first call loads numpy's masked arrays (100 ms).
@@ -74,7 +74,7 @@ def snapshot_dtype(
     if option is not None and _shows_more(option):
         names.update(_FOR_OPTIONS)
     held = [name for name in names if array_kind(data, name) is not None]
-    # In the order of the memory, which is read faster so.
+    # In memory order, which is faster to read.
     held.sort(key=lambda name: address_of(getattr(data, name)))
     arrays = [(name, array_kind(data, name)) for name in held]
     if has_limited_tendons(model):
@@ -83,8 +83,8 @@ def snapshot_dtype(
 
 
 def array_kind(holder: Any, name: str) -> np.dtype[Any] | None:
-    """Return the kind of an array of a model or of data; None where it is empty."""
-    # `bvh_active` and others are not in every version.
+    """Return the dtype and shape of an array of a model or data; None if empty."""
+    # Some arrays, such as `bvh_active`, are not in every version.
     array = getattr(holder, name, None)
     if array is None or not array.size:
         return None
@@ -92,7 +92,7 @@ def array_kind(holder: Any, name: str) -> np.dtype[Any] | None:
 
 
 def has_limited_tendons(model: mujoco.MjModel) -> bool:
-    """Return whether a tendon may be drawn in another colour than the model's."""
+    """Return whether a tendon may be drawn in a colour different from the model's."""
     if not model.ntendon:
         return False
     spatial = model.wrap_type[model.tendon_adr] != _JOINT_WRAP
@@ -101,7 +101,7 @@ def has_limited_tendons(model: mujoco.MjModel) -> bool:
 
 
 def needs_constraints(model: mujoco.MjModel, option: mujoco.MjvOption) -> str | None:
-    """Say what `option` shows that no snapshot holds; None if there is nothing.
+    """Return why no snapshot can hold what `option` shows; None if snapshots can.
 
     Contacts, constraint islands and joints at their limits are drawn from the
     constraints of a step.
@@ -119,7 +119,7 @@ def needs_constraints(model: mujoco.MjModel, option: mujoco.MjvOption) -> str | 
         return None
     return (
         f"{' and '.join(shown)} of the visual options show constraints (contacts, "
-        "joints at their limits), which are gone once the step is over"
+        "joints at their limits), which are not kept after the step"
     )
 
 
@@ -139,8 +139,8 @@ def _flag(option: mujoco.MjvOption, name: str) -> bool:
 
 
 def _has_islands(model: mujoco.MjModel) -> bool:
-    """Return whether islands of constraints are looked for in this model."""
-    # In mujoco 3.3 they had to be enabled, and the flag that shows them was on.
+    """Return whether MuJoCo computes constraint islands for this model."""
+    # In mujoco 3.3 islands had to be enabled, and the flag that shows them was on.
     enabling = getattr(mujoco.mjtEnableBit, "mjENBL_ISLAND", None)
     if enabling is not None:
         return bool(model.opt.enableflags & int(enabling))

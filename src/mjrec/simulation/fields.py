@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The fields of a model and of a view, by name: read, set and compared.
+"""The fields of a model and a view, by name: reading, setting and comparing them.
 
-Names are those of `MjModel`'s arrays (`geom_rgba`) and of the members of its structs
-(`opt.gravity`, `vis.headlight.ambient`); of a view `camera.lookat`, `option.flags` ...
+The names are those of `MjModel`'s arrays (`geom_rgba`) and of the members of its
+structs (`opt.gravity`, `vis.headlight.ambient`); a view's fields are `camera.lookat`,
+`option.flags` and so on.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ VIEW_PREFIXES = ("camera.", "option.")
 
 @functools.cache
 def array_names() -> tuple[str, ...]:
-    """Return the names of all arrays of `MjModel`, in this version of MuJoCo."""
+    """Return the names of all arrays of `MjModel` in this version of MuJoCo."""
     model = empty_model()
     names = (name for name in dir(model) if not name.startswith("_"))
     return tuple(n for n in names if isinstance(getattr(model, n), np.ndarray))
@@ -33,7 +34,7 @@ def array_names() -> tuple[str, ...]:
 def struct_names() -> tuple[str, ...]:
     """Return the names of all members of `opt`, `vis` and `stat`, with these prefixes.
 
-    Members that the bindings cannot read (`vis.rgba.bv`) are not among them.
+    Members that the bindings cannot read (`vis.rgba.bv`) are left out.
     """
     model = empty_model()
     return tuple(
@@ -45,15 +46,15 @@ def struct_names() -> tuple[str, ...]:
 
 @functools.cache
 def empty_model() -> mujoco.MjModel:
-    """Return a model with nothing in it, which is not to be changed."""
+    """Return an empty model, which must not be modified."""
     return mujoco.MjModel.from_xml_string("<mujoco/>")
 
 
 def member_names(struct: object) -> Iterator[str]:
-    """Yield the names of a struct's members that hold numbers.
+    """Yield the names of a struct's numeric members.
 
-    Members of structs inside it get a name with dots. An array without elements is
-    none that could be read or set, and is left out.
+    Members of nested structs have dotted names. Empty arrays cannot be read or set and
+    are left out.
     """
     for name in dir(struct):
         if name.startswith("_"):
@@ -69,24 +70,25 @@ def member_names(struct: object) -> Iterator[str]:
 
 
 def holder_of(struct: Any, name: str) -> tuple[Any, str]:
-    """Return what has a member whose name may have dots, and its last name."""
+    """Return the object that has a member with a dotted name, and its last part."""
     *parts, last = name.split(".")
     return functools.reduce(getattr, parts, struct), last
 
 
 def read_member(struct: object, name: str) -> NDArray[Any]:
-    """Return a copy of a member of `struct`, whose name may have dots."""
+    """Return a copy of a member of `struct`, which may have a dotted name."""
     return np.array(getattr(*holder_of(struct, name)))
 
 
 def read_fields(
     model: mujoco.MjModel, names: Iterable[str], **view: Any
 ) -> dict[str, NDArray[Any]]:
-    """Return copies of fields; single numbers as arrays of no dimension.
+    """Return copies of fields; single numbers become zero-dimensional arrays.
 
     Args:
         model: the model.
-        names: of its fields, or those that begin with `camera.` and `option.`.
+        names: names of the model's fields, or names that begin with `camera.` or
+            `option.`.
         view: the `camera` and the `option`.
     """
     values = {}
@@ -104,18 +106,20 @@ def apply_fields(
     camera: mujoco.MjvCamera | None = None,
     option: mujoco.MjvOption | None = None,
 ) -> None:
-    """Set fields of a model, and of a view.
+    """Set fields of a model and of a view.
 
     Args:
         model: the model to change.
-        fields: values by names.
-        camera: what names that begin with `camera.` are set in; without it they are
-            left out.
-        option: likewise for `option.`.
+        fields: values by name.
+        camera: the camera to set fields that begin with `camera.` in; if None, they are
+            skipped.
+        option: the option to set fields that begin with `option.` in; if None, they are
+            skipped.
 
     Raises:
-        InvalidArgument: there is no such field, it has another shape, or it is none
-            that `is_settable`. Fields before it have been set then.
+        InvalidArgument: a field does not exist, its value has the wrong shape, type or
+            range, or it may not be set (see `is_settable`). Fields before it have then
+            been set.
     """
     view = {"camera": camera, "option": option}
     for name, value in fields.items():
@@ -128,11 +132,11 @@ def apply_fields(
 
 
 def is_settable(name: str) -> bool:
-    """Return whether a field of a model may be set to what a file says.
+    """Return whether a model's field may be set to a value from a file.
 
     MuJoCo trusts types, addresses and most indices in a model: a wrong one makes it
-    read foreign memory. Numbers with a point, flags, colours of textures and indices
-    that can be checked are settable.
+    read out of bounds. Floating-point numbers, flags, texture data and indices that can
+    be checked are settable.
     """
     if "." in name or name in _INDICES or _INTEGERS.fullmatch(name):
         return True
@@ -142,7 +146,7 @@ def is_settable(name: str) -> bool:
 _HARMLESS_TYPES = ("<f4", "<f8", "|u1", "|b1")
 _INTEGERS = re.compile(r"\w+_(contype|conaffinity|group|condim|priority)")
 
-# Indices by the size of the model that they have to be less than; -1 is none.
+# Indices, with the size of the model that bounds them; -1 means none.
 _INDICES = {
     **dict.fromkeys(
         ("geom_matid", "site_matid", "skin_matid", "flex_matid", "tendon_matid"), "nmat"
@@ -151,29 +155,29 @@ _INDICES = {
     "light_texid": "ntex",
 }
 
-# The visualiser looks these up in tables of its own, without a look at their bounds.
+# The visualiser uses these as indices into its own tables without checking bounds.
 _KINDS = {
     "option.label": int(mujoco.mjtLabel.mjNLABEL),
     "option.frame": int(mujoco.mjtFrame.mjNFRAME),
 }
 
-# Where a model's files were when it was compiled, and a checksum that nothing here
-# depends on.
+# The locations of a model's files when it was compiled, and a checksum that nothing
+# here depends on.
 _PLACES = re.compile(r"paths|npaths|nbuffer|signature|\w+_(path|contenttype)adr")
 
 
 def differing_fields(
     model: mujoco.MjModel, other: mujoco.MjModel
 ) -> dict[str, NDArray[Any]]:
-    """Return the fields of `other` that are not as in `model`, for `apply_fields`.
+    """Return the fields of `other` that differ from `model`, for `apply_fields`.
 
-    Environments set fields of a model after they compiled it: the size of the frame
-    buffer, the position of a target. Where the files of the models are, is not looked
-    at.
+    Environments set fields of a model after compiling it: the size of the frame
+    buffer, the position of a target. The locations of the models' files are not
+    compared.
 
     Raises:
-        ValueError: the models consist of different things, so that no setting of
-            fields makes one of the other.
+        ValueError: the models are structurally different, so that no setting of fields
+            turns one into the other.
     """
     for name in dir(model):
         value = None if name.startswith("_") else getattr(model, name)
@@ -182,11 +186,11 @@ def differing_fields(
             raise ValueError(f"{name} differs")
     names = [n for n in (*array_names(), *struct_names()) if not _PLACES.fullmatch(n)]
     ours, theirs = read_fields(model, names), read_fields(other, names)
-    # By their bytes: NaN is the same as NaN.
+    # Compared as bytes, because NaN must equal NaN.
     changed = {n: theirs[n] for n in names if ours[n].tobytes() != theirs[n].tobytes()}
     fixed = [name for name in changed if not is_settable(name)]
     if fixed:
-        raise ValueError(f"{', '.join(fixed)} differ, which only compiling can set")
+        raise ValueError(f"{', '.join(fixed)} differ, which only compiling can change")
     return changed
 
 
@@ -198,15 +202,15 @@ def _all_names() -> frozenset[str]:
 
 
 def _check_name(name: str) -> None:
-    # Names may come from a file: nothing else is ever looked up or set.
+    # Names may come from a file, so no others are ever looked up or set.
     if name not in _all_names():
         raise InvalidArgument(
             f"MuJoCo {mujoco.__version__} has no model field {name!r}. Use the version "
-            "that the recording was made with; its metadata names it."
+            "that the recording was made with; see its metadata."
         )
     if not is_settable(name):
         raise InvalidArgument(
-            f"The model field {name} is part of what the model consists of, and is not "
+            f"The model field {name} is part of the model's structure, so it cannot be "
             "set from a recording."
         )
 
@@ -219,25 +223,25 @@ def _set(struct: Any, name: str, value: NDArray[Any], *, field: str) -> None:
     if (
         np.shape(present) != value.shape
         or value.dtype.kind not in "iufb"
-        # NaN would pass for any index.
+        # NaN would pass the check of an index.
         or (is_whole and not (np.floor(value) == value).all())
     ):
         raise InvalidArgument(
-            f"The model field {field} is {'whole ' * is_whole}numbers of the shape "
-            f"{np.shape(present)} here, and the recorded one is {value.dtype} of the "
+            f"The model field {field} must be {'whole ' * is_whole}numbers of shape "
+            f"{np.shape(present)} here, but the recorded value is {value.dtype} of "
             f"shape {value.shape}: it belongs to another model."
         )
     if name in _INDICES:
         size = getattr(struct, _INDICES[name])
         if value.size and (value.min() < -1 or value.max() >= size):
             raise InvalidArgument(
-                f"The model field {name} holds indices from -1 to {size - 1} in this "
-                f"model, and the recorded one has some from {value.min()} to "
+                f"The model field {name} must hold indices from -1 to {size - 1} for "
+                f"this model, but the recorded ones range from {value.min()} to "
                 f"{value.max()}."
             )
     if field in _KINDS and value.item() not in range(_KINDS[field]):
         raise InvalidArgument(
-            f"The field {field} has to be from 0 to {_KINDS[field] - 1} in MuJoCo "
+            f"The field {field} must be from 0 to {_KINDS[field] - 1} in MuJoCo "
             f"{mujoco.__version__}, got {value}."
         )
     if isinstance(present, np.ndarray):

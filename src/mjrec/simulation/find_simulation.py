@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The MuJoCo simulation inside an environment, found by its shape.
+"""Finding the MuJoCo simulation inside an environment, by duck typing.
 
-Nothing is imported: an environment that has no simulation must not load MuJoCo, which
-settles its OpenGL backend when it is imported.
+Nothing is imported: an environment without a simulation must not load MuJoCo, which
+chooses its OpenGL backend on import.
 """
 
 from __future__ import annotations
@@ -10,21 +10,21 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any
 
-# Where the simulated part is, if it is not the environment itself: dm_control's
-# physics, and the environments inside Gymnasium-Robotics' mazes and kitchen.
+# Attributes that may hold the simulation if the environment itself does not:
+# dm_control's physics, and the environments in Gymnasium-Robotics' mazes and kitchen.
 _HOLDERS = ("physics", "point_env", "ant_env", "robot_env")
 
 
 def simulation_in(env: object) -> Any:
     """Return the object that has MuJoCo's `model` and `data` as attributes.
 
-    They are MuJoCo's own, or dm_control's wrappers of them.
+    These are MuJoCo's own objects, or dm_control's wrappers of them.
 
     Args:
         env: a Gymnasium or dm_env environment, wrapped or not.
 
     Returns:
-        None where there is no simulation that can be seen.
+        The object; None if no simulation can be found.
     """
     base = getattr(env, "unwrapped", env)
     for holder in _holders(base):
@@ -40,12 +40,12 @@ def _holders(base: object) -> Iterator[object]:
 
 
 def simulation_time(env: object) -> float | None:
-    """Return the time of the simulation inside `env`, in seconds; None without one."""
+    """Return the simulation time of `env` in seconds; None without a simulation."""
     simulation = simulation_in(env)
     return None if simulation is None else float(simulation.data.time)
 
 
 def _is_mujocos(holder: object, name: str) -> bool:
-    # MjModel and MjData, in dm_control's wrappers as `ptr`.
+    # dm_control's wrappers hold the MjModel or MjData as `ptr`.
     value = getattr(holder, name, None)
     return type(getattr(value, "ptr", value)).__name__ == f"Mj{name.capitalize()}"

@@ -1,14 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Files of strangers, worked on by a process with limits: this module as a program.
+"""A limited process that handles untrusted files. This module is its program.
 
-A few kilobytes of HDF5 can claim any amount of memory, the same data under a million
-names any amount of time, and a damaged file may crash or hang the HDF5 library. A line
-of MJCF can ask for a body replicated a thousand million times. So a trajectory in a
-directory that this user has not recorded into (`model_trust`) is read once, wholly, by
-such a process before it is read here, and all sources of models are compiled in one.
-Half a second is what that costs; one's own trajectories and models cost nothing.
+A few kilobytes of HDF5 can claim any amount of memory. The same data under a million
+names can take any amount of time. A damaged file may crash or hang the HDF5 library.
+One line of MJCF can ask for a body replicated a billion times.
 
-Logs of recordings in flight are not packed: they hold no more than their size.
+So if this user has not recorded into a trajectory's directory (`model_trust`), such a
+process reads the whole trajectory once before it is read here. All model sources are
+compiled in such a process too. This takes half a second; the user's own trajectories
+and models cost nothing.
+
+Logs of recordings in flight are not compressed, so they hold no more than their size.
 """
 
 from __future__ import annotations
@@ -33,13 +35,13 @@ if TYPE_CHECKING:
 _GIB = 1 << 30
 _LONGEST_REASON = 2000
 
-# What `load_trajectory` reads into memory: as much as that, or this many times the size
-# of the file. A robot that stands still packs so well; a file that is made to fill the
-# memory packs a thousandfold.
+# Memory for the data that `load_trajectory` reads: this much, plus this many times the
+# size of the file. A robot that stands still compresses that well; a file made to
+# exhaust memory compresses a thousandfold.
 _READING_MEMORY = 2 * _GIB
 _MOST_EXPANSION = 64
-# A file of a megabyte holds, at the most that HDF5's compression can do, a gigabyte,
-# which is unpacked in some seconds of the CPU; the machine may be busy.
+# HDF5's compression can pack at most a gigabyte into a megabyte of file. Unpacking it
+# takes some seconds of CPU time; the machine may be busy.
 _CPU_SECONDS = 8
 _CPU_SECONDS_PER_MB = 4
 _SECONDS_PER_CPU_SECOND = 10
@@ -47,28 +49,28 @@ _ROWS_AT_ONCE = 256
 
 # The largest robots and rooms of the field compile in seconds.
 _COMPILING_SECONDS = 300.0
-# Python, MuJoCo and what they need for threads, and then some room.
+# Enough for Python, MuJoCo and their threads, with some room to spare.
 _COMPILING_MEMORY = 6 * _GIB
 _MEMORY_FACTOR = 8
 _COMPILED = "model.mjb"
 
-# Name, device, inode, size and times of the files that did no harm.
+# Name, device, inode, size and times of the files that proved harmless.
 _harmless: set[tuple[str | int, ...]] = set()
 
 
 def open_vetted_trajectory(path: Path) -> TrajectoryReader:
-    """Open a trajectory for reading, as `open_trajectory` does, also a stranger's.
+    """Open a trajectory like `open_trajectory`, but safely if it is untrusted.
 
     Raises:
-        UnreadableFile: as `open_trajectory`; or the file is a stranger's and does harm
-            to the process that reads it.
+        UnreadableFile: see `open_trajectory`; or the file is untrusted and harms the
+            process that reads it.
     """
     if is_finished(path) and not (is_inside() or is_own_directory(path.parent)):
         found = file_of(path).stat()
         times = (found.st_mtime_ns, found.st_ctime_ns)
         identity = (path.name, found.st_dev, found.st_ino, found.st_size, *times)
         if identity not in _harmless:
-            # Holes count for nothing.
+            # Holes in a sparse file do not count.
             size = min(found.st_size, 512 * found.st_blocks)
             cpu_seconds = int(_CPU_SECONDS + _CPU_SECONDS_PER_MB * size / 1e6)
             memory = _READING_MEMORY + _MOST_EXPANSION * size
@@ -81,19 +83,19 @@ def open_vetted_trajectory(path: Path) -> TrajectoryReader:
 def compile_sources(
     path: Path, *, compiled_size: int, seconds: float = _COMPILING_SECONDS
 ) -> mujoco.MjModel:
-    """Return the model that `write_authored` was given, compiled by this MuJoCo.
+    """Return the model passed to `write_authored`, compiled by this MuJoCo.
 
     Args:
-        path: of the zip.
-        compiled_size: of the model when it was recorded, by which it is judged how
-            much memory compiling may take.
-        seconds: how long it may take.
+        path: the zip file.
+        compiled_size: size of the model in bytes when it was recorded. It determines
+            how much memory compiling may take.
+        seconds: the time limit.
 
     Raises:
-        UnreadableFile: it is damaged or dangerous, this MuJoCo refuses it, or it needs
-            more time or memory than that.
+        UnreadableFile: the file is damaged or dangerous, this MuJoCo rejects it, or
+            compiling exceeds the time or memory limit.
     """
-    # Here, because reading trajectories needs no simulator.
+    # Imported here, because reading trajectories needs no simulator.
     import mujoco
 
     memory = _COMPILING_MEMORY + _MEMORY_FACTOR * compiled_size
@@ -106,10 +108,10 @@ def compile_sources(
 def _done(
     task: str, path: Path, limits: dict[str, int], seconds: float
 ) -> Iterator[Path]:
-    """Let a process with limits do something with a file; yield what it left behind.
+    """Run a task on a file in a process with limits; yield its output directory.
 
     Raises:
-        UnreadableFile: it could not, or not in that time.
+        UnreadableFile: the task failed or took too long.
     """
     with (
         tempfile.TemporaryDirectory(prefix="mjrec-sandbox-") as place,
@@ -118,26 +120,26 @@ def _done(
             {"task": task, "path": str(path.absolute())},
             place=Path(place),
             limits={**LIMITS, **limits},
-            # Threads that nothing uses would take of the memory.
+            # Unused threads would take up memory.
             more_environ={"OPENBLAS_NUM_THREADS": "1"},
         ) as sandbox,
     ):
         answer = next(sandbox.answers(seconds), {})
         if answer is None:
-            reason = f"to {task} it takes longer than {seconds:g} seconds"
+            reason = f"it takes longer than {seconds:g} seconds to {task} it"
             raise UnreadableFile(path, reason)
         if "done" not in answer:
             raise UnreadableFile(
                 path,
                 answer.get("reason")
-                or f"the process that was to {task} it {sandbox.last_words()} (it may "
-                f"use {limits['RLIMIT_DATA'] / _GIB:.1f} GiB of memory)",
+                or f"the process that had to {task} it {sandbox.last_words()} (its "
+                f"memory limit is {limits['RLIMIT_DATA'] / _GIB:.1f} GiB)",
             )
         yield Path(place)
 
 
 def main() -> int:
-    """Do what the parent asks for."""
+    """Run the task that the parent requests."""
     request, say = enter()
     try:
         {"read": _read, "compile": _compile}[request["task"]](Path(request["path"]))
@@ -149,7 +151,7 @@ def main() -> int:
 
 
 def _read(path: Path) -> None:
-    """Read all that a trajectory holds, in the way in which it is used."""
+    """Read everything in a trajectory, the way it is normally read."""
     with open_trajectory(path) as reader:
         together = (
             reader.states(0, reader.row_count),
@@ -164,7 +166,7 @@ def _read(path: Path) -> None:
 
 
 def _compile(path: Path) -> None:
-    # Here, because reading trajectories needs no simulator.
+    # Imported here, because reading trajectories needs no simulator.
     import mujoco
 
     from .model_sources import read_authored

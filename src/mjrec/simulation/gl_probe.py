@@ -1,17 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """The child process that tries one OpenGL backend: `python -m` this module.
 
-It imports mujoco as `MUJOCO_GL` says, draws a scene, looks at the frame, and sends
-what it found to its parent, each thing at once: what was sent stays known if the driver
-crashes afterwards.
+It imports mujoco with the backend in `MUJOCO_GL`, draws a scene, checks the frame, and
+sends each result to its parent at once. So results already sent stay known if the
+driver crashes afterwards.
 
 ::
 
-    {"notes": [...]}                              what a failure may come from
+    {"notes": [...]}                              possible causes of a failure
     {"error": "ImportError: ..."}                 it does not render, or
     {"renders": true, "gl_renderer": ..., ...}    it does
     {"frames_per_second": 16.2}                   with --measure
-    {"devices": [...]}                            EGL's, where it tells; in any case
+    {"devices": [...]}                            always with EGL, if it lists them
 """
 
 from __future__ import annotations
@@ -37,8 +37,8 @@ _SMALL = 96
 _MEASURED_SECONDS = 0.8
 _MEASURED_FRAMES = 200
 
-# Colours that only shine, so that their pixels are the same whatever the light; the
-# floor and the shadows cost what they cost in a usual scene.
+# The colours are purely emissive, so their pixels do not depend on the light. The floor
+# and the shadows cost as much as in a normal scene.
 _SCENE = """
 <mujoco>
   <asset>
@@ -63,7 +63,7 @@ _SCENE = """
 </mujoco>
 """
 
-# (row, column) as parts of the height and the width, and what stands there.
+# The pixel's (row, column) as fractions of height and width, and its expected colour.
 _EXPECTED = {
     "red on the left": ((0.62, 0.23), (255, 0, 0)),
     "blue on the right": ((0.62, 0.77), (0, 0, 255)),
@@ -73,14 +73,14 @@ _TOLERANCE = 40
 
 
 class WrongFrame(Exception):
-    """A frame was drawn and does not show what it should."""
+    """A frame was drawn but does not show what it should."""
 
 
 def check_frame(frame: np.ndarray) -> None:
-    """Raise unless the probe's scene can be seen in `frame`.
+    """Check that `frame` shows the probe's scene.
 
     Raises:
-        WrongFrame: it is black or of one colour, or a colour is not in its place.
+        WrongFrame: the frame has a single colour, or a colour is in the wrong place.
     """
     if np.ptp(frame.reshape(-1, 3), axis=0).max() == 0:
         colour = tuple(frame[0, 0].tolist())
@@ -90,7 +90,7 @@ def check_frame(frame: np.ndarray) -> None:
         pixel = frame[int(row * height), int(column * width)]
         if np.abs(pixel.astype(int) - colour).max() > _TOLERANCE:
             raise WrongFrame(
-                f"The frame should show {name}, and that pixel is "
+                f"The frame should show {name}, but that pixel is "
                 f"{tuple(pixel.tolist())}."
             )
 
@@ -98,22 +98,24 @@ def check_frame(frame: np.ndarray) -> None:
 def draw_test_scene(
     side: int = _SMALL, canvas: Any = None
 ) -> tuple[Callable[[], np.ndarray], dict[str, Any]]:
-    """Draw the test scene and look at the frame.
+    """Draw the test scene and check the frame.
 
-    At MuJoCo's default quality; where a small frame is enough, without shadows.
+    It is drawn at MuJoCo's default quality, or without shadows and multisampling if the
+    frame is smaller than the probe's own.
 
     Args:
-        side: of the frame, in pixels.
-        canvas: what to draw with, as of `SceneRenderer`.
+        side: side of the square frame in pixels.
+        canvas: the canvas to draw with, see `SceneRenderer`.
 
     Returns:
-        What draws it again, and what metadata says of who draws.
+        A function that draws the scene again, and the facts about the driver for the
+        metadata.
 
     Raises:
-        WrongFrame: it does not show what it should.
-        Exception: of any kind; drivers raise what they like.
+        WrongFrame: the frame does not show what it should.
+        Exception: anything else; drivers raise all kinds of errors.
     """
-    # Not at the top: these imports are part of what is tried.
+    # Not at the top of the module: these imports are part of the test.
     import mujoco
 
     from .renderer import SceneRenderer
@@ -131,7 +133,7 @@ def draw_test_scene(
 
 
 def main() -> None:
-    """Try the backend that `MUJOCO_GL` names."""
+    """Try the backend in `MUJOCO_GL`."""
     parent = Parent()
     backend = os.environ.get("MUJOCO_GL", "")
     facts: dict[str, Any] = {}
@@ -140,9 +142,9 @@ def main() -> None:
         parent.send(renders=True, **facts)
         if "--measure" in sys.argv:
             parent.send(frames_per_second=_frames_per_second(draw))
-    except Exception as error:  # Whatever it is, it is the answer.
+    except Exception as error:  # Any error is a result.
         parent.send(notes=list(_notes(backend)), error=_text_of(error))
-    # Last, because asking for CUDA's numbers begins CUDA, which may fail or hang.
+    # Last, because querying CUDA's numbers initialises CUDA, which may fail or hang.
     if backend == "egl":
         used = facts.get("gl_device", {}).get("index")
         devices = [
@@ -163,7 +165,7 @@ def _frames_per_second(draw: Callable[[], np.ndarray]) -> float:
             return frames / elapsed
 
 
-# --- What a failure may come from -------------------------------------------------
+# --- Possible causes of a failure -------------------------------------------------
 
 _LIBRARIES = {
     "egl": ["libEGL.so.1"],
@@ -175,7 +177,7 @@ _VENDOR_DIRECTORIES = "/etc/glvnd/egl_vendor.d:/usr/share/glvnd/egl_vendor.d"
 
 
 def _notes(backend: str) -> Iterator[str]:
-    """Yield what there is of a backend's parts, one sentence each."""
+    """Yield one sentence about each part of a backend that was looked for."""
     for library in _LIBRARIES.get(backend, []):
         yield f"library {library}: {_load(library)}"
     if backend == "egl":
@@ -195,7 +197,7 @@ def _load(library: str) -> str:
 
 
 def _vendor_notes() -> Iterator[str]:
-    """Yield which drivers libEGL finds, by its own rules."""
+    """Yield the drivers that libEGL finds by its own rules."""
     names = os.environ.get("__EGL_VENDOR_LIBRARY_FILENAMES", "")
     directories = os.environ.get("__EGL_VENDOR_LIBRARY_DIRS", "") or _VENDOR_DIRECTORIES
     files = (
@@ -223,14 +225,14 @@ def _vendor_library(file: Path) -> str:
 
 
 def _mesa_notes() -> Iterator[str]:
-    """Yield Mesa's version: since 24.2 it is part of a library's name."""
+    """Yield Mesa's version, which is part of a library's name since 24.2."""
     for directory in _LIBRARY_DIRECTORIES:
         for file in Path("/").glob(f"{directory.lstrip('/')}/libgallium-*.so"):
             yield f"Mesa's library: {file.name}"
 
 
 def _text_of(error: BaseException) -> str:
-    """Return an exception and what caused it, outermost first, a line each."""
+    """Return an exception and its causes, outermost first, one per line."""
     lines = []
     link: BaseException | None = error
     while link is not None:
@@ -241,5 +243,5 @@ def _text_of(error: BaseException) -> str:
 
 if __name__ == "__main__":
     main()
-    # Some versions of mujoco print tracebacks while contexts end at exit.
+    # Some versions of mujoco print tracebacks when contexts are freed at exit.
     os._exit(0)

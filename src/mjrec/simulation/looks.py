@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What has changed in a model and in how it is shown, found by comparing memory.
+"""Changes in a model and its view, found by comparing memory.
 
-Comparing some five hundred arrays one by one takes longer than a simulation step. They
-all lie in one allocation, and the structs `opt`, `vis` and `stat` one behind the other
-in `mjModel` itself, so that comparing a few long pieces tells that nothing has changed,
-which is usual. Only a piece that differs is looked at by name.
+Comparing some 500 arrays one by one takes longer than a simulation step. But all of
+them are in one allocation, and the structs `opt`, `vis` and `stat` follow one another
+in `mjModel` itself. Comparing a few long pieces therefore shows that nothing has
+changed, which is the usual case. Only a piece that differs is examined by name.
 """
 
 from __future__ import annotations
@@ -21,36 +21,36 @@ from .fields import array_names, member_names, read_fields, struct_names
 from .raw_memory import address_of, raw_memory
 from .view import SceneView
 
-# What each frame is drawn from; whole groups, because a few long pieces are compared
-# faster than what the visualiser is known to read. Other arrays are compared at resets.
+# The arrays that each frame is drawn from. Whole groups, because a few long pieces are
+# compared faster than the exact arrays. Other arrays are compared at resets.
 _DRAWN = (
     *("geom_", "site_", "mat_", "light_", "cam_", "tendon_", "actuator_cranklength"),
     *("skin_matid", "skin_group", "skin_rgba", "skin_inflate"),
     *("flex_matid", "flex_group", "flex_rgba", "flex_radius"),
 )
 
-# How far a camera and an option reach before their first and behind their last array.
-# Nothing beyond is looked at: it belongs to others, and may change at any time.
+# Bytes of a camera and an option before their first and after their last array. Memory
+# beyond belongs to other objects and may change at any time, so it is not compared.
 _REACH = {mujoco.MjvCamera: (16, 32), mujoco.MjvOption: (8, 8)}
 
 _Arrays = list[tuple[str, NDArray[Any]]]
 
 
 class Looks:
-    """Remembers a model and a view, and tells which of their fields have changed.
+    """The remembered fields of a model and a view, to find which have changed.
 
-    At a reset any field of the model counts, in between what each frame is drawn from:
-    not textures and meshes, which have to be uploaded to the graphics card. The model
-    is only read, and kept alive.
+    At a reset all fields of the model are compared. Between resets only those are
+    compared that each frame is drawn from. These exclude textures and meshes, which
+    must be uploaded to the graphics card. The model is only read, and is kept alive.
 
     Args:
         model: the model, as it is stored now.
 
     Attributes:
-        seen: what is watched, in pieces, as it was when last looked at. The list is
-            another one after `follow`; its pieces are changed in place.
-        present: the same pieces as they are: where the lists are equal, nothing of
-            what is watched has changed.
+        seen: the watched memory in pieces, as of the last look. `follow` may replace
+            the list; its pieces are changed in place.
+        present: the same pieces as they are now. If the two lists are equal, nothing
+            watched has changed.
     """
 
     def __init__(self, model: mujoco.MjModel) -> None:
@@ -66,12 +66,12 @@ class Looks:
         self.present: list[Any] = []
 
     def is_of(self, model: mujoco.MjModel) -> bool:
-        """Return whether `model` is the model remembered, in whatever wrapper."""
-        # The address is of no other model while this one is kept alive.
+        """Return whether `model` is the remembered model, in any wrapper."""
+        # No other model can have this address while this one is kept alive.
         return bool(model._address == self._model._address)
 
     def follow(self, view: SceneView) -> None:
-        """Watch the camera and the option of a view from here on, as they are now."""
+        """Watch the camera and the option of a view from now on."""
         structs = {"camera": view.camera, "option": view.option}
         if all(self._structs.get(name) is struct for name, struct in structs.items()):
             for piece in self._view:
@@ -92,9 +92,9 @@ class Looks:
         return bytes(self._view[1].raw)
 
     def since_stored(self) -> dict[str, NDArray[Any]]:
-        """Return the model's fields that are other than when this was made.
+        """Return the model's fields that have changed since this was created.
 
-        What is there now counts as seen.
+        The current values count as seen.
         """
         names: list[str] = []
         for piece in (*self._watched, *self._others):
@@ -102,13 +102,13 @@ class Looks:
         return read_fields(self._model, names)
 
     def changed(self, *, anything: bool = False) -> dict[str, NDArray[Any]] | None:
-        """Return the watched fields that are other than when last looked at.
+        """Return the watched fields that have changed since the last look.
 
         Args:
-            anything: look at textures, meshes and the like, too.
+            anything: also compare textures, meshes and the like.
 
         Returns:
-            Copies by their names; None, in a microsecond, where all are the same.
+            Copies by name; None, within a microsecond, if nothing has changed.
         """
         if not anything and self.seen == self.present:
             return None
@@ -120,8 +120,8 @@ class Looks:
 class _Piece:
     """A piece of memory, as it was at first (`stored`) and when it was last `seen`.
 
-    Of what is not watched at each step, which may be large, one copy is kept until
-    something changes.
+    For memory that is not watched at each step, which may be large, the two share one
+    copy until something changes.
     """
 
     def __init__(self, address: int, size: int, *, is_watched: bool = True) -> None:
@@ -130,7 +130,7 @@ class _Piece:
         self.seen = bytearray(self.raw) if is_watched else self.stored
 
     def look(self) -> list[str]:
-        """Return the names of what has changed since the last look."""
+        """Return the names of the fields that have changed since the last look."""
         if self.seen == self.raw:
             return []
         names = self.differing(self.seen)
@@ -138,8 +138,8 @@ class _Piece:
         return names
 
     def look_from_stored(self) -> list[str]:
-        """Return the names of what is other than at first."""
-        # Once: it may be megabytes of textures.
+        """Return the names of the fields that differ from `stored`."""
+        # Compared only once: there may be megabytes of textures.
         is_same = self.stored == self.raw
         is_one = self.seen is self.stored
         if not (is_one and is_same) and self.seen != self.raw:
@@ -147,19 +147,19 @@ class _Piece:
         return [] if is_same else self.differing(self.stored)
 
     def see(self) -> None:
-        """Remember what is there, in place: `Looks` has given `seen` away."""
+        """Remember the current bytes, in place because `Looks` shares `seen`."""
         if self.seen is self.stored:
             self.seen = bytearray(self.raw)
         else:
             self.seen[:] = self.raw
 
     def differing(self, before: bytearray) -> list[str]:
-        """Return the names of what is other than in a copy of the memory."""
+        """Return the names of the fields that differ from a copy of the memory."""
         raise NotImplementedError
 
 
 class _ArrayPiece(_Piece):
-    """Arrays that lie one behind the other."""
+    """Arrays that follow one another in memory."""
 
     def __init__(self, arrays: _Arrays, *, is_watched: bool) -> None:
         first = address_of(arrays[0][1])
@@ -176,11 +176,11 @@ class _ArrayPiece(_Piece):
 
 
 class _StructPiece(_Piece):
-    """Structs, whose members are looked at one by one where any byte has changed.
+    """Structs, whose members are compared one by one once any byte has changed.
 
     Args:
-        names: of the members, as `read_fields` takes them.
-        holders: its other arguments.
+        names: the members' names, as `read_fields` takes them.
+        holders: the other arguments of `read_fields`.
     """
 
     def __init__(
@@ -206,11 +206,11 @@ class _StructPiece(_Piece):
 
 
 def _pieces(model: mujoco.MjModel) -> list[tuple[bool, _Arrays]]:
-    """Return pieces of memory that together hold all arrays, and what is watched."""
+    """Return the pieces of memory that hold all arrays, each with `is_watched`."""
     named = [(name, getattr(model, name)) for name in array_names()]
     arrays = [(name, array) for name, array in named if array.nbytes]
     arrays.sort(key=lambda item: address_of(item[1]))
-    # Should other memory lie between them, each is a piece of its own.
+    # If there is other memory between the arrays, each array is a piece of its own.
     are_together = _extent(arrays) <= int(model.nbuffer)
     groups = itertools.groupby(
         arrays, lambda item: (item[0].startswith(_DRAWN), are_together or item[0])
@@ -224,7 +224,7 @@ def _extent(arrays: _Arrays) -> int:
 
 
 def _structs_of(model: mujoco.MjModel) -> _StructPiece:
-    # They lie behind the sizes; the last member of the last of them is an array.
+    # They follow the sizes; the last member of the last struct is an array.
     size = address_of(model.stat.center) + model.stat.center.nbytes - model._address
     return _StructPiece(model._address, size, struct_names(), model=model)
 

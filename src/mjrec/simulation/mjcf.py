@@ -16,7 +16,7 @@ from ..rates import MAX_DENOMINATOR
 
 FRAME_RATE = Fraction(60)
 
-# Authors write five digits of a timestep that is one over a whole number.
+# Authors write a timestep of 1/n seconds with about five digits.
 _ROUNDING = Fraction(1, 10**5)
 
 _INTEGRATION = int(mujoco.mjtState.mjSTATE_INTEGRATION)
@@ -31,34 +31,34 @@ def load_mjcf(path: Path) -> mujoco.MjModel:
     """Return the compiled model of an MJCF file.
 
     Raises:
-        UnreadableFile: it is not there, or MuJoCo refuses it, with MuJoCo's reason.
+        UnreadableFile: the file is missing, or MuJoCo rejects it (with its reason).
     """
     if path.exists() and not path.is_file():
-        # Opening a pipe would wait for ever.
+        # Opening a pipe would block forever.
         raise UnreadableFile(path, "it is not a regular file")
     try:
         return mujoco.MjModel.from_xml_path(str(path))
-    # Where memory does not suffice it is a RuntimeError.
+    # If memory runs out, MuJoCo raises RuntimeError.
     except (RuntimeError, ValueError, mujoco.FatalError) as error:
         reason = " ".join(str(error).split())
         raise UnreadableFile(path, reason.rstrip(".")) from error
 
 
 class MjcfSimulation:
-    """Simulates a model by whole physics steps, 60 frames to the simulated second.
+    """A simulation in whole physics steps, at 60 frames per simulated second.
 
-    After frame k the simulation is where whole steps bring it nearest to k/60 seconds:
-    with a timestep of 0.01 the frames are 2, 1, 2, 2, 1, 2 ... steps apart, never more
-    than half a step off, and no error adds up. Where the timestep is longer than 1/60
-    of a second, each frame is one step and the rate is one over the timestep.
+    Frame k is taken after the whole number of steps that comes closest to k/60 seconds.
+    With a timestep of 0.01, frames are 2, 1, 2, 2, 1, 2 ... steps apart, never more
+    than half a step off, and errors do not accumulate. If the timestep is longer than
+    1/60 second, each frame is one step, and the rate is one over the timestep.
 
     Args:
-        model: the compiled model, as of `load_mjcf`.
+        model: the compiled model, see `load_mjcf`.
 
     Attributes:
         model: the `mujoco.MjModel`.
         data: its `mujoco.MjData`.
-        frame_rate: frames in a simulated second.
+        frame_rate: frames per simulated second.
     """
 
     def __init__(self, model: mujoco.MjModel) -> None:
@@ -70,7 +70,7 @@ class MjcfSimulation:
         self.reset()
 
     def reset(self) -> None:
-        """Go to the model's initial state: `mj_resetData`, no keyframe."""
+        """Reset to the model's initial state with `mj_resetData`, not to a keyframe."""
         self._frames = 0
         mujoco.mj_resetData(self.model, self.data)
         mujoco.mj_forward(self.model, self.data)
@@ -78,15 +78,15 @@ class MjcfSimulation:
     def advance(self, ctrl: NDArray[np.float64]) -> str | None:
         """Simulate until the next frame.
 
-        Where the simulation becomes unstable MuJoCo starts it anew in the middle of a
-        step. That is undone: the simulation stays at the last frame that was sound.
+        If the simulation becomes unstable, MuJoCo resets it in the middle of a step.
+        This is undone: the simulation stays at the last good frame.
 
         Args:
-            ctrl: the control of the actuators, `(nu,) float64`; MuJoCo clamps it into
-                the actuators' ranges.
+            ctrl: the actuators' controls, `(nu,) float64`; MuJoCo clamps them to the
+                actuators' ranges.
 
         Returns:
-            What went wrong; None if nothing did.
+            A description of the problem; None if there was none.
         """
         mujoco.mj_getState(self.model, self.data, self._before, _INTEGRATION)
         self.data.ctrl[:] = ctrl
@@ -105,7 +105,7 @@ class MjcfSimulation:
     def control_ranges(self) -> NDArray[np.float64]:
         """Return the lowest and highest control of each actuator, `(nu, 2) float64`.
 
-        An actuator without limits has infinite ones.
+        The range of an actuator without limits is infinite.
         """
         limited = self.model.actuator_ctrllimited.astype(bool)[:, np.newaxis]
         endless = np.array([-np.inf, np.inf])
@@ -118,12 +118,12 @@ class MjcfSimulation:
         return math.floor(frame / (self.frame_rate * self._timestep) + Fraction(1, 2))
 
     def _trouble(self) -> str | None:
-        # Starting anew clears older counts, so one of these is set after any bad step.
+        # MuJoCo's reset clears older counts, so one of these is set after any bad step.
         for warning, quantity in _BAD_STATES.items():
             if self.data.warning[warning].number:
                 index = self.data.warning[warning].lastinfo
                 return (
-                    "the simulation became unstable: a NaN, infinite or huge "
+                    "the simulation became unstable: found a NaN, infinite or huge "
                     f"{quantity} at index {index}"
                 )
         return None

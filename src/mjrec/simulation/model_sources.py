@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a model was made from: MJCF and the files it refers to, in one zip.
+"""The sources of a model: its MJCF and the files that it refers to, in one zip.
 
 ::
 
     contents.json          {"format": 1, "main": "humanoid.xml"}
-    source/humanoid.xml    the files, laid out as their authors did
+    source/humanoid.xml    the files, in their authors' layout
     source/meshes/...
-    fields/<name>.npy      the fields in which the stored model is other than the
-                           compiled sources: what an environment set by hand
+    fields/<name>.npy      the fields in which the stored model differs from the
+                           compiled sources, because an environment set them
 
-The same content makes the same bytes. Compiling reads nothing but these files.
+The same content always gives the same bytes. Compiling reads no files but these.
 """
 
 from __future__ import annotations
@@ -43,16 +43,16 @@ _SOURCE = "source/"
 _FIELDS = "fields/"
 _EPOCH = (1980, 1, 1, 0, 0, 0)
 
-# Attributes of MJCF that say where the files are.
+# Attributes of MJCF that name directories of files.
 _DIRECTORIES = ("assetdir", "meshdir", "texturedir")
 _XML_ELEMENTS = ("include", "model")
 
-# A path is put together from several attributes, and each may go up so far. The files
-# are compiled further below an empty directory than that: going up leads to nothing.
+# A path is composed of several attributes, each of which may go up this many levels.
+# The files are compiled deeper than that in an empty directory, so `..` finds nothing.
 _MOST_UP = 4
 _EMPTY = PurePosixPath(*["x"] * 8 * _MOST_UP)
 
-# What MuJoCo raises where memory does not suffice, as a RuntimeError.
+# The message of the RuntimeError that MuJoCo raises if memory runs out.
 _MUJOCO_GAVE_UP = "Caught an unknown exception!"
 
 
@@ -61,8 +61,8 @@ class AuthoredModel:
     """MJCF with every file that it depends on.
 
     Attributes:
-        main: the name of the MJCF file that is compiled.
-        files: the content of every file by its name: a relative path with `/`.
+        main: the name of the MJCF file to compile.
+        files: the content of every file by its name, a relative path with `/`.
     """
 
     main: str
@@ -70,26 +70,26 @@ class AuthoredModel:
 
 
 def authored_from_file(path: Path) -> AuthoredModel | None:
-    """Return an MJCF file and everything it includes and refers to.
+    """Return an MJCF file and everything that it includes and refers to.
 
     Returns:
-        None where that cannot be found out or stored: a file is missing or named by
-        an absolute path, a plugin is used, or it is no MJCF.
+        The files; None if they cannot be determined or stored: a file is missing or is
+        given by an absolute path, a plugin is used, or it is not MJCF.
     """
     try:
         return _gathered(Path(os.path.abspath(path)))  # noqa: PTH100  resolve() would follow links, and names are relative to where a file is named
     except (ValueError, OSError):
-        logger.debug("What %s is made from is not stored.", path, exc_info=True)
+        logger.debug("The sources of %s are not stored.", path, exc_info=True)
         return None
 
 
 def write_authored(path: Path, authored: AuthoredModel, model: mujoco.MjModel) -> None:
-    """Write what `model` was made from, and what was set in it by hand.
+    """Write the sources of `model`, and the fields that were set after compiling.
 
     Raises:
-        ValueError: that would not give the same model.
+        ValueError: the sources do not give the same model.
     """
-    # Some have names such as `./meshes/../a.obj`.
+    # Some names are like `./meshes/../a.obj`.
     files = {posixpath.normpath(name): data for name, data in authored.files.items()}
     authored = AuthoredModel(posixpath.normpath(authored.main), files)
     fields = differing_fields(_compile(authored), model)
@@ -110,12 +110,12 @@ def write_authored(path: Path, authored: AuthoredModel, model: mujoco.MjModel) -
 
 
 def read_authored(path: Path) -> mujoco.MjModel:
-    """Return the model that `write_authored` was given, compiled by this MuJoCo.
+    """Return the model that was passed to `write_authored`, compiled by this MuJoCo.
 
-    Only for a sandbox: what is in a stranger's file may take any time and memory.
+    Use it only in a sandbox: an untrusted file may take any time and memory.
 
     Raises:
-        UnreadableFile: it is damaged or dangerous, or this MuJoCo refuses it.
+        UnreadableFile: the file is damaged or dangerous, or this MuJoCo rejects it.
     """
     sources, fields = {}, {}
     try:
@@ -129,53 +129,53 @@ def read_authored(path: Path) -> mujoco.MjModel:
                     value = np.load(io.BytesIO(archive.read(name)), allow_pickle=False)
                     fields[field] = np.asarray(value)
         if not isinstance(contents, dict) or contents.get("format") != _FORMAT:
-            raise ValueError("it holds no model of a format that this mjrec knows")
+            raise ValueError("its format is not known to this version of mjrec")
         model = _compile(AuthoredModel(contents["main"], sources))
         apply_fields(model, fields)
-    # Whatever it is that zipfile, NumPy and MuJoCo raise for such a file.
+    # zipfile, NumPy and MuJoCo may raise any error for such a file.
     except Exception as error:
         reason = " ".join(str(error).split())
         if isinstance(error, MemoryError) or reason == _MUJOCO_GAVE_UP:
-            reason = "it needs more memory than there is, or than it may have"
+            reason = "it needs more memory than is available or allowed"
         raise UnreadableFile(path, reason.rstrip(".")) from error
     return model
 
 
 def with_embedded_files(model: mujoco.MjModel) -> mujoco.MjModel:
-    """Return the model with the textures in it that it only refers to."""
-    # MuJoCo 3.17 brought such textures; what is not in the model has no address.
+    """Return the model with those textures embedded that it only refers to."""
+    # MuJoCo 3.17 introduced such textures. Their address in the model is negative.
     if not hasattr(mujoco, "mj_embedAssets") or not (model.tex_adr < 0).any():
         return model
     return mujoco.mj_embedAssets(model)
 
 
 def _compile(authored: AuthoredModel) -> mujoco.MjModel:
-    """Return the compiled model; no file but those of `authored` is read.
+    """Return the compiled model. Only the files of `authored` are read.
 
     Raises:
-        ValueError: MuJoCo refuses it, or a name in it leads elsewhere, or it uses a
+        ValueError: MuJoCo rejects the model, a name in it points outside, or it uses a
             plugin.
     """
     by_base_name: dict[str, list[str]] = {}
     for name in authored.files:
         _check_reference(name)
         if any(part in ("", ".", "..") for part in name.split("/")):
-            raise ValueError(f"it holds a file called {name!r}")
+            raise ValueError(f"it holds a file named {name!r}")
         by_base_name.setdefault(PurePosixPath(name).name, []).append(name)
     if _parsed(authored.main, authored.files[authored.main]).tag != "mujoco":
         raise ValueError(f"{authored.main} is not MJCF")
-    # All files that may be read as MJCF are looked at, whatever they are called, and
-    # wherever they are: MuJoCo's rules for that have changed.
+    # Every file that MuJoCo may read as MJCF is checked, whatever its name or folder,
+    # because MuJoCo's rules for finding files have changed.
     waiting, goes_up = [authored.main], False
     while waiting:
         name = waiting.pop()
         references = _References(name, authored.files[name])
         goes_up |= references.go_up
         for reference in references.xml:
-            # Taken out, so that nothing is looked at twice, however often it is named.
+            # Removed, so that no file is checked twice, however often it is named.
             waiting += by_base_name.pop(PurePosixPath(reference).name, [])
     with tempfile.TemporaryDirectory(prefix="mjrec-model-") as directory:
-        # Making so many folders takes longer than compiling most models.
+        # Creating that many folders takes longer than compiling most models.
         root = Path(directory) / _EMPTY if goes_up else Path(directory)
         for name, content in authored.files.items():
             (root / name).parent.mkdir(parents=True, exist_ok=True)
@@ -185,16 +185,16 @@ def _compile(authored: AuthoredModel) -> mujoco.MjModel:
 
 
 class _References:
-    """What one MJCF file refers to, as it is written there.
+    """The files that one MJCF file refers to, as written there.
 
     Attributes:
-        xml: other MJCF.
+        xml: other MJCF files.
         assets: all other files.
-        directories: in which they are looked for.
-        go_up: whether a path leaves a folder by `..`.
+        directories: the directories in which they are looked up.
+        go_up: whether a path leaves a folder with `..`.
 
     Raises:
-        ValueError: it is no plain MJCF, or refers to what is elsewhere.
+        ValueError: the file is not plain MJCF, or refers to files outside.
     """
 
     def __init__(self, name: str, content: bytes) -> None:
@@ -216,27 +216,27 @@ class _References:
 
 
 def _parsed(name: str, content: bytes) -> ElementTree.Element:
-    """Return the XML, if MuJoCo's own parser cannot see another one in it."""
+    """Return the XML, unless MuJoCo's parser might read it differently."""
     text = content.decode("utf-8-sig")
     declared = re.match(r"\s*<\?xml[^>]*encoding\s*=\s*[\"']([^\"']*)", text)
     if declared and declared[1].lower() != "utf-8":
-        raise ValueError(f"{name} is written in {declared[1]}, not in UTF-8")
+        raise ValueError(f"{name} is encoded in {declared[1]}, not in UTF-8")
     if "\0" in text or re.search(r"<\s*!\s*(DOCTYPE|ENTITY)", text, re.IGNORECASE):
-        raise ValueError(f"{name} is no plain XML")
+        raise ValueError(f"{name} is not plain XML")
     if re.search(r"<\s*plugin\b", text):
-        raise ValueError(f"{name} uses a plugin, and none is loaded for a recording")
+        raise ValueError(f"{name} uses a plugin, and plugins are not loaded here")
     try:
         return ElementTree.fromstring(text)
     except ElementTree.ParseError as error:
-        raise ValueError(f"{name} is no XML: {error}") from error
+        raise ValueError(f"{name} is not XML: {error}") from error
 
 
 def _check_reference(value: str) -> None:
-    # A colon is a drive, or what a resource provider is called by.
+    # A colon marks a drive, or a resource provider's name.
     if value.startswith(("/", "~")) or any(c in value for c in "\\:\0"):
-        raise ValueError(f"it refers to {value!r}, which is no plain relative path")
+        raise ValueError(f"it refers to {value!r}, which is not a plain relative path")
     if value.split("/").count("..") > _MOST_UP:
-        raise ValueError(f"it refers to {value!r}, which is outside")
+        raise ValueError(f"it refers to {value!r}, which is outside its directory")
 
 
 def _gathered(main: Path) -> AuthoredModel:
@@ -262,8 +262,8 @@ def _gathered(main: Path) -> AuthoredModel:
 def _existing(
     bases: Iterable[Path], directories: Iterable[str], reference: str
 ) -> list[Path]:
-    """Return every file that the reference may stand for."""
-    # `strippath` takes the directories away.
+    """Return every file that the reference may denote."""
+    # `strippath` strips the directories.
     names = {reference, PurePosixPath(reference).name}
     candidates = {
         Path(os.path.normpath(base / directory / name))
@@ -273,5 +273,5 @@ def _existing(
     }
     found = [path for path in candidates if path.is_file()]
     if not found:
-        raise ValueError(f"there is no {reference!r}")
+        raise ValueError(f"{reference!r} does not exist")
     return found

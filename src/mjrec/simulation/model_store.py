@@ -5,11 +5,11 @@
 
     directory/
     ├── openaigym.model.<16 hex digits>.mjb.gz    the compiled model, exactly
-    └── openaigym.model.<16 hex digits>.zip       what it was made from, where known
+    └── openaigym.model.<16 hex digits>.zip       its sources, if known
 
-The digits are the beginning of the sha256 of the compiled model. Only the MuJoCo
-version that compiled a model can load it; the zip is for all others, and for readers
-other than the user who has stored it (`model_trust`).
+The digits are the beginning of the compiled model's sha256. Only the MuJoCo version
+that compiled a model can load it. The zip is for all other versions, and for all users
+except the one who stored it (`model_trust`).
 """
 
 from __future__ import annotations
@@ -44,12 +44,12 @@ from .model_trust import (
 
 logger = logging.getLogger(__name__)
 
-# Of dm_control's humanoid (11.8 MB) level 3 makes 529 KB in 42 ms, level 6 323 KB in
-# 112 ms, level 1 686 KB in 37 ms; what it saves is time of a CPU that renders.
+# For dm_control's humanoid (11.8 MB), level 1 gives 686 KB in 37 ms, level 3 529 KB in
+# 42 ms, level 6 323 KB in 112 ms. This time is taken from a CPU that also renders.
 _LEVEL = 3
 _CHUNK = 1 << 20
 
-# Nothing that was recorded comes near; a file that claims more is made to hurt.
+# No recorded model comes near this; a file that claims more was made to do harm.
 _LARGEST = 1 << 31
 
 _NAME = re.compile(r"openaigym\.model\.[0-9a-f]{16}\.(mjb\.gz|zip)")
@@ -62,13 +62,13 @@ class _Job(NamedTuple):
 
 
 class ModelStore:
-    """Stores models beside recordings, off the caller's thread.
+    """A store of models next to recordings, written in a background thread.
 
-    Files appear whole or not at all, and one that is there is not written again, so
-    that any number of processes may store into one directory.
+    Files appear complete or not at all, and an existing one is never rewritten. So any
+    number of processes may store into one directory.
 
     Args:
-        directory: of the recordings; it must be there.
+        directory: the recordings' directory, which must exist.
     """
 
     def __init__(self, directory: Path) -> None:
@@ -80,18 +80,18 @@ class ModelStore:
     def add(
         self, model: mujoco.MjModel, authored: AuthoredModel | None = None
     ) -> dict[str, Any]:
-        """Store a model as it is now; the writing is done on another thread.
+        """Store a model as it is now; it is written in another thread.
 
         Args:
-            model: not changed, and not referred to later.
-            authored: what it was made from. The model may be other than that in the
-                values of its fields, not in what it consists of; where it is, what it
-                was made from is not stored, and the name of it stands for nothing.
+            model: the model; it is not modified, and not used later.
+            authored: its sources. The model may differ from them in the values of its
+                fields, but not in its structure. If its structure differs, the sources
+                are not stored, and the file that `xml` names will not exist.
 
         Returns:
-            The facts by which `load_model` finds it: `sha256` of the compiled model,
-            `bytes` of it, `mjb` and `xml` (base names; `xml` may be None), `mujoco`
-            (the version).
+            The facts with which `load_model` finds the model: its `sha256`, its size
+            in `bytes`, the base names `mjb` and `xml` (which may be None), and the
+            `mujoco` version.
         """
         compiled = saved_model(model)
         digest = hashlib.sha256(compiled.data).hexdigest()
@@ -101,7 +101,7 @@ class ModelStore:
             self._known |= names
             note_models([digest, directory_digest(self._directory)])
             if self._writer is None:
-                # Models may be large, and more than one waiting would add up.
+                # Models may be large, so at most one may wait.
                 self._writer = WorkerThread(self._store, capacity=1, name="model store")
             self._writer.put(_Job(stem, compiled, authored))
         return {
@@ -116,7 +116,7 @@ class ModelStore:
         """Wait until every model is stored. More may be added afterwards.
 
         Raises:
-            FileNotWritten: one could not be. It is tried again by the next call.
+            FileNotWritten: a model could not be stored. The next call retries it.
         """
         self.settle()
         failed, self._failed = self._failed, []
@@ -126,13 +126,13 @@ class ModelStore:
             raise self._failed[0][1]
 
     def settle(self) -> None:
-        """Wait until every model is stored, or could not be: `finish` says so."""
+        """Wait until every model is stored or has failed; `finish` reports failures."""
         if self._writer is not None:
             self._writer.close()
             self._writer = None
 
     def leave(self) -> None:
-        """Let what waits be stored in the background. Never blocks."""
+        """Store waiting models in the background. Never blocks."""
         if self._writer is not None:
             self._writer.leave()
 
@@ -156,20 +156,20 @@ def load_model(
 ) -> mujoco.MjModel:
     """Return a stored model.
 
-    It is loaded as it was compiled, where this is the MuJoCo version that compiled it
-    and this user has stored it (`model_trust`). Else it is compiled again from what
-    it was made from; of that, only files from the zip are read.
+    The compiled model is loaded if this MuJoCo version compiled it and this user stored
+    it (`model_trust`). Otherwise the model is recompiled from its sources, and no files
+    outside the zip are read.
 
     Args:
-        directory: of the recording.
-        facts: as `ModelStore.add` returned them.
-        trust_models: whether to load a stranger's compiled model too. MuJoCo
-            believes what stands in it: a crafted one can do anything.
+        directory: the recording's directory.
+        facts: the facts that `ModelStore.add` returned.
+        trust_models: whether to load an untrusted compiled model. MuJoCo does not check
+            its content: a crafted one can run any code.
 
     Raises:
-        UnreadableFile: the files are missing, damaged or not what the facts say, or
+        UnreadableFile: the files are missing, damaged or do not match the facts, or
             another MuJoCo version is needed.
-        UntrustedModel: there is only a stranger's compiled model.
+        UntrustedModel: there is only a compiled model, and it is untrusted.
     """
     compiled, source = (_path(directory, facts.get(key)) for key in ("mjb", "xml"))
     try:
@@ -178,8 +178,8 @@ def load_model(
         if source is None:
             raise
         objection = error
-    logger.info("%s It is compiled from %s.", objection, source.name)
-    # Here, because it loads h5py, for which who records has no use.
+    logger.info("%s The model is compiled from %s.", objection, source.name)
+    # Imported here, because it loads h5py, which recording does not need.
     from .foreign_files import compile_sources
 
     try:
@@ -192,7 +192,7 @@ def load_model(
 
 
 def saved_model(model: mujoco.MjModel) -> NDArray[np.uint8]:
-    """Return a model as `mj_saveModel` writes it, with all that it refers to."""
+    """Return a model as `mj_saveModel` writes it, with its textures embedded."""
     whole = with_embedded_files(model)
     buffer = np.empty(mujoco.mj_sizeModel(whole), np.uint8)
     mujoco.mj_saveModel(whole, None, buffer)
@@ -206,26 +206,26 @@ def _write(path: Path, write: Callable[[Path], None]) -> None:
 
 
 def _write_gzip(path: Path, content: NDArray[np.uint8]) -> None:
-    # No name and no time in it: the same model makes the same file.
+    # Without a name and a time, so that the same model always gives the same file.
     with (
         path.open("wb") as file,
         gzip.GzipFile(
             filename="", mode="wb", compresslevel=_LEVEL, fileobj=file, mtime=0
         ) as stream,
     ):
-        # In pieces: the interpreter's lock is let go while each is compressed.
+        # In chunks, because compressing each one releases the interpreter's lock.
         for start in range(0, len(content), _CHUNK):
             stream.write(content.data[start : start + _CHUNK])
 
 
 def _path(directory: Path, name: object) -> Path | None:
-    """Return the path of a model's file; None where there is none."""
+    """Return the path of a model's file; None if it does not exist."""
     if name is None:
         return None
     if not isinstance(name, str) or not _NAME.fullmatch(name):
         raise UnreadableFile(
             directory,
-            f"a recording in it calls a model {name!r:.200}, which is no name",
+            f"a recording in it names a model {name!r:.200}, which is not a valid name",
         )
     return directory / name if (directory / name).exists() else None
 
@@ -237,12 +237,12 @@ def _load_compiled(
     if path is None or facts.get("mujoco") != mujoco.__version__:
         raise _not_loadable(directory, facts)
     if not (trust_models or is_stored(digest) or is_trusted()):
-        raise _untrusted(path, "is not there")
+        raise _untrusted(path, "are missing")
     content = _read_gzip(path, _recorded_size(path, facts))
-    # MuJoCo trusts the sizes and addresses in such a file.
+    # MuJoCo trusts the sizes and addresses in the file, so its hash must match.
     found = hashlib.sha256(content).hexdigest()
     if found != digest or f".{found[:16]}." not in path.name:
-        raise UnreadableFile(path, "its content is not what was recorded")
+        raise UnreadableFile(path, "its content is not the recorded model")
     try:
         return _loaded(content)
     except (ValueError, mujoco.FatalError) as error:
@@ -257,10 +257,10 @@ def _recorded_size(path: Path, facts: Mapping[str, Any]) -> int:
 
 
 def _read_gzip(path: Path, size: int) -> bytes:
-    """Return the `size` bytes that the file holds, and never read more."""
+    """Return the `size` bytes compressed in the file, never decompressing more."""
     with unreadable(path), open_regular(path) as file:
-        # Not with the module `gzip`, which goes through a header of any length, and
-        # through any number of empty streams, byte by byte in Python.
+        # Not with the gzip module, which would parse a header of any length, and any
+        # number of empty streams, byte by byte in Python.
         stream = zlib.decompressobj(wbits=zlib.MAX_WBITS | 16)
         try:
             content = stream.decompress(file.read(size + _CHUNK), size + 1)
@@ -279,8 +279,8 @@ def _loaded(content: bytes) -> mujoco.MjModel:
 def _untrusted(compiled: Path, what_of_sources: str) -> UntrustedModel:
     return UntrustedModel(
         compiled,
-        "it was not written by this user on this machine, and a crafted one can do "
-        "anything to the process that loads it; and what it was made from "
+        "it was not written by this user on this machine, and a crafted model can run "
+        "any code in the process that loads it; its sources "
         f"{what_of_sources}. If you trust its author: `mjrec render --trust-models`, "
         "mjrec.load_trajectory(path, trust_models=True), or the environment variable "
         f"{TRUST_VARIABLE}=1",
@@ -294,13 +294,13 @@ def _not_loadable(directory: Path, facts: Mapping[str, Any]) -> UnreadableFile:
     if version == mujoco.__version__:
         return UnreadableFile(
             directory / name,
-            "the model of the recording is missing; copy it from the recorded "
-            "directory",
+            "the recording's model is missing; copy it from the directory that was "
+            "recorded",
         )
     source = facts.get("xml")
     return UnreadableFile(
         directory / name,
         f"the model was written by mujoco {version}, this is {mujoco.__version__}, and "
-        "what it was made from is not there. Install that version: pip install "
-        f"mujoco=={version}" + (f"; or put {source} beside it" if source else ""),
+        "its sources are missing. Install that version: pip install "
+        f"mujoco=={version}" + (f"; or put {source} next to it" if source else ""),
     )

@@ -1,27 +1,26 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which compiled models are loaded: those that this user has stored.
+"""The compiled models that this user has stored, which are the only ones loaded.
 
-MuJoCo believes the addresses and types in a compiled model, so that a crafted one can
-do anything to the process that loads it. The hashes in a directory prove nothing:
-its maker wrote them too. So the models that this user stores are listed where only
-this user can write::
+MuJoCo trusts the addresses and types in a compiled model, so loading a crafted one can
+run any code. The hashes in a directory prove nothing, because its author wrote them
+too. So the models that this user stores are listed where only this user can write::
 
-    $XDG_STATE_HOME/mjrec/models       their sha256, one a line, and those of the
-                                       paths of directories that they were stored in
+    $XDG_STATE_HOME/mjrec/models       their sha256, one per line, and those of the
+                                       paths of the directories they were stored in
     ~/.local/state/mjrec/models        by default
-    <temporary directory>/mjrec-<uid>/models       where that cannot be written
+    <temporary directory>/mjrec-<uid>/models       if that is not writable
 
 A list that others can open is neither used nor replaced, because only its owner knows
-what they wrote. Until it is mended, the other place has a list.
+what they wrote. Until its permissions are fixed, the other place has a list.
 
-A list of 65,536 lines becomes `models.old`, and the one before it is forgotten: what
-it names counts as a stranger's from then on.
+A list of 65,536 lines becomes `models.old`, replacing the previous one, whose models
+are untrusted from then on.
 
-Workers on other machines, whose homes may be others, are sent the hashes that their
-jobs need and list them as their own; what they store, they report, and the machine
-that sent the job lists it.
+Workers on other machines, whose home directories may differ, are sent the hashes that
+their jobs need and list them as their own. They report the models they store, and the
+machine that sent the job lists them.
 
-Needs no simulator.
+This module needs no simulator.
 """
 
 from __future__ import annotations
@@ -49,19 +48,20 @@ ALL_MODELS = "1"
 
 _DIGEST = re.compile("[0-9a-f]{64}")
 _DIGITS_IN_NAME = 16
-# A task may compile a model for each episode. So many are 4.3 MB, read in milliseconds.
+# A task may compile a model for each episode. This size, 4.3 MB, is read in
+# milliseconds.
 _MOST_BYTES = 65_536 * 66
-# Nothing is followed, or waited for should it be a pipe.
+# Do not follow links, and do not block on a pipe.
 _CAREFULLY = os.O_NOFOLLOW | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC
 
-# What is listed in this context, for a worker's report.
+# The models listed in this context, for a worker's report.
 _noting: ContextVar[list[str] | None] = ContextVar("noting", default=None)
 
 
 def note_models(digests: Iterable[str]) -> None:
-    """List models as this user's; those that are listed already stay where they are.
+    """List models as this user's own. Those already listed stay where they are.
 
-    Where no list can be kept, a warning says so.
+    If no list can be written, this is logged as a warning.
 
     Args:
         digests: the sha256 of the compiled models, in hex.
@@ -83,14 +83,14 @@ def note_models(digests: Iterable[str]) -> None:
         _warn_once(
             "The list of this user's models cannot be written "
             f"({'; '.join(reasons)}), so the models of these recordings will not be "
-            f"trusted. If their sources are not stored, rendering needs "
-            f"{TRUST_VARIABLE}=1."
+            f"trusted. If their sources are not stored, set {TRUST_VARIABLE}=1 to "
+            "render them."
         )
 
 
 @contextlib.contextmanager
 def noting_models() -> Iterator[list[str]]:
-    """Yield a list that gets the hashes of all models that are stored in the block."""
+    """Yield a list that collects the hashes of all models stored in the block."""
     noted: list[str] = []
     token = _noting.set(noted)
     try:
@@ -103,7 +103,7 @@ def is_stored(digest: object) -> bool:
     """Return whether this user has stored a model.
 
     Args:
-        digest: the sha256 of the compiled model, as a file says; anything.
+        digest: the sha256 of the compiled model, from a file; any value is accepted.
     """
     if not isinstance(digest, str) or not _DIGEST.fullmatch(digest):
         return False
@@ -111,10 +111,10 @@ def is_stored(digest: object) -> bool:
 
 
 def directory_digest(directory: Path) -> str:
-    """Return what `note_models` notes of a directory that this user records into.
+    """Return the digest with which `note_models` lists a directory.
 
-    By its place: what was moved or copied is a stranger's, which costs a moment and
-    nothing else.
+    It identifies the directory by its path: one that was moved or copied is untrusted,
+    which costs only a moment.
     """
     place = f"directory {os.path.realpath(directory)}"
     return hashlib.sha256(place.encode(errors="surrogateescape")).hexdigest()
@@ -129,7 +129,7 @@ def stored_models(directories: Iterable[Path]) -> list[str]:
     """Return the hashes of this user's models in some directories.
 
     Args:
-        directories: of recordings; each may be missing.
+        directories: directories of recordings, which need not exist.
     """
     pattern = f"{FILE_PREFIX}.model.*.mjb.gz"
     paths = (path for directory in directories for path in directory.glob(pattern))
@@ -139,15 +139,15 @@ def stored_models(directories: Iterable[Path]) -> list[str]:
 
 
 def is_trusted() -> bool:
-    """Return whether the environment variable says that all models are to be loaded."""
+    """Return whether the environment variable says to load all models."""
     return os.environ.get(TRUST_VARIABLE, "") not in ("", "0")
 
 
 @contextlib.contextmanager
 def trusting_models() -> Iterator[None]:
-    """Let this process, and those that it starts in the block, load all models.
+    """Allow this process, and those that it starts in the block, to load all models.
 
-    In a program's own main thread: environment variables belong to the process.
+    Use it only in a program's own main thread: environment variables are global.
     """
     before = os.environ.get(TRUST_VARIABLE)
     os.environ[TRUST_VARIABLE] = ALL_MODELS
@@ -165,21 +165,21 @@ def _warn_once(message: str) -> None:
 
 
 def _directories() -> Iterator[Path]:
-    """Yield where a list may be, the best place first."""
+    """Yield the possible directories of a list, the best one first."""
     state, home = os.environ.get("XDG_STATE_HOME", ""), os.path.expanduser("~")  # noqa: PTH111  `Path.home` raises for users without one
-    # Relative ones are to be ignored, says its specification.
+    # The XDG specification says to ignore relative paths.
     if state.startswith("/"):
         yield Path(state, "mjrec")
-    # Root could make a home directory of what is only a name, such as /nonexistent.
+    # Root could create a home directory that is only a placeholder, like /nonexistent.
     elif home.startswith("/") and os.access(home, os.F_OK):
         yield Path(home, ".local", "state", "mjrec")
     yield Path(tempfile.gettempdir(), f"mjrec-{os.geteuid()}")
 
 
 def _listed() -> str:
-    """Return what this user's lists hold: each hash between ends of lines."""
+    """Return the content of this user's lists: each hash between newlines."""
     content = ""
-    # The home directory may have been writable only at one time of two.
+    # All lists are read, because the home directory may not always be writable.
     for directory in _directories():
         for name in ("models.old", "models"):
             try:
@@ -193,24 +193,24 @@ def _listed() -> str:
             except OSError as error:
                 _warn_once(
                     f"The list of this user's models is not used: {error}. If no one "
-                    "else has written to it, correct that; else remove it. Models "
-                    "stored before are then no longer trusted."
+                    "else has written to it, fix its permissions; otherwise delete it. "
+                    "Models listed in it are then no longer trusted."
                 )
     return content
 
 
 def _append(directory: Path, digests: Iterable[str]) -> None:
-    """Add to the list in a directory, made where there is none.
+    """Append to the list in a directory, creating it if necessary.
 
     Raises:
-        OSError: it cannot be written, or others can open it.
+        OSError: the list cannot be written, or others can open it.
     """
     path = directory / "models"
     directory.mkdir(mode=0o700, parents=True, exist_ok=True)
     with _opened(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND) as descriptor:
-        # Network file systems do not append in one piece.
+        # Appending is not atomic on network file systems.
         fcntl.flock(descriptor, fcntl.LOCK_EX)
-        # The first end of a line is for one that a full disk has cut off.
+        # The first newline ends a line that a full disk may have truncated.
         text = "".join(f"\n{digest}" for digest in digests).encode() + b"\n"
         if os.write(descriptor, text) < len(text):
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
@@ -220,10 +220,10 @@ def _append(directory: Path, digests: Iterable[str]) -> None:
 
 @contextlib.contextmanager
 def _opened(path: Path, flags: int) -> Iterator[int]:
-    """Yield the descriptor of a list.
+    """Yield the file descriptor of a list.
 
     Raises:
-        OSError: it cannot be opened, or others can open it or have made it.
+        OSError: the list cannot be opened, or others can open it or have created it.
     """
     _check(path.parent, path.parent.lstat(), stat.S_IFDIR, mode=700)
     descriptor = os.open(path, flags | _CAREFULLY, 0o600)
@@ -235,8 +235,8 @@ def _opened(path: Path, flags: int) -> Iterator[int]:
 
 
 def _check(path: Path, facts: os.stat_result, kind: int, *, mode: int) -> None:
-    """Raise PermissionError where others may have written what stands at a path."""
+    """Raise PermissionError if others may have written to a path."""
     if stat.S_IFMT(facts.st_mode) != kind or facts.st_uid != os.geteuid():
-        raise PermissionError(f"{path} is not this user's, or a link or a pipe")
+        raise PermissionError(f"{path} belongs to another user, or is a link or pipe")
     if facts.st_mode & (stat.S_IRWXG | stat.S_IRWXO):
         raise PermissionError(f"{path} is open to others (chmod {mode} {path})")

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The memory of a simulation, gathered and compared without a look at each array.
+"""Access to the memory of a simulation, to gather or compare many arrays at once.
 
-All arrays of `MjData` stay where they are for as long as it lives, and so do our own.
-Where this process's whole memory is seen as one long array of 64-bit words, a row is
-`WORDS.take(index, None, out, "clip")`: a tenth of what copying each array costs. Only
-the words of an index are ever touched.
+The arrays of an `MjData` keep their addresses for as long as it lives, and so do our
+own. `WORDS` presents the whole memory of this process as one long array of 64-bit
+words. With it a row is gathered by `WORDS.take(index, None, out, "clip")`, at a tenth
+of the cost of copying each array. Only the words of an index are ever touched.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 _WORD = 8
-# Beyond what any process can address; not from 0 on, which NumPy takes for no memory.
+# Beyond what any process can address. It does not start at 0, a null pointer to NumPy.
 _COUNT = (1 << 56) // _WORD
 WORDS: NDArray[np.uint64] = np.frombuffer(
     memoryview((ctypes.c_uint64 * _COUNT).from_address(_WORD)), np.uint64
@@ -25,24 +25,24 @@ WORDS: NDArray[np.uint64] = np.frombuffer(
 
 
 def address_of(array: NDArray[Any]) -> int:
-    """Return where the first byte of an array lies."""
+    """Return the address of an array's first byte."""
     return int(array.__array_interface__["data"][0])
 
 
 def raw_memory(address: int, size: int) -> Any:
-    """Return another object's bytes; keep that alive for as long.
+    """Return a view of another object's bytes; the caller must keep that object alive.
 
-    Compared with a `bytearray` they are not copied: that is a `memcmp`.
+    Comparing it with a `bytearray` is a `memcmp` and copies nothing.
     """
     return (ctypes.c_ubyte * size).from_address(address)
 
 
 def words_of(arrays: Iterable[NDArray[Any]]) -> NDArray[np.intp]:
-    """Return which of `WORDS` arrays are, one behind the other.
+    """Return the indices into `WORDS` of all arrays, concatenated.
 
     Args:
-        arrays: those for which `can_be_gathered` is true. They must be kept alive for
-            as long as the words are read.
+        arrays: arrays for which `can_be_gathered` is true. The caller must keep them
+            alive for as long as the words are read.
     """
     words = [np.empty(0, np.intp)]
     for array in arrays:
@@ -53,7 +53,7 @@ def words_of(arrays: Iterable[NDArray[Any]]) -> NDArray[np.intp]:
 
 
 def can_be_gathered(arrays: Iterable[NDArray[Any]]) -> bool:
-    """Return whether each array is contiguous and begins with a word."""
+    """Return whether each array is contiguous and starts at a word boundary."""
     return all(
         array.flags.c_contiguous and address_of(array) % _WORD == 0
         for array in arrays

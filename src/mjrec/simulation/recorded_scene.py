@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is drawn: a recorded episode or given states, brought back frame by frame."""
+"""Sources of frames: a recorded episode or given states, restored frame by frame."""
 
 from __future__ import annotations
 
@@ -29,24 +29,24 @@ _MODEL, _STATES = "model.mjb", "states.npy"
 class RecordedScene:
     """A model and its data, as they were at a frame of a trajectory.
 
-    Only what the visualiser reads is put back into the data; it is for drawing.
+    Only what the visualiser reads is restored into the data, which is for drawing only.
 
     Args:
-        reader: of the trajectory; used as long as this object is.
+        reader: the trajectory's reader, used for as long as this object.
 
     Raises:
-        UnreadableFile: what it says of its scene cannot be, or its model is missing,
-            damaged or of another MuJoCo.
+        UnreadableFile: the file's facts about the scene are invalid, or its model is
+            missing, damaged or from another MuJoCo version.
 
     Attributes:
-        model: the model, as it was at the frame last brought back.
-        data: its data, likewise.
-        view: how the environment showed it. The camera and the option change with the
+        model: the model, as it was at the frame last restored.
+        data: its data at that frame.
+        view: the environment's view of the scene. Its camera and option change with the
             frames.
-        previous_cameras: where the two cameras of the environment's scene stood before
+        previous_cameras: positions of the two cameras of the environment's scene before
             the first frame, `(2, 3)`.
-        count: how many frames there are.
-        is_constant: model and view are the same in all of them.
+        count: number of frames.
+        is_constant: whether the model and view are the same in all frames.
     """
 
     def __init__(self, reader: TrajectoryReader) -> None:
@@ -55,11 +55,11 @@ class RecordedScene:
         try:
             self.view = view_from_facts(facts["scene"])
             self.previous_cameras = _positions(facts["scene"].get("previous_cameras"))
-        # Not all that NumPy and the bindings refuse is looked for.
+        # Not everything that NumPy and the bindings reject is checked beforehand.
         except (AttributeError, TypeError, ValueError, OverflowError) as error:
-            raise UnreadableFile(reader.path, f"of its scene: {error}") from error
+            raise UnreadableFile(reader.path, f"in its scene: {error}") from error
         if not isinstance(facts.get("model"), dict):
-            raise UnreadableFile(reader.path, "it does not say which model it is of")
+            raise UnreadableFile(reader.path, "it does not name its model")
         self.model = load_model(reader.path.parent, facts["model"])
         self.data = mujoco.MjData(self.model)
         self.count = reader.frame_count
@@ -74,10 +74,10 @@ class RecordedScene:
         self._block = range(0)
 
     def bring_to(self, index: int) -> bool:
-        """Bring back what was there at frame `index`, one of `count`.
+        """Restore frame `index`, from 0 to `count` - 1.
 
         Returns:
-            Whether something has changed in the model that an OpenGL context keeps.
+            Whether any model field changed that an OpenGL context keeps.
 
         Raises:
             UnreadableFile: the file is damaged, or does not fit its model.
@@ -100,26 +100,26 @@ class RecordedScene:
         self._step = -1
 
     def _change_model(self, step: int) -> dict[str, NDArray[Any]]:
-        """Make the model what it was after `step`; return what changed."""
+        """Change the model to what it was after `step`; return the changed fields."""
         fields: dict[str, NDArray[Any]] = {}
         if step < self._step:
             fields.update(self._originals)
             self._restart()
         self._step = step
-        # All changes together may be more than the memory holds.
+        # Merged one by one: all changes together may not fit into memory.
         while self._next is not None and self._next.step <= step:
             fields.update(self._next.fields)
             self._next = next(self._changes, None)
         view = {"camera": self.view.camera, "option": self.view.option}
         for name in fields.keys() - self._originals.keys():
-            # One that there is not is an error of `apply_fields`.
+            # `apply_fields` reports names that do not exist.
             with contextlib.suppress(AttributeError):
                 self._originals |= read_fields(self.model, [name], **view)
         apply_fields(self.model, fields, **view)
         return fields
 
     def _row(self, index: int) -> Any:
-        """Return a snapshot; they are read in blocks."""
+        """Return a snapshot. Snapshots are read in blocks."""
         if index not in self._block:
             rows = max(1, _BLOCK_BYTES // max(1, self._rows.itemsize))
             start = index - index % rows
@@ -133,11 +133,12 @@ def check_states(model: Any, states: ArrayLike, spec: int) -> NDArray[np.float64
 
     Args:
         model: a `mujoco.MjModel`, or dm_control's wrapper of one.
-        states: one row for each state.
-        spec: which components a row has, a combination of `mujoco.mjtState`.
+        states: one row per state.
+        spec: the components of a row, a combination of `mujoco.mjtState`.
 
     Raises:
-        InvalidArgument: `spec` is no combination of states, or the shape is another.
+        InvalidArgument: `spec` is not a combination of states, or `states` has the
+            wrong type or shape.
     """
     try:
         size = int(mujoco.mj_stateSize(raw_model(model), int(spec)))
@@ -147,27 +148,27 @@ def check_states(model: Any, states: ArrayLike, spec: int) -> NDArray[np.float64
         ) from error
     rows = np.asarray(states)
     if rows.dtype.kind not in "iuf":
-        raise InvalidArgument(f"States are numbers, got an array of {rows.dtype}.")
+        raise InvalidArgument(f"States must be numbers, got an array of {rows.dtype}.")
     if rows.ndim == 3 and rows.shape[2] == size:
         raise InvalidArgument(
-            f"States are wanted as (n, {size}), got {rows.shape}: the shape that "
-            "mujoco.rollout gives, many runs of many steps. Give one run, states[k], "
-            f"or states.reshape(-1, {size}) for all, one after the other."
+            f"States must have the shape (n, {size}), got {rows.shape}: many runs of "
+            "many steps, as mujoco.rollout returns them. Pass one run, states[k], or "
+            f"all runs one after another, states.reshape(-1, {size})."
         )
     if rows.ndim != 2 or rows.shape[1] != size:
         raise InvalidArgument(
-            f"States are wanted as (n, {size}), because mujoco.mj_stateSize(model, "
-            f"{int(spec)}) is {size}, got {rows.shape}. Give the spec that the rows "
-            "were made with, and the model that they belong to."
+            f"States must have the shape (n, {size}), got {rows.shape}, because "
+            f"mujoco.mj_stateSize(model, {int(spec)}) is {size}. Pass the spec and the "
+            "model that the rows were made with."
         )
     return np.ascontiguousarray(rows, np.float64)
 
 
 def save_states(directory: Path, model: Any, states: NDArray[np.float64]) -> None:
-    """Write what `GivenStates` reads.
+    """Write the files that `GivenStates` reads.
 
     Raises:
-        FileNotWritten: the disk is full.
+        FileNotWritten: a file cannot be written, for example because the disk is full.
     """
     whole = with_embedded_files(raw_model(model))
     try:
@@ -180,17 +181,17 @@ def save_states(directory: Path, model: Any, states: NDArray[np.float64]) -> Non
 class GivenStates:
     """A model and its data in one of the states that `save_states` has written.
 
-    Everything that follows from a state is computed, as `mj_forward` does; what the
-    rows leave out is as in a new `MjData`. So each frame depends on its row alone.
+    Everything derived from a state is computed, as by `mj_forward`; components that the
+    rows leave out are as in a new `MjData`. So each frame depends only on its row.
 
     Args:
-        directory: where `save_states` wrote.
-        spec: which components a row has.
+        directory: the directory that `save_states` wrote to.
+        spec: the components of a row.
 
     Attributes:
         model: the model.
-        data: its data, in the state last brought to.
-        count: how many rows there are.
+        data: its data, in the state last set.
+        count: number of rows.
     """
 
     is_constant = True
@@ -199,21 +200,21 @@ class GivenStates:
         self.model = mujoco.MjModel.from_binary_path(str(directory / _MODEL))
         self.data = mujoco.MjData(self.model)
         self._spec = spec
-        # Only the rows that are asked for come into memory.
+        # Only the rows that are used are read into memory.
         self._states = np.load(directory / _STATES, mmap_mode="r", allow_pickle=False)
         self.count = len(self._states)
 
     def bring_to(self, index: int) -> bool:
-        """Put a row into the data; return False: the model never changes."""
+        """Set a row in the data; return False, because the model never changes."""
         mujoco.mj_resetData(self.model, self.data)
-        # A copy: mujoco 3.3 takes none that it could not write to.
+        # Copied, because mujoco 3.3 does not accept a read-only array.
         state = np.array(self._states[index])
         mujoco.mj_setState(self.model, self.data, state, self._spec)
         mujoco.mj_forward(self.model, self.data)
         return False
 
     def close(self) -> None:
-        """Do nothing: the files are the caller's."""
+        """Do nothing: the files belong to the caller."""
 
 
 def _positions(previous: Any) -> NDArray[np.float64]:

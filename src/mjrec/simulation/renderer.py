@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Frames of a simulation from a renderer of our own, beside the environment's."""
+"""Frames of a simulation from our own renderer, independent of the environment's."""
 
 from __future__ import annotations
 
@@ -37,9 +37,9 @@ _EVERYTHING = int(mujoco.mjtCatBit.mjCAT_ALL)
 _DRAFT_SHADOW_MAP = 1024
 _MAX_RENDERBUFFER_SIZE = 0x84E8
 
-# Most of a model is read anew for every frame. This was copied to the graphics card, or
-# compiled into a display list, when the context was made. Absent from some versions of
-# mujoco: tex_colorspace.
+# Most of a model is read again for every frame. These fields were copied to the
+# graphics card, or compiled into a display list, when the context was created.
+# tex_colorspace is missing from some versions of mujoco.
 _KEPT = (
     *("hfield_data", "hfield_size"),
     *("tex_data", "tex_type", "tex_width", "tex_height", "tex_nchannel"),
@@ -56,27 +56,27 @@ _KEPT_OF_PLANES = ("geom_type", "geom_size")
 
 
 def is_kept_by_context(name: str) -> bool:
-    """Return whether an OpenGL context may keep a field of this name.
+    """Return whether an OpenGL context may keep a copy of a field.
 
     Args:
-        name: of an array of `MjModel` (`tex_data`), or of a member of its structs
-            (`vis.map.haze`).
+        name: the name of an array of `MjModel` (`tex_data`), or of a member of its
+            structs (`vis.map.haze`).
     """
     return name in (*_KEPT, *_KEPT_OF_PLANES)
 
 
 class Canvas:
-    """What scenes are drawn with: an OpenGL context for a model, size and quality.
+    """An OpenGL context for a model, size and quality, in which scenes are drawn.
 
-    It stays as it is from one `prepare` to the next where those three do, and nothing
-    has changed that the context keeps of the model.
+    `prepare` keeps it as it is if all three are the same as before, and the context's
+    copy of the model is up to date.
 
     Args:
-        is_alone: nothing else draws in this process, so that its context can stay
-            current on its thread.
+        is_alone: whether nothing else draws in this process, so that the context can
+            stay current on its thread.
 
     Attributes:
-        gl_facts: what metadata says of who draws, as `current_gl_facts`.
+        gl_facts: the facts about the driver for the metadata, see `current_gl_facts`.
     """
 
     def __init__(self, *, is_alone: bool = False) -> None:
@@ -90,10 +90,10 @@ class Canvas:
         self._kept = b""
 
     def open(self) -> None:
-        """Make the context now, so that the first frame comes sooner. Idempotent.
+        """Create the context now, so that the first frame comes sooner. Idempotent.
 
         Raises:
-            GLError: as of `new_context`.
+            GLError: see `new_context`.
         """
         with self._current():
             pass
@@ -101,13 +101,13 @@ class Canvas:
     def prepare(
         self, model: mujoco.MjModel, *, height: int, width: int, quality: str
     ) -> None:
-        """Make it ready for scenes of a model.
+        """Prepare for scenes of a model.
 
         Raises:
-            InvalidArgument: a size that the driver cannot draw.
-            GLError: as of `new_context`.
+            InvalidArgument: the driver cannot draw frames of this size.
+            GLError: see `new_context`.
         """
-        # Not by what a recording says of its model, which may be a stranger's.
+        # Not identified by a recording's facts about its model, which may be untrusted.
         buffer = np.empty(mujoco.mj_sizeModel(model), np.uint8)
         mujoco.mj_saveModel(model, None, buffer)
         kind = (hashlib.blake2b(buffer.data).digest(), height, width, quality)
@@ -120,13 +120,13 @@ class Canvas:
         self.update(model)
 
     def update(self, model: mujoco.MjModel) -> None:
-        """Bring it up to date with changes of its model.
+        """Bring the context up to date with changes of its model.
 
         Args:
-            model: the same, or loaded from the same file.
+            model: the same model, or one loaded from the same file.
 
         Raises:
-            InvalidArgument, GLError: as `prepare`.
+            InvalidArgument, GLError: see `prepare`.
         """
         kept = _kept_of(model)
         if kept != self._kept:
@@ -135,7 +135,7 @@ class Canvas:
             self._kept = kept
 
     def draw(self, scene: mujoco.MjvScene) -> Frame:
-        """Return the frame of `scene`, the top row first.
+        """Return the frame of `scene`, top row first.
 
         Raises:
             ClosedError: after `close`.
@@ -147,19 +147,19 @@ class Canvas:
         return np.ascontiguousarray(self._bottom_up[::-1])
 
     def close(self) -> None:
-        """Free what lies in the context, then the context. Idempotent."""
+        """Free the context and everything in it. Idempotent."""
         self._closed = True
         context, self._context = self._context, None
-        # At exit EGL may have been shut down already, and all is gone. What a
-        # forked child has is its parent's.
+        # At exit EGL may have shut down already, and nothing is left to free. A forked
+        # child must not free its parent's context.
         if context is not None and os.getpid() == self._process_id:
             with context_kept(), contextlib.suppress(Exception):
                 context.make_current()
                 self._free_drawing()
                 context.free()
 
-    # Forgotten, MuJoCo's context would be freed in whichever context is current then,
-    # and take what lies there under the same numbers.
+    # If it were dropped without this, MuJoCo would free its context in whichever one is
+    # current then, and delete the objects there that have the same numbers.
     __del__ = close
 
     @contextlib.contextmanager
@@ -179,17 +179,17 @@ class Canvas:
             yield
 
     def _load(self, model: mujoco.MjModel) -> None:
-        """Give the context what it keeps of a model."""
+        """Copy to the context the parts of a model that it keeps."""
         height, width = self._rectangle.height, self._rectangle.width
         with self._current():
-            # The longest side that the driver can draw.
+            # Longest side that the driver can draw.
             limits = np.zeros(1, np.int32)
             raw_opengl().glGetIntegerv(_MAX_RENDERBUFFER_SIZE, limits)
             limit = int(limits[0])
             if max(height, width) > limit:
                 raise InvalidArgument(
-                    f"A frame of {width}x{height} pixels is larger than this OpenGL "
-                    f"driver ({self.gl_facts['gl_renderer']}) can draw: "
+                    f"A frame of {width}x{height} pixels is too large. This OpenGL "
+                    f"driver ({self.gl_facts['gl_renderer']}) can draw at most "
                     f"{limit}x{limit}."
                 )
             self._free_drawing()
@@ -201,7 +201,7 @@ class Canvas:
                 )
             except mujoco.FatalError as error:
                 what = f"A {width}x{height} frame cannot be drawn"
-                raise gl_error(what, error, remedy="Ask for a smaller one.") from error
+                raise gl_error(what, error, remedy="Try a smaller size.") from error
             offscreen = int(mujoco.mjtFramebuffer.mjFB_OFFSCREEN)
             mujoco.mjr_setBuffer(offscreen, self._drawing)
 
@@ -212,19 +212,19 @@ class Canvas:
 
 
 class SceneRenderer:
-    """Draws a simulation: the frames of `mujoco.Renderer`, byte for byte.
+    """A renderer whose frames are those of `mujoco.Renderer`, byte for byte.
 
-    What else draws on the caller's thread is left alone. Neither the model nor the data
-    is written to.
+    It does not disturb anything else that draws on the caller's thread, and modifies
+    neither the model nor the data.
 
-    Most changes to the model show in the next frame. Those to height fields,
+    Most changes to the model show in the next frame. Changes to height fields,
     textures, meshes, sizes of planes, textures of materials, fog and rendering quality
     show after `model_changed`.
 
-    MuJoCo's visualiser remembers the frame before: an infinite plane is drawn around
-    the place where the cameras stood in it, and a camera that tracks a body goes a part
+    MuJoCo's visualiser remembers the previous frame: an infinite plane is drawn around
+    the positions that the cameras had in it, and a camera that tracks a body moves part
     of the way to it in each frame. `begin` and `look` bring the renderer to any frame
-    as if all before had been drawn.
+    as if all previous ones had been drawn.
 
     ::
 
@@ -233,31 +233,31 @@ class SceneRenderer:
 
     Args:
         model: the model.
-        height: in pixels; may be larger than the model's offscreen buffer.
-        width: likewise.
-        camera: as `resolve_camera` takes it; an `MjvCamera` is read anew for every
+        height: height in pixels; may exceed the model's offscreen buffer.
+        width: width in pixels; may exceed the model's offscreen buffer.
+        camera: the camera, see `resolve_camera`; an `MjvCamera` is read again for every
             frame.
-        scene_option: read anew for every frame; MuJoCo's default, if None, which is
-            not dm_control's: that draws no range finders.
-        max_geom: how many geoms a scene may have; the rest is not drawn. Environments'
-            own renderers have other limits (Gymnasium's 1000).
-        quality: `"full"` is what the model asks for. `"draft"` is the model without
+        scene_option: the visual options, read again for every frame; None for MuJoCo's
+            default. This is not dm_control's default, which draws no range finders.
+        max_geom: maximum number of geoms in the scene; more are not drawn. The
+            environments' own renderers have other limits (Gymnasium's is 1000).
+        quality: `"full"` draws what the model specifies. `"draft"` draws without
             multisampling and with a shadow map of at most 1024x1024.
-        fresh: draw each frame as if it were the first, as dm_control does.
-        canvas: what to draw with, which others of this model, size and quality may draw
-            with in turn; one of its own, if None.
-        begins_at: where the two cameras of its scene stand before the first frame,
+        fresh: whether to draw each frame as if it were the first, as dm_control does.
+        canvas: the canvas to draw with, which other renderers of the same model, size
+            and quality may share in turn; None to create one.
+        begins_at: positions of the scene's two cameras before the first frame,
             `(2, 3)`.
-        is_moved: the camera is brought to its place before each frame from outside.
+        is_moved: whether the camera is moved from outside before each frame.
 
     Attributes:
         size: `(height, width)` of the frames.
-        is_following: each frame moves the camera.
+        is_following: whether each frame moves the camera.
 
     Raises:
-        UnknownName: the model has no such camera, or there is no such quality.
-        InvalidArgument: a camera number or a size that cannot be, also a size that the
-            driver cannot draw.
+        UnknownName: the model has no such camera, or the quality is unknown.
+        InvalidArgument: the camera's number or the size is invalid, or the driver
+            cannot draw this size.
         GLError: no OpenGL backend works here, or this process was forked from one that
             had used OpenGL.
     """
@@ -282,7 +282,7 @@ class SceneRenderer:
         placed = resolve_camera(model, camera)
         self.is_following = not is_moved and is_tracking(placed)
         self._model = model
-        # The place of the free camera and the number of a name may change.
+        # Kept by name or number, because the model's cameras may change later.
         self._camera = placed if isinstance(camera, Mapping) else camera
         self._scene_option = scene_option or mujoco.MjvOption()
         self._fresh = fresh
@@ -295,18 +295,18 @@ class SceneRenderer:
 
     @property
     def gl_facts(self) -> dict[str, Any]:
-        """What metadata says of who draws, as `gl_context.current_gl_facts`."""
+        """The facts about the driver for the metadata, see `current_gl_facts`."""
         return self._canvas.gl_facts
 
     @property
     def shows_frame_before(self) -> bool:
-        """Whether a frame depends on where the cameras stood in the one before."""
+        """Whether a frame depends on the cameras' positions in the previous one."""
         return self.is_following or (
             not self._fresh and has_infinite_plane(self._model)
         )
 
     def begin(self) -> None:
-        """Go to before the first frame."""
+        """Return to the situation before the first frame."""
         self._put_cameras(self._begins_at)
         if self.is_following:
             resolve_camera(self._model, self._camera).lookat[:] = (
@@ -314,17 +314,17 @@ class SceneRenderer:
             )
 
     def look(self, data: mujoco.MjData) -> None:
-        """Leave in the scene what a frame of `data` would, without drawing one."""
+        """Update the scene's cameras as drawing a frame of `data` would."""
         camera = resolve_camera(self._model, self._camera)
         mujoco.mjv_updateCamera(self._model, data, camera, self._scene)
 
     def render(self, data: mujoco.MjData) -> Frame:
         """Return the frame of `data`, a new `(height, width, 3) uint8` array.
 
-        The first row is the top one.
+        The first row is at the top.
 
         Args:
-            data: of the model. Its derived quantities are drawn as they are: after
+            data: the model's data. Its derived quantities are drawn as they are: after
                 `mj_step` they belong to the state before the last substep.
 
         Raises:
@@ -343,16 +343,16 @@ class SceneRenderer:
     def model_changed(self) -> None:
         """Bring the canvas up to date with the model.
 
-        Compares what an OpenGL context keeps of a model (milliseconds where there are
-        large textures), and gives it that anew where something differs.
+        This compares the parts of the model that an OpenGL context keeps, which takes
+        milliseconds with large textures, and copies them again if any has changed.
 
         Raises:
-            GLError: as `render`.
+            GLError: see `render`.
         """
         self._canvas.update(self._model)
 
     def close(self) -> None:
-        """Close the canvas, if it is its own. Idempotent."""
+        """Close the canvas, if this renderer created it. Idempotent."""
         if self._owns_canvas:
             self._canvas.close()
 
@@ -368,7 +368,7 @@ class SceneRenderer:
 
 
 def _kept_of(model: mujoco.MjModel) -> bytes:
-    """Return a digest of what an OpenGL context keeps of a model."""
+    """Return a digest of the parts of a model that an OpenGL context keeps."""
     digest = hashlib.blake2b(digest_size=16)
     for name in _KEPT:
         if "." in name or hasattr(model, name):
@@ -382,7 +382,7 @@ def _kept_of(model: mujoco.MjModel) -> bytes:
 def _with_settings(
     model: mujoco.MjModel, height: int, width: int, quality: str
 ) -> mujoco.MjModel:
-    """Return `model`, or a copy with a large enough buffer and of that quality."""
+    """Return `model`, or a copy with a large enough buffer and this quality."""
     buffer = model.vis.global_
     is_large_enough = height <= buffer.offheight and width <= buffer.offwidth
     if is_large_enough and quality == "full":

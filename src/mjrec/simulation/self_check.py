@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Proof that a snapshot holds what the visualiser reads, on the spot.
+"""A check, during recording, that a snapshot holds everything the visualiser reads.
 
-MuJoCo may read a field that we do not know of. Putting a scene together needs no OpenGL
-and microseconds: one is made from the live data and one from what a snapshot brings
-back, and they have to be the same.
+MuJoCo may read a field that we do not know about. Building a scene takes microseconds
+and needs no OpenGL. So one scene is built from the live data and one from the restored
+snapshot, and they must be equal.
 
-One scene does not tell of plugins: MuJoCo calls a plugin's `visualize` for each scene,
-and what that draws may come from its own memory and show only at times (a touch grid
-draws nothing until something touches it). So models with plugins are recorded live.
+Checking one scene is not enough for plugins. MuJoCo calls a plugin's `visualize` for
+each scene, which may draw from the plugin's own memory, and only sometimes: a touch
+grid draws nothing until something touches it. So models with plugins are recorded live.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from .view import SceneView
 
 _EVERYTHING = int(mujoco.mjtCatBit.mjCAT_ALL)
 
-# Not set by `mjv_updateScene` in every geom, or only later, when it is drawn.
+# Not set by `mjv_updateScene` for every geom, or set later, when it is drawn.
 _NOT_SET = ("camdist", "modelrbound", "transparent")
 
 
@@ -36,22 +36,22 @@ def scene_difference(
     row: Any,
     view: SceneView,
 ) -> str | None:
-    """Say in what the frame of a snapshot would differ from the one of the live data.
+    """Return how the frame of a snapshot would differ from one of the live data.
 
-    Neither model nor data is written to.
+    Neither the model nor the data is modified.
 
     Args:
-        model: the model of this moment.
+        model: the current model.
         data: its data.
-        row: the snapshot of this moment.
-        view: how the scene is shown.
+        row: a snapshot of the current data.
+        view: the camera, options and size of the scene.
 
     Returns:
-        What differs, in words; None where the scenes are the same.
+        The name of the first difference; None if the scenes are equal.
     """
     if model.nplugin:
-        return "its plugins may draw by themselves, from what they alone know"
-    # Where tendons have colours of their own these are set in the model.
+        return "its plugins may draw from their own memory"
+    # The tendons' own colours are restored into the model.
     sets_model = TENDON_RGBA in (row.dtype.names or ())
     restored_model = copy.copy(model) if sets_model else model
     restored = mujoco.MjData(restored_model)
@@ -64,12 +64,12 @@ def scene_difference(
 def updated_scene(
     model: mujoco.MjModel, data: mujoco.MjData, view: SceneView
 ) -> mujoco.MjvScene:
-    """Return a new scene of `data`; the view is left as it is."""
+    """Return a new scene of `data`; the view is not modified."""
     scene = mujoco.MjvScene(model, maxgeom=view.max_geom)
     for name in _shapes():
-        # What is not shown is not set either, and may be anything.
+        # Arrays of what is not shown are not initialised either.
         getattr(scene, name)[...] = 0
-    # A camera that follows something is moved by what it follows.
+    # Updating the scene moves a tracking camera.
     camera = copy.copy(view.camera)
     mujoco.mjv_updateScene(model, data, view.option, None, camera, _EVERYTHING, scene)
     return scene
@@ -78,7 +78,7 @@ def updated_scene(
 def differences(
     live: mujoco.MjvScene, again: mujoco.MjvScene, option: mujoco.MjvOption
 ) -> Iterator[str]:
-    """Yield in words what of `again` is not, to the last bit, as in `live`."""
+    """Yield the names of the parts of `again` that differ in any bit from `live`."""
     found = dict(_parts(again, option))
     for what, value in _parts(live, option):
         if found.get(what) != value:
@@ -88,7 +88,7 @@ def differences(
 def _parts(
     scene: mujoco.MjvScene, option: mujoco.MjvOption
 ) -> Iterator[tuple[str, Any]]:
-    """Yield what a scene consists of, by what it is called."""
+    """Yield the parts of a scene with their names."""
     is_labelled = option.label != int(mujoco.mjtLabel.mjLABEL_NONE)
     not_set = _NOT_SET if is_labelled else (*_NOT_SET, "label")
     yield "the number of geoms", scene.ngeom
@@ -108,7 +108,7 @@ def _parts(
 
 def _value(struct: Any, name: str) -> Any:
     value = getattr(struct, name)
-    # By bytes: a NaN is the same as a NaN, and -0.0 is not 0.0.
+    # Compared as bytes: a NaN equals a NaN, and -0.0 differs from 0.0.
     return value.tobytes() if isinstance(value, np.ndarray) else value
 
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Snapshots of a simulation: taken as one row of bytes, and put back for drawing.
+"""Taking snapshots of a simulation as rows of bytes, and restoring them for drawing.
 
-Restored into fresh data they give the same scene, byte for byte.
+A snapshot restored into a new `MjData` gives the same scene, byte for byte.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ from ..errors import InvalidArgument
 from .captured_arrays import ALWAYS, SNAPSHOT_ARRAYS, TENDON_RGBA, array_kind
 from .raw_memory import WORDS, can_be_gathered, words_of
 
-# Indices of geoms and of each other, which the visualiser follows unseen.
+# Indices of geoms and of each other, which the visualiser does not check.
 _PATHS = ("ten_wrapadr", "ten_wrapnum", "wrap_obj")
-# In the place of a geom.
+# Replaces the index of a geom.
 _PULLEY = -2
 
 _LIMIT_TENDON = int(mujoco.mjtConstraint.mjCNSTR_LIMIT_TENDON)
@@ -27,16 +27,16 @@ _DYNAMIC = int(mujoco.mjtCatBit.mjCAT_DYNAMIC)
 
 
 class SnapshotSource:
-    """Takes snapshots of one `MjData`.
+    """A source of snapshots of one `MjData`.
 
     Args:
-        model: the model; kept alive, as is the data.
+        model: the model; kept alive, like the data.
         data: its data.
-        kind: what `snapshot_dtype` gave for the model.
+        kind: the dtype that `snapshot_dtype` returned for the model.
 
     Attributes:
-        words: what a snapshot consists of in `memory.WORDS`; None where it cannot be
-            gathered, or more than the data's own arrays is in it.
+        words: the snapshot's indices into `raw_memory.WORDS`; None if it cannot be
+            gathered, or consists of more than the data's own arrays.
     """
 
     def __init__(
@@ -51,13 +51,13 @@ class SnapshotSource:
                 arrays.append(self._colours.rgba)
             else:
                 arrays.append(getattr(data, name))
-        # They keep the data alive.
+        # These references keep the data alive.
         self._arrays = arrays
         self._words = words_of(arrays) if can_be_gathered(arrays) else None
         self.words = self._words if self._colours is None else None
 
     def take(self, out: NDArray[np.uint64]) -> None:
-        """Write a snapshot of this moment into `out`, all of its words."""
+        """Write a snapshot of the current data into `out`, filling all of its words."""
         if self._colours is not None:
             self._colours.update()
         if self._words is not None:
@@ -68,22 +68,22 @@ class SnapshotSource:
             row[name] = array
 
     def taken(self) -> Any:
-        """Return a snapshot of this moment: MuJoCo's arrays are its members."""
+        """Return a snapshot of the current data; its members are MuJoCo's arrays."""
         words = np.zeros(self._kind.itemsize // 8, np.uint64)
         self.take(words)
         return words.view(self._kind)[0]
 
 
 class TendonColours:
-    """The colours that a model's tendons are drawn in.
+    """The colours in which a model's tendons are drawn.
 
-    MuJoCo mixes the colour of a spatial tendon at its limit with that of constraints,
-    by the strength of the limit, unless a colour or a material was chosen for it. The
-    strength is gone once the step is over, so the colour itself is recorded. A scene
-    with nothing in it but the tendons tells it.
+    MuJoCo blends the colour of a spatial tendon at its limit with the colour of
+    constraints, weighted by the strength of the limit. Tendons with a material or a
+    colour of their own are not blended. The strength is not kept after the step, so the
+    resulting colour is recorded. It is read from a scene that holds only the tendons.
 
     Attributes:
-        rgba: `(ntendon, 4) float32`, as of the last `update`; always the same array.
+        rgba: `(ntendon, 4) float32`, set by the last `update`; always the same array.
     """
 
     def __init__(self, model: mujoco.MjModel, data: mujoco.MjData) -> None:
@@ -100,7 +100,7 @@ class TendonColours:
         self.rgba = np.array(model.tendon_rgba)
 
     def update(self) -> None:
-        """Bring `rgba` up to date with model and data."""
+        """Bring `rgba` up to date with the model and data."""
         model, data = self._model, self._data
         self.rgba[:] = model.tendon_rgba
         limits = slice(data.ne + data.nf, data.ne + data.nf + data.nl)
@@ -118,42 +118,42 @@ class TendonColours:
 def check_layout(
     model: mujoco.MjModel, data: mujoco.MjData, kind: np.dtype[Any]
 ) -> None:
-    """Check that recorded snapshots are of this model, before they are restored.
+    """Check that recorded snapshots belong to this model, before they are restored.
 
-    They hold at least what MuJoCo's default option needs.
+    They must hold at least the arrays that MuJoCo's default option needs.
 
     Raises:
-        InvalidArgument: they are not, or of another version of MuJoCo.
+        InvalidArgument: the snapshots belong to another model or version of MuJoCo.
     """
     for name in kind.names or ():
         is_colour = name == TENDON_RGBA
         if not is_colour and name not in SNAPSHOT_ARRAYS:
             raise InvalidArgument(
-                f"The snapshots hold {name!r:.40}, which no frame needs."
+                f"The snapshots hold {name!r:.40}, which is not used for drawing."
             )
         own = array_kind(model if is_colour else data, name)
         if kind[name] != own:
             raise InvalidArgument(
-                f"The snapshots' {name} is {kind[name]}, and here it is {own}: they "
+                f"The snapshots' {name} is {kind[name]}, but here it is {own}. They "
                 "belong to another model or version of MuJoCo."
             )
     held = {*(kind.names or ())}
     missing = {name for name in ALWAYS if array_kind(data, name) is not None} - held
     if missing:
-        raise InvalidArgument(f"The snapshots hold no {', no '.join(sorted(missing))}.")
+        raise InvalidArgument(f"The snapshots lack {', '.join(sorted(missing))}.")
 
 
 def restore_snapshot(row: Any, model: mujoco.MjModel, data: mujoco.MjData) -> None:
-    """Put what a snapshot holds back, ready for `mjv_updateScene`.
+    """Restore a snapshot, ready for `mjv_updateScene`.
 
     Args:
-        row: one of `TrajectoryReader.snapshots`, whose layout was checked.
-        model: the colours of its tendons are set where `row` has them.
+        row: an element of `TrajectoryReader.snapshots`, whose layout was checked.
+        model: the model; its tendons' colours are set if `row` has them.
         data: its data.
 
     Raises:
-        InvalidArgument: a tendon leads to where the model has nothing, which MuJoCo
-            would not notice.
+        InvalidArgument: a tendon refers to something that is not in the model, which
+            MuJoCo would not notice.
     """
     names = row.dtype.names or ()
     for name in names:
@@ -164,18 +164,18 @@ def restore_snapshot(row: Any, model: mujoco.MjModel, data: mujoco.MjData) -> No
 
 
 def _check_paths(model: mujoco.MjModel, data: mujoco.MjData) -> None:
-    """Check what the visualiser follows, unseen, along a tendon."""
+    """Check the indices that the visualiser follows unchecked along a tendon."""
     first, count = data.ten_wrapadr.astype(np.int64), data.ten_wrapnum
     points, wrapped = 2 * model.nwrap, data.wrap_obj
     ends = first + count
     if ((count < 0) | (first < 0) | (ends > points))[count != 0].any():
         raise InvalidArgument(
-            f"The snapshot's tendons run over points up to {ends.max()}, and this "
-            f"model has {points}."
+            f"The snapshot's tendons use points up to {ends.max()}, but this model has "
+            f"only {points}. The snapshot belongs to another model, or is damaged."
         )
     if wrapped.size and (wrapped.min() < _PULLEY or wrapped.max() >= model.ngeom):
         raise InvalidArgument(
-            f"The snapshot's wrap_obj holds geoms from {_PULLEY} (a pulley) and -1 (a "
-            f"site) to {model.ngeom - 1} in this model, and there are some from "
+            f"The snapshot's wrap_obj must be from {_PULLEY} (a pulley) and -1 (a "
+            f"site) to {model.ngeom - 1} for this model, but it holds values from "
             f"{wrapped.min()} to {wrapped.max()}."
         )

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The state of a simulation: as a recorded row, in memory, set again, preserved.
+"""The state of a simulation: its dtype, its memory, and setting and preserving it.
 
-It is `mjSTATE_INTEGRATION`, everything that the next step depends on. MuJoCo gives it
-as one vector, whose parts are numbered by bits; the bits were renumbered between
-releases, so that what is kept goes by names.
+The state is `mjSTATE_INTEGRATION`, everything that the next step depends on. MuJoCo
+returns it as one vector whose components are identified by bits. The bits have been
+renumbered between releases, so recordings identify components by name.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ STATE_SPEC = int(mujoco.mjtState.mjSTATE_INTEGRATION)
 
 _PREFIX = "mjSTATE_"
 
-# Components whose array in `MjData` has another name.
+# Components whose array in `MjData` has a different name.
 _STATE_ARRAYS = {"warmstart": "qacc_warmstart", "plugin": "plugin_state"}
-# The time is no array but a number of the struct, which lies close to this one.
+# The time is not an array but a number in the struct, close to this array.
 _NEIGHBOUR, _REACH = "energy", 16
 
-# What an environment moves or colours to show a goal or a touch.
+# Fields that an environment moves or colours to show a goal or a touch.
 _SHOWING = (
     *("site_pos", "site_quat", "site_size", "site_rgba"),
     *("geom_pos", "geom_quat", "geom_size", "geom_rgba"),
@@ -39,14 +39,14 @@ _SHOWING = (
 
 
 def _elementary_bits() -> dict[str, int]:
-    """Return the bits inside `STATE_SPEC` by their names, in MuJoCo's order.
+    """Return the single bits of `STATE_SPEC` by name, in MuJoCo's order.
 
     Combinations of several bits (`mjSTATE_PHYSICS`) are left out.
     """
     values = {
         name.removeprefix(_PREFIX).lower(): int(value)
         for name, value in mujoco.mjtState.__members__.items()
-        # mjNSTATE is a number of bits, not one of them.
+        # mjNSTATE is the number of bits, not a bit.
         if name.startswith(_PREFIX)
     }
     bits = {n: v for n, v in values.items() if v & STATE_SPEC and v.bit_count() == 1}
@@ -57,9 +57,9 @@ STATE_BITS = _elementary_bits()
 
 
 def state_dtype(model: mujoco.MjModel) -> np.dtype[Any]:
-    """Return what the state of `model` consists of, in the order of its vector.
+    """Return the dtype of the state of `model`, in the order of its vector.
 
-    Components that this model has none of (`act` without activations) are left out.
+    Components that are empty for this model (`act` without activations) are left out.
     """
     sizes = {name: mujoco.mj_stateSize(model, bit) for name, bit in STATE_BITS.items()}
     return packed((name, ("<f8", (size,))) for name, size in sizes.items() if size)
@@ -73,13 +73,14 @@ def read_state(model: mujoco.MjModel, data: mujoco.MjData) -> NDArray[np.float64
 
 
 def state_words(model: mujoco.MjModel, data: mujoco.MjData) -> NDArray[np.intp] | None:
-    """Return which of `memory.WORDS` are the state of `data`, which is kept alive.
+    """Return the indices into `raw_memory.WORDS` of the state of `data`.
 
-    That they hold what `mj_getState` gives is tried, not taken from a header.
+    The caller must keep `data` alive. Whether these words hold what `mj_getState`
+    returns is tested, not assumed from a header.
 
     Returns:
-        None where a component is kept as another type than it is given as
-        (`eq_active`), or is new in MuJoCo.
+        The indices; None if a component is stored with another type than in the state
+        (`eq_active`), is new in MuJoCo, or cannot be gathered.
     """
     arrays = []
     for part in state_dtype(model).names or ():
@@ -102,7 +103,7 @@ def _time(data: mujoco.MjData) -> NDArray[np.float64]:
 
 @functools.cache
 def _time_offset() -> int:
-    """Return where the time lies, from its neighbour on, by setting it."""
+    """Return the offset of the time from its neighbour, found by setting the time."""
     data = mujoco.MjData(mujoco.MjModel.from_xml_string("<mujoco/>"))
     start = address_of(getattr(data, _NEIGHBOUR)) - _REACH
     near = np.frombuffer(memoryview(raw_memory(start, 3 * _REACH)), np.float64)
@@ -114,11 +115,11 @@ def _time_offset() -> int:
 def state_columns(
     model: mujoco.MjModel, parts: Mapping[str, slice]
 ) -> NDArray[np.intp]:
-    """Return where in a recorded row the numbers of this MuJoCo's state stand.
+    """Return the columns of a recorded row that make up the state of this MuJoCo.
 
     Raises:
-        InvalidArgument: a component is unknown to this MuJoCo, or this model has
-            another number of it.
+        InvalidArgument: a component is unknown to this MuJoCo, or has a different
+            length in this model.
     """
     own = columns_of(state_dtype(model))
     if _lengths(parts) == _lengths(own):
@@ -127,17 +128,17 @@ def state_columns(
     if unknown:
         raise InvalidArgument(
             f"The state holds {', '.join(unknown)}, which MuJoCo {mujoco.__version__} "
-            "does not know; use the MuJoCo version that recorded it, or a later one."
+            "does not know. Use the MuJoCo version that recorded it, or a later one."
         )
     recorded, here = _lengths(parts), _lengths(own)
     differences = [
-        f"{name}: {recorded.get(name, 0)}, and this model has {here.get(name, 0)}"
+        f"{name} has {recorded.get(name, 0)}, in this model {here.get(name, 0)}"
         for name in STATE_BITS
         if recorded.get(name, 0) != here.get(name, 0)
     ]
     raise InvalidArgument(
-        "The state is not one of this model. How many numbers it holds: "
-        f"{'; '.join(differences)}. Use the model that it was recorded with "
+        "The state does not belong to this model: its components differ in length "
+        f"({'; '.join(differences)}). Use the model that it was recorded with "
         "(`trajectory.model()`)."
     )
 
@@ -152,15 +153,15 @@ def set_state(
     parts: Mapping[str, slice],
     row: NDArray[np.float64],
 ) -> None:
-    """Put a recorded state into `data`, whichever MuJoCo it was recorded by.
+    """Set a recorded state in `data`, whichever MuJoCo version recorded it.
 
-    What follows from the state (positions of bodies, contacts) is not computed.
-    Nothing is set where anything does not fit.
+    Quantities derived from the state (positions of bodies, contacts) are not computed.
+    Nothing is set if the state does not fit.
 
     Args:
         model: the model of `data`.
-        data: what is set.
-        parts: where the parts of the state are in `row`.
+        data: the data to change.
+        parts: the columns of each component in `row`.
         row: the state, `(n,) float64`.
 
     Raises:
@@ -170,7 +171,7 @@ def set_state(
     values = np.asarray(row, np.float64)
     if values.ndim != 1 or len(values) < len(columns):
         raise InvalidArgument(
-            f"A state of this model is {len(columns)} numbers, got an array of shape "
+            f"A state of this model has {len(columns)} numbers, got an array of shape "
             f"{values.shape}."
         )
     mujoco.mj_setState(model, data, values[columns], STATE_SPEC)
@@ -182,35 +183,35 @@ def enter_state(
     parts: Mapping[str, slice],
     row: NDArray[np.float64],
 ) -> None:
-    """Put a recorded state of a reset into `data`, and compute what follows from it.
+    """Set the recorded state of a reset in `data`, and compute derived quantities.
 
     Args:
-        model: as of `set_state`, like all of these.
-        data: likewise.
-        parts: likewise.
-        row: likewise.
+        model: the model of `data`.
+        data: the data to change.
+        parts: the columns of each component in `row`.
+        row: the state, `(n,) float64`.
 
     Raises:
         InvalidArgument: the row is not a state of this model.
     """
     set_state(model, data, parts, row)
     mujoco.mj_forward(model, data)
-    # That may have changed the warm start.
+    # `mj_forward` may have changed the warm start.
     set_state(model, data, parts, row)
 
 
 def turns_by_rk4(model: mujoco.MjModel) -> bool:
-    """Return whether quaternions are integrated by the method of Runge and Kutta."""
+    """Return whether the Runge-Kutta method (RK4) integrates any quaternions."""
     kinds = (mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_BALL)
     is_rk4 = model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4
     return bool(is_rk4 and np.isin(model.jnt_type, [int(k) for k in kinds]).any())
 
 
 class PreservedState:
-    """Puts a simulation back as it was before a block.
+    """The state of a simulation, preserved over a block.
 
-    All of the data is put back, and of the model what places, sizes and colours sites,
-    geoms and bodies. The arrays stay where they are in memory.
+    After the block all of the data is restored, and the fields of the model that place,
+    size and colour sites, geoms and bodies. The arrays keep their addresses.
     """
 
     def __init__(self) -> None:
@@ -219,12 +220,12 @@ class PreservedState:
 
     @contextlib.contextmanager
     def around(self, model: mujoco.MjModel, data: mujoco.MjData) -> Iterator[None]:
-        """Preserve `model` and `data` over the block, also if it raises.
+        """Preserve `model` and `data` over the block, even if it raises.
 
         Not reentrant.
         """
         if self._model is not model:
-            # Making one costs as much as a hundred copies.
+            # Creating an MjData costs as much as a hundred copies.
             self._scratch, self._model = mujoco.MjData(model), model
         fields = [getattr(model, name) for name in _SHOWING]
         before = [field.copy() for field in fields]

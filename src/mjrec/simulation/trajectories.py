@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Recorded episodes, read back as arrays.
 
-Reading needs no simulator: MuJoCo is imported where a model or its data is asked for.
+Reading needs no simulator: MuJoCo is imported only for a model or its data.
 """
 
 from __future__ import annotations
@@ -35,22 +35,22 @@ def load_trajectory(
     """Return a recorded episode.
 
     Args:
-        path: of its `openaigym.trajectory.*.h5`. If the episode is not over, or its
-            process was killed, there is no such file yet, and its monitor's log is
-            read.
-        trust_models: let `model()` and `mjrec.render` load a compiled model that
-            another user or machine wrote. A crafted model can run any code; without
-            this, the model is compiled from its sources, if they exist.
+        path: its file, `openaigym.trajectory.*.h5`. While the episode runs, and if its
+            process was killed, this file does not exist yet, and the monitor's log is
+            read instead.
+        trust_models: whether `model()` and `mjrec.render` may load a compiled model
+            that another user or machine wrote. A crafted model can run any code. If
+            false, the model is compiled from its sources, if they exist.
             `MJREC_TRUST_MODELS=1` does the same for all.
 
     Raises:
-        UnreadableFile: the file is missing, damaged, of a newer format, or hostile.
-        InvalidArgument: it is a directory; the message lists its trajectories.
+        UnreadableFile: the file is missing, damaged, from a newer format, or hostile.
+        InvalidArgument: the path is a directory; the message lists its trajectories.
     """
     path = Path(path)
     if path.is_symlink() and infix_of(path.name) is None:
-        # The user's own name for a file, `latest.h5`; a link that bears the name of a
-        # monitor's file was put there with the directory.
+        # A link such as `latest.h5` is the user's own. A link with the name of a
+        # monitor's file may come with the directory from a stranger.
         path = Path(os.path.realpath(path))
     if path.is_dir() or (path.is_file() and is_bundle(path.name)):
         raise InvalidArgument(_what_is_in(path))
@@ -59,15 +59,15 @@ def load_trajectory(
 
 
 class Trajectory:
-    """A recorded episode of T steps, with F frames made or promised of it.
+    """A recorded episode of T steps, with F frames, rendered or still to be rendered.
 
-    Rows `k` of `states`, `time` and `observations` are what was there after `k` steps;
-    row 0 is what was there after the reset. Rows `k` of `actions`, `rewards`,
-    `terminated` and `truncated` belong to the step from state `k` to state `k + 1`.
+    Row `k` of `states`, `time` and `observations` is the value after `k` steps; row 0
+    is the value after the reset. Row `k` of `actions`, `rewards`, `terminated` and
+    `truncated` belongs to the step from state `k` to state `k + 1`.
 
-    To make a step again, set state `k`, give the inputs that stand in state `k + 1`,
-    and simulate one control step; with the same MuJoCo on the same machine that is
-    state `k + 1`, bit for bit, where the environment does nothing but `mj_step`
+    To reproduce a step, set state `k`, set the inputs stored in state `k + 1`, and
+    simulate one control step. With the same MuJoCo on the same machine the result is
+    state `k + 1`, bit for bit, if the environment does nothing but `mj_step`
     (`substeps` times, `frame_skip` in Gymnasium)::
 
         model = trajectory.model()
@@ -76,31 +76,30 @@ class Trajectory:
         data.ctrl[:] = trajectory.component("ctrl")[k + 1]
         mujoco.mj_step(model, data, nstep=substeps)
 
-    Besides `ctrl` the inputs are `qfrc_applied`, `xfrc_applied`, `eq_active`,
+    In addition to `ctrl`, the inputs are `qfrc_applied`, `xfrc_applied`, `eq_active`,
     `mocap_pos`, `mocap_quat` and `userdata`, for environments that use them. An action
-    is what the environment was given, which need not be what the actuators were given.
+    is the input of the environment, which need not be the input of the actuators.
 
-    Snapshots and changes of the model are read when they are asked for; the rest is
-    in memory.
+    Snapshots and changes of the model are read on demand; the rest is in memory.
 
     Args:
-        reader: of the file; it may be closed afterwards.
-        trust_models: whether a compiled model that a stranger wrote is loaded.
+        reader: the file's reader; it may be closed afterwards.
+        trust_models: whether to load a compiled model that a stranger wrote.
 
     Attributes:
-        path: of the file that was read.
-        trust_models: as given.
-        facts: all that is known besides arrays, as
-            `docs/reference/trajectories.md` lists it.
+        path: the file that was read.
+        trust_models: whether to load a compiled model that a stranger wrote.
+        facts: all metadata, as listed in `docs/reference/trajectories.md`.
         states: `(T + 1, n) float64`, the physics states (`mjSTATE_INTEGRATION`, in
-            MuJoCo's units); n is 0 where there was no simulation. See `component`.
-        actions: `(T, *shape)`; None where actions are no plain arrays.
+            MuJoCo's units); n is 0 without a simulation. See `component`.
+        actions: `(T, *shape)`; None if actions are not plain arrays.
         rewards: `(T,) float64`.
-        terminated: `(T,) bool`, the task ended the episode.
-        truncated: `(T,) bool`, a limit from outside the task ended it.
-        observations: `(T + 1, *shape)`; None where they were not recorded.
-        frame_steps: `(F,) int64`, after how many steps each frame was taken.
-        dropped: how many rows at the end were torn when its process was killed.
+        terminated: `(T,) bool`, whether the task ended the episode.
+        truncated: `(T,) bool`, whether a limit outside the task ended it.
+        observations: `(T + 1, *shape)`; None if they were not recorded.
+        frame_steps: `(F,) int64`, the number of steps before each frame.
+        dropped: number of rows at the end that were incomplete because the process was
+            killed.
     """
 
     def __init__(self, reader: TrajectoryReader, *, trust_models: bool = False) -> None:
@@ -157,7 +156,7 @@ class Trajectory:
 
     @property
     def environment(self) -> dict[str, Any] | None:
-        """What makes the environment again: framework, id, kwargs; None if unknown."""
+        """The framework, id and kwargs to recreate the environment; None if unknown."""
         return self.facts.get("environment")
 
     @property
@@ -167,7 +166,7 @@ class Trajectory:
 
     @property
     def seed(self) -> Any:
-        """As it was given to `reset`."""
+        """The seed, as passed to `reset`."""
         return self.facts.get("seed")
 
     @property
@@ -177,53 +176,54 @@ class Trajectory:
 
     @property
     def components(self) -> tuple[str, ...]:
-        """The names of what a state consists of: `time`, `qpos`, `qvel`, `ctrl` ..."""
+        """The names of a state's components: `time`, `qpos`, `qvel`, `ctrl` ..."""
         return tuple(self._columns)
 
     @property
     def time(self) -> NDArray[np.float64] | None:
-        """`(T + 1,)`, the simulation's time in seconds; None without a simulation."""
+        """`(T + 1,)`, the simulation time in seconds; None without a simulation."""
         return self.component("time")[:, 0] if "time" in self.components else None
 
     @functools.cached_property
     def snapshots(self) -> dict[str, NDArray[Any]]:
-        """What the frames are made from: MuJoCo's arrays by name, `(F, *shape)`.
+        """The arrays that frames are drawn from, by MuJoCo's names, `(F, *shape)`.
 
         Raises:
-            UnreadableFile: the file is gone or damaged.
+            UnreadableFile: the file has been removed or is damaged.
         """
         with open_vetted_trajectory(self.path) as reader:
             rows = reader.snapshots(0, len(self.frame_steps))
         return {name: rows[name].copy() for name in rows.dtype.names or ()}
 
     def component(self, name: str) -> NDArray[np.float64]:
-        """Return a part of the states, `(T + 1, length)`.
+        """Return a component of the states, `(T + 1, length)`.
 
         Args:
-            name: MuJoCo's, in lower case, one of `components`: `qpos` is
-                `(T + 1, nq)`, `time` `(T + 1, 1)`.
+            name: one of `components`, MuJoCo's name in lower case. `qpos` is
+                `(T + 1, nq)`, `time` is `(T + 1, 1)`.
 
         Raises:
-            UnknownName: this model's states have no such part.
+            UnknownName: this model's states have no such component.
         """
         if name not in self._columns:
             raise UnknownName("state component", name, self.components)
         return self.states[:, self._columns[name]]
 
     def model(self, step: int = 0) -> mujoco.MjModel:
-        """Return the model as it was in this episode, a new one at each call.
+        """Return the model as it was in this episode, a new copy at each call.
 
         Args:
-            step: after how many steps, where the environment changes its model on the
-                way; what it set in the reset is there from step 0 on.
+            step: the number of steps taken, if the environment changes its model during
+                the episode; changes made in the reset are included from step 0.
 
         Raises:
-            UnreadableFile: the model beside this file is missing or damaged, or was
-                written by another MuJoCo version and not with its sources.
-            UntrustedModel: likewise, and it was written by another user.
-            InvalidArgument: there is no such step.
+            UnreadableFile: the model next to this file is missing or damaged, or was
+                written by another MuJoCo version and without its sources.
+            UntrustedModel: the model cannot be compiled from its sources, and was
+                compiled by another user.
+            InvalidArgument: the step does not exist.
         """
-        # Here, because reading needs no simulator.
+        # Imported here, because reading needs no simulator.
         from .fields import apply_fields
         from .model_store import load_model
 
@@ -231,13 +231,13 @@ class Trajectory:
         stored = self.facts.get("model")
         if stored is None:
             raise UnreadableFile(
-                self.path, "it was recorded without a MuJoCo simulation to be seen"
+                self.path, "no MuJoCo simulation was found when it was recorded"
             )
         if not isinstance(stored, Mapping):
-            raise UnreadableFile(self.path, "what it says of its model is no object")
+            raise UnreadableFile(self.path, "its facts about its model are invalid")
         model = load_model(self.path.parent, stored, trust_models=self.trust_models)
         try:
-            # One at a time: there may be thousands, and each as large as a texture.
+            # One at a time: there may be thousands, each as large as a texture.
             with open_vetted_trajectory(self.path) as reader:
                 for change in reader.iter_model_changes():
                     if change.step <= step:
@@ -247,17 +247,17 @@ class Trajectory:
         return model
 
     def set_state(self, data: mujoco.MjData, step: int) -> None:
-        """Put a recorded state into `data`; what follows from it is not computed.
+        """Set a recorded state in `data`, without computing derived quantities.
 
         Args:
-            data: of `model()`.
-            step: after how many steps; -1 is the last.
+            data: the `mujoco.MjData` of `model()`.
+            step: the number of steps taken; -1 is the last state.
 
         Raises:
-            InvalidArgument: there is no such step, or the state is not one of the
-                data's model.
+            InvalidArgument: the step does not exist, or the state does not belong to
+                the data's model.
         """
-        # Here, because reading needs no simulator.
+        # Imported here, because reading needs no simulator.
         from .states import set_state
 
         row = self.states[self._step(step)]
@@ -266,11 +266,11 @@ class Trajectory:
     def _step(self, step: int) -> int:
         count = len(self.states)
         if isinstance(step, bool) or not isinstance(step, int | np.integer):
-            raise InvalidArgument(f"A step is a whole number, got {step!r}.")
+            raise InvalidArgument(f"A step must be a whole number, got {step!r}.")
         if not -count <= step < count:
             raise InvalidArgument(
-                f"{self.path.name} holds {count} states, counted from 0; there is no "
-                f"state {step}."
+                f"{self.path.name} holds {count} states, counted from 0; state {step} "
+                "does not exist."
             )
         return step % count
 
@@ -284,7 +284,7 @@ def _what_is_in(path: Path) -> str:
         in_flight = (each.path.name for each in recordings_in_flight(path))
         names = sorted({*finished, *in_flight})
     if not names:
-        return f"{path} is a {kind}, and holds no trajectories."
+        return f"{path} is a {kind} without trajectories."
     more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
     return (
         f"{path} is a {kind}. Name one of the trajectories in it: "

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How an environment shows its scene: the camera, the options, the size.
+"""The view of a scene in an environment: the camera, the options and the size.
 
-A viewer makes an OpenGL context, and a recording of states must do without one: cameras
-and options are settled here as the frameworks' viewers settle theirs.
+A viewer creates an OpenGL context, but states must be recorded without one. So cameras
+and options are set here the way the frameworks' viewers set theirs.
 """
 
 from __future__ import annotations
@@ -18,25 +18,26 @@ import numpy as np
 from ..errors import InvalidArgument
 from .fields import apply_fields, empty_model, member_names, read_member
 
-# A scene's memory is a quarter of a kilobyte for each.
+# A scene allocates a quarter of a kilobyte per geom.
 _MOST_GEOMS = 1 << 20
-# OpenGL's own limits are below it.
+# OpenGL's own limits are lower.
 _LARGEST = 1 << 16
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SceneView:
-    """What a frame depends on besides model and data.
+    """Everything except the model and data that a frame depends on.
 
     Attributes:
         camera: the environment's own live camera, or one of ours.
-        option: likewise the visual options, which are not always MuJoCo's default.
-        max_geom: how many geoms the scene may have; the rest is not drawn.
-        fresh: whether each frame gets a new scene, as in dm_control. In a scene that
-            stays, an infinite plane is drawn around the camera of the frame before.
-        height: of the frames, in pixels.
-        width: likewise.
-        label: what metadata calls the camera: a name, a number, or where it is.
+        option: the visual options, the environment's own or ours. They are not always
+            MuJoCo's defaults.
+        max_geom: maximum number of geoms in the scene; more are not drawn.
+        fresh: whether each frame gets a new scene, as in dm_control. In a reused
+            scene, an infinite plane is drawn around the camera of the previous frame.
+        height: height of the frames in pixels.
+        width: width of the frames in pixels.
+        label: the camera in the metadata: a name, a number or a pose.
     """
 
     camera: mujoco.MjvCamera
@@ -48,7 +49,7 @@ class SceneView:
     label: Any
 
     def facts(self) -> dict[str, Any]:
-        """Return what JSON can hold of it, all of it."""
+        """Return the complete view as JSON-compatible values."""
         return {
             "camera": _struct_facts(self.camera),
             "option": _struct_facts(self.option),
@@ -62,11 +63,10 @@ class SceneView:
 
 
 def view_from_facts(facts: Mapping[str, Any]) -> SceneView:
-    """Return the view that `SceneView.facts` has described.
+    """Return the view described by `SceneView.facts`.
 
     Raises:
-        InvalidArgument: something is missing, or is not what it should be; the facts
-            may come from a file.
+        InvalidArgument: a value is missing or invalid; the facts may come from a file.
     """
     structs = {"camera": mujoco.MjvCamera(), "option": mujoco.MjvOption()}
     fields = {}
@@ -90,7 +90,7 @@ def view_from_facts(facts: Mapping[str, Any]) -> SceneView:
 
 
 def viewer_option(flags: Mapping[int, bool] | None = None) -> mujoco.MjvOption:
-    """Return MuJoCo's default option with some of its flags set."""
+    """Return MuJoCo's default option with some of its flags changed."""
     option = mujoco.MjvOption()
     for flag, value in (flags or {}).items():
         option.flags[flag] = value
@@ -103,7 +103,7 @@ def option_without_rangefinder() -> mujoco.MjvOption:
 
 
 def place_free_camera(model: mujoco.MjModel, camera: mujoco.MjvCamera) -> None:
-    """Put a camera where the model's fields, as they are now, have the free camera."""
+    """Move a camera to the model's free camera, as the model's fields are now."""
     mujoco.mjv_defaultFreeCamera(model, camera)
 
 
@@ -113,21 +113,21 @@ def place_viewer_camera(
     config: Mapping[str, Any] | None,
     camera: mujoco.MjvCamera,
 ) -> None:
-    """Put a camera where a viewer that Gymnasium makes at this moment has its own.
+    """Move a camera to where a viewer that Gymnasium creates now has its own.
 
-    It looks at the median of where the geoms are now, and stays: a viewer made later
-    shows another frame of the same state.
+    The camera looks at the median of the current geom positions and stays there: a
+    viewer created later shows a different frame of the same state.
 
     Args:
         model: the model.
         data: its data.
-        config: members of the camera by their names, as environments give them
+        config: values of the camera's members by name, as environments define them
             (`default_camera_config`).
-        camera: is put there.
+        camera: the camera to move.
     """
     mujoco.mjv_defaultCamera(camera)
     select_camera(camera, -1)
-    # The median, without the numpy.ma that `np.median` imports.
+    # Computed without `np.median`, which imports numpy.ma.
     places = np.sort(data.geom_xpos, axis=0)
     camera.lookat[:] = (places[(len(places) - 1) // 2] + places[len(places) // 2]) / 2
     camera.distance = model.stat.extent
@@ -136,12 +136,12 @@ def place_viewer_camera(
 
 
 def select_camera(camera: mujoco.MjvCamera, camera_id: int | None) -> None:
-    """Do to a viewer's camera what Gymnasium does when it draws.
+    """Select a camera in a viewer, as Gymnasium does when it renders.
 
     Args:
-        camera: of the viewer.
-        camera_id: of one of the model's cameras; -1 is a free camera, wherever it is;
-            None leaves it as it is.
+        camera: the viewer's camera.
+        camera_id: the number of one of the model's cameras; -1 for a free camera,
+            wherever it is; None to leave the camera as it is.
     """
     if camera_id is not None:
         kind = "FREE" if camera_id == -1 else "FIXED"
@@ -150,7 +150,7 @@ def select_camera(camera: mujoco.MjvCamera, camera_id: int | None) -> None:
 
 
 def copy_members(source: Any, target: Any) -> None:
-    """Make a camera, or an option, say what another of its type says."""
+    """Copy all members of a camera or an option to another one."""
     for name in _names(target.__class__):
         _assign(target, name, getattr(source, name))
 
@@ -182,7 +182,7 @@ def _whole(facts: Mapping[str, Any], name: str, *, most: int = _LARGEST) -> int:
     value = facts.get(name)
     if type(value) is not int or not 1 <= value <= most:
         raise InvalidArgument(
-            f"{name} of a scene has to be a whole number from 1 to {most}, got "
+            f"The scene's {name} must be a whole number from 1 to {most}, got "
             f"{value!r:.100}."
         )
     return value

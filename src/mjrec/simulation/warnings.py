@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What MuJoCo warns of."""
+"""MuJoCo's warnings."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ _NUMBERS = re.compile(r"[\d.]+")
 
 
 def log_mujoco_warnings() -> None:
-    """Log each kind of MuJoCo's warnings once, for the rest of this process.
+    """Log each kind of MuJoCo warning once, for the rest of this process.
 
     MuJoCo itself would write `MUJOCO_LOG.TXT` into the working directory; a full scene,
-    for one, warns at each frame. For processes of our own only: there is one handler
-    in a process.
+    for example, causes a warning at each frame. Only for processes that mjrec starts,
+    because a process can have only one handler.
     """
     warned: set[str] = set()
 
     def warn(text: str) -> None:
-        # One that says when it was, or where, is no other warning the next time.
+        # A warning that differs only in its numbers (a time, an index) is not new.
         kind = _NUMBERS.sub("", text)
         if kind not in warned:
             warned.add(kind)
@@ -35,22 +35,23 @@ def log_mujoco_warnings() -> None:
 
 
 def warning_counts(simulation: Any) -> dict[str, int]:
-    """Return how often MuJoCo has warned in a simulation since its data was reset.
+    """Return the number of MuJoCo warnings in a simulation since its data was reset.
 
-    MuJoCo resets the counts, too, where it resets a simulation that has become unstable
-    by itself; then the warning that says so is counted again.
+    When a simulation becomes unstable, MuJoCo resets it together with these counts,
+    then counts the warning that reports it again.
 
     Args:
-        simulation: has MuJoCo's `data`, or dm_control's wrapper of it, as attribute.
+        simulation: an object with the attribute `data`, MuJoCo's own or dm_control's
+            wrapper of it.
 
     Returns:
-        The counts that are not zero, by name, without `mjWARN_`.
+        The nonzero counts by name, without the prefix `mjWARN_`.
     """
     data = getattr(simulation.data, "ptr", simulation.data)
     kinds = {
         name.removeprefix(_PREFIX): kind
         for name, kind in mujoco.mjtWarning.__members__.items()
-        # The last one is how many there are.
+        # The last member of the enum, mjNWARNING, is their number.
         if name.startswith(_PREFIX)
     }
     counts = {name: int(data.warning[kind].number) for name, kind in kinds.items()}
