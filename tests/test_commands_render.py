@@ -74,7 +74,7 @@ def test_what_is_not_rendered_is_listed_with_its_reason(tmp_path, mjrec, painter
     status, out, _ = mjrec(tmp_path)
     assert status == 1
     assert "1 video rendered" in out
-    assert "1 video left to another process" in out
+    assert "1 video being rendered by another process" in out
     assert "3 videos could not be rendered:" in out
     assert "nothing that frames can be made of" in out
     lock.release()
@@ -214,7 +214,7 @@ def test_strict_fails_where_nothing_is_to_be_seen(again_at, tmp_path, mjrec, pai
     manifest = write_pending_manifest(tmp_path, 0)
     status, out, _ = mjrec(tmp_path, "--strict", *again_at)
     assert status == 1
-    assert "1 video rendered, showing nothing:" in out
+    assert "1 video rendered, but blank:" in out
     assert "all 5 frames are of a single colour" in out
     assert len(list(tmp_path.glob("*.mp4"))) == 1
     content = json.loads(manifest.read_text())
