@@ -76,7 +76,7 @@ def test_what_is_not_rendered_is_listed_with_its_reason(tmp_path, mjrec, painter
     assert "1 video rendered" in out
     assert "1 video being rendered by another process" in out
     assert "3 videos could not be rendered:" in out
-    assert "nothing that frames can be made of" in out
+    assert "nothing to draw frames from" in out
     lock.release()
     status, out, _ = mjrec(tmp_path, "--json")
     assert status == 1
@@ -169,7 +169,7 @@ def test_out_names_the_file(name, tmp_path, mjrec, painter):
         (["--size", "0x64"], "width"),
         (["--fps", "-1"], "fps"),
         (["--out", "x.mp4"], "several episodes"),
-        (["--out", f"{VIDEO}.mkv", "--episode", "0"], "name of a recorded video"),
+        (["--out", f"{VIDEO}.mkv", "--episode", "0"], "original video"),
         (["--out", "x.txt", "--episode", "0"], "ends in"),
         (["--out", "/no/such/directory/x.mp4", "--episode", "0"], "/no/such/directory"),
         (["--engine", "local", "--engine-option", "partition"], "KEY=VALUE"),
