@@ -66,8 +66,8 @@ class Background:
 
     Args:
         directory: the monitor directory.
-        workers: number of processes that draw. None is one for each usable CPU, shared
-            by all processes that render into the directory.
+        workers: number of processes that draw. None means one for each usable CPU,
+            shared by all processes that render into the directory.
         strict: whether a blank video counts as a failure, although it is written.
 
     Raises:
@@ -334,8 +334,8 @@ def _stop(signum: int, frame: object) -> None:
 
 
 def _leave() -> None:
-    # The signal wakes the main thread, wherever it waits. If it does not exit, the
-    # process is of no more use.
+    # The signal wakes the main thread, wherever it waits. If that does not exit in
+    # time, the process is ended after this function returns.
     os.kill(os.getpid(), signal.SIGTERM)
     time.sleep(_SECONDS_TO_LEAVE)
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Recording which episodes of an evaluation get a video.
+"""Writing down which episodes of an evaluation get a video.
 
 Monitors of an evaluation plan no videos, because the best episode of a task may be in
 any of its chunks. The choice is made when all episodes of a task have ended. It is then
@@ -43,7 +43,7 @@ def write_choice(
     An episode that was chosen earlier, among fewer episodes, keeps its video.
 
     Args:
-        folder: the chunk's monitor directory, whose monitors are closed.
+        folder: the chunk's monitor directory. Its monitors must be closed.
         chosen: the chosen episodes and their roles.
         rule: the rule that chose them.
         finished: number of finished episodes among which they were chosen.

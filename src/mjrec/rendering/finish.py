@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Finishing a directory: everything that has ended but is not finished yet.
 
-This is one operation, of which all others are parts. It finishes each recording (during
-a simulation, the background process does that for its monitor), updates manifests and
-second names, and finishes dead monitors (`recover` and `resume=True` do all of this
-except the drawing). It may be interrupted or killed at any point and run again, and any
-number of processes may run it on one directory.
+Closing, rendering, recovering and resuming all run this operation or parts of it. It
+finishes each recording (during a simulation, the background process does that for its
+monitor), updates manifests and second names, and finishes dead monitors (`recover` and
+`resume=True` do everything except the drawing). It may be interrupted or killed at any
+point and run again, and any number of processes may run it on one directory.
 """
 
 from __future__ import annotations
@@ -42,9 +42,9 @@ def finish(
 
     Args:
         directory: the monitor directory.
-        keys: the recordings to finish. None is all, including the files that killed
+        keys: the recordings to finish. None means all, including the files that killed
             monitors left behind.
-        workers: number of processes that draw. None is one for each free CPU.
+        workers: number of processes that draw. None means one for each free CPU.
         engine: an engine whose workers do the work instead.
         strict: whether a blank video is a failure.
         on_progress: called with the progress.

@@ -50,7 +50,7 @@ def do_jobs(
     Args:
         jobs: the jobs to do.
         directory: the directory whose CPU locks are used if `workers` is None.
-        workers: number of processes that draw. None is one for each free CPU.
+        workers: number of processes that draw. None means one for each free CPU.
         on_progress: called after every frame, and when a job has ended.
     """
     pool = WorkerPool(workers, directory=directory)
@@ -95,7 +95,7 @@ class Finisher:
         self.progress = Progress(frames=0)
         self.on_progress = on_progress
         self._pool = pool
-        # The plan is None if planning failed; the reason is reported in its turn.
+        # The plan is None if planning failed. The reason is reported by `do_next`.
         self._waiting: dict[str, tuple[VideoJob, Plan | None]] = {}
         self._gl_failure: GLError | None = None
 
@@ -126,7 +126,7 @@ class Finisher:
         return plan is None or plan.has_model
 
     def do_next(self) -> tuple[VideoJob, RenderedVideos]:
-        """Do the first job."""
+        """Do the next job, and return it with its result."""
         job, plan = self._waiting.pop(next(iter(self._waiting)))
         before, (videos, frames) = self.progress.frames_done, _work(plan)
         result = self._do(job)

@@ -67,7 +67,7 @@ class WorkerPool:
 
     Workers use the backend that `MUJOCO_GL` names. If it names none, or turns rendering
     off (which applies to the simulation), each starts with EGL and checks a test frame
-    of its own first. Only if that fails, the pool looks for the first backend that
+    of its own first. Only if that fails does the pool look for the first backend that
     works, like `mjrec.use_gl`.
 
     Use it from one thread at a time.
@@ -170,7 +170,7 @@ class WorkerPool:
             trajectory: the trajectory's file.
             indices: the numbers of the frames, from 0, in any order; repetitions are
                 allowed.
-            view: the camera, size and quality; None is as recorded.
+            view: the camera, size and quality; None means as recorded.
             cameras: cameras that replace that of the view; None among them is as
                 recorded. Each frame is then a grid of their frames.
 

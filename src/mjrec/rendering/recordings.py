@@ -48,7 +48,7 @@ class Plan:
     """The work left to do on a recording.
 
     Attributes:
-        parts: the files of its rows, in order; rows in a log have such a name too.
+        parts: the paths of its parts, in order. Parts still in a log have no file.
         videos: the videos to render, the first camera's first.
         frame_count: number of frames to render, in all videos together.
         logs: the logs that still contain its rows.
@@ -159,7 +159,7 @@ def recordings(directory: Path) -> list[RecordingKey]:
 
 
 def parts_of(directory: Path, key: RecordingKey) -> list[Path]:
-    """Return the files of a recording's rows, in order; rows in a log have one too."""
+    """Return the paths of a recording's parts, in order; see `Plan.parts`."""
     if not key.is_clip:
         path = find_trajectory(directory, key.infix, key.number)
         return [] if path is None else [path]
@@ -179,7 +179,7 @@ def may_be_left(directory: Path, key: RecordingKey) -> bool:
 
 
 def _is_done(directory: Path, key: RecordingKey) -> bool:
-    """Return whether a recording is an episode with finished trajectory and video."""
+    """Return whether a recording is an episode whose trajectory and video are done."""
     if key.is_clip or not is_done(directory / key.video_name):
         return False
     return is_finished(directory / f"{key.name}{FINISHED}")

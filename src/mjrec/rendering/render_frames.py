@@ -55,14 +55,14 @@ def render(
         trajectory: from `mjrec.load_trajectory`, or its path. If it was loaded with
             `trust_models=True`, its compiled model is loaded too.
         camera: name or number of one of the model's cameras, -1 for the free camera
-            where the model places it, an `mujoco.MjvCamera`, or a mapping of its
-            members. None is as recorded.
-        width: width in pixels. None is as recorded.
-        height: height in pixels. None is as recorded.
+            where the model places it, a `mujoco.MjvCamera`, or a mapping of its
+            members. None means as recorded.
+        width: width in pixels. None means as recorded.
+        height: height in pixels. None means as recorded.
         max_fps: draw only frames 0, n, 2n ... and the last, with at most this many per
             second of simulated time. None draws all recorded frames.
         quality: `"full"` or `"draft"` (no multisampling, shadow maps of at most
-            1024x1024). None is as recorded.
+            1024x1024). None means as recorded.
         workers: number of worker processes. The frames do not depend on it.
 
     Returns:

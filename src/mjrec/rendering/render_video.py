@@ -89,8 +89,8 @@ def render_video(
         variant: changes from the recording. If it names a camera, there is one video,
             from that camera.
         workers: the workers that draw the frames.
-        out: the video of the first camera, or of all side by side. None is the name in
-            the recording, next to it.
+        out: the video of the first camera, or of all side by side. None means the name
+            in the recording, next to it.
         strict: whether a blank video is listed in the result's `blank`. Otherwise there
             is only a warning.
         on_frame: called once for every frame of every video.
@@ -164,7 +164,7 @@ def render_video(
 
 
 def _note_that_it_broke(recorded: Recorded, out: Path | None) -> None:
-    """Write metadata which says that a recording can never have a video.
+    """Write metadata that marks a recording's video as broken, without a video.
 
     Raises:
         NoPictures: the reason is unknown, the recording has no video, or `out` is

@@ -69,8 +69,8 @@ def render_videos(
     Args:
         target: a monitor directory; or a trajectory or video in one, for that episode
             only.
-        episode: number of the episode. None is all recorded episodes.
-        camera: see `mjrec.render`. None is as recorded, here and below.
+        episode: number of the episode. None means all recorded episodes.
+        camera: see `mjrec.render`. None means as recorded, here and below.
         height: height in pixels.
         width: width in pixels.
         max_fps: maximum frames per second of simulated time: every n-th recorded frame
@@ -79,8 +79,8 @@ def render_videos(
         fps: frames per second written into the file. It does not select frames.
         annotate: write episode, step, time and return on the frames.
         out: the file to write, for one episode. Its suffix chooses the format.
-        workers: number of worker processes. None is one per free CPU. If `engine` is a
-            name, the number of engine workers.
+        workers: number of worker processes. None means one per free CPU. If `engine`
+            is a name, the number of engine workers.
         strict: list videos that show nothing (black, one colour, no movement) in
             `blank`. They are kept.
         trust_models: load compiled models that another user or machine wrote. A crafted
@@ -92,7 +92,7 @@ def render_videos(
             every video.
 
     Returns:
-        The rendered videos, and the reasons of failures.
+        The rendered videos, and the reasons for failures.
 
     Raises:
         InvalidArgument: no such recordings exist, or an argument is invalid.

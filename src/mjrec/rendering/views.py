@@ -16,7 +16,7 @@ from ..rates import to_rate
 
 PlainCamera: TypeAlias = "str | int | dict[str, Any]"
 
-# The public members of an `mujoco.MjvCamera`.
+# The public members of a `mujoco.MjvCamera`.
 CAMERA_MEMBERS = (
     *("type", "fixedcamid", "trackbodyid", "lookat", "distance"),
     *("azimuth", "elevation", "orthographic"),
@@ -25,11 +25,11 @@ CAMERA_MEMBERS = (
 
 @dataclass(frozen=True, kw_only=True)
 class View:
-    """The camera, size and quality of frames; None is as recorded.
+    """The camera, size and quality of frames; None means as recorded.
 
     Attributes:
         camera: the name or number of one of the model's cameras, -1 for the free
-            camera where the model places it, or the members of an `mujoco.MjvCamera` by
+            camera where the model places it, or the members of a `mujoco.MjvCamera` by
             name (MuJoCo's defaults for those left out). Any value that `plain_camera`
             accepts may be passed.
         height: height in pixels.
@@ -68,7 +68,7 @@ class View:
 
 @dataclass(frozen=True, kw_only=True)
 class Variant:
-    """Changes for re-rendering a recording; None is as recorded.
+    """Changes for re-rendering a recording; None means as recorded.
 
     Attributes:
         view: the camera, size and quality.
@@ -97,7 +97,7 @@ def plain_camera(camera: Any) -> PlainCamera:
     """Return a camera in a JSON-serialisable form.
 
     Args:
-        camera: a name, a number, an `mujoco.MjvCamera`, or a mapping of its members.
+        camera: a name, a number, a `mujoco.MjvCamera`, or a mapping of its members.
 
     Raises:
         UnknownName: a key of the mapping is not a member of `MjvCamera`.

@@ -97,7 +97,7 @@ class ReportTask:
         summary: the summary of its episodes.
         episodes: `(n,)` of dtype `EPISODE`.
         runs: the names of the runs, if they are monitors.
-        failures: the reasons of failed episodes, by index.
+        failures: the reasons why episodes failed, by index.
         videos: its videos, in the order of their episodes.
         provenance: pairs of label and value, for people: versions, GL renderer, policy,
             seeds, selection rule, protocol ...

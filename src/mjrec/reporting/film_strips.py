@@ -71,7 +71,7 @@ def film_strip(
     Args:
         file: a trajectory (`.h5`), which is rendered, or a video, which is decoded.
         frames: number of frames.
-        columns: frames per row. None is one row of up to eight, or several equal rows.
+        columns: frames per row. None means up to eight, or several equal rows.
         camera: see `mjrec.render` (trajectories only).
         height: height of each frame in pixels (trajectories only).
         width: width of each frame in pixels (trajectories only).

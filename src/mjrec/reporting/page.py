@@ -385,7 +385,7 @@ def _most_telling(
     Args:
         task: the task.
         videos: its videos, by the episode's index.
-        most: maximum number of each kind; None is all episodes.
+        most: maximum number of each kind; None means all episodes.
     """
     if most is None:
         return np.arange(len(task.episodes))
