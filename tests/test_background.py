@@ -288,7 +288,7 @@ def test_one_that_hangs_is_ended(hangs, others, tmp_path, start, caplog, monkeyp
         return
     assert "hung for 2.1 seconds" in background.failures[log.name]
     assert "in wait_for_a_disk_that_does_not_answer" in caplog.text
-    assert caplog.text.count("What its threads were at") == 2
+    assert caplog.text.count("Its threads' stacks") == 2
     assert is_in_flight(log)
     started = [int(pid) for pid in pids.read_text().split()]
     assert len(started) == 2
@@ -316,7 +316,7 @@ def test_workers_are_forks_and_one_that_dies_is_replaced(
         background.wait()
         assert background.failures == {}
         if victim == "a worker":
-            assert "A drawing worker died and is replaced" in caplog.text
+            assert "A render worker died and is being replaced" in caplog.text
             background.stop()
             background = start(recorded, workers=2)
         wait_until(lambda: all(map(has_ended, workers)))  # noqa: B023  called at once

@@ -239,13 +239,13 @@ def test_a_return_that_is_nan_is_no_success(
     run = ("nan_env:Nan-v0", "--policy", "zero", "--episodes", 2, *allowed)
     status, out, _ = mjrec("record", *run, "--out", "r", "--schedule", "none")
     assert status == expected
-    assert "2 returns NaN or infinite" in out
+    assert "NaN or infinite: 2 returns" in out
     small = ("--keep", "none", "--num-seeds", 1, "--workers", 1)
     status, out, err = mjrec("evaluate", *run, *small, "--out", "e")
     assert status == expected
     # Nothing is drawn, so how fast it would play is no news.
     assert "does not declare a frame rate" not in err
-    assert "2 returns NaN or infinite" in out
+    assert "NaN or infinite: 2 returns" in out
     # None of them is the best.
     assert "best" not in out
 
@@ -396,7 +396,7 @@ def test_a_long_list_is_printed_as_it_is_read(tmp_path, monkeypatch):
 def test_list_says_that_there_is_nothing(mjrec, tmp_path):
     """Not an empty table, and no error: a run may not have come to an end yet."""
     status, out, _ = mjrec("list", tmp_path)
-    assert (status, out) == (0, f"No episode is recorded in {tmp_path}.\n")
+    assert (status, out) == (0, f"No episodes are recorded in {tmp_path}.\n")
     assert mjrec("list", tmp_path, "--json")[:2] == (0, "")
     status, _, err = mjrec("list", tmp_path / "nothing")
     assert status == 1

@@ -124,7 +124,7 @@ def test_what_is_required(required, reason, two, capsys):
         (["--require", "improvement > 0.5"], "probability of improvement"),
         (["--require", f"{WALK}: IQM A > 0.5"], "mean A"),
         (["--require", "y: difference > 0"], "Hopper-v5"),
-        (["--margin", "0.05"], "belong together"),
+        (["--margin", "0.05"], "must be given together"),
         (["--no-worse-than", "A", "--margin", "-1"], "0 or more"),
         (["--confidence", "95"], "between 0 and 1"),
         (["more"], "--against"),

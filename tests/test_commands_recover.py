@@ -40,7 +40,7 @@ def test_failures_are_listed(tmp_path, capsys):
     assert f"  {log.name}: " in said
     assert log.read_bytes() == content
     assert main(["recover", str(tmp_path / "missing")]) == 1
-    assert capsys.readouterr().err.startswith("mjrec: There is no directory")
+    assert capsys.readouterr().err.startswith("mjrec: Cannot recover")
 
 
 def test_json_is_one_object(tmp_path, capsys):

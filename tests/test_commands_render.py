@@ -74,9 +74,9 @@ def test_what_is_not_rendered_is_listed_with_its_reason(tmp_path, mjrec, painter
     status, out, _ = mjrec(tmp_path)
     assert status == 1
     assert "1 video rendered" in out
-    assert "1 video left to another process" in out
+    assert "1 video being rendered by another process" in out
     assert "3 videos could not be rendered:" in out
-    assert "nothing that frames can be made of" in out
+    assert "nothing to draw frames from" in out
     lock.release()
     status, out, _ = mjrec(tmp_path, "--json")
     assert status == 1
@@ -169,7 +169,7 @@ def test_out_names_the_file(name, tmp_path, mjrec, painter):
         (["--size", "0x64"], "width"),
         (["--fps", "-1"], "fps"),
         (["--out", "x.mp4"], "several episodes"),
-        (["--out", f"{VIDEO}.mkv", "--episode", "0"], "name of a recorded video"),
+        (["--out", f"{VIDEO}.mkv", "--episode", "0"], "original video"),
         (["--out", "x.txt", "--episode", "0"], "ends in"),
         (["--out", "/no/such/directory/x.mp4", "--episode", "0"], "/no/such/directory"),
         (["--engine", "local", "--engine-option", "partition"], "KEY=VALUE"),
@@ -214,7 +214,7 @@ def test_strict_fails_where_nothing_is_to_be_seen(again_at, tmp_path, mjrec, pai
     manifest = write_pending_manifest(tmp_path, 0)
     status, out, _ = mjrec(tmp_path, "--strict", *again_at)
     assert status == 1
-    assert "1 video rendered, showing nothing:" in out
+    assert "1 video rendered, but blank:" in out
     assert "all 5 frames are of a single colour" in out
     assert len(list(tmp_path.glob("*.mp4"))) == 1
     content = json.loads(manifest.read_text())

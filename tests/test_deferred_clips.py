@@ -283,7 +283,7 @@ def test_no_other_video_is_written_over(name, tmp_path):
     add_facts(log, {"video": {"recording": "deferred", "name": named}})
     before = set(tmp_path.iterdir())
     [outcome] = finish(tmp_path)
-    assert "not that of its own" in str(outcome.failures)
+    assert "does not belong to its episode" in str(outcome.failures)
     [new] = set(tmp_path.iterdir()) - before
     assert new.match("openaigym.clip.*.failed.json")
 

@@ -158,7 +158,7 @@ def test_what_people_see():
     reason = "Nothing renders.\negl: why"
     assert "egl: why" not in shown(report_of(backend=None, reason=reason))
     for said in (
-        "12.3 frames a second",
+        "12.3 frames per second",
         "llvmpipe (LLVM 15.0.6, 256 bits), on the CPU",
         "4.5 Mesa [22.3.6]",
         "EGL device 0: the CPU, /dev/dri/renderD128, CUDA device 3, used",
@@ -167,7 +167,7 @@ def test_what_people_see():
         "Something is odd.",
         "not installed",
         "Cause: It is too new.",
-        "2 usable (4 allowed of 64 present, a quota of 2.5)",
+        "2 usable (4 of 64 allowed, a quota of 2.5)",
         "/dev/nvidia0",
         "SciPy       1.14",
         'python -m pip install "mjrec[ray]"',

@@ -220,7 +220,7 @@ def test_intervals_made_in_another_way_are_told(tmp_path):
     write_recorded(tmp_path / "a", ["a/x"])
     write_evaluation(tmp_path / "b", {"b/y": [[1.0, 2.0]]}, monitor="0.batch")
     [problem] = gather([tmp_path / "a", tmp_path / "b"]).problems
-    assert "b were made in another way: 10 resamples with seed 0, 0.95." in problem
+    assert "computed differently: 10 resamples with seed 0, confidence 0.95." in problem
 
 
 def test_videos_of_an_evaluation_know_their_episode(corridor, tmp_path):
@@ -242,7 +242,7 @@ def test_pending_videos_of_an_evaluation_are_told(tmp_path):
     name = "openaigym.video.0.batch.video000000.mp4"
     write_recorded(tmp_path, ["a/x"], videos={"a/x": name})
     [problem] = gather(tmp_path).problems
-    assert "1 of 1 videos of a/x are not there" in problem
+    assert "1 of 1 videos of a/x are missing" in problem
     assert f"mjrec render {tmp_path / 'a-x'}" in problem
 
 
@@ -269,7 +269,7 @@ def test_an_evaluation_without_results_is_shown_by_its_monitors(
     assert contents.tasks[0].episodes["total_reward"].tolist() == [3.0, 1.0, 2.0]
     [problem] = contents.problems
     assert told in problem
-    assert "What its monitors recorded is shown instead." in problem
+    assert "The recordings of its monitors are shown instead." in problem
 
 
 # --- Roles and verdicts -----------------------------------------------------------
@@ -347,14 +347,14 @@ def test_a_directory_without_recordings_is_an_error(tmp_path):
     """It is named, with what to do; so is one that is not there, or a file."""
     (tmp_path / "deep" / "deeper").mkdir(parents=True)
     write_journal(tmp_path / "deep" / "deeper", "0.a", "X-v0", [entry(0)])
-    with pytest.raises(InvalidArgument, match="holds no recordings"):
+    with pytest.raises(InvalidArgument, match="contains no recordings"):
         gather(tmp_path)
     named = tmp_path / "my runs; $(x)"
     named.mkdir()
     with pytest.raises(InvalidArgument, match="--out") as error:
         gather(named)
     assert f"--out {shlex.quote(str(named))}`" in str(error.value)
-    with pytest.raises(InvalidArgument, match="is not there"):
+    with pytest.raises(InvalidArgument, match="does not exist"):
         gather(tmp_path / "nowhere")
     with pytest.raises(InvalidArgument, match="is a file"):
         gather(GYM.parent.parent / "conftest.py")

@@ -533,7 +533,7 @@ def test_two_recoveries_at_once_do_the_work_once(cut: Path) -> None:
 
 def test_what_cannot_be_recovered_is_one_error(cut: Path) -> None:
     """No directory, one that cannot be written to, no timeout; nothing is half done."""
-    with pytest.raises(mjrec.InvalidArgument, match="no directory"):
+    with pytest.raises(mjrec.InvalidArgument, match="not a directory"):
         mjrec.recover(cut / "missing")
     for wrong in (-1, float("nan"), "5", True):
         with pytest.raises(mjrec.InvalidArgument, match="timeout"):

@@ -85,7 +85,7 @@ def test_another_view_takes_the_place_of_the_recorded_one(ride, kind):
 WRONG = [
     ({"camera": "top"}, UnknownName, r"no camera 'top'.*side, rider"),
     ({"camera": 1.5}, InvalidArgument, "camera must be a name"),
-    ({"camera": {"distance": "far"}}, InvalidArgument, "distance is a number"),
+    ({"camera": {"distance": "far"}}, InvalidArgument, "distance must be a number"),
     ({"width": 0}, InvalidArgument, "width must be"),
     ({"height": 20000}, InvalidArgument, "height must be"),
     ({"camera": 7}, InvalidArgument, "Camera number 7 does not exist"),
@@ -117,7 +117,7 @@ def test_what_is_no_recording(tmp_path):
         mjrec.render(tmp_path / "lost.h5")
     with pytest.raises(NoPictures, match="no snapshots"):
         mjrec.render(write_log(tmp_path, frames=False, scene=None))
-    with pytest.raises(InvalidArgument, match="trajectory is a path"):
+    with pytest.raises(InvalidArgument, match="trajectory must be a path"):
         mjrec.render(3)
 
 
@@ -139,7 +139,7 @@ def test_frames_are_chosen_by_rate(count, max_fps, chosen):
     facts = {"rate": "20", "stride": 2}
     assert chosen_frames(count, facts, max_fps).indices == chosen
     # The process was killed before its second step.
-    with pytest.raises(InvalidArgument, match="Leave max_fps out"):
+    with pytest.raises(InvalidArgument, match="Omit max_fps"):
         chosen_frames(2, {}, 30)
     assert chosen_frames(1, {}, 30).indices == [0]
 

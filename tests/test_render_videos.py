@@ -201,19 +201,19 @@ def test_ctrl_c_leaves_what_is_finished(tmp_path, painter, options):
 
 
 WRONG = [
-    ({"episode": 4}, InvalidArgument, "It has those of 0"),
+    ({"episode": 4}, InvalidArgument, "Available: 0"),
     ({"workers": 0}, InvalidArgument, "workers"),
     ({"height": -1}, InvalidArgument, "height"),
     ({"quality": "low"}, UnknownName, "draft"),
     ({"max_fps": 0}, InvalidArgument, "fps"),
     ({"camera": 1.5}, InvalidArgument, "A camera must be a name"),
     ({"camera": {"zoom": 1}}, UnknownName, "distance"),
-    ({"out": f"{VIDEO}.mp4"}, InvalidArgument, "name of a recorded video"),
+    ({"out": f"{VIDEO}.mp4"}, InvalidArgument, "original video"),
     ({"engine": "spark"}, UnknownName, "slurm"),
     ({"engine": 3}, InvalidArgument, r"mjrec\.LocalEngine\(\)"),
     ({"engine": LocalEngine(1), "workers": 2}, InvalidArgument, "its own workers"),
     ({"engine": "local", "workers": 0}, InvalidArgument, "workers"),
-    ({"engine": "local", "out": f"{VIDEO}.mp4"}, InvalidArgument, "recorded video"),
+    ({"engine": "local", "out": f"{VIDEO}.mp4"}, InvalidArgument, "original video"),
 ]
 
 
@@ -229,12 +229,12 @@ def test_what_cannot_be_is_one_clear_error(tmp_path, options, kind, words):
 
 def test_what_is_no_recording_is_said(tmp_path):
     """A directory without any, a path to nothing, and a file of another name."""
-    with pytest.raises(InvalidArgument, match="holds no recordings"):
+    with pytest.raises(InvalidArgument, match="contains no recordings"):
         render_videos(tmp_path)
-    with pytest.raises(InvalidArgument, match="no directory or file"):
+    with pytest.raises(InvalidArgument, match="does not exist"):
         render_videos(tmp_path / "missing")
     copy = write_finished(tmp_path).rename(tmp_path / "copy.h5")
-    with pytest.raises(InvalidArgument, match="no recording has such a name"):
+    with pytest.raises(InvalidArgument, match="no recording has that name"):
         render_videos(copy)
 
 

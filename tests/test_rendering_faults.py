@@ -105,7 +105,7 @@ def test_a_killed_encoder_gets_a_second_try(two, tmp_path, monkeypatch, caplog):
     results = finish(two, on_progress=told.append)
     assert flag.exists()
     assert not [each for each in results if each.failures]
-    assert "begun anew" in caplog.text
+    assert "Restarting the video" in caplog.text
     assert "no memory" in caplog.text
     assert max(progress.frames_done for progress in told) == 2 * FRAMES
     check_nothing_is_half(two)

@@ -107,7 +107,7 @@ def test_without_a_frame_there_is_metadata_or_an_error(tmp_path, names):
 def test_a_trajectory_writes_no_video_but_its_own(name, tmp_path):
     """What a file says it is to be called may come from anybody."""
     trajectory = write_log(tmp_path, video=None)
-    with pytest.raises(UnreadableFile, match="own episode"):
+    with pytest.raises(UnreadableFile, match="its episode"):
         video_path(trajectory, {"video": {"name": name}})
 
 

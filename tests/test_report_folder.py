@@ -119,8 +119,8 @@ def test_a_video_that_is_none_is_named_and_the_rest_is_there(recordings, tmp_pat
     assert "posters/0000-unknown-corridor.jpg" not in names(page.parent)
     assert "posters/0001-unknown-corridor.jpg" in names(page.parent)
     text = page.read_text()
-    assert "There is no frame of a video" in text
-    assert "not the file that its metadata describe" in text
+    assert "A video has no poster" in text
+    assert "does not match its metadata" in text
     assert sha256(first) in text
     second.write_text("<html><script>alert(1)</script></html>")
     page = write_report(recordings, tmp_path / "report")
@@ -168,8 +168,8 @@ def test_a_report_replaces_a_report(recordings, tmp_path):
         ("report", "report/videos/mine.mp4", {}, "videos/mine.mp4"),
         ("report", "report/notes.txt", {}, "notes.txt"),
         # Whoever names the same directory twice keeps it.
-        ("recordings", "recordings/notes.txt", {}, "no report"),
-        ("mine.html", "mine.html", {"single_file": True}, "is no report"),
+        ("recordings", "recordings/notes.txt", {}, "belong to a report"),
+        ("mine.html", "mine.html", {"single_file": True}, "is not a report"),
         ("mine.html", "mine.html", {}, "single_file"),
         ("file", "file", {}, "is a file"),
         ("file/report", "file", {}, "file"),
@@ -255,5 +255,5 @@ def test_replays_stand_beside_the_videos(tmp_path):
     # It is still a report, which another one replaces.
     write_report(tmp_path / "run", tmp_path / "report")
     assert not (tmp_path / "report" / "replays").exists()
-    with pytest.raises(InvalidArgument, match="Replays are pages"):
+    with pytest.raises(InvalidArgument, match="Replays are separate pages"):
         write_report(tmp_path / "run", tmp_path / "x", single_file=True, replays=True)

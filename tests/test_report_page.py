@@ -164,8 +164,8 @@ def test_why_figures_are_missing_or_made_in_another_way_is_said():
     assert usual.endswith("50 resamples, seed 0")
     notes = re.findall(r"<li><span[^>]*>(\w+)</span>: ([^<]*)\.</li>", page)
     assert notes == [
-        ("large", f"Intervals by another method, {method}"),
-        ("odd", "No figures of the returns: 1 of 3 returns is no finite number"),
+        ("large", f"Intervals by a different method, {method}"),
+        ("odd", "No figures for the returns: 1 of 3 returns is not finite"),
     ]
 
 

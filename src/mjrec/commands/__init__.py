@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The command line: a module for each command, each over one library call."""
+"""The command line: one module per command, each a thin layer over a library call."""
 
 from __future__ import annotations
 
@@ -20,41 +20,41 @@ from .overview import EXAMPLES, examples, overview, recordings_in
 
 __all__ = ["main"]
 
-# Each command: its module, which is imported when it is chosen, and has a function that
-# is called like the command (`list_episodes`, because `list` is Python's), and what it
-# does.
+# The module and the summary of each command. The module is imported when the command is
+# run, and its function has the module's name (`list_episodes`, because `list` is a
+# builtin).
 COMMANDS = {
     "record": ("record", "Record episodes of an environment."),
-    "render": ("render", "Render pending videos, or episodes once more."),
-    "recover": ("recover", "Finish what a killed run left."),
+    "render": ("render", "Render pending videos, or re-render episodes."),
+    "recover": ("recover", "Finish what a killed run left behind."),
     "list": ("list_episodes", "List recorded episodes."),
     "strip": ("strip", "Put frames of an episode side by side."),
     "replay": ("replay", "Show an episode in 3D, in one HTML file."),
-    "view": ("view", "Show a run in a browser while it goes on."),
+    "view": ("view", "Watch a run in a browser while it is running."),
     "evaluate": ("evaluate", "Evaluate a policy on tasks and seeds."),
     "compare": ("compare", "Compare evaluations."),
-    "report": ("report", "Make a web page of recordings or results."),
+    "report": ("report", "Make a web page from recordings or results."),
     "pack": ("pack", "Pack a run into one file for others."),
-    "verify": ("verify", "Run a packed run again and compare."),
+    "verify": ("verify", "Re-run a packed run and compare."),
     "doctor": ("doctor", "Check whether this machine can render."),
-    "completion": ("completion", "Print tab completion for a shell."),
+    "completion": ("completion", "Print a shell completion script."),
 }
 
 _FAILED = 1
 _TRACEBACK = "Traceback (most recent call last)"
-_INTERRUPTED = 130  # what shells say of a process that Ctrl-C ended
+_INTERRUPTED = 130  # what shells report for a process that Ctrl-C ended
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a command and return its exit status.
 
-    0 is success, 1 an error with one message on stderr, 2 (as `SystemExit`) a command
-    line that cannot be understood, 130 an interruption, 143 (as `SystemExit`) SIGTERM,
-    129 SIGHUP: all of them close the files first. An error that is not one of ours
-    keeps its traceback.
+    0 means success, 1 an error with one message on stderr, 130 an interruption by
+    Ctrl-C. As `SystemExit`: 2 for an invalid command line, 143 for SIGTERM, 129 for
+    SIGHUP. Files are closed first in all cases. Exceptions that are not mjrec's own
+    keep their traceback.
 
     Args:
-        argv: the arguments; those of the process, if None.
+        argv: the arguments; by default those of the process.
     """
     with _warnings_on_stderr(), exiting_on_signals():
         return _run(argv)
@@ -65,7 +65,7 @@ def _run(argv: Sequence[str] | None) -> int:
     module, _ = COMMANDS[name]
     try:
         command = importlib.import_module(f".{module}", __name__)
-        # Later than the overview, which must be quick.
+        # Imported only now, because the overview must be quick.
         from .help_text import flowing_help
 
         tyro = importlib.import_module("tyro")
@@ -75,34 +75,35 @@ def _run(argv: Sequence[str] | None) -> int:
             args=arguments,
             config=(tyro.conf.FlagCreatePairsOff,),
         )
-        # Here, and not at exit, so that a reader who has left is noticed here.
+        # Flush here, not at exit, so that a closed pipe raises here.
         sys.stdout.flush()
     except Error as error:
-        # The one place where an error becomes text and a number.
+        # The only place that turns an error into a message and an exit status.
         print(f"mjrec: {error}", file=sys.stderr)  # noqa: T201
         return _FAILED
     except KeyboardInterrupt:
         return _INTERRUPTED
     except BrokenPipeError:
-        # The reader of our output has left (`mjrec list DIR | head`). What Python still
-        # holds back would raise once more at exit.
+        # The reader of our output has closed the pipe (`mjrec list DIR | head`).
+        # Flushing Python's buffer at exit would raise again.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return _FAILED
     return status
 
 
 class _Parser(argparse.ArgumentParser):
-    """Knows the commands; the help is a list in groups."""
+    """A parser that knows the commands; its help lists them in groups."""
 
     def format_help(self) -> str:
         return overview(COMMANDS)
 
 
 def _arguments(argv: Sequence[str] | None) -> Sequence[str]:
-    """Return the arguments, which begin with a command.
+    """Return the arguments, the first of which is a command.
 
     Raises:
-        SystemExit: there is no such command, or help was asked for; that is printed.
+        SystemExit: the command is unknown, it or its arguments are missing, or help or
+            the version was requested. A message has been printed.
     """
     given = list(sys.argv[1:] if argv is None else argv)
     if not given:
@@ -127,7 +128,7 @@ def _version() -> str:
 
 @contextlib.contextmanager
 def _warnings_on_stderr() -> Iterator[None]:
-    # Only what mjrec says: MuJoCo's remarks on other people's models are not news here.
+    # Show only mjrec's warnings: MuJoCo's remarks on third-party models are noise here.
     logging.getLogger("absl").setLevel(logging.ERROR)
     handler = logging.StreamHandler()
     handler.setFormatter(logging.Formatter("%(levelname)s: %(message)s"))
@@ -141,9 +142,9 @@ def _warnings_on_stderr() -> Iterator[None]:
 
 
 class _OnceInARun(logging.Filter):
-    """Lets MuJoCo's warnings pass once of each kind, and one traceback.
+    """A filter that passes each kind of MuJoCo warning once, and one traceback.
 
-    Each worker has its own, at its own time.
+    Every worker logs its own copy, at its own time.
     """
 
     def __init__(self) -> None:

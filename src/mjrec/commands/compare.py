@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`mjrec compare`: how much better the second of two evaluations is, or of two sets."""
+"""`mjrec compare`: compare two evaluations, or two sets of them."""
 
 from __future__ import annotations
 
@@ -49,18 +49,18 @@ def compare(
 ) -> int:
     """Compare evaluations: how much better is B than A?
 
-    Compare two directories, mjrec compare A B, or several trainings on each side,
+    Compare two directories, mjrec compare A B, or several training runs on each side,
     mjrec compare A... --against B... With several, each evaluation counts as one
-    training with its mean return.
+    training run, represented by its mean return.
 
     For each common task: both means, their difference B - A, the probability of
     improvement (B's return is higher than A's), and the p-value of the Mann-Whitney
     test, adjusted for the number of tasks (Holm). Across tasks: the mean probability
     of improvement and the difference of the interquartile means of scores.
 
-    The exit status is 1 if a task cannot be compared (no completed episode, or NaN),
-    and if what --require or --no-worse-than asks for is not met. With one of these it
-    is also 1 if an episode of B failed (with --no-worse-than B: of A).
+    The exit status is 1 if a task cannot be compared (no completed episode, or NaN), or
+    if a requirement of --require or --no-worse-than is not met. With either option, it
+    is also 1 if an episode of B failed (of A, for --no-worse-than B).
 
     Args:
         a: A and B; with --against, the directories of A.
@@ -68,30 +68,30 @@ def compare(
         require: [TASK: ]FIGURE > NUMBER, also >=, < and <=, such as 'probability of
             improvement > 0.75'. Figures across tasks: probability of improvement, IQM
             A, IQM B, IQM difference. Figures of TASK, or of each task: mean A, mean B,
-            difference, paired difference, p-value. A figure followed by low or high is
+            difference, paired difference, p-value. Append low or high to a figure for
             that end of its interval. May be repeated.
-        no_worse_than: A requires that B's interquartile mean score is not lower by
-            --margin or more, as far as the interval tells; B requires the same of A.
+        no_worse_than: A requires that, according to the interval, B's interquartile
+            mean score is less than --margin below A's; B requires the reverse.
         margin: a score difference, such as 0.05.
         confidence: confidence level of the intervals.
         resamples: bootstrap resamples.
         seed: seed of the bootstrap.
-        allow_nan: NaN and infinite returns do not set the exit status to 1.
+        allow_nan: do not exit with 1 because of NaN or infinite returns.
         as_json: print one JSON object instead of text.
     """
     if not against:
         if len(a) != 2:
             raise InvalidArgument(
-                "Two evaluations are compared (mjrec compare A B), or two sets (mjrec "
-                f"compare A... --against B...), got {len(a)} without --against."
+                "Give two evaluations (mjrec compare A B) or two sets (mjrec compare "
+                f"A... --against B...), got {len(a)} without --against."
             )
         a, against = a[:1], a[1:]
     if (no_worse_than is None) != (margin is None):
-        raise InvalidArgument("--no-worse-than and --margin belong together.")
+        raise InvalidArgument("--no-worse-than and --margin must be given together.")
     texts = list(require)
     if margin is not None:
         if margin < 0:
-            raise InvalidArgument(f"--margin is 0 or more, got {margin:g}.")
+            raise InvalidArgument(f"--margin must be 0 or more, got {margin:g}.")
         bound = f"low > -{margin}" if no_worse_than == "A" else f"high < {margin}"
         texts.append(f"IQM difference {bound}")
     required = [parse_requirement(text) for text in texts]
@@ -137,7 +137,7 @@ def _lines_before(comparison: Comparison) -> Iterator[str]:
 
 
 def _table(comparison: Comparison) -> rich.table.Table:
-    # Not all comparisons have that of paired differences.
+    # Not all comparisons have a column of paired differences.
     names = [n for n in TASK_FIGURES if any(n in t.figures for t in comparison.tasks)]
     made = table(["task", "episodes", *names])
     for task in comparison.tasks:
@@ -153,7 +153,7 @@ def _table(comparison: Comparison) -> rich.table.Table:
 def _cell(name: str, estimate: Estimate | None) -> str:
     if estimate is None:
         return ""
-    # There is no room for the intervals of all.
+    # The table has no room for the intervals of the means.
     if name.startswith("mean"):
         return _number(estimate.value)
     return _estimate(estimate).replace(" (", "\n(")
@@ -162,8 +162,8 @@ def _cell(name: str, estimate: Estimate | None) -> str:
 def _lines_after(comparison: Comparison) -> Iterator[str]:
     percent = f"{comparison.bootstrap.confidence * 100:g} %"
     yield (
-        f"In brackets: {percent} intervals, over {comparison.unit}. Equal returns "
-        "count half in the probability of improvement; p-values are Holm's."
+        f"In brackets: {percent} intervals over {comparison.unit}. Ties count as half "
+        "in the probability of improvement; p-values are Holm-adjusted."
     )
     for name, tasks in zip("AB", comparison.left_out, strict=True):
         if tasks:
@@ -174,7 +174,7 @@ def _lines_after(comparison: Comparison) -> Iterator[str]:
 
 
 def _sentence(comparison: Comparison) -> str:
-    """Return what the figures say, in words."""
+    """Return a summary of the figures in one sentence."""
     differences = [
         each.figures["difference"].value for each in comparison.tasks if each.figures
     ]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`mjrec completion`: what a shell needs to complete commands and options."""
+"""`mjrec completion`: a shell script that completes commands and options."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ def completion(
     ] = "bash",
     /,
 ) -> int:
-    """Print tab completion for a shell.
+    """Print a shell completion script.
 
     For bash, put this into ~/.bashrc: eval "$(mjrec completion bash)". For zsh, write
-    the output into a file _mjrec in a folder of $fpath.
+    the output to a file named _mjrec in a folder on $fpath.
 
     Args:
-        shell: whose completion.
+        shell: which shell to complete for.
     """
     from . import COMMANDS
 

@@ -16,13 +16,13 @@ from ..machine_report import Ffmpeg, MachineReport, Package, examine_machine
 from .terminal import print_json
 
 _INDENT = 2
-# Where values stand, right of names.
+# The column where values start.
 _DEEPER = 14
 
 
 @dataclasses.dataclass(frozen=True)
 class _Row:
-    """A name, its value, a remark beside it, and lines below."""
+    """A name, its value, a remark after the value, and lines below."""
 
     name: str
     value: str
@@ -36,7 +36,7 @@ def doctor(*, json: bool = False) -> int:
 
     Renders a frame with each OpenGL backend, encodes a video with ffmpeg, and tries the
     simplest task of each package, in separate processes. The exit status is 0 if a
-    recording would get frames, else 1.
+    recording would get frames, otherwise 1.
 
     Args:
         json: print one JSON object instead of text.
@@ -71,11 +71,11 @@ def show_report(report: MachineReport, console: Console) -> None:
 
 def _probe(probe: Probe) -> _Row:
     if not probe.renders:
-        # In no alarming colour: one backend is enough.
+        # Not in red: one working backend is enough.
         below = _advice(probe.cause, probe.fix)
         return _Row(probe.backend, "does not render", style="yellow", below=below)
     speed = probe.frames_per_second
-    rate = "" if speed is None else f"{speed:.3g} frames a second, 480x480"
+    rate = "" if speed is None else f"{speed:.3g} frames per second, 480x480"
     renderer = f"{probe.gl_renderer}{', on the CPU' * probe.software}"
     facts = (renderer, f"OpenGL {probe.gl_version}") if probe.gl_renderer else ()
     below = (*facts, *map(_device, probe.devices))
@@ -96,7 +96,7 @@ def _choice(report: MachineReport) -> Iterator[_Row]:
     if report.backend:
         yield _Row("mjrec", f"uses {report.backend}", f"({report.reason})", "green")
     else:
-        # The rest says again what stands above.
+        # The other lines repeat what is printed above.
         reason = report.reason.partition("\n")[0]
         yield _Row("mjrec", "cannot render", style="red", below=(reason,))
     for problem in report.problems:
@@ -131,7 +131,7 @@ def _extra(extra: Package) -> _Row:
 def _machine(report: MachineReport) -> Iterator[_Row]:
     cpus = report.cpus
     quota = "no quota" if cpus.quota is None else f"a quota of {cpus.quota:g}"
-    remark = f"usable ({cpus.allowed} allowed of {cpus.present} present, {quota})"
+    remark = f"usable ({cpus.allowed} of {cpus.present} allowed, {quota})"
     yield _Row("CPUs", str(cpus.usable), remark)
     files = ", ".join(report.gpu_device_files)
     yield _Row("GPUs", files or "none", "" if files else "(no device file in /dev)")
@@ -142,9 +142,9 @@ def _advice(cause: str, fix: str) -> tuple[str, ...]:
 
 
 def _print(console: Console, row: _Row) -> None:
-    """Print a row, wrapped in the value's column; its lines that are commands are not.
+    """Print a row, wrapped within the value column, except for lines with commands.
 
-    What is copied from a terminal stays one line.
+    Commands stay on one line so that they can be copied from the terminal.
     """
     grid = Table.grid(padding=0)
     grid.add_column(width=_DEEPER - _INDENT, no_wrap=True)

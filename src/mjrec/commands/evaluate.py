@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`mjrec evaluate`: a policy in many environments."""
+"""`mjrec evaluate`: evaluate a policy in many environments."""
 
 from __future__ import annotations
 
@@ -81,10 +81,10 @@ def evaluate(
 ) -> int:
     """Evaluate a policy: run episodes of each task and summarise the returns.
 
-    The exit status is 1 if an episode failed (the policy or the environment raised, or
-    an action was NaN or misshaped), if a return is NaN, or if a task is below
-    --fail-under. The results are written in any case. mjrec evaluate --resume DIR
-    continues an interrupted evaluation.
+    The exit status is 1 if an episode failed (the policy or the environment raised an
+    exception, or an action was NaN or had the wrong shape), if a return is NaN or
+    infinite, or if a task is below --fail-under. The results are written either way.
+    mjrec evaluate --resume DIR continues an interrupted evaluation.
 
     Args:
         tasks: environments as in mjrec record, sets (dm_control:benchmarking,
@@ -93,9 +93,9 @@ def evaluate(
         policy: random, zero, module:name, module:name() or a file, as in mjrec record.
         out: the evaluation's directory, empty or new.
         episodes: episodes per task and seed. By default 10.
-        num_seeds: number of seeds, from 0 on. By default 5.
+        num_seeds: number of seeds, counting from 0. By default 5.
         workers: worker processes. By default one per CPU. Results do not depend on
-            it. With --engine, the number of its workers.
+            this number. With --engine, the number of engine workers.
         seeds: the seeds, such as 0,1,2 or 0-99, instead of --num-seeds.
         keep: which episodes of each task get a video: best, best:N, median, worst,
             worst:N, failures, failures:N, joined by commas; or cubic, all or none. By
@@ -103,17 +103,17 @@ def evaluate(
         protocol: seeded starts episode i of seed s from NumPy's SeedSequence([s, i]);
             suite has one random stream per task and seed, seeded with s. By default
             seeded.
-        resume: continue the evaluation in the directory and repeat nothing that is
-            finished. Options that are not given stay. You may add tasks, seeds and
-            episodes.
+        resume: continue the evaluation in the directory without repeating finished
+            work. Options that you do not give keep their values. You may add tasks,
+            seeds and episodes.
         force: delete the evaluation in the directory first.
         max_steps: truncate episodes after this many steps. By default the
             environment's limit, or 1000.
-        episode_timeout: an episode that takes longer, in seconds, has failed.
+        episode_timeout: seconds after which an episode counts as failed.
         camera: name or number. By default the model's tracking camera, if it has one.
         size: size of the videos, WIDTHxHEIGHT in pixels.
-        max_fps: most frames per second of simulated time. By default 60.
-        quality: full, or draft: several times faster, with coarser edges and shadows.
+        max_fps: maximum frames per second of simulated time. By default 60.
+        quality: full, or draft (several times faster, with coarser edges and shadows).
             By default full.
         env_kwargs: arguments for each environment, as a JSON object.
         policy_kwargs: arguments for the policy, as a JSON object.
@@ -121,11 +121,11 @@ def evaluate(
             tasks. dm_control tasks have their own. May be repeated.
         fail_under: TASK=VALUE: exit with 1 if the task's mean return is lower or one
             of its episodes failed. TASK may be a pattern. May be repeated.
-        allow_nan: NaN and infinite returns do not set the exit status to 1.
+        allow_nan: do not exit with 1 because of NaN or infinite returns.
         confidence: confidence level of the intervals.
         as_json: print one JSON object at the end, and nothing else.
-        engine_options: where episodes and videos are computed, instead of processes of
-            this command.
+        engine_options: where episodes and videos are computed, if not in this command's
+            own processes.
     """
     height, width = size_of(size)
     least = _by_task("--fail-under", fail_under, float, "TASK=VALUE")
@@ -168,7 +168,7 @@ def evaluate(
                 force=force,
                 confidence=confidence,
                 on_progress=_shown_progress(show, console),
-                # What is not given is as it was begun, or the library's default.
+                # Other options are as in the evaluation to resume, or by default.
                 **{name: value for name, value in options.items() if value is not None},
             )
     except KeyboardInterrupt:
@@ -194,7 +194,7 @@ def evaluate(
 def _shown_progress(
     show: ShowProgress, console: rich.console.Console
 ) -> Callable[[EvaluationProgress], None]:
-    """Return what shows a bar or, for the logs of machines, says each tenth once."""
+    """Return a callback that shows a bar or, in a log, prints a line every 10 %."""
     said = 0
 
     def tell(progress: EvaluationProgress) -> None:
@@ -205,7 +205,7 @@ def _shown_progress(
         show("running", done, total, words + failed)
         if progress.videos:
             drawn = f"{progress.videos_done}/{progress.videos} videos"
-            show("drawing", progress.videos_done, progress.videos, drawn)
+            show("rendering", progress.videos_done, progress.videos, drawn)
         tenth = 10 * done // max(1, total)
         if tenth > said and not console.is_terminal:
             said = tenth
@@ -228,10 +228,10 @@ def _tasks_and_directory(
 
 
 def _matching(least: Mapping[str, float], names: Sequence[str]) -> dict[str, float]:
-    """Return what is asked for by task; a pattern is of all tasks that match it.
+    """Return the required value of each task; a pattern sets it for all that match.
 
     Raises:
-        UnknownName: no task matches.
+        UnknownName: no task matches one of the patterns.
     """
     matching: dict[str, float] = {}
     for pattern, value in least.items():
@@ -247,17 +247,21 @@ def _matching(least: Mapping[str, float], names: Sequence[str]) -> dict[str, flo
 def _by_task(
     option: str, given: Sequence[str], read: Callable[[str], T], form: str
 ) -> dict[str, T]:
-    """Return what TASK=... options say, by task."""
+    """Return the values of repeated TASK=... options, by task.
+
+    Raises:
+        InvalidArgument: an option does not have the form `form`.
+    """
     said: dict[str, T] = {}
     for text in given:
-        # A path may have one in it.
+        # A task may be a path that contains "=".
         task, equals, value = text.rpartition("=")
         try:
             if not (task and equals):
                 raise ValueError
             said[task] = _finite(read(value))
         except ValueError:
-            raise InvalidArgument(f"{option} is {form}, got {text!r}.") from None
+            raise InvalidArgument(f"{option} must be {form}, got {text!r}.") from None
     return said
 
 
@@ -280,8 +284,8 @@ def _seeds_of(text: str) -> list[int]:
         last = int(ends[2] or first) if ends else -1
         if not first <= last < first + _MOST_SEEDS:
             raise InvalidArgument(
-                "--seeds are whole numbers, or ranges of them, with commas between, "
-                f"such as 0,1,2 or 0-99, got {text!r}."
+                "--seeds must be whole numbers or ranges, separated by commas, such as "
+                f"0,1,2 or 0-99, got {text!r}."
             )
         seeds += range(first, last + 1)
     return seeds
@@ -290,7 +294,7 @@ def _seeds_of(text: str) -> list[int]:
 def _shortfalls(
     evaluation: Evaluation, least: Mapping[str, float]
 ) -> Iterator[tuple[str, str]]:
-    """Yield the tasks that are not as good as they have to be, and why."""
+    """Yield the tasks that miss their required value, and why."""
     for task, value in least.items():
         summary = evaluation.summary(task)
         if summary.failed:
@@ -301,7 +305,7 @@ def _shortfalls(
             yield task, f"its mean return {summary.mean:.6g} is below {value:g}"
 
 
-# --- What is printed --------------------------------------------------------------
+# --- Output -----------------------------------------------------------------------
 
 
 def _table(evaluation: Evaluation) -> rich.table.Table:
@@ -336,7 +340,7 @@ def _lines(evaluation: Evaluation, short: Mapping[str, str]) -> Iterator[str]:
         if len(videos) > _SHOWN:
             yield f"  and {len(videos) - _SHOWN} more"
     if pending:
-        yield f"{counted(len(pending), 'video')} could not be drawn:"
+        yield f"{counted(len(pending), 'video')} could not be rendered:"
         reasons = {path.name: reason for path, reason in pending.items()}
         for reason, names in names_by(reasons).items():
             yield f"  {and_more(names)}: {printable(reason)}"
@@ -359,7 +363,7 @@ def _across_lines(evaluation: Evaluation) -> Iterator[str]:
     )
     yield f"Over {counted(len(across.tasks), 'task')}, as scores from 0 to 1: {said}"
     for task, reason in across.left_out.items():
-        yield f"  without {task}: {printable(reason)}"
+        yield f"  left out: {task}: {printable(reason)}"
 
 
 def _failure_lines(evaluation: Evaluation) -> Iterator[str]:
@@ -373,13 +377,13 @@ def _failure_lines(evaluation: Evaluation) -> Iterator[str]:
             yield f"  and {len(reasons) - _SHOWN} more reasons, in results.csv"
     if not_finite := evaluation.not_finite:
         yield (
-            f"{counted(len(not_finite), 'return')} NaN or infinite (--allow-nan "
+            f"NaN or infinite: {counted(len(not_finite), 'return')} (--allow-nan "
             f"accepts them): {and_more([*map(_name, not_finite)])}"
         )
 
 
 def _example_lines(evaluation: Evaluation) -> Iterator[str]:
-    """Yield the best, median and worst episode of each task, each with a file."""
+    """Yield a line for the best, median and worst episode of each task."""
     not_finite = set(map(_name, evaluation.not_finite))
     for task in evaluation.plan.tasks[:_SHOWN]:
         known = [

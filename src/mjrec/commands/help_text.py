@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What `--help` shows: the docstrings, with their lines joined."""
+"""Help texts: the docstrings of commands, with their lines joined."""
 
 from __future__ import annotations
 
@@ -9,17 +9,16 @@ from typing import TypeVar
 
 C = TypeVar("C", bound=Callable[..., object])
 
-# The lines of an argument's description after its first, in a Google-style docstring.
+# The continuation lines of an argument's description in a Google-style docstring.
 _CONTINUATION = re.compile(r"\n {12,}(?=\S)")
 
 
 def flowing_help(command: C) -> C:
-    """Make each description in a docstring one line, and return what it is of.
+    """Join the lines of each description in an object's docstring; return the object.
 
-    Of a command, or of a class that holds options of several commands.
-
-    tyro breaks a description where the docstring does, and again where the terminal
-    ends.
+    The object is a command, or a class of options that several commands share.
+    Otherwise tyro would break a description where the docstring does, and again at the
+    edge of the terminal.
     """
     command.__doc__ = _CONTINUATION.sub(" ", command.__doc__ or "")
     return command

@@ -33,13 +33,14 @@ def list_episodes(
 ) -> int:
     """List the episodes of a monitor directory or an evaluation.
 
-    For an evaluation: task, seed, return and video of each episode, also before it is
-    finished. A folder that only contains monitor directories lists theirs.
+    For an evaluation, finished or not: the task, seed, return and video of each
+    episode. For a folder that only contains monitor directories, the episodes of each.
 
     Args:
-        directory: a monitor directory, an evaluation, or a folder that contains some.
-        as_json: print one JSON object per line and episode instead of a table. It has
-            `directory` if there are several.
+        directory: a monitor directory, an evaluation, or a folder of monitor
+            directories.
+        as_json: print one JSON object per episode, one per line, instead of a table.
+            Each has a `directory` key if there are several directories.
     """
     if is_evaluation(directory):
         results = _fields_of_results(directory)
@@ -67,7 +68,7 @@ def _print_all(objects: Iterable[dict[str, Any]]) -> None:
 
 def _print_table(directory: Path, names: Sequence[str], rows: _Rows) -> None:
     if not print_rows(names, rows, left=_TEXTS):
-        sys.stdout.write(f"No episode is recorded in {directory}.\n")
+        sys.stdout.write(f"No episodes are recorded in {directory}.\n")
 
 
 # --- An evaluation ----------------------------------------------------------------
@@ -127,7 +128,7 @@ def _end(terminated: bool | None) -> str:
 
 
 def _print_monitors(directory: Path) -> None:
-    # The names of the videos that are of a completed episode alone.
+    # The names of the videos that each show one completed episode.
     known: set[str] = set()
 
     def rows() -> _Rows:
@@ -137,7 +138,7 @@ def _print_monitors(directory: Path) -> None:
             if episode.video is not None:
                 known.update([episode.video.name, *further])
                 video = episode.video.name
-                video += f" and {len(further)} of further cameras" * bool(further)
+                video += f" and {len(further)} from other cameras" * bool(further)
             yield (
                 *(str(episode.episode_id), str(episode.length)),
                 *(_return(episode.reward), _end(episode.terminated), video),
@@ -145,7 +146,7 @@ def _print_monitors(directory: Path) -> None:
 
     names = ("episode", "steps", "return", "ended", "video")
     _print_table(directory, names, rows())
-    # Such as clips, and those that show all sub-environments.
+    # For example clips, and videos that show all sub-environments.
     others = [path.name for path in _videos(directory) if path.name not in known]
     if others:
         sys.stdout.write("\n  ".join(["Other videos:", *others]) + "\n")
@@ -166,7 +167,7 @@ def _fields(episode: Episode) -> dict[str, Any]:
 
 
 def _further_videos(episode: Episode) -> list[str]:
-    """Return the names of the videos of an episode's further cameras."""
+    """Return the names of an episode's videos from its other cameras."""
     if episode.video is None or episode.metadata is None:
         return []
     return [name for name, _ in finished_videos(episode.video)[1:]]

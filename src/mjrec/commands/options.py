@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What options say that several commands have."""
+"""Options that several commands share, and their parsing."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ _LOCAL = "local"
 
 
 def size_of(text: str | None) -> tuple[int | None, int | None]:
-    """Return `(height, width)` of WIDTHxHEIGHT; twice None for None.
+    """Return `(height, width)` of WIDTHxHEIGHT; `(None, None)` for None.
 
     Raises:
-        InvalidArgument: it is no size.
+        InvalidArgument: `text` is not a valid size.
     """
     if text is None:
         return None, None
@@ -39,20 +39,20 @@ def size_of(text: str | None) -> tuple[int | None, int | None]:
 
 
 def number_or_name(text: str) -> str | int:
-    """Return the number, if `text` is a whole number, else `text`."""
+    """Return `text` as an int if it is a whole number, otherwise unchanged."""
     return int(text) if re.fullmatch(r"-?\d+", text, re.ASCII) else text
 
 
 def camera_of(text: str | None) -> str | int | None:
-    """Return the number or the name of a camera; None for None."""
+    """Return a camera's number or name; None for None."""
     return None if text is None else number_or_name(text)
 
 
 def kwargs_of(text: str, option: str = "--env-kwargs") -> dict[str, Any]:
-    """Return the arguments that an option names.
+    """Return the keyword arguments in an option's value.
 
     Raises:
-        InvalidArgument: it is no JSON object, or has a key twice, or NaN.
+        InvalidArgument: `text` is not a JSON object, repeats a key, or contains NaN.
     """
     wrong = f"{option} must be a JSON object"
     try:
@@ -64,7 +64,7 @@ def kwargs_of(text: str, option: str = "--env-kwargs") -> dict[str, Any]:
     for name, value in kwargs.items():
         if has_nan(value):
             raise InvalidArgument(
-                f"{wrong}, and {name!r} holds NaN, which JSON has no number for."
+                f"{wrong}, but {name!r} contains NaN, which JSON cannot represent."
             )
     return kwargs
 
@@ -75,13 +75,15 @@ class EngineOptions:
     """Where the work runs.
 
     Attributes:
-        engine: local (processes of this machine), ray, slurm, or dask:ADDRESS of a
-            scheduler. All machines see the directory under the same path.
-        gpus: part of a GPU for each worker; with 0.25 four share one.
+        engine: local (processes on this machine), ray, slurm, or dask:ADDRESS (a
+            scheduler's address). All machines must see the directory under the same
+            path.
+        gpus: fraction of a GPU per worker; with 0.25, four workers share one.
         require_gpu: fail if a worker would render in software.
-        address: of the Ray cluster: HOST:PORT, or auto for the one on this machine. By
-            default RAY_ADDRESS, else a Ray is started for this command.
-        engine_option: KEY=VALUE, an option of this engine, such as partition=gpu for
+        address: the Ray cluster's address: HOST:PORT, or auto for the one on this
+            machine. By default RAY_ADDRESS, otherwise a cluster started for this
+            command.
+        engine_option: KEY=VALUE, an engine-specific option, such as partition=gpu for
             Slurm. May be repeated.
     """
 
@@ -92,15 +94,16 @@ class EngineOptions:
     engine_option: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
 
     def chosen(self, workers: int | None) -> Executor | None:
-        """Return the engine that was asked for; None where none was.
+        """Return the requested engine, or None if no engine option is set.
 
         Args:
-            workers: how many it has.
+            workers: the engine's number of workers.
 
         Raises:
-            InvalidArgument: options contradict each other, or are of another engine.
-            UnknownName: the engine has no such option of its own.
-            MissingDependency: what the engine needs is not installed.
+            InvalidArgument: options contradict each other, or belong to a different
+                engine.
+            UnknownName: the engine has no option with that name.
+            MissingDependency: a package that the engine needs is not installed.
         """
         options = _options_of(self.engine_option)
         if self.engine is None and self.address is not None:
@@ -130,7 +133,8 @@ def _options_of(given: Sequence[str]) -> dict[str, str]:
         key, equals, value = text.partition("=")
         if not (key and equals):
             raise InvalidArgument(
-                f"--engine-option is KEY=VALUE, such as partition=gpu, got {text!r}."
+                "--engine-option must be KEY=VALUE, such as partition=gpu, "
+                f"got {text!r}."
             )
         if key in options:
             raise InvalidArgument(f"--engine-option {key} was given twice.")
@@ -138,7 +142,7 @@ def _options_of(given: Sequence[str]) -> dict[str, str]:
     return options
 
 
-# What is asked for where nothing is said.
+# The default: no engine option is set.
 NO_ENGINE = EngineOptions()
 Engine: TypeAlias = Annotated[
     tyro.conf.OmitArgPrefixes[EngineOptions], tyro.conf.arg(name="engine")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The list of commands, examples, and what `mjrec` alone says of a directory."""
+"""The list of commands, usage examples, and a summary of a directory's recordings."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from ..evaluation.episode_results import EpisodeResult
 
-# Each command, in the group in which people look for it.
+# The commands, grouped by purpose.
 GROUPS = {
     "Record and render": (
         *("record", "render", "list", "strip", "replay", "view", "recover"),
@@ -21,7 +21,7 @@ GROUPS = {
     "Help": ("doctor", "completion"),
 }
 
-# What a command without its arguments shows.
+# Shown when a command is run without arguments.
 EXAMPLES = {
     "record": (
         "mjrec record HalfCheetah-v5 --out recordings/first",
@@ -50,7 +50,7 @@ _MOST_SHOWN = 10
 
 
 def overview(commands: Mapping[str, tuple[str, str]]) -> str:
-    """Return the commands in their groups, each with what it does."""
+    """Return the list of commands in groups, with their summaries."""
     width = max(map(len, commands))
     lines = ["mjrec COMMAND [OPTION ...]: a headless MuJoCo recorder", ""]
     for group, names in GROUPS.items():
@@ -61,7 +61,7 @@ def overview(commands: Mapping[str, tuple[str, str]]) -> str:
 
 
 def examples(command: str) -> str:
-    """Return how a command is used that was given nothing to work on."""
+    """Return usage examples for a command that was run without arguments."""
     lines = [f"mjrec {command} needs arguments. For example:"]
     lines += (f"  {example}" for example in EXAMPLES[command])
     lines.append(f"All options: mjrec {command} --help")
@@ -69,10 +69,10 @@ def examples(command: str) -> str:
 
 
 def recordings_in(directory: Path) -> str:
-    """Return what is recorded in a directory, and what to do with it.
+    """Return a summary of the recordings in a directory, and useful commands for them.
 
-    Looked at are the directory and two levels below it. Nothing is said of other
-    directories.
+    The directory and two levels below it are searched. The summary is empty if nothing
+    is found, or if a directory cannot be listed.
     """
     try:
         places = list(itertools.islice(_places(directory, 2), _MOST_SHOWN + 1))
@@ -92,7 +92,7 @@ def recordings_in(directory: Path) -> str:
     steps = {f"mjrec list {first}": "shows its episodes"}
     if pending:
         steps[f"mjrec render {pending}"] = "renders its pending videos"
-    steps[f"mjrec report {first}"] = "makes a web page of it"
+    steps[f"mjrec report {first}"] = "makes a web page from it"
     steps["mjrec --help"] = "shows all commands"
     width = max(map(len, steps))
     lines += ["", *(f"{command:{width}}  {what}" for command, what in steps.items())]
@@ -101,7 +101,7 @@ def recordings_in(directory: Path) -> str:
 
 def _places(directory: Path, levels: int) -> Iterator[Path]:
     """Yield the evaluations and monitor directories at and below a directory."""
-    # Not at the top: the list of commands is there at once without them.
+    # Imported here so that the list of commands appears at once.
     from ..evaluation.evaluation import is_evaluation
     from ..formats.monitor_directory import iter_monitor_files
 
@@ -114,7 +114,7 @@ def _places(directory: Path, levels: int) -> Iterator[Path]:
 
 
 def _summary(directory: Path) -> tuple[str, bool]:
-    """Return what a directory holds, and whether a video is pending."""
+    """Return a summary of a directory, and whether a video is pending."""
     from ..errors import Error
     from ..evaluation.evaluation import is_evaluation
     from ..results import iter_episodes
@@ -142,7 +142,7 @@ def _summary(directory: Path) -> tuple[str, bool]:
 
 
 def _results(directory: Path) -> Iterator[EpisodeResult]:
-    """Yield the results of an evaluation, also of one that is not finished."""
+    """Yield the results of an evaluation, finished or not."""
     from ..errors import UnreadableFile
     from ..evaluation.chunk_results import recorded_results
     from ..evaluation.evaluation import read_results

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`mjrec pack`: a monitor directory as one file that a stranger can verify."""
+"""`mjrec pack`: pack a monitor directory into one file that others can verify."""
 
 from __future__ import annotations
 
@@ -42,18 +42,19 @@ def pack(
     same bytes. Readers check it with mjrec verify.
 
     Args:
-        directory: a monitor directory, or one with several, as of an evaluation.
-        out: the archive, a new file that ends in .zip.
+        directory: a monitor directory, or one with several, such as an evaluation.
+        out: the archive: a new file whose name ends in .zip.
         author: "Name", "Name <address>" or "Name <ORCID>". May be repeated.
         license: SPDX identifier of the licence, such as CC-BY-4.0, or its URL.
-        title: title of the run. By default what was recorded.
+        title: title of the run. By default, derived from what was recorded.
         anonymous: remove everything that names a user, a machine or an author.
         episodes: pack videos and states of these episodes only, such as 0,8,27. The
             archive says so.
-        max_size: size limit, such as 50M. If needed, videos are drawn again, smaller.
+        max_size: size limit, such as 50M. If needed, videos are re-rendered at a
+            smaller size.
     """
     console = rich.console.Console(stderr=True)
-    with render_progress(console, title="drawing smaller videos") as on_progress:
+    with render_progress(console, title="rendering smaller videos") as on_progress:
         archive = pack_directory(
             directory,
             out,
@@ -73,13 +74,13 @@ def _numbers(text: str) -> list[int]:
     """Return the numbers in a list such as "0,8,27".
 
     Raises:
-        InvalidArgument: it is none.
+        InvalidArgument: `text` is not a list of numbers.
     """
     plain = text.replace(" ", "")
     if not _NUMBERS.fullmatch(plain):
         raise InvalidArgument(
-            "--episodes is a list of numbers with commas between them, such as 0,8,27, "
-            f"got {text!r}."
+            "--episodes must be a comma-separated list of numbers, such as 0,8,27, got "
+            f"{text!r}."
         )
     return [int(number) for number in plain.split(",")]
 
@@ -90,7 +91,7 @@ def _show(archive: Path) -> None:
         digest = hashlib.file_digest(file, "sha256").hexdigest()
     with zipfile.ZipFile(archive) as packed:
         count = len(packed.infolist())
-    # Names must survive copying, so no line is folded.
+    # Lines are not wrapped, so that names can be copied.
     rich.console.Console().print(
         f"{archive}\n"
         f"  {count} files, {shown_size(size)} ({size} bytes)\n"

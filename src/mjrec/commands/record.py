@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`mjrec record`: episodes of an environment into a monitor directory."""
+"""`mjrec record`: record episodes of an environment into a monitor directory."""
 
 from __future__ import annotations
 
@@ -67,9 +67,9 @@ def record(
             (dm_control/humanoid-run) or the path of an MJCF file.
         out: the monitor directory.
         episodes: number of episodes.
-        policy: random, zero, module:name (a function, or a class that is built with
-            the environment), module:name() (called with the environment, returns
-            the policy), or a file you trust: model.zip of Stable-Baselines3,
+        policy: random, zero, module:name (a function, or a class that is instantiated
+            with the environment), module:name() (called with the environment; returns
+            the policy), or a file you trust: model.zip from Stable-Baselines3,
             TorchScript (.pt), ONNX (.onnx).
         seed: S; episode i starts from NumPy's SeedSequence([S, i]). By default a new
             seed, which is printed.
@@ -77,7 +77,7 @@ def record(
         max_steps: truncate episodes after this many steps. By default the
             environment's limit, or 1000.
         camera: name or number. By default the model's tracking camera, if it has one.
-            Repeat it for a video from each.
+            Repeat the option to get a video from each camera.
         schedule: which episodes get a video: cubic (0, 1, 8, 27 ... and every 1000th),
             all, none, every:N or at:0,5,9. By default cubic.
         keep: choose the videos after the episodes have ended: best:N or worst:N (by
@@ -85,23 +85,23 @@ def record(
             are deleted.
         force: delete the recordings in the directory first.
         resume: add to the recordings in the directory.
-        quality: full, or draft: several times faster, with coarser edges and shadows.
+        quality: full, or draft (several times faster, with coarser edges and shadows).
         workers: processes that render deferred videos. By default one per CPU. 0
             renders nothing now and needs no OpenGL; mjrec render DIR does it later.
         render: deferred saves states and renders in worker processes; live renders
             while the simulation runs; off makes no videos. By default deferred if
-            the frames are known to be the same, else live.
-        max_fps: most frames per second of simulated time. Steps in between are left
+            the frames are known to be the same, otherwise live.
+        max_fps: maximum frames per second of simulated time. Steps in between are left
             out of the video; the last step never is.
         fps: frames per second written into the videos. By default real time.
         tiled: one video with all cameras side by side.
         annotate: write episode, step, time and return on the frames.
-        name_prefix: also give the videos the names of Gymnasium's RecordVideo:
+        name_prefix: also name the videos as Gymnasium's RecordVideo does:
             PREFIX-episode-27.mp4.
         env_kwargs: arguments for the environment, as a JSON object.
-        policy_kwargs: arguments for the policy's class, call or file reader, as a JSON
-            object.
-        allow_nan: NaN and infinite returns do not set the exit status to 1.
+        policy_kwargs: arguments for the policy's class, factory or file loader, as a
+            JSON object.
+        allow_nan: do not exit with 1 because of NaN or infinite returns.
         as_json: print one JSON object at the end, and nothing else.
     """
     height, width = size_of(size)
@@ -148,8 +148,8 @@ def record(
         print_lines(console, _summary(session, recorded, interrupted))
         if not_finite:
             what = counted(len(not_finite), "return")
-            where = f"(--allow-nan accepts them): episode {not_finite[0]}"
-            print_lines(console, [f"{what} NaN or infinite {where}"])
+            where = f"(--allow-nan accepts them), first in episode {not_finite[0]}"
+            print_lines(console, [f"NaN or infinite: {what} {where}"])
     if interrupted:
         return _INTERRUPTED
     return _FAILED if not_finite and not allow_nan else 0
@@ -158,7 +158,7 @@ def record(
 def _run(
     session: Session, console: rich.console.Console
 ) -> tuple[list[SessionEpisode], bool]:
-    """Return the recorded episodes, and whether Ctrl-C ended them early."""
+    """Return the recorded episodes, and whether Ctrl-C ended the recording early."""
     recorded: list[SessionEpisode] = []
     steps, total = 0, session.episodes
     with progress_bar(console) as show:
@@ -170,7 +170,7 @@ def _run(
         def count_step() -> None:
             nonlocal steps
             steps += 1
-            # An update costs more than a step of a small environment.
+            # Updating the bar costs more than a step of a small environment.
             if steps % 16 == 0:
                 show_progress()
 
@@ -197,7 +197,7 @@ def _summary(
     session: Session, recorded: list[SessionEpisode], interrupted: bool
 ) -> Iterator[str]:
     if interrupted:
-        yield "Interrupted. What was recorded so far is complete:"
+        yield "Interrupted. Everything recorded so far is complete:"
     videos = [episode.video for episode in recorded if episode.video]
     files = [name for video in videos for name in _files(video)]
     episodes = counted(len(recorded), "episode")
@@ -208,8 +208,8 @@ def _summary(
 
 
 def _files(video: Path) -> list[str]:
-    """Return the names of an episode's videos, those of further cameras too."""
-    # Nothing incomplete has a video's final name.
+    """Return the names of an episode's videos from all cameras."""
+    # Incomplete videos never have their final name.
     if video.exists():
         return [name for name, _ in finished_videos(video)]
     return [f"{video.name}  (pending: mjrec render {video.parent})"]

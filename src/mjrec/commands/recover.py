@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`mjrec recover`: what killed processes have left in a directory, in order."""
+"""`mjrec recover`: finish what killed processes left in a directory."""
 
 from __future__ import annotations
 
@@ -27,9 +27,10 @@ def recover(
 ) -> int:
     """Finish what a killed recording or rendering left in a directory.
 
-    Live videos get their names, logs become trajectories, and statistics and manifest
-    are written from the journal. What was cut off is marked incomplete. Files of living
-    processes are not touched. Deferred videos stay pending: mjrec render DIR.
+    Live videos get their final names, logs become trajectories, and the statistics and
+    manifest are rebuilt from the journal. Anything that was cut off is marked
+    incomplete. Files of running processes are not touched. Deferred videos stay
+    pending: render them with mjrec render DIR.
 
     Args:
         directory: a monitor directory or an evaluation.
@@ -45,7 +46,7 @@ def recover(
 
 
 def _recover_all(directory: Path, timeout: float) -> Recovery:
-    """Recover a directory, and of an evaluation all monitor directories in it."""
+    """Recover a directory; for an evaluation, also the monitor directories in it."""
     recovery = recover_directory(directory, timeout=timeout)
     for below in monitor_directories_in(directory) if is_evaluation(directory) else ():
         found = recover_directory(below, timeout=timeout, bundle=True)

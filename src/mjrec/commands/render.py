@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`mjrec render`: the videos of recorded episodes, now or once more."""
+"""`mjrec render`: render pending videos, or re-render recorded episodes."""
 
 from __future__ import annotations
 
@@ -51,33 +51,33 @@ def render(
     as_json: AsJson = False,
     engine_options: Engine = NO_ENGINE,
 ) -> int:
-    """Render pending videos, or recorded episodes once more.
+    """Render pending videos, or re-render recorded episodes.
 
     Without options, all pending videos of the directory are rendered as planned.
-    Several of these commands on one directory share the work.
+    Several such commands running on one directory share the work.
 
-    With an option that asks for another video (such as --camera, --size, --quality,
-    or --out) recorded episodes are rendered once more, into new files beside the
-    originals: openaigym.video.<...>.video000027.side.mp4. An episode with several
-    cameras gives one video: of --camera, else of the first camera, or tiled if it was
-    recorded tiled.
+    With an option that changes the video (such as --camera, --size, --quality, or
+    --out), recorded episodes are rendered again, into new files next to the originals:
+    openaigym.video.<...>.video000027.side.mp4. An episode with several cameras gives
+    one video: from --camera if given, otherwise from the first camera, or tiled if it
+    was recorded tiled.
 
     Args:
         target: a monitor directory or an evaluation; or one of their trajectories or
             videos, for that episode only.
         episode: number of the episode. By default all recorded ones. In an evaluation,
-            the episode with this number of each task and seed.
+            the episode with that number for every task and seed.
         camera: name or number. By default as recorded, like the options below.
         size: WIDTHxHEIGHT in pixels.
-        quality: full, the model's own settings, or draft, several times faster.
-        workers: processes that render. By default one per free CPU. With --engine,
-            the number of its workers.
+        quality: full (the model's own settings) or draft (several times faster).
+        workers: processes that render. By default one per free CPU. With --engine, the
+            number of engine workers.
         out: the file to write, for one episode. Its suffix chooses the format.
-        max_fps: most frames per second of simulated time; every n-th recorded frame
-            is drawn, and the last.
+        max_fps: maximum frames per second of simulated time: every n-th recorded frame
+            and the last one are drawn.
         fps: frames per second written into the file. It does not select frames.
         annotate: write episode, step, time and return on the frames.
-        no_annotate: leave recorded captions out.
+        no_annotate: leave out the recorded captions.
         pending: render the pending videos only. This is the default.
         strict: fail if a video shows nothing (black, one colour, no movement). The
             video is kept.
@@ -85,11 +85,11 @@ def render(
             if their sources are missing. A crafted model can run any code, so
             use it only if you trust the author.
         as_json: print one JSON object at the end, and nothing else.
-        engine_options: where the work runs, instead of processes of this command.
+        engine_options: where the work runs, if not in this command's own processes.
     """
     height, width = size_of(size)
     if annotate and no_annotate:
-        raise InvalidArgument("Give one of --annotate and --no-annotate, or neither.")
+        raise InvalidArgument("Give either --annotate or --no-annotate, not both.")
     if annotate:
         check_annotation()
     variant = Variant(
@@ -102,8 +102,8 @@ def render(
     )
     if pending and (variant != Variant() or out is not None):
         raise InvalidArgument(
-            "--pending renders videos as planned. To render an episode in another way, "
-            "leave it out."
+            "--pending renders videos as planned. To render an episode differently, "
+            "omit it."
         )
     places, number = _places(target, episode)
     if out is not None and len(places) > 1:
@@ -135,7 +135,7 @@ def render(
     if nothing and (episode is not None or not target.is_dir()):
         what = target.name if episode is None else f"episode {episode}"
         raise InvalidArgument(
-            f"No video of {what} is pending. To render it once more, say what should "
+            f"No video of {what} is pending. To render it again, say what should "
             "change (--camera, --size, --max-fps, --quality, --fps, --annotate) or "
             "where to write it (--out)."
         )
@@ -149,10 +149,13 @@ def render(
 
 
 def _places(target: Path, episode: int | None) -> tuple[list[Path], int | None]:
-    """Return the directories, or recordings, that are named, and which episode of each.
+    """Return the directories or recordings to render, and the episode number in each.
 
-    Those of an evaluation are the monitor directories in it or, of one number, the
-    trajectories.
+    For an evaluation, these are its monitor directories or, if an episode is given,
+    that episode's trajectories.
+
+    Raises:
+        InvalidArgument: the evaluation has no such episode.
     """
     if episode is not None and is_evaluation(target):
         found = list(_trajectories(target, episode))
@@ -175,10 +178,10 @@ def _trajectories(directory: Path, episode: int) -> Iterator[Path]:
 def _collect(
     results: Iterable[RenderedVideos], console: rich.console.Console
 ) -> tuple[list[RenderedVideos], bool]:
-    """Say of each video that it is there; return all results.
+    """Print each finished video, and collect the results.
 
     Returns:
-        That, and whether Ctrl-C came before the end.
+        The results, and whether Ctrl-C came before the end.
     """
     done = []
     try:
@@ -204,9 +207,9 @@ def _summary(report: RenderedVideos, is_interrupted: bool) -> Iterator[str]:
         yield f"  {shown}"
     if report.elsewhere:
         what = counted(len(report.elsewhere), "video")
-        yield f"{what} left to another process that is rendering."
+        yield f"{what} being rendered by another process."
     yield from _reasons("could not be rendered:", report.failures)
-    yield from _reasons("rendered, showing nothing:", report.blank)
+    yield from _reasons("rendered, but blank:", report.blank)
 
 
 def _reasons(what: str, failures: Mapping[str, str]) -> Iterator[str]:

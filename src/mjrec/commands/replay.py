@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`mjrec replay`: a page that shows a recorded episode from every side."""
+"""`mjrec replay`: write a page that shows a recorded episode from any angle."""
 
 from __future__ import annotations
 
@@ -26,19 +26,20 @@ def replay(
 ) -> int:
     """Show an episode in 3D, in one HTML file that needs no network.
 
-    The page plays all recorded states from any side and from the model's cameras, with
+    The page plays all recorded states from any angle and from the model's cameras, with
     the reward and return of each. It is a view, not evidence.
 
     Args:
         target: a trajectory (openaigym.trajectory.*.h5) or a monitor directory.
-        episode: of a directory: number of the episode. By default the last one.
-        max_fps: most states per second of simulated time. By default all.
+        episode: number of the episode, if the target is a directory. By default the
+            last one.
+        max_fps: maximum states per second of simulated time. By default all.
         out: the page to write. An existing file is replaced.
         trust_models: load compiled models that another user or machine wrote. A crafted
             model can run any code, so use it only if you trust the author.
         as_json: print one JSON object at the end.
     """
-    # Not at the top: help is there without the extra.
+    # Imported here so that --help works without the optional packages.
     from ..viewing.episodes import trajectory_in
     from ..viewing.replay import write_replay
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`mjrec report`: a page that shows recordings."""
+"""`mjrec report`: make a web page from recordings."""
 
 from __future__ import annotations
 
@@ -30,25 +30,25 @@ def report(
     verification: tyro.conf.UseAppendAction[tuple[Path, ...]] = (),
     as_json: AsJson = False,
 ) -> int:
-    """Make a web page of recordings: figures, curves, videos and their provenance.
+    """Make a web page from recordings: figures, curves, videos and their provenance.
 
     The result is a folder with index.html and copies of the videos. It opens from disk
-    without a network, and making it needs no MuJoCo and no OpenGL. Directories of old
+    without a network; making it needs neither MuJoCo nor OpenGL. Directories from old
     gym work too. Unreadable files are named on the page.
 
     Args:
-        directories: evaluations, monitor directories, or folders that contain some.
-        out: the folder to write. An existing report is replaced; another folder that
-            is not empty is left alone.
+        directories: evaluations, monitor directories, or folders that contain them.
+        out: the folder to write. An existing report is replaced; any other non-empty
+            folder is left alone.
         single_file: put images and videos into the page itself. --out may then name
             the page.
         max_single_file_bytes: size limit of that page. Videos that do not fit are left
             out, with a note.
-        replay: put a page in 3D beside the videos of the best, median and worst
-            episode. It needs MuJoCo, and is loaded when it is opened.
+        replay: add a 3D page next to the videos of the best, median and worst episodes.
+            It needs MuJoCo, and is loaded only when opened.
         title: title of the page.
         verification: output of mjrec verify --json. May be repeated. A
-            verification.json in a directory is found by itself.
+            verification.json in a directory is found automatically.
         as_json: print one JSON object at the end.
     """
     console = rich.console.Console(stderr=True)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`mjrec strip`: some frames of an episode side by side, for a paper."""
+"""`mjrec strip`: put frames of an episode side by side, for a paper."""
 
 from __future__ import annotations
 
@@ -28,17 +28,17 @@ def strip(
 ) -> int:
     """Put frames of an episode side by side, with their times.
 
-    Frames are evenly spread, first and last included. From a trajectory they are
-    rendered, in any size and from any camera; from a video they are decoded.
+    Frames are evenly spaced, including the first and the last. From a trajectory they
+    are rendered, at any size and from any camera; from a video they are decoded.
 
     Args:
         file: a trajectory (openaigym.trajectory.*.h5) or a video.
         out: the PNG to write.
         frames: number of frames.
-        size: of a trajectory: WIDTHxHEIGHT of each frame in pixels.
-        camera: of a trajectory: name or number. By default as recorded.
+        size: WIDTHxHEIGHT of each frame in pixels (trajectories only).
+        camera: name or number (trajectories only). By default as recorded.
         columns: frames per row. By default up to eight.
-        quality: of a trajectory: full, the model's own settings, or draft.
+        quality: full (the model's own settings) or draft (trajectories only).
         as_json: print one JSON object at the end.
     """
     height, width = size_of(size)

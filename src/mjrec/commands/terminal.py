@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What commands print: for people, on a terminal or in a log, and for programs."""
+"""Printing for people, on a terminal or in a log, and for programs."""
 
 from __future__ import annotations
 
@@ -14,23 +14,23 @@ import rich.table
 from .. import json_text
 
 _LOG_WIDTH = 160
-# Of a long table, these rows say how wide its columns are.
+# The number of rows from which the column widths of a long table are measured.
 _ROWS_MEASURED = 1000
 
 
 def result_console() -> rich.console.Console:
-    """Return the console that results go to."""
+    """Return the console that results are printed to."""
     console = rich.console.Console()
     if console.is_terminal:
         return console
-    # A log has no width, and a folded name cannot be copied.
+    # A log has no width of its own, and a wrapped name cannot be copied.
     return rich.console.Console(width=_LOG_WIDTH)
 
 
 def printable(text: str) -> str:
-    """Return a text of a file's, or of foreign code's, that gives a terminal no orders.
+    """Return untrusted text (from files or foreign code) made safe for a terminal.
 
-    What cannot be printed stands there as Python writes it.
+    Unprintable characters are replaced by their Python escapes.
     """
     return "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
 
@@ -41,13 +41,13 @@ def counted(number: int, noun: str) -> str:
 
 
 def and_more(names: Sequence[str]) -> str:
-    """Return the first of some names, and how many there are besides."""
+    """Return the first name, and how many more there are."""
     more = len(names) - 1
     return f"{names[0]} and {more} more" if more else names[0]
 
 
 def names_by(reasons: Mapping[str, str]) -> dict[str, list[str]]:
-    """Return the names of each reason, from the reason of each name."""
+    """Group names by their reason."""
     names: dict[str, list[str]] = {}
     for name, reason in reasons.items():
         names.setdefault(reason, []).append(name)
@@ -55,18 +55,18 @@ def names_by(reasons: Mapping[str, str]) -> dict[str, list[str]]:
 
 
 def print_lines(console: rich.console.Console, lines: Iterable[str]) -> None:
-    """Print texts as they are. Names must survive copying, so no line is folded."""
+    """Print lines verbatim, without wrapping, so that names can be copied."""
     for line in lines:
         console.print(line, highlight=False, markup=False, soft_wrap=True)
 
 
 def print_json(value: object) -> None:
-    """Print a line of JSON."""
+    """Print a value as one line of JSON."""
     sys.stdout.write(json_text.dumps(value) + "\n")
 
 
 def table(names: Iterable[str], *, left: Iterable[str] = ("task",)) -> rich.table.Table:
-    """Return an empty table of numbers; those `left` are texts."""
+    """Return an empty table of numbers; the columns in `left` hold text."""
     made = rich.table.Table(
         box=rich.box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False
     )
@@ -79,15 +79,15 @@ def table(names: Iterable[str], *, left: Iterable[str] = ("task",)) -> rich.tabl
 def print_rows(
     names: Sequence[str], rows: Iterator[Sequence[str]], *, left: Sequence[str]
 ) -> bool:
-    """Print a table of any length; only its beginning is kept in memory.
+    """Print a table of any length, keeping only its beginning in memory.
 
     Args:
-        names: of the columns.
-        rows: the cells, which may be of foreign text.
-        left: the columns that are texts; the others are numbers.
+        names: the column names.
+        rows: the cells of each row, which may contain untrusted text.
+        left: the columns of text, aligned left; the others hold numbers.
 
     Returns:
-        Whether there was a row.
+        Whether there was at least one row.
     """
     first = list(itertools.islice(rows, _ROWS_MEASURED))
     widths = [max(map(len, column)) for column in zip(names, *first, strict=True)]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A verification on one screen: the verdict, excuses, a line for each topic."""
+"""A verification on one screen: the verdict, excuses, and a line for each topic."""
 
 from __future__ import annotations
 
@@ -34,9 +34,9 @@ def show_verification(
     """Print a verification.
 
     Args:
-        verification: the result.
-        console: where to.
-        verbose: list all findings, and what it was made with.
+        verification: the verification to print.
+        console: the console to print to.
+        verbose: list all findings, and the software and machine it was verified with.
     """
     most = None if verbose else _MOST_SHOWN
     verdict = str(verification.verdict)
@@ -47,12 +47,12 @@ def show_verification(
     console.print(_table(verification))
     if drawn := summary.sampled(verification):
         console.print(f"  {drawn}")
-    _list(console, "Asked for", summary.inputs(verification), most)
+    _list(console, "Inputs", summary.inputs(verification), most)
     if verbose:
         rows = [_finding(each) for each in verification.findings]
         _list(console, "Findings", rows, None)
         facts = (f"{key}: {value}" for key, value in verification.facts.items())
-        _list(console, "Made with", facts, None)
+        _list(console, "Verified with", facts, None)
 
 
 def _table(verification: Verification) -> rich.table.Table:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`mjrec verify`: make a packed run again, and compare."""
+"""`mjrec verify`: re-run a packed run and compare the results."""
 
 from __future__ import annotations
 
@@ -33,16 +33,16 @@ def verify(
     seed: int | None = None,
     as_json: Annotated[bool, tyro.conf.arg(name="json")] = False,
 ) -> int:
-    """Run a packed run again from its seeds and actions, and compare.
+    """Re-run a packed run from its seeds and actions, and compare the results.
 
     The archive may come from a stranger: it is read, run and compared in processes with
     limits, without network or home directory, and no code that it names is executed.
-    The exit status is 0 (PASS: all equal), 3 (PARTLY: nothing contradicts, but
-    something had to be believed) or 1 (FAIL).
+    The exit status is 0 (PASS: all equal), 3 (PARTLY: nothing contradicts the archive,
+    but something had to be taken on trust) or 1 (FAIL).
 
     Args:
-        path: an archive of mjrec pack, an unpacked one, a monitor directory, or one
-            with several, as of an evaluation.
+        path: an archive made by mjrec pack, an unpacked one, a monitor directory, or a
+            directory with several, such as an evaluation.
         level: where to stop. files checks the bag; stats also rewards, ends, statistics
             and the selection of episodes; physics also all states; pixels also all
             frames and files.
@@ -51,9 +51,9 @@ def verify(
         allow: accept an excuse, by name and value, such as "gl=NVIDIA H100". May be
             repeated.
         verbose: show every finding.
-        trust: id of an environment that may be made although it is not in Gymnasium's
-            or dm_control's registry. This runs code that you have installed. May be
-            repeated.
+        trust: id of an environment that may be created even though it is not in
+            Gymnasium's or dm_control's registry. This runs code that you have
+            installed. May be repeated.
         seed: seed for --sample. By default a random one, which is printed.
         as_json: print one JSON object instead of text.
     """

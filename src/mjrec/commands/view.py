@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`mjrec view`: a look at a run while it goes on, in a browser."""
+"""`mjrec view`: watch a run in a browser while it is running."""
 
 from __future__ import annotations
 
@@ -17,11 +17,12 @@ def view(
     port: int = 0,
     trust_models: bool = False,
 ) -> int:
-    """Show a run in a browser while it goes on: latest states in 3D, returns, episodes.
+    """Watch a run in a browser while it is running.
 
-    Prints an address on this machine, with a token that the browser needs, and serves
-    it until Ctrl-C. It only reads, at low priority, and never blocks the run. From
-    another machine, forward the port: ssh -L PORT:127.0.0.1:PORT HOST.
+    Shows the latest states in 3D, returns and episodes. Prints an address on this
+    machine, with a token that the browser needs, and serves it until Ctrl-C. It only
+    reads, at low priority, and never blocks the run. From another machine, forward the
+    port: ssh -L PORT:127.0.0.1:PORT HOST.
 
     Args:
         directory: a monitor directory.
@@ -29,12 +30,12 @@ def view(
         trust_models: load compiled models that another user or machine wrote. A crafted
             model can run any code, so use it only if you trust the author.
     """
-    # Not at the top: help is there without the extra.
+    # Imported here so that --help works without the optional packages.
     from ..viewing.live import LiveView, be_nice
 
     with LiveView(directory, port=port, trust_models=trust_models) as live:
         be_nice()
-        sys.stdout.write(f"{live.url}\nCtrl-C ends it.\n")
+        sys.stdout.write(f"{live.url}\nPress Ctrl-C to stop.\n")
         sys.stdout.flush()
         try:
             live.serve()

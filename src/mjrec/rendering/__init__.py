@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From recorded states to frames, in processes of their own."""
+"""Rendering of recorded states, in separate processes."""

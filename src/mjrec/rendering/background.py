@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Finishing recordings beside a simulation, in a process of its own.
+"""Finishing recordings while a simulation runs, in a separate process.
 
-`Background` lives in the simulation's process and does next to nothing there: no
-thread, no simulator and no OpenGL comes into it. It starts the process that does the
-work, `python -m mjrec.rendering.background DIRECTORY --workers N|auto [--strict]`, and
-sends it::
+`Background` lives in the simulation's process and does next to nothing there: it adds
+no thread, no simulator and no OpenGL. It starts the process that does the work,
+`python -m mjrec.rendering.background DIRECTORY --workers N|auto [--strict]`, and sends
+it::
 
-    {"expected": "<name>"|null}     a video will have to be rendered, that of a
-                                    recording which begins now, where it has one
+    {"expected": "<name>"|null}     a video will have to be rendered; the name is that
+                                    of the recording that begins now, if there is one
     {"recording": "<name>"}         an ended trajectory, or the first part of a clip
     {"waited_for": true}            nothing more comes for now
 
@@ -17,7 +17,7 @@ The process sends::
     {"done": "<recording>", "failures": {"<video or trajectory>": "..."}}
     {"log": ["mjrec.x", 30, "..."]}
 
-It ends at once, leaving the rest as it is, when the simulation's process does.
+When the simulation's process ends, it ends at once and leaves the rest as it is.
 """
 
 from __future__ import annotations
@@ -52,32 +52,31 @@ _NICE = 10
 _SECONDS_BETWEEN_REPORTS = 0.2
 _SECONDS_BETWEEN_LOOKS = 0.05
 _SECONDS_TO_LEAVE = 2.0
-# What the process waits for itself, it gives up after one timeout.
+# The process itself gives up waiting after one timeout, so allow it several.
 _PATIENCES = 3
 
 
 class Background:
-    """Turns ended recordings into trajectories and videos, beside the caller.
+    """Turns ended recordings into trajectories and videos while the caller continues.
 
-    `expect`, or the first recording, starts the process that does it, which stays with
-    its workers until `stop`. Where it dies, another one goes on with what is left; what
-    that one does not do either is left pending. One that hangs while it is waited for
-    is ended and has died. It belongs to the process that made this object.
+    `expect`, or the first recording, starts the process that does the work. It stays
+    with its workers until `stop`. If it dies, a second process continues; if that one
+    dies too, the rest stays pending. A process that hangs while `wait` waits for it is
+    ended and counts as dead. The process belongs to the one that created this object.
 
     Args:
         directory: the monitor directory.
-        workers: how many processes draw; None is one for each CPU that can be used,
-            shared by all that render into the directory.
-        strict: whether a video that shows nothing counts as one that could not be
-            rendered, though it is there.
+        workers: number of processes that draw. None means one for each usable CPU,
+            shared by all processes that render into the directory.
+        strict: whether a blank video counts as a failure, although it is written.
 
     Raises:
-        InvalidArgument: `workers` is no number of processes.
+        InvalidArgument: `workers` is not a valid number of processes.
 
     Attributes:
-        failures: why videos could not be rendered, by their base names; for an episode
-            without a video, that of the trajectory.
-        waiting: the recordings that were taken over and are not done, in their order.
+        failures: reasons for missing videos, by base name; for an episode without a
+            video, by the trajectory's base name.
+        waiting: the submitted recordings that are not done yet, in order.
     """
 
     def __init__(
@@ -96,21 +95,21 @@ class Background:
         self._is_waited_for = self._is_prepared = False
         self._progress = Progress()
         self._is_stopped = self._waits_later = False
-        # How processes have died; the second death is the last.
+        # How processes have died. After the second death, no more are started.
         self._deaths: list[str] = []
         self.failures: dict[str, str] = {}
-        # A dictionary for its order.
+        # A dict used as an ordered set.
         self.waiting: dict[str, None] = {}
 
     def share(self) -> Share:
-        """Return what one of several monitors has of it."""
+        """Return a share of this object for one of several monitors."""
         return Share(self)
 
     def expect(self, recording: Path | None = None) -> None:
-        """Start all processes: a video will have to be rendered. Idempotent.
+        """Start all processes ahead of a video that must be rendered. Idempotent.
 
         Args:
-            recording: as of `recorder.finishers.Finisher`. Only the first is used.
+            recording: see `recorder.finishers.Finisher`. Only the first is used.
         """
         is_news = self._child is None or (recording and not self._is_prepared)
         if is_news and not self._was_forked():
@@ -118,30 +117,33 @@ class Background:
             self._send(expected=None if recording is None else recording.name)
 
     def submit(self, recording: Path) -> None:
-        """Take over an ended trajectory, or a clip. Never waits, raises no failure.
+        """Take over an ended trajectory, or a clip, without waiting.
 
-        After `stop` nothing is done: the recording stays as it is.
+        Later failures are not raised but collected in `failures`. After `stop`, nothing
+        is done: the recording stays as it is.
 
         Raises:
-            Error: in a process forked from the one that this belongs to.
+            Error: this process was forked from the one that owns the object.
         """
         if self._was_forked():
             raise Error(
-                f"Process {self._process_id} renders into {self._directory}, and this "
-                f"is {os.getpid()}, forked from it. Make a monitor of its own here."
+                f"Process {self._process_id} renders into {self._directory}, but this "
+                f"process, {os.getpid()}, was forked from it. Create a separate "
+                "monitor here."
             )
         name = Path(recording).name
         self.waiting[name] = None
         self._send(recording=name)
 
     def wait(self, on_progress: Callable[[Progress], object] = lambda _: None) -> None:
-        """Return when all that was taken over is done, or the process has died.
+        """Wait until all submitted recordings are done, or the process is gone.
 
-        What could not be done is in `failures`. May be interrupted (Ctrl-C); then
-        `stop` ends it, and another `wait` waits on.
+        Recordings that could not be finished are listed in `failures`. Ctrl-C may
+        interrupt the wait. Afterwards, `stop` ends the process, and another `wait`
+        resumes waiting.
 
         Args:
-            on_progress: called now and then with a `Progress`.
+            on_progress: called from time to time with a `Progress`.
         """
         if self._was_forked() or self._is_stopped or self._waits_later:
             return
@@ -152,16 +154,16 @@ class Background:
                 self._is_waited_for = True
             on_progress(self._progress)
             has_news = timeout.wait(lambda slice_: wait_for_news([child], slice_))
-            # What it waits for itself, it looks at every second. Blocked for good, by
-            # a disk that does not answer for example, it uses no CPU.
+            # While the process waits for something itself, it polls every second and so
+            # uses CPU. If it is blocked for good (by a dead disk, say), it uses none.
             before, cpu_seconds = cpu_seconds, child.cpu_seconds()
             self._listen()
             if cpu_seconds > before:
                 timeout.renew()
             elif not has_news and timeout.is_over:
                 logger.error(
-                    "The process that renders the videos of %s has given no sign of "
-                    "life for %g seconds, and is ended. What its threads were at:\n%s",
+                    "The process that renders the videos of %s has shown no activity "
+                    "for %g seconds and is being ended. Its threads' stacks:\n%s",
                     self._directory,
                     timeout.seconds,
                     child.stacks(),
@@ -171,7 +173,7 @@ class Background:
                 timeout.renew()
         on_progress(self._progress)
         if self.waiting:
-            reason = f"the process that renders is gone: {self._deaths[-1]}"
+            reason = f"the rendering process is gone: {self._deaths[-1]}"
             self.failures.update(dict.fromkeys(self.waiting, reason))
             self.waiting.clear()
 
@@ -179,9 +181,9 @@ class Background:
     def waiting_at_the_end(
         self, on_progress: Callable[[Progress], object]
     ) -> Iterator[None]:
-        """Let no monitor wait inside the block, and wait for all at its end.
+        """Make `wait` return at once inside the block, and wait for all at its end.
 
-        The process is waited for once all monitors have said what there is.
+        All monitors can then submit their recordings before the first wait.
         """
         self._waits_later = True
         try:
@@ -191,15 +193,15 @@ class Background:
         self.wait(on_progress)
 
     def stop(self) -> None:
-        """Stop at once; what is not done stays pending. Idempotent."""
+        """Stop at once; unfinished recordings stay pending. Idempotent."""
         self._is_stopped = True
         child, self._child = self._child, None
         if child is not None and not self._was_forked():
-            # What it has told of failures belongs into the manifest.
+            # Failures that the process has reported belong in the manifest.
             with contextlib.suppress(EOFError):
                 self._take_from(child)
             if not self.waiting:
-                # There is nothing that it would have to clean up.
+                # The process has nothing to clean up.
                 child.kill()
             child.end()
 
@@ -207,7 +209,7 @@ class Background:
         return os.getpid() != self._process_id
 
     def _send(self, **message: Any) -> None:
-        """Send the process something; it is started if need be."""
+        """Send the process a message, starting it if necessary."""
         if self._is_stopped or len(self._deaths) > 1:
             return
         try:
@@ -221,7 +223,7 @@ class Background:
         self._listen()
 
     def _listen(self) -> None:
-        """Take what was sent."""
+        """Read the messages that have arrived."""
         if (child := self._child) is not None:
             try:
                 self._take_from(child)
@@ -240,7 +242,11 @@ class Background:
                 self.failures.update(message["failures"])
 
     def _replace(self, how: str) -> None:
-        """Let another process do what one that has died left; it is the last."""
+        """Replace a process that has died; the second one is not replaced.
+
+        Args:
+            how: how it died.
+        """
         if self._child is not None:
             self._child.end()
             self._child = None
@@ -249,7 +255,7 @@ class Background:
         logger.warning(
             "The process that renders the videos of %s is gone%s: %s",
             self._directory,
-            ", and they stay pending" if is_last else ", and another one goes on",
+            "; the videos stay pending" if is_last else "; a new process takes over",
             how,
         )
         for name in list(self.waiting):
@@ -257,7 +263,10 @@ class Background:
 
 
 class Share:
-    """What one of several monitors has of a `Background`, which it does not stop."""
+    """One monitor's share of a `Background` that several monitors use.
+
+    Its `stop` does not stop the `Background`.
+    """
 
     def __init__(self, background: Background) -> None:
         self._background = background
@@ -267,7 +276,7 @@ class Share:
 
     @property
     def failures(self) -> Mapping[str, str]:
-        """Why videos of this monitor could not be rendered, by their base names."""
+        """Reasons why videos of this monitor are missing, by base name."""
         failures = self._background.failures.items()
         return {name: why for name, why in failures if infix_of(name) in self._infixes}
 
@@ -277,16 +286,16 @@ class Share:
         self._background.submit(recording)
 
     def stop(self) -> None:
-        """Do nothing: other monitors go on."""
+        """Do nothing, because other monitors still need the process."""
 
 
 class _Stopped(BaseException):
-    """Raised in the main thread of the process, wherever it is: clean up and leave."""
+    """Raised in the main thread of the process to make it clean up and exit."""
 
 
 def main() -> None:
-    """Finish the recordings that the simulation's process names, until it ends."""
-    # Not at the top: the simulation's process needs none of it.
+    """Finish the recordings that the simulation's process names, until that ends."""
+    # Not imported at the top: the simulation's process does not need it.
     from .pool import WorkerPool
 
     parser = argparse.ArgumentParser()
@@ -305,11 +314,11 @@ def main() -> None:
         pool = WorkerPool(workers, directory=directory, forks=True)
         with contextlib.closing(pool):
             if "expected" in first:
-                # Before there is a second thread, which a fork would not have. What is
-                # in the way is said when there is something to draw.
+                # Before a second thread exists, because a fork would lose it. Errors
+                # are reported when there is something to draw.
                 with contextlib.suppress(Error):
                     pool.start()
-            # They make their contexts while the rest is imported.
+            # The workers create their contexts while the rest is imported.
             from .finisher import Finisher
 
             finisher = Finisher(pool)
@@ -319,26 +328,26 @@ def main() -> None:
 
 def _stop(signum: int, frame: object) -> None:
     del frame
-    # One is enough, and cleaning up must not be disturbed.
+    # Ignore further signals, so that nothing interrupts the cleanup.
     signal.signal(signum, signal.SIG_IGN)
     raise _Stopped
 
 
 def _leave() -> None:
-    # To the main thread, wherever it waits. Should it not come out of that, it is of no
-    # use any more.
+    # The signal wakes the main thread, wherever it waits. If that does not exit in
+    # time, the process is ended after this function returns.
     os.kill(os.getpid(), signal.SIGTERM)
     time.sleep(_SECONDS_TO_LEAVE)
 
 
 class _Work:
-    """What the process does.
+    """The main loop of the process.
 
     Args:
-        finisher: does it.
+        finisher: finishes the recordings.
         directory: the monitor directory.
         parent: the simulation's process.
-        strict: as of `Background`.
+        strict: see `Background`.
     """
 
     def __init__(
@@ -353,7 +362,11 @@ class _Work:
         finisher.on_progress = self._look_up
 
     def do(self, first: Mapping[str, Any]) -> None:
-        """Do what the parent sends, and send the results, to the process's end."""
+        """Handle the parent's messages and send it the results, without returning.
+
+        Args:
+            first: the first message.
+        """
         finisher = self._finisher
         self._take_in(first)
         while True:
@@ -363,7 +376,8 @@ class _Work:
             elif finisher.is_ready() or self._is_waited_for:
                 job, result = finisher.do_next()
                 if not finisher:
-                    # Before the parent knows: it may end this process then.
+                    # Before the parent is notified, because it may then end the
+                    # process.
                     finisher.rest()
                 self._parent.send(progress=vars(finisher.progress))
                 failures = {**result.failures, **result.blank}
@@ -391,12 +405,12 @@ class _Work:
                 self._parent.send(done=name, failures={})
 
     def _look_up(self, progress: Progress) -> None:
-        """Listen and report, in the midst of work."""
+        """Read the parent's messages and report progress while work is in progress."""
         now = time.monotonic()
         if now - self._last_report >= _SECONDS_BETWEEN_REPORTS:
             self._last_report = now
             self._take_in_all()
-            # It is read only then, and a pipe's room is limited.
+            # The parent reads only while it waits, and a pipe's buffer is small.
             if self._is_waited_for:
                 self._parent.send(progress=vars(progress))
 
@@ -404,8 +418,8 @@ class _Work:
 def _environ() -> dict[str, str]:
     """Return the environment variables of the process."""
     environ = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}
-    # Beside a simulation a single worker, too, has one CPU to itself and no more: the
-    # threads of Mesa's rasteriser would get in the way of the steps.
+    # Limit even a single worker to one CPU: the threads of Mesa's rasteriser would slow
+    # down the simulation.
     environ.setdefault("LP_NUM_THREADS", "0")
     return environ
 

@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which episodes of an evaluation get a video, written down where they were recorded.
+"""Writing down which episodes of an evaluation get a video.
 
-Monitors of an evaluation promise no videos: the best episode of a task may be in any of
-its chunks. When all episodes of a task have ended, the choice is made, and the
-trajectories, journals and manifests of what was chosen say so, as if each monitor had
-chosen itself. `finish` then draws these videos, and `mjrec render` what is left.
+Monitors of an evaluation plan no videos, because the best episode of a task may be in
+any of its chunks. The choice is made when all episodes of a task have ended. It is then
+written into the chosen episodes' trajectories, journals and manifests, as if each
+monitor had made it. `finish` renders these videos, and `mjrec render` any that remain.
 
-What can only be drawn while it runs has videos already, and those that were not chosen
+Episodes that can only be recorded live already have videos; those that were not chosen
 are removed.
 
-All of it may be killed at any point and done again.
+The process may be killed at any point, and all of this repeated.
 """
 
 from __future__ import annotations
@@ -40,23 +40,23 @@ def write_choice(
 ) -> set[RecordingKey]:
     """Write down which episodes of a chunk get a video. Idempotent.
 
-    An episode that was chosen before, among fewer, keeps its video.
+    An episode that was chosen earlier, among fewer episodes, keeps its video.
 
     Args:
-        folder: the chunk's monitor directory, whose monitors are closed.
-        chosen: the episodes, each with its roles.
-        rule: by which they were chosen.
-        finished: among how many.
-        among: the infix of the monitor, where others of the directory are no part of
+        folder: the chunk's monitor directory. Its monitors must be closed.
+        chosen: the chosen episodes and their roles.
+        rule: the rule that chose them.
+        finished: number of finished episodes among which they were chosen.
+        among: the monitor's infix, if other monitors in the directory do not belong to
             the chunk.
 
     Returns:
-        Those of the chosen ones that can be drawn.
+        The chosen episodes that can be rendered.
 
     Raises:
         UnreadableFile: a trajectory, a journal or metadata is damaged.
         FileNotWritten: the disk is full.
-        DirectoryNotWritable: there can be no lock in the directory.
+        DirectoryNotWritable: a lock cannot be created in the directory.
     """
     facts = {"rule": rule, "decided": True, "scope": EVALUATION, "finished": finished}
     drawable: set[RecordingKey] = set()
@@ -73,7 +73,7 @@ def write_choice(
         }
         filmed = {key for key in selections if key.number in live}
         for key, selection in selections.items():
-            # Drawn live, or chosen before among fewer episodes.
+            # Recorded live, or chosen earlier among fewer episodes.
             video = folder / key.video_name
             if metadata_path(video).exists():
                 amend_metadata(video, {"selection": selection})
@@ -102,13 +102,16 @@ def write_choice(
 def _promise_videos(
     folder: Path, selections: Mapping[RecordingKey, Mapping[str, Any]]
 ) -> set[RecordingKey]:
-    """Let trajectories promise the videos that they could have; return which could."""
+    """Mark videos as pending in trajectories; return the episodes with a possible one.
+
+    Episodes that are not in a finished trajectory are included.
+    """
     drawable: set[RecordingKey] = set()
     changes: dict[Path, Callable[[Any], Any]] = {}
     for key, selection in selections.items():
         path = folder / f"{key.name}{FINISHED}"
         if not is_finished(path):
-            # Drawing it will say so.
+            # Rendering it will report the problem.
             drawable.add(key)
             continue
         with open_hdf5(path) as reader:
@@ -128,9 +131,9 @@ def _with_video(video: Mapping[str, Any], known: Mapping[str, Any]) -> Any:
 
 
 def _remove_videos(video: Path) -> None:
-    """Remove the videos of an episode; the metadata, which says they are there, first.
+    """Remove the videos of an episode, each after its metadata.
 
-    The first one goes last: it names those of further cameras.
+    The first camera's video is removed last, because it names those of the others.
     """
     for name, metadata in reversed(finished_videos(video)):
         path = video.with_name(name)

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Jobs done by the workers of an engine: handing them out, and doing one.
+"""Render jobs on an engine's workers: submitting jobs, and doing one in a worker.
 
-The process that hands them out opens no trajectory and draws nothing. It may be killed
-at any time, and what its workers have finished stays. The settings of the workers may
-be `{"models": [sha256, ...]}`: compiled models that the user whose jobs they are has
-stored, and that the workers load. What comes back is a `RenderedVideos`.
+The process that submits the jobs opens no trajectory and draws nothing. If it is
+killed, its workers' finished videos stay. The workers' settings may be
+`{"models": [sha256, ...]}`: compiled models that the submitting user has stored, which
+the workers may load. The result of a job is a `RenderedVideos`.
 """
 
 from __future__ import annotations
@@ -33,20 +33,20 @@ def do_on_engine(
     *,
     on_progress: Callable[[Progress], object] = lambda _: None,
 ) -> Iterator[RenderedVideos]:
-    """Do what `do_jobs` does, by the workers of an engine.
+    """Do jobs on the workers of an engine; otherwise like `do_jobs`.
 
-    Outcomes come in the order in which they are over.
+    Results are yielded in the order in which the jobs end.
 
     Args:
-        engine: whose workers.
-        jobs: which, in directories that all workers see.
-        on_progress: called when a job is over.
+        engine: the engine.
+        jobs: the jobs, in directories that all workers see.
+        on_progress: called when a job has ended.
 
     Raises:
-        Error: the engine cannot do any work.
+        Error: the engine cannot work.
     """
     by_name = {
-        # Of several directories, which may have files of one name.
+        # Full paths, because files in different directories may share a name.
         job.name: job
         for job in jobs
         if job.variant is not None or may_be_left(job.directory, job.key)
@@ -58,7 +58,7 @@ def do_on_engine(
     directories = list(dict.fromkeys(job.directory for job in by_name.values()))
     work = Work(
         entry=_WORKER,
-        # Workers elsewhere may have another home, and no list of this user's models.
+        # Workers on other machines may lack this user's list of stored models.
         settings={"models": stored_models(directories)},
         environ=environ_for_drawing(),
         shared_directory=directories[0].absolute(),
@@ -67,10 +67,10 @@ def do_on_engine(
         for name, job in by_name.items():
             run.submit(name, **to_json(_everywhere(job)))
         for done in run.results():
-            # Without timeout there is always one.
+            # Without a timeout, `done` is never None.
             assert done is not None
             result = result_of(done, by_name[done.key])
-            # It was taken for one video.
+            # The job was counted as one video.
             count = len(result.videos)
             videos = count or int(bool(result.failures or result.elsewhere))
             now = Progress(
@@ -85,16 +85,16 @@ def do_on_engine(
 
 
 def result_of(done: JobOutcome, job: VideoJob) -> RenderedVideos:
-    """Return the result of a job that an engine's worker did."""
+    """Return the result of a job from its outcome on an engine."""
     directory = job.directory if job.video is None else job.video.parent
     if done.failure is not None:
         if job.variant is None:
-            # Its worker has died, and could not.
+            # The worker died, so it could not do this itself.
             note_failure(job.directory, _name_of(job), done.failure)
         failures = {_name_of(job): done.failure}
         return RenderedVideos(directory=directory, failures=failures)
     assert done.value is not None
-    # Under the name by which this process knows it.
+    # The path as this process knows it.
     return replace(from_json(RenderedVideos, done.value), directory=directory)
 
 
@@ -109,32 +109,31 @@ def _name_of(job: VideoJob) -> str:
 
 
 def environ_for_drawing() -> dict[str, str]:
-    """Return environment variables of workers that draw, wherever they are."""
-    # There are several, and Mesa's rasteriser would start as many threads as there are
-    # CPUs in each of them.
+    """Return environment variables for workers that draw, on any machine."""
+    # In each of several workers, Mesa's rasteriser would start one thread per CPU.
     environ = {_RASTERISER_THREADS: os.environ.get(_RASTERISER_THREADS, "1")}
     if TRUST_VARIABLE in os.environ:
-        # Those on other machines do not have it from this process.
+        # Workers on other machines do not inherit it from this process.
         environ[TRUST_VARIABLE] = os.environ[TRUST_VARIABLE]
     return environ
 
 
 class VideoWorker:
-    """Does one job after the other; a handler of `engines.jobs`.
+    """A handler for `engines.jobs` that does one render job after another.
 
-    A process of its own draws, which stays from job to job.
+    A child process draws. It is kept from job to job.
 
     Args:
-        settings: see the module.
+        settings: see the module docstring.
     """
 
     def __init__(self, settings: Mapping[str, Any] | None = None) -> None:
         note_models((settings or {}).get("models", ()))
-        # With a number of workers no directory's CPUs are shared.
+        # With a fixed number of workers, the CPUs are not shared with other processes.
         self._finisher = Finisher(WorkerPool(1))
 
     def __call__(self, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
-        """Do a job."""
+        """Do a job, and return its result."""
         job = from_json(VideoJob, arguments)
         result = RenderedVideos(directory=job.directory)
         if self._finisher.add(job):

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Finishing a directory: whatever is over and not finished yet.
+"""Finishing a directory: everything that has ended but is not finished yet.
 
-One operation; everything else is a part of it. It does what is left of each
-recording (the process beside a simulation does that for its monitor's), keeps manifests
-and second names true, and puts dead monitors in order (`recover`, and `resume=True`,
-are all of it but the drawing). It may be interrupted or killed at any point and run
-again, and any number of processes may run it on one directory.
+Closing, rendering, recovering and resuming all run this operation or parts of it. It
+finishes each recording (during a simulation, the background process does that for its
+monitor), updates manifests and second names, and finishes dead monitors (`recover` and
+`resume=True` do everything except the drawing). It may be interrupted or killed at any
+point and run again, and any number of processes may run it on one directory.
 """
 
 from __future__ import annotations
@@ -37,16 +37,17 @@ def finish(
 ) -> Iterator[RenderedVideos]:
     """Finish what is pending in a directory, and yield the result of each recording.
 
-    Nothing is yielded of one that nothing was to be done about. What another process
-    is at is left to it.
+    Recordings that need nothing yield no result. Recordings that another process is
+    working on are left to it.
 
     Args:
         directory: the monitor directory.
-        keys: which recordings; if None all, and what killed monitors have left.
-        workers: how many processes draw; None is one for each free CPU.
-        engine: whose workers do it instead.
-        strict: whether a video that shows nothing is a failure.
-        on_progress: called with how far it is.
+        keys: the recordings to finish. None means all, including the files that killed
+            monitors left behind.
+        workers: number of processes that draw. None means one for each free CPU.
+        engine: an engine whose workers do the work instead.
+        strict: whether a blank video is a failure.
+        on_progress: called with the progress.
 
     Raises:
         UnreadableFile: a manifest is damaged.
@@ -64,7 +65,8 @@ def finish(
     try:
         bring_up_to_date(directory)
     except FileNotWritten:
-        # On a full disk, what failed has said so; the manifest comes with the next try.
+        # On a full disk, a failure has been reported already. The next run writes the
+        # manifest.
         if not has_failed:
             raise
         return
@@ -74,17 +76,18 @@ def finish(
 
 
 def bring_up_to_date(directory: Path) -> None:
-    """Give videos their second names, keep manifests true, and remove idle logs.
+    """Give videos their second names, update manifests, and remove idle logs.
 
-    To be called when videos of a directory have been finished. It also does what an
-    earlier run could not.
+    Call this after videos of a directory have been finished. It also completes what
+    an earlier run left undone.
 
     Raises:
         UnreadableFile: a manifest is damaged.
     """
     give_all_second_names(directory)
     for log in log_paths(directory):
-        # Those of a process that died between finishing the last and removing them.
+        # A process may have died after finishing the last recording of a log, before
+        # removing the log.
         with contextlib.suppress(DirectoryNotWritable):
             remove_if_done(log)
     update_manifests(directory)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Doing what is left of recordings: the trajectory's final form, and the videos.
+"""Finishing recordings: the final trajectory files, and the videos.
 
-One recording after the other, each by all workers. What cannot be done is reported,
-stays as it was, and stops nothing else.
+Recordings are finished one after another, each by all workers. A failure is reported,
+leaves its recording as it was, and does not stop the others.
 """
 
 from __future__ import annotations
@@ -45,13 +45,13 @@ def do_jobs(
     workers: int | None,
     on_progress: _OnProgress = lambda _: None,
 ) -> Iterator[RenderedVideos]:
-    """Do jobs with workers of this process, and yield the result of each.
+    """Do jobs with this process's own workers, and yield the result of each.
 
     Args:
-        jobs: which.
-        directory: whose CPUs are shared, where `workers` is None.
-        workers: how many processes draw; None is one for each free CPU.
-        on_progress: called after every frame, and when a job is over.
+        jobs: the jobs to do.
+        directory: the directory whose CPU locks are used if `workers` is None.
+        workers: number of processes that draw. None means one for each free CPU.
+        on_progress: called after every frame, and when a job has ended.
     """
     pool = WorkerPool(workers, directory=directory)
     with contextlib.closing(Finisher(pool, on_progress=on_progress)) as finisher:
@@ -64,12 +64,13 @@ def do_jobs(
 
 
 def note_failure(directory: Path, name: str, reason: str) -> None:
-    """Let the manifest say why a video is still pending.
+    """Note for the manifest why a video is still pending.
 
     Args:
         directory: the monitor directory.
-        name: of the video, or of a clip's first part; nothing is said of other files.
-        reason: why.
+        name: the name of the video, or of a clip's first part. Other files are
+            ignored.
+        reason: the reason.
     """
     key = key_of(name)
     if name.endswith(".mp4") or (key is not None and key.is_clip):
@@ -77,15 +78,15 @@ def note_failure(directory: Path, name: str, reason: str) -> None:
 
 
 class Finisher:
-    """Does the jobs that are added to it, in their order, with one pool of workers.
+    """Does the jobs that are added to it, in order, with one worker pool.
 
     Args:
-        pool: of the workers; closed with it.
-        on_progress: as of `do_jobs`. It may add jobs.
+        pool: the worker pool; `close` closes it.
+        on_progress: see `do_jobs`. It may add jobs.
 
     Attributes:
-        progress: how far it is.
-        on_progress: as given.
+        progress: the progress so far.
+        on_progress: as given; may be replaced.
     """
 
     def __init__(
@@ -94,7 +95,7 @@ class Finisher:
         self.progress = Progress(frames=0)
         self.on_progress = on_progress
         self._pool = pool
-        # None where a job cannot be planned: its turn says why.
+        # The plan is None if planning failed. The reason is reported by `do_next`.
         self._waiting: dict[str, tuple[VideoJob, Plan | None]] = {}
         self._gl_failure: GLError | None = None
 
@@ -120,36 +121,36 @@ class Finisher:
         return True
 
     def is_ready(self) -> bool:
-        """Return whether the model of the next job is there."""
+        """Return whether the model of the next job exists."""
         _, plan = next(iter(self._waiting.values()))
         return plan is None or plan.has_model
 
     def do_next(self) -> tuple[VideoJob, RenderedVideos]:
-        """Do the first job."""
+        """Do the next job, and return it with its result."""
         job, plan = self._waiting.pop(next(iter(self._waiting)))
         before, (videos, frames) = self.progress.frames_done, _work(plan)
         result = self._do(job)
         if videos:
-            # Also the frames that were not drawn: they are not waited for any more.
+            # Count the frames that were not drawn, too: they will not come any more.
             self.progress = replace(self.progress, frames_done=before + frames)
             self._count(videos_done=videos)
         return job, result
 
     def start_workers(self) -> None:
-        """Start the workers: soon there is a video to draw. Idempotent."""
-        # What stands in the way is reported when the video is drawn.
+        """Start the workers ahead of the first video. Idempotent."""
+        # Errors are reported when the video is drawn.
         with contextlib.suppress(Error):
             self._pool.start()
 
     def prepare(self, recording: Path) -> None:
-        """Let the workers load what a recording will be drawn with, once it is there.
+        """Make the workers load a recording's model ahead of time.
 
-        It may be running still.
+        The recording may still be running.
         """
         self._pool.prepare(recording)
 
     def rest(self) -> None:
-        """Let others use the CPUs: there is nothing to do."""
+        """Release the CPUs for other processes while there is nothing to do."""
         self._pool.rest()
 
     def _count(self, **more: int) -> None:
@@ -171,7 +172,7 @@ class Finisher:
             if lock is None:
                 return replace(nothing, elsewhere=(name,))
             try:
-                # Another process may have done it since it was added.
+                # Another process may have finished it since the job was added.
                 plan = look_at(job.directory, job.key)
                 if plan is None:
                     return nothing
@@ -182,7 +183,7 @@ class Finisher:
         except (Error, OSError) as error:
             reason = str(error)
         except Exception as error:
-            logger.exception("%s cannot be rendered.", job.recording)
+            logger.exception("%s could not be rendered.", job.recording)
             reason = f"{type(error).__name__}: {error}"
         if job.variant is None:
             note_failure(job.directory, name, reason)
@@ -207,7 +208,7 @@ class Finisher:
 
     def _render(self, job: VideoJob, plan: Plan) -> RenderedVideos:
         if self._gl_failure is not None:
-            # The same for all of them, after a second of trying each.
+            # Every other job would fail the same way, after a second of trying.
             raise self._gl_failure
         try:
             return render_video(
@@ -224,10 +225,10 @@ class Finisher:
 
 
 def _plan(job: VideoJob) -> Plan | None:
-    """Return what a job is; None where nothing is to be done.
+    """Return the plan for a job; None if there is nothing to do.
 
     Raises:
-        InvalidArgument: a video would replace one of a further camera.
+        InvalidArgument: the video would replace one recorded by another camera.
         Error: the recording cannot be read.
     """
     if job.variant is None:
@@ -241,13 +242,13 @@ def _plan(job: VideoJob) -> Plan | None:
     if job.video.with_suffix(".mp4").name in originals:
         raise InvalidArgument(
             f"{job.video.name} is a recorded video: this camera was recorded too. If "
-            "it is not there yet, render what is pending; else say what is to be other "
-            "besides the camera, or where to write it."
+            "it is still missing, render the pending videos. Otherwise change more "
+            "than the camera, or say where to write the file."
         )
     frames = len(recorded.chosen(job.variant.max_fps).indices)
     return Plan(parts=(trajectory,), videos=(job.video,), frame_count=frames)
 
 
 def _work(plan: Plan | None) -> tuple[int, int]:
-    """Return how many videos and frames a job is, as far as is known."""
+    """Return a job's number of videos and of frames, if known."""
     return (1, 0) if plan is None else (len(plan.videos), plan.frame_count)

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is to be rendered and its results, in plain data.
+"""Render jobs and their results, as plain data.
 
-A job is about one recording, and the same wherever it is done: in this process, in the
-one beside a simulation, by a worker of an engine. It can be done twice, also by two at
-once: the second finds nothing left to do, or puts the same file in its place.
+A job is about one recording. It is the same wherever it is done: in this process, in
+the background process of a simulation, or in an engine's worker. It can safely be done
+twice, even by two processes at once: the second finds nothing left to do, or replaces
+the file with an identical one.
 """
 
 from __future__ import annotations
@@ -31,15 +32,14 @@ from .views import Variant
 
 @dataclass(frozen=True, kw_only=True)
 class Progress:
-    """How far a rendering is.
+    """The progress of rendering.
 
     Attributes:
-        videos_done: how many videos are over, also as failures.
-        videos: how many there are, as far as is known.
-        frames_done: how many frames of these videos are drawn.
-        frames: how many frames these videos have; None where they were not counted:
-            the frames of a video that an engine's worker draws are known when it is
-            over.
+        videos_done: number of videos that are finished or have failed.
+        videos: number of videos known so far.
+        frames_done: number of frames of these videos that are drawn.
+        frames: number of frames of these videos. None if an engine draws them: the
+            frames of a video are then counted only when it is finished.
     """
 
     videos_done: int = 0
@@ -50,12 +50,12 @@ class Progress:
 
 @dataclass(frozen=True)
 class RecordingKey:
-    """Which recording of a directory.
+    """The key of a recording within its directory.
 
     Attributes:
-        infix: of its monitor.
-        number: the episode's; of a clip, how many steps the monitor had recorded when
-            it began.
+        infix: the infix of its monitor.
+        number: the episode's number; for a clip, the number of steps that the monitor
+            had recorded when it began.
         is_clip: whether it is a clip.
     """
 
@@ -65,32 +65,36 @@ class RecordingKey:
 
     @property
     def name(self) -> str:
-        """The base name of the trajectory without extension; that of the first part."""
+        """The base name of the trajectory, without extension, or of the first part."""
         if self.is_clip:
             return clip_part_name(self.infix, self.number, 0)
         return trajectory_prefix(self.infix, self.number)
 
     @property
     def video_name(self) -> str:
-        """The base name of an episode's video. In which a clip began, only rows say."""
+        """The base name of an episode's video.
+
+        A clip's video cannot be named from the key: only its rows say in which episode
+        it began.
+        """
         return f"{video_prefix(self.infix, self.number)}.mp4"
 
     @property
     def shown_name(self) -> str:
-        """What it is called where nothing is known of it."""
+        """The name to show for it when only the key is known."""
         return self.name if self.is_clip else self.video_name
 
     @property
     def lock_name(self) -> str:
-        """The name of the file that is locked by the process that works on it."""
+        """The name of the file that the process working on it locks."""
         name_of = clip_lock_name if self.is_clip else video_lock_name
         return name_of(self.infix, self.number)
 
 
 def key_of(name: str) -> RecordingKey | None:
-    """Return that of the recording that a file is of; None for other files.
+    """Return the key of the recording that a file belongs to; None for other files.
 
-    A clip's video that began with an episode is called as that episode's.
+    The video of a clip that began with an episode has the name of that episode's video.
     """
     if (part := ClipPart.parse(name)) is not None:
         return RecordingKey(part.infix, part.first_step, is_clip=True)
@@ -105,15 +109,15 @@ def key_of(name: str) -> RecordingKey | None:
 
 @dataclass(frozen=True, kw_only=True)
 class VideoJob:
-    """One recording that is to be rendered.
+    """One recording to render.
 
     Attributes:
-        directory: where it is.
+        directory: the monitor directory.
         recording: the name of one of its files; with a variant, of its trajectory.
-        strict: whether a video that shows nothing is a failure.
-        variant: what is to be other, for a video beside the original; None finishes
-            what is pending.
-        video: the video with a variant.
+        strict: whether a blank video is a failure.
+        variant: the changes for a video next to the original. None finishes what is
+            pending.
+        video: the path of that video. None without a variant.
     """
 
     directory: Path
@@ -126,17 +130,17 @@ class VideoJob:
     def finishing(
         cls, directory: Path, key: RecordingKey, *, strict: bool = False
     ) -> Self:
-        """Return the job that finishes what is pending of a recording."""
+        """Return the job that finishes the pending parts of a recording."""
         return cls(directory=directory, recording=key.shown_name, strict=strict)
 
     @property
     def name(self) -> str:
-        """What tells it from other jobs: the path of what it makes, as far as known."""
+        """A unique name: the path of the video to write, or of the recording."""
         return str(self.video or self.directory / self.recording)
 
     @property
     def key(self) -> RecordingKey:
-        """Which recording it finishes."""
+        """The key of the recording that it finishes."""
         key = key_of(self.recording)
         assert key is not None
         return key
@@ -144,14 +148,14 @@ class VideoJob:
 
 @dataclass(frozen=True, kw_only=True)
 class RenderedVideos:
-    """The results of a rendering, by file name.
+    """The results of rendering, by file name.
 
     Attributes:
-        directory: where the videos are.
+        directory: the directory of the videos.
         videos: number of frames of each rendered video.
         trajectories: finished trajectories of episodes without a video.
-        failures: reasons of videos that could not be rendered.
-        blank: with `strict`: what is wrong with videos that show nothing.
+        failures: the reason for each video that could not be rendered.
+        blank: with `strict`, what is wrong with each blank video.
         elsewhere: videos that another process is rendering.
     """
 
@@ -164,11 +168,11 @@ class RenderedVideos:
 
     @classmethod
     def joined(cls, parts: Iterable[Self], directory: Path) -> Self:
-        """Return what several results, in which no name comes twice, come to.
+        """Combine several results, in which each name occurs only once.
 
         Args:
             parts: the results.
-            directory: where the videos are, if there are no results that say it.
+            directory: the directory of the videos, if there are no results.
         """
         parts = list(parts)
         return cls(

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Finishing what a monitor left that was killed, or closed without waiting.
+"""Finishing the files of a monitor that was killed, or closed without waiting.
 
-Recordings in flight become trajectories, live videos get their names, the journal gets
-the lines that it lacks, and statistics and manifest follow from it. Meanwhile the
-monitor's lock is held, as the monitor did: to all others it is open.
+Recordings in flight become trajectories, live videos get their final names, missing
+lines are added to the journal, and statistics and manifest are written from it.
+Meanwhile the monitor's lock is held, so that the monitor looks open to all other
+processes.
 """
 
 from __future__ import annotations
@@ -63,11 +64,11 @@ _Line = tuple[str, Mapping[str, Any]]
 
 @dataclass(frozen=True, kw_only=True)
 class Report:
-    """What was done, and what failed.
+    """A report of finished files and failures.
 
     Attributes:
-        files: names, and what was done.
-        failures: names, and why it could not be.
+        files: pairs of a file name and what was done.
+        failures: pairs of a file name and the reason.
     """
 
     files: list[tuple[str, str]] = field(default_factory=list)
@@ -79,17 +80,17 @@ class Report:
 
     @contextlib.contextmanager
     def attempt(self, name: str) -> Iterator[None]:
-        """Note what fails inside the block, and go on."""
+        """Turn an exception inside the block into a failure, and continue."""
         try:
             yield
         except (Error, OSError) as error:
             self.failures.append((name, str(error)))
         except Exception as error:
-            logger.exception("%s cannot be recovered.", name)
+            logger.exception("%s could not be recovered.", name)
             self.failures.append((name, f"{type(error).__name__}: {error}"))
 
     def remove(self, stale: Path) -> None:
-        """Remove an unfinished file, or a lock that no process holds."""
+        """Remove an unfinished file, or a lock file that no process holds."""
         with self.attempt(stale.name):
             if stale.suffix != ".lock":
                 stale.unlink(missing_ok=True)
@@ -102,19 +103,19 @@ class Report:
 def finish_killed_monitor(
     directory: Path, infix: Infix, report: Report, *, bundles: bool
 ) -> None:
-    """Do all that is left to do of one monitor but drawing, unless it is open.
+    """Finish everything of one monitor except pending videos, unless it is open.
 
     Args:
-        directory: where it recorded.
-        infix: the monitor's.
-        report: takes what was done.
-        bundles: its trajectories lie in one file.
+        directory: the directory that it recorded into.
+        infix: the monitor's infix.
+        report: collects the results.
+        bundles: whether its trajectories are stored in one file.
     """
     path = directory / lock_name(infix)
     with report.attempt(path.name):
         was_killed = path.exists()
         monitor = _KilledMonitor(directory, infix, report, bundles=bundles)
-        # Before there is a lock, which is what a killed monitor leaves.
+        # Before the lock is taken, because a lock file is the sign of a killed monitor.
         is_behind = lacks_results(files_of(directory, infix))
         lock = try_lock(path)
         if lock is None:
@@ -124,11 +125,11 @@ def finish_killed_monitor(
         try:
             monitor.finish(is_behind=is_behind)
         except BaseException:
-            # What it says of the environment may not be written anywhere else.
+            # Keep the file: its facts about the environment may exist nowhere else.
             lock.let_go()
             raise
         lock.release()
-        # A process that rendered meanwhile took the monitor for open.
+        # To a process that rendered meanwhile, the monitor looked open.
         if (directory / manifest_name(infix)).exists():
             write_manifest_and_stats(directory, infix)
 
@@ -145,22 +146,22 @@ class _KilledMonitor:
         self._bundles = bundles
 
     def _left(self, kind: Kind) -> list[Path]:
-        """Return what is left to do now, of one kind."""
+        """Return the leftover files of one kind, as of now."""
         return leftovers(self._files(), kind)
 
     def finish(self, *, is_behind: bool) -> None:
-        """Do it, with the monitor's lock held.
+        """Finish the monitor's files. The caller holds the monitor's lock.
 
         Args:
-            is_behind: its results may be older than the rest.
+            is_behind: whether statistics and manifest may be outdated.
         """
         report = self._report
         for log in logs_left(self._files()):
             with report.attempt(log.name):
                 self._finish_log(log)
-        # Of logs a manifest says nothing that is not so of trajectories.
+        # Turning logs into trajectories does not change the manifest.
         before = len(report.files)
-        # The first video's metadata names those of further cameras.
+        # First cameras come last: their metadata names the other cameras' videos.
         for note in sorted(self._left("video"), key=_is_first):
             path = note.with_name(final_name(note.name) or "")
             with report.attempt(path.name):
@@ -190,10 +191,10 @@ class _KilledMonitor:
             self._report.note(name, what)
 
     def _finish_log(self, log: Path) -> None:
-        """Make trajectories of the episodes of a log; remove it where it is idle.
+        """Turn the episodes of a log into trajectories; remove the log if it is idle.
 
         Raises:
-            UnreadableFile: the journal does not say what is in it; it stays.
+            UnreadableFile: the journal does not say what is in the log. The log stays.
         """
         in_flight = [each for each in recordings_in(log) if each.is_in_flight]
         episodes = [each for each in in_flight if each.path.suffix == FINISHED]
@@ -225,7 +226,7 @@ class _KilledMonitor:
 
     @contextlib.contextmanager
     def _claimed(self, path: Path) -> Iterator[bool]:
-        """Hold the lock of a file's recording; False where another process keeps it."""
+        """Hold the lock of a file's recording; yield False if another process does."""
         key = key_of(final_name(path.name) or path.name)
         if key is None:
             yield True
@@ -234,16 +235,16 @@ class _KilledMonitor:
         with contextlib.nullcontext() if lock is None else lock:
             yield lock is not None
 
-    # What is known of episodes
+    # Known facts about episodes
 
     @functools.cached_property
     def _entries(self) -> dict[int, JournalEntry | None]:
-        """Episodes with files and a line in the journal; None where it was cut.
+        """Journal entries of the episodes with files; None for an episode cut off.
 
-        Of the others there may be millions.
+        Episodes without files are left out: there may be millions.
         """
         files, entries = self._files(), dict[int, JournalEntry | None]()
-        # One that cannot be read is reported when the statistics are made.
+        # An unreadable journal is reported when the statistics are written.
         with contextlib.suppress(UnreadableFile):
             if files.journal is not None:
                 numbers = _numbers(files)
@@ -258,7 +259,7 @@ class _KilledMonitor:
         return entries
 
     def _facts(self, number: int | None) -> Mapping[str, Any]:
-        """Return what an episode's trajectory says; nothing without, or of damaged."""
+        """Return the facts in an episode's trajectory; empty if missing or damaged."""
         with contextlib.suppress(UnreadableFile):
             if number is None:
                 return {}
@@ -268,7 +269,7 @@ class _KilledMonitor:
         return {}
 
     def _known(self, number: int | None) -> dict[str, Any]:
-        """Return what metadata says of an episode's end, as far as its files say it."""
+        """Return the metadata about an episode's end, as far as its files have it."""
         facts = self._facts(number)
         entry = None if number is None else self._entries.get(number)
         known = {key: facts[key] for key in ("length", "reward") if key in facts}
@@ -283,7 +284,7 @@ class _KilledMonitor:
     # Journal, statistics, manifest
 
     def _missing_episodes(self, now: MonitorFiles) -> Iterator[_Line]:
-        """Yield what the journal lacks of episodes with a trajectory or a video."""
+        """Yield the journal's missing lines for episodes with a trajectory or video."""
         is_choosing = bool(MonitorResults(now).run.facts.get("keep"))
         for number in sorted(_numbers(now) - self._entries.keys()):
             facts = self._facts(number)
@@ -305,9 +306,10 @@ class _KilledMonitor:
                 yield "cut", {**line, "reason": facts.get("reason", KILLED)}
 
     def _missing_clips(self, now: MonitorFiles) -> Iterator[_Line]:
-        """Yield the clips, deferred and live; those that the journal has say the same.
+        """Yield a line for each clip, deferred or live.
 
-        One that cannot be read is left out; rendering the directory reports it.
+        Some may repeat lines of the journal. Unreadable clips are left out; rendering
+        the directory reports them.
         """
         in_flight = recordings_in_flight(self._directory, self._infix)
         for key in {key_of(each.name) for each in in_flight}:
@@ -333,7 +335,7 @@ class _KilledMonitor:
                 yield "clip", {"episode_id": name.episode_id, "video": name.video}
 
     def _complete_journal(self, now: MonitorFiles) -> None:
-        """Write down what the monitor did not live to write down."""
+        """Add the lines that the monitor did not live to write."""
         lines = [*self._missing_episodes(now), *self._missing_clips(now)]
         path = self._directory / journal_name(self._infix)
         writer = JournalWriter(path, run=self._run_facts(now))
@@ -348,7 +350,7 @@ class _KilledMonitor:
             self._report.note(path.name, f"{_counted(added, 'episode')} added")
 
     def _run_facts(self, now: MonitorFiles) -> Mapping[str, Any]:
-        """Return what the first line says of a journal that is gone, or never was."""
+        """Return the first line for a journal that is lost or was never written."""
         with contextlib.suppress(OSError, ValueError):
             if run := locked_run(self._directory / lock_name(self._infix)):
                 return run

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Videos that were recorded live when their process was killed.
+"""Videos that were being recorded live when their process was killed.
 
-The encoder goes on to the end of what it was given, and finishes its hidden file. A
-note beside it says what it is.
+The encoder encodes all frames that it received, and finishes its hidden file. A note
+next to that file says which video it is.
 
-Text recordings are on the disk frame by frame, and have no note: their frames tell the
-rate, and the trajectory, where there is one, the episode.
+Text recordings are written to disk frame by frame and have no note. Their frames give
+the rate; the episode's trajectory, if it exists, gives the other facts.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from ..formats.video_metadata import (
 )
 from ..formats.video_sink import VideoSink
 
-# In the metadata of clips only.
+# Only the metadata of clips has this key.
 _FIRST_STEP = "first_step"
 _CUT = {"complete": False, "reason": KILLED}
 _BROKEN = (
@@ -39,22 +39,22 @@ _BROKEN = (
 
 
 def finish_video(path: Path, known: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
-    """Give a live video its name and its metadata, as far as it goes.
+    """Give a live video its final name and its metadata, for the frames that it has.
 
-    A file that cannot be decoded keeps its hidden name, and the metadata says that the
-    video broke, and why.
+    A file that cannot be decoded keeps its hidden name; the metadata then says that the
+    video is broken, and why.
 
     Args:
-        path: the video. An episode's first comes after those of its further cameras,
-            which its metadata names.
-        known: what is known of the end of its episode, with `complete` where it ended,
-            and of its `length` and `reward`.
+        path: the video. Call this for an episode's first camera last, because its
+            metadata names the other cameras' videos.
+        known: known facts about the episode: its `length`, its `reward`, and how it
+            ended, including `complete` if it did.
 
     Yields:
-        The name of the file and what was done; nothing where only the note was left.
+        The name of the file and what was done. Nothing if only the note was left.
 
     Raises:
-        Error: its encoder is still at it, or the files cannot be written.
+        Error: the encoder is still running, or the files cannot be written.
     """
     try:
         video = read_note(path)
@@ -69,7 +69,7 @@ def finish_video(path: Path, known: Mapping[str, Any]) -> Iterator[tuple[str, st
         )
     if not metadata_path(path).exists():
         if _FIRST_STEP in video.metadata:
-            # A clip crosses episodes: what is known of one says nothing of its end.
+            # A clip spans episodes: facts about one do not describe the clip's end.
             known = {}
         try:
             metadata = _metadata(video, video.finish(), known)
@@ -78,7 +78,8 @@ def finish_video(path: Path, known: Mapping[str, Any]) -> Iterator[tuple[str, st
             ending = known if "complete" in known else {**known, **_CUT}
             metadata = {**video.metadata, **ending, "empty": True, "recovered": True}
             done = metadata_path(path).name, "there was no frame yet"
-            # The hash comes first: of the last one the encoder may have had nothing.
+            # Frames are hashed before they are encoded, so the encoder may never have
+            # received the last one.
             if video.hashed_frames > 1:
                 why = (error.stderr.strip().splitlines() or [str(error)])[-1]
                 metadata |= {"broken": True, "broken_reason": f"{_BROKEN}: {why}"}
@@ -102,14 +103,14 @@ def _metadata(
     frame_count, stride = facts["frame_count"], facts["stride"]
     frames_per_step = facts.pop("frames_per_step")
     length = known.get("length", 0)
-    # The last step is always among them.
+    # The last step always has a frame.
     steps = [*range(0, length, stride), length]
     is_whole = len(steps) == frame_count and frames_per_step == 1
     if not is_whole or "complete" not in known:
-        # The last frames were on their way to the encoder.
+        # The last frames had not reached the encoder.
         steps = [*range(0, frame_count * stride, stride)]
         known = {**_sums(known), **_CUT}
-    # How many frames each step gave is known only where it is one.
+    # The step of each frame is known only if there is one frame per step.
     is_known = frames_per_step == 1
     further = further_live_videos(video.path)
     return {
@@ -129,16 +130,16 @@ def _sums(known: Mapping[str, Any]) -> dict[str, Any]:
 def finish_text(
     part: Path, path: Path, facts: Mapping[str, Any], known: Mapping[str, Any]
 ) -> Iterator[tuple[str, str]]:
-    """Make a text recording, and its metadata, of the frames that are there.
+    """Write a text recording and its metadata from the frames on disk.
 
     Args:
-        part: the hidden file that the frames were written into.
-        path: of the recording.
-        facts: what the trajectory of its episode says; nothing without one.
-        known: as of `finish_video`.
+        part: the hidden file that the frames were written to.
+        path: the recording to write.
+        facts: the facts in its episode's trajectory; empty without one.
+        known: see `finish_video`.
 
     Yields:
-        The name of the file and what was done; nothing where it was there already.
+        The name of the file and what was done. Nothing if the recording already exists.
 
     Raises:
         Error: the files cannot be written.
@@ -147,7 +148,7 @@ def finish_text(
         try:
             rate, frames = unfinished_recording(part)
         except UnreadableFile:
-            # There is no whole frame in it.
+            # It does not contain a complete frame.
             part.unlink(missing_ok=True)
             yield part.name, "unfinished, removed"
             return

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a monitor that is not open has left to be put in order.
+"""Files that a monitor left unfinished when it ended.
 
-Only names, locks and the journal are looked at: it is done at each
-`resume`, in the process of the simulation.
+Only names, locks and the journal are examined, because every `resume` does this in the
+simulation's process.
 """
 
 from __future__ import annotations
@@ -29,41 +29,42 @@ from ..results.monitor_files import MonitorFiles, files_of, monitors_of
 
 _SHARED_LOCK = re.compile(r"\.openaigym\.(recover|render\.\d+)\.lock")
 
-# The note of a live video; the frames of a text recording; an unfinished file that no
-# process will finish, or a dead one's lock. What is left is done in this order, after
-# the logs.
+# "video" is the note of a live video, "text" the frames of a text recording, and
+# "stale" an unfinished file that no process will finish, or a dead process's lock.
+# Leftovers are finished in this order, after the logs.
 Kind = Literal["video", "text", "stale"]
 
 
 def logs_left(files: MonitorFiles) -> list[Path]:
-    """Return the row logs of a monitor that hold episodes, or are of no use."""
+    """Return the row logs of a monitor that contain episodes, or are useless."""
     return [log for log in sorted(files.logs) if _has_work(log)]
 
 
 def leftovers(files: MonitorFiles, kind: Kind) -> list[Path]:
-    """Return the files of one kind that are left of a monitor."""
+    """Return a monitor's leftover files of one kind."""
     return [path for path in files.paths if _kind_of(path, files) == kind]
 
 
 def has_leftovers(files: MonitorFiles) -> bool:
-    """Return whether anything is left to do of a monitor."""
+    """Return whether a monitor has left anything to do."""
     is_left = bool(logs_left(files)) or any(_kind_of(p, files) for p in files.paths)
     return is_left or lacks_results(files)
 
 
 def is_at_work(directory: Path, infix: Infix) -> bool:
-    """Return whether an encoder or renderer is at a file of a monitor that is gone."""
+    """Return whether an encoder or renderer still works on a dead monitor's files."""
     files = files_of(directory, infix)
     hidden = [path for path in files.paths if path.name.startswith(".")]
     return any(is_locked(path) for path in hidden if path != files.lock)
 
 
 def stale_shared_files(directory: Path) -> list[Path]:
-    """Return what is left behind of files that belong to all monitors of a directory.
+    """Return the stale files that belong to no single monitor of a directory.
 
-    That is unfinished files of models, unless a monitor is open, and locks.
+    These are unfinished model files, unless a monitor is open, and locks.
     """
-    # In this order: a process that is at one of them has held a lock since before.
+    # List the files before looking at locks: a process that is working on a listed
+    # file has held its lock since before.
     hidden = [p for p in iter_monitor_files(directory, hidden=True) if p.name[0] == "."]
     models = [path for path in hidden if path.name.startswith(".openaigym.model.")]
     if models and any(files.is_open for files in monitors_of(directory)):
@@ -73,17 +74,17 @@ def stale_shared_files(directory: Path) -> list[Path]:
 
 
 def _has_work(log: Path) -> bool:
-    """Return whether a log is to be finished or removed."""
+    """Return whether a log must be finished or removed."""
     try:
         in_flight = [each for each in recordings_in(log) if each.is_in_flight]
     except UnreadableFile:
         return True
-    # Clips wait for their video.
+    # Clips stay in the log until their video is rendered.
     return not in_flight or any(each.path.suffix == ".h5" for each in in_flight)
 
 
 def _kind_of(path: Path, files: MonitorFiles) -> Kind | None:
-    """Return what is to be done about a hidden file; None where nothing is."""
+    """Return the kind of a leftover file; None if nothing must be done about it."""
     if path.suffix == ".lock" and path != files.lock:
         return None if is_locked(path) else "stale"
     final = final_name(path.name)
@@ -91,7 +92,7 @@ def _kind_of(path: Path, files: MonitorFiles) -> Kind | None:
         return None
     video = path.with_name(final)
     if is_note(path.name):
-        # What is left of a broken one stays, for those who want to try more.
+        # The data of a broken video stays, in case someone can repair it.
         return None if is_broken(metadata_path(video)) else "video"
     name = VideoName.parse(final)
     if name is None:
@@ -99,7 +100,7 @@ def _kind_of(path: Path, files: MonitorFiles) -> Kind | None:
     mp4 = path.with_name(name.video)
     if note_path(mp4).exists() and final.endswith((".mp4", ".framehash")):
         return None
-    # A clip's video may be called as an episode's.
+    # A clip's video may have the name of an episode's video.
     clips = f".openaigym.clip.{files.infix}."
     locks = [p for p in files.paths if p.name.startswith(clips)]
     if any(map(is_locked, [*unfinished_files(mp4), *locks, _lock_of(mp4)])):
@@ -112,14 +113,15 @@ def _lock_of(video: Path) -> Path:
 
 
 def lacks_results(files: MonitorFiles) -> bool:
-    """Return whether statistics or manifest are missing, or may be older than the rest.
+    """Return whether statistics or manifest are missing, or may be outdated.
 
-    A monitor that has closed wrote both, and removed its lock.
+    A monitor that closed normally wrote both and removed its lock.
     """
     if files.lock is not None:
         return True
     if files.manifest is None:
-        # Gym's own never had these, and its manifests cannot be made again.
+        # gym's own recordings have no journal or trajectory, and their manifests cannot
+        # be recreated.
         return bool(files.journal or files.trajectories)
     try:
         results = MonitorResults(files)

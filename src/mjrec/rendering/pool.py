@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """A pool of processes that draw frames, in order, for one caller.
 
-The machine's CPUs are shared by all processes that render into one directory. A CPU is
-a lock file, `.openaigym.render.<number>.lock`; the process that holds it may keep one
-worker busy. Eight environments in eight processes that record into one directory on a
-machine with two CPUs so have two workers at work, not sixteen.
+All processes that render into one directory share the machine's CPUs. Each CPU is a
+lock file, `.openaigym.render.<number>.lock`, and the process that holds it may keep one
+worker busy. If eight processes record into one directory on a machine with two CPUs,
+two workers are busy, not sixteen.
 """
 
 from __future__ import annotations
@@ -54,25 +54,24 @@ _SECONDS_BETWEEN_TRIES = 0.1
 
 
 class WorkerPool:
-    """Draws frames in processes of their own, and gives them in order.
+    """Draws frames in worker processes, and returns them in order.
 
-    Of n workers, worker k draws frames k, k+n, k+2n ... of a job and writes them to its
-    pipe. Of each at most two frames are kept here that were not asked for yet, however
-    many are to come. One that dies is started again at the frame that it owes; the
-    second time at one frame is an error. One that hangs, having sent nothing for
-    `timeout_s` while it was waited for, is ended and counts as dead; where it hung is
-    in the log.
+    With n workers, worker k draws frames k, k+n, k+2n ... of a job and writes them to
+    its pipe. At most two frames per worker are buffered here. A worker that dies is
+    restarted at the frame that it owes; if it dies twice at the same frame, that is an
+    error. A worker that sends nothing for `timeout_s` while the pool waits for it is
+    ended and counts as dead; the log shows where it hung.
 
-    The processes are started as they are needed, or by `start`, and stay until `close`,
-    garbage collection or the end of this process. Only one that is given up in the
-    midst of a job is ended, and started again for the next.
+    The processes start when needed, or with `start`, and stay until `close`, garbage
+    collection or the end of this process. Only a worker whose job is abandoned midway
+    is ended, and restarted for the next job.
 
-    They use the backend that `MUJOCO_GL` names. Where it names none, or turns rendering
-    off (which is for the simulation), each begins with EGL and looks at a frame of its
-    own before it draws others'; only where that fails, the first backend that works is
-    looked for, as of `mjrec.use_gl`.
+    Workers use the backend that `MUJOCO_GL` names. If it names none, or turns rendering
+    off (which applies to the simulation), each starts with EGL and checks a test frame
+    of its own first. Only if that fails does the pool look for the first backend that
+    works, like `mjrec.use_gl`.
 
-    For one thread at a time.
+    Use it from one thread at a time.
 
     ::
 
@@ -81,21 +80,21 @@ class WorkerPool:
                 ...
 
     Args:
-        workers: how many processes; more than one use one CPU each. None is one for
-            each CPU of the directory that is free when a job begins.
-        directory: whose CPUs are shared.
-        trust_models: whether they load compiled models that a stranger wrote; they do
-            in any case where `MJREC_TRUST_MODELS` says so here.
-        forks: whether `start` forks this process, which then imports once for all. It
-            has a single thread until then, and never uses OpenGL.
+        workers: number of processes. If there are several, each uses one CPU. None is
+            one for each CPU of the directory that is free when a job begins.
+        directory: the directory whose CPU locks are used.
+        trust_models: whether workers load compiled models from untrusted sources. They
+            do so in any case if `MJREC_TRUST_MODELS` allows it here.
+        forks: whether `start` forks this process, so that modules are imported only
+            once. Until then it must have a single thread, and it must never use OpenGL.
 
     Raises:
         InvalidArgument: `workers` is not a whole number of at least 1.
-        UnknownName: `MUJOCO_GL` names no backend that there is.
+        UnknownName: `MUJOCO_GL` names an unknown backend.
 
     Attributes:
-        gl_facts: who draws, as `gl_context.current_gl_facts`; empty before the first
-            frame.
+        gl_facts: facts about the renderer, from `gl_context.current_gl_facts`; empty
+            before the first frame.
     """
 
     def __init__(
@@ -109,12 +108,12 @@ class WorkerPool:
         self._fixed = check_workers(workers)
         count = self._fixed or usable_cpus()
         self._environ = _environment(os.environ, alone=count == 1)
-        # The user's backend, or one that was found to work, needs no trial.
+        # The user's backend, or one that is known to work, needs no test.
         self._is_chosen = "MUJOCO_GL" in self._environ
         if trust_models:
             self._environ[TRUST_VARIABLE] = ALL_MODELS
         self._directory = directory
-        # The CPUs of the directory that this process holds.
+        # The locks of the directory's CPUs that this process holds.
         self._held: dict[int, Lock] = {}
         self._workers = [_Worker() for _ in range(count)]
         self._forks = forks
@@ -129,8 +128,8 @@ class WorkerPool:
         """Start the workers now, so that the first frame comes sooner. Idempotent.
 
         Raises:
-            DirectoryNotWritable: there can be no lock in the directory.
-            Error: one cannot be started.
+            DirectoryNotWritable: a lock cannot be created in the directory.
+            Error: a worker cannot be started.
         """
         self._check_usable()
         for worker in self._workers[: self._free()]:
@@ -138,10 +137,10 @@ class WorkerPool:
         self.rest()
 
     def prepare(self, trajectory: Path) -> None:
-        """Let the workers load what a trajectory is drawn with; it may come later.
+        """Make idle workers load a trajectory's model, which may not exist yet.
 
-        Those that are started and have nothing to draw. What fails, fails when frames
-        are asked for.
+        Nothing is done while a job is running, or by workers that are not started.
+        Errors are reported when frames are requested.
         """
         if self._job is None:
             drawing = {"trajectory": str(trajectory), "view": to_json(View())}
@@ -150,7 +149,7 @@ class WorkerPool:
                     worker.child.send(prepares=drawing)
 
     def rest(self) -> None:
-        """Give the CPUs back: there is nothing to draw. The workers stay."""
+        """Release the CPUs while there is nothing to draw. The workers stay."""
         while self._held:
             _, lock = self._held.popitem()
             lock.release()
@@ -165,24 +164,25 @@ class WorkerPool:
     ) -> Iterator[Frame]:
         """Return the frames of a trajectory, in the order of `indices`.
 
-        The first is drawn before this returns, for which a CPU has to be free. Each is
-        a new array.
+        Waits for a free CPU and draws the first frame before returning. Each frame is a
+        new array.
 
         Args:
-            trajectory: its file.
-            indices: the numbers of the frames, from 0; in any order, also repeated.
-            view: how they are wanted; None is as recorded.
-            cameras: several in place of that of the view; None among them is as
-                recorded. A frame is then all that they show, in a grid.
+            trajectory: the trajectory's file.
+            indices: the numbers of the frames, from 0, in any order; repetitions are
+                allowed.
+            view: the camera, size and quality; None means as recorded.
+            cameras: cameras that replace that of the view; None among them is as
+                recorded. Each frame is then a grid of their frames.
 
         Raises:
-            UnreadableFile: of the trajectory or its model.
-            InvalidArgument: there is no such frame, no such camera in the model, or a
-                size that the driver cannot draw.
-            GLError: no backend works here, or all that was tried hangs.
-            Error: a worker died twice at one frame; the message names the signal and
-                what the worker said. Errors at later frames are raised by the
-                iterator, at their places.
+            UnreadableFile: the trajectory or its model cannot be read.
+            InvalidArgument: a frame does not exist, the model lacks the camera, or the
+                driver cannot draw frames of this size.
+            GLError: no backend works here, or all attempts to draw hang.
+            Error: a worker died twice at the same frame. The message contains the
+                signal and the worker's last output. Errors at later frames are raised
+                when the iterator reaches them.
         """
         drawing: dict[str, Any] = {
             "trajectory": str(Path(trajectory).absolute()),
@@ -197,7 +197,7 @@ class WorkerPool:
     ) -> Iterator[Frame]:
         """Return the frames of anything that `worker.open_drawing` opens.
 
-        As `frames`. Frames that an earlier call has not given yet are given up.
+        Works like `frames`. The remaining frames of an earlier call are abandoned.
         """
         self._check_usable()
         for worker in self._workers:
@@ -210,7 +210,7 @@ class WorkerPool:
         return itertools.chain(first, drawn)
 
     def close(self) -> None:
-        """End the processes at once, whatever they are at. Idempotent."""
+        """End the processes at once, whatever they are doing. Idempotent."""
         self._closed = True
         for worker in self._workers:
             worker.end()
@@ -224,17 +224,17 @@ class WorkerPool:
 
     def _check_usable(self, job: _Job | None = None) -> None:
         if job is not None and job is not self._job:
-            raise ClosedError("A later call has taken the workers over.")
+            raise ClosedError("A later call has taken over the workers.")
         if self._closed:
-            raise ClosedError("The pool of workers is closed.")
+            raise ClosedError("The worker pool is closed.")
         if os.getpid() != self._process_id:
             raise ClosedError(
-                f"The pool of workers belongs to process {self._process_id}: make one "
-                "in the process that uses it."
+                f"The worker pool belongs to process {self._process_id}. Create one in "
+                "the process that uses it."
             )
 
     def _free(self) -> int:
-        """Take the CPUs that are free; return how many workers may draw."""
+        """Lock the CPUs that are free; return the number of workers that may draw."""
         if self._fixed is not None or self._directory is None:
             return len(self._workers)
         for number in range(len(self._workers)):
@@ -252,13 +252,14 @@ class WorkerPool:
         if not self._is_chosen:
             environ = environment_for(BACKENDS[0], environ)
         try:
-            # No directory of others is kept from being removed or unmounted.
+            # The working directory is "/", so that workers do not keep any directory
+            # from being removed or unmounted.
             worker.child = Child(
                 _MODULE, environ=environ, cwd="/", fork=self._main_of_fork(environ)
             )
         except OSError as error:
             raise Error(
-                f"No process that draws could be started: {sys.executable!r}: {error}."
+                f"A render worker could not be started: {sys.executable!r}: {error}."
             ) from error
         worker.is_tried = self._is_chosen
         worker.child.send(tries=not self._is_chosen)
@@ -267,26 +268,29 @@ class WorkerPool:
         if not self._forks or threading.active_count() > 1:
             return None
         before = dict(os.environ)
-        # Read when mujoco is imported.
+        # mujoco reads them when it is imported.
         os.environ.update(environ)
         try:
-            # Not at the top: other processes that have a pool draw nothing.
+            # Not imported at the top: other processes that have a pool never draw.
             from .worker import main
         except Exception:
-            # A process of its own says why; or another backend works.
+            # A separate worker process reports the reason, or another backend works.
             self._forks = False
             return None
         finally:
-            # Which backend is the user's choice is asked again where this one fails.
+            # If this backend fails, the user's own choice is looked up again.
             os.environ.clear()
             os.environ.update(before)
         return main
 
     def _choose_backend(self) -> None:
-        """Look for the first backend that works; what was imported for EGL is no use.
+        """Choose the first backend that works, and stop forking.
+
+        This process has imported mujoco for EGL, so a fork of it could not use another
+        backend.
 
         Raises:
-            GLError: there is none.
+            GLError: no backend works.
         """
         if not self._is_chosen:
             self._environ = environment_for(backend_for_children(), self._environ)
@@ -308,7 +312,7 @@ class WorkerPool:
                     self._check_usable(job)
                 frame = worker.arrived.popleft()
                 self._timeout.renew()
-                # Before the caller has it: it may be busy with it for long.
+                # Before yielding, because the caller may be busy for a long time.
                 self._listen(job, 0)
                 yield frame
                 self._check_usable(job)
@@ -318,7 +322,7 @@ class WorkerPool:
                     worker.leave()
 
     def _order(self, worker: _Worker, job: _Job) -> None:
-        """Tell a worker what to draw, and start it if need be."""
+        """Send a worker its part of a job, starting it if necessary."""
         self._start(worker)
         assert worker.child is not None
         indices = [int(job.indices[position]) for position in worker.owes]
@@ -326,20 +330,24 @@ class WorkerPool:
         worker.child.send(drawing=job.drawing, indices=indices)
 
     def _wait_for_news(self, job: _Job) -> None:
-        """Wait until a worker says something; end those that have not for too long."""
+        """Wait until a worker sends something; end workers that exceed the timeout."""
         hungry = [worker for worker in job.workers if worker.may_send]
         for worker in hungry:
             if worker.child is None:
                 self._order(worker, job)
         self._timeout.wait(lambda seconds: self._listen(job, seconds))
         if self._timeout.is_over:
-            # All that sent more have no room for it, or owe nothing.
+            # The other workers have full buffers or owe nothing, so they do not hang.
             for worker in hungry:
                 self._end_hanging(worker, job)
             self._timeout.renew()
 
     def _listen(self, job: _Job, seconds: float) -> bool:
-        """Take in what the workers send, waiting so long for it; tell if they did."""
+        """Read the workers' messages, waiting at most `seconds` for one.
+
+        Returns:
+            Whether there was a message.
+        """
         by_child = {
             worker.child: worker
             for worker in job.workers
@@ -353,7 +361,7 @@ class WorkerPool:
             except EOFError:
                 self._lose(worker, job, "died", f"it {worker.child.last_words()}")
             except BaseException:
-                # Ctrl-C, in the midst of a message: what follows makes no sense.
+                # Ctrl-C within a message: the rest of the pipe cannot be understood.
                 worker.end()
                 raise
         return bool(heard)
@@ -373,7 +381,7 @@ class WorkerPool:
                 continue
             elif "untried" in message:
                 logger.info("A worker cannot draw with EGL: %s", message["untried"])
-                # It ends, and another one takes its place.
+                # It exits and is replaced.
                 self._choose_backend()
             elif "error" in message:
                 worker.error = unpacked(message["error"])
@@ -386,17 +394,17 @@ class WorkerPool:
         assert worker.child is not None
         seconds = self._timeout.seconds
         logger.error(
-            "A drawing worker hangs: it has drawn nothing for %g seconds, and is "
-            "ended. What its threads were at:\n%s",
+            "A render worker hangs: it has drawn nothing for %g seconds and is being "
+            "ended. Its threads' stacks:\n%s",
             seconds,
             worker.child.stacks(),
         )
         worker.child.kill()
         how = (
-            f"it drew nothing for {seconds:g} seconds and was ended; where it hung is "
-            "in the log"
+            f"it drew nothing for {seconds:g} seconds and was ended; the log shows "
+            "where it hung"
         )
-        # Where nothing was ever drawn, it is not for the sake of this frame.
+        # If nothing was ever drawn, this frame is not the cause.
         kind = Error if self._has_drawn else GLError
         self._lose(worker, job, "hung", how, kind=kind)
 
@@ -409,7 +417,7 @@ class WorkerPool:
         *,
         kind: type[Error] = Error,
     ) -> None:
-        """End a worker's process; the second that is lost at a frame is an error."""
+        """End a worker's process; the second loss at the same frame is an error."""
         worker.end()
         if not worker.is_tried:
             self._choose_backend()
@@ -419,16 +427,16 @@ class WorkerPool:
             source = job.drawing.get("trajectory", "the given states")
             worker.error = kind(
                 f"A worker {what} while drawing frame {job.indices[position]} of "
-                f"{source}, which was the second try: {how}"
+                f"{source} for the second time: {how}"
             )
         else:
-            logger.warning("A drawing worker %s and is replaced: %s", what, how)
+            logger.warning("A render worker %s and is being replaced: %s", what, how)
         worker.lost_at = position
 
 
 @dataclass(frozen=True)
 class _Job:
-    """What is drawn, which frames of it, and by which workers."""
+    """A drawing, the numbers of its frames to draw, and the workers that draw them."""
 
     drawing: Mapping[str, Any]
     indices: Sequence[int]
@@ -436,16 +444,16 @@ class _Job:
 
 
 class _Worker:
-    """A worker's process, which may be a second one, and its part of a job.
+    """A worker's process, which may be a replacement, and its part of a job.
 
     Attributes:
-        child: the process; None where there is none now.
-        shape: of its frames.
-        arrived: the frames that it has sent and that were not taken.
-        owes: the positions of those that are to come.
-        error: what there is instead of the next one.
-        lost_at: the position at which a process was lost.
-        is_tried: its backend is the user's, or has drawn what it should.
+        child: the process; None if it is not running.
+        shape: the shape of its frames.
+        arrived: the frames that it has sent and that were not taken yet.
+        owes: the positions of the frames that it still has to send.
+        error: the error that replaces the next frame.
+        lost_at: the position at which a process was last lost.
+        is_tried: whether its backend is the user's choice, or has passed its test.
     """
 
     def __init__(self) -> None:
@@ -459,12 +467,12 @@ class _Worker:
 
     @property
     def may_send(self) -> bool:
-        """Whether there is something to come, and room for it."""
+        """Whether it owes a frame, and the buffer has room for one."""
         is_full = len(self.arrived) >= _MOST_BUFFERED
         return bool(self.owes) and self.error is None and not is_full
 
     def leave(self) -> None:
-        """Forget the job; a process that has more to send of it is ended."""
+        """Forget the job; end the process if it has more to send."""
         if self.owes and self.error is None:
             self.end()
         self.owes = range(0)
@@ -472,7 +480,7 @@ class _Worker:
         self.arrived.clear()
 
     def end(self) -> None:
-        """End the process, whatever it is at. Idempotent."""
+        """End the process, whatever it is doing. Idempotent."""
         child, self.child = self.child, None
         if child is not None:
             child.end()
@@ -481,7 +489,11 @@ class _Worker:
 def _environment(environ: Mapping[str, str], *, alone: bool) -> dict[str, str]:
     """Return the environment variables of workers.
 
-    Without `MUJOCO_GL` the worker has to choose a backend.
+    They lack `MUJOCO_GL` if a backend must still be chosen.
+
+    Args:
+        environ: this process's environment variables.
+        alone: whether there is only one worker.
     """
     backend = None if rendering_is_off(environ) else backend_in_environment(environ)
     changed = environment_for(backend, environ) if backend else dict(environ)
@@ -489,12 +501,12 @@ def _environment(environ: Mapping[str, str], *, alone: bool) -> dict[str, str]:
         changed.pop("MUJOCO_GL", None)
     if changed.get("LP_NATIVE_VECTOR_WIDTH") == "512":
         logger.warning(
-            "Workers that draw go without LP_NATIVE_VECTOR_WIDTH=512: Mesa crashes "
-            "with it."
+            "Render workers run without LP_NATIVE_VECTOR_WIDTH=512, because Mesa "
+            "crashes with it."
         )
         del changed["LP_NATIVE_VECTOR_WIDTH"]
     if not alone:
-        # Mesa's rasteriser would start as many threads as there are CPUs, in each. One
-        # of its own would only be waited for.
+        # In each worker, Mesa's rasteriser would start one thread per CPU. Even a
+        # single extra thread brings nothing: the worker would only wait for it.
         changed.setdefault("LP_NUM_THREADS", "0")
     return changed

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Recordings as rendering takes them: checked facts, the frames and their captions.
+"""The facts of a recording, checked for rendering, and its frames and captions.
 
-A recording may come from anybody. Facts are checked here, once, so that everything
-behind it finds a rate where there should be one, and no path leads elsewhere.
+A recording may come from a stranger. Its facts are checked here, once, so that later
+code can rely on a rate being a rate, and on paths staying inside the directory.
 """
 
 from __future__ import annotations
@@ -55,28 +55,26 @@ logger = logging.getLogger(__name__)
 
 _BLOCK_BYTES = 1 << 20
 
-# Of an episode that ended before its second step: any is as good.
+# For an episode that ended before its second step; any rate would do.
 _RATE_OF_ONE_FRAME = Fraction(30)
 
-# What the user has asked for is written as it was given: 29.97, or a fraction that a
-# float exactly is. Not all that `Fraction` takes: 1e20000000 keeps it busy.
+# A rate that the user requested is stored as given, such as 29.97, or as the exact
+# fraction of a float. `Fraction` accepts more, but 1e20000000 would keep it busy.
 _ASKED_RATE = re.compile(r"\d{1,40}(\.\d{1,40}|/0*[1-9]\d{0,39})?", re.ASCII)
 
 
 def open_for_rendering(path: Path, *, is_vetted: bool = False) -> TrajectoryReader:
-    """Open a trajectory, also a stranger's, and check its facts.
+    """Open a trajectory, which may be a stranger's, and check its facts.
 
-    Afterwards `rate`, `timestep`, `scene`, `model`, `video` and `clip` are there as
-    they should be, or None, or missing; `stride`, `kept` and `candidate` as they should
-    be, or missing.
+    Afterwards `rate`, `timestep`, `scene`, `model`, `video` and `clip` are valid, None,
+    or missing; `stride`, `kept` and `candidate` are valid or missing.
 
     Args:
-        path: of the trajectory.
-        is_vetted: whether another process of ours has opened it before.
+        path: the trajectory.
+        is_vetted: whether another mjrec process has already opened it successfully.
 
     Raises:
-        UnreadableFile: of `open_vetted_trajectory`; or a fact is of a kind that it
-            cannot be.
+        UnreadableFile: `open_vetted_trajectory` raised it, or a fact is invalid.
     """
     reader = open_trajectory(path) if is_vetted else open_vetted_trajectory(path)
     try:
@@ -89,28 +87,28 @@ def open_for_rendering(path: Path, *, is_vetted: bool = False) -> TrajectoryRead
 
 
 def model_file(directory: Path, facts: Mapping[str, Any]) -> Path | None:
-    """Return the file of a recording's model that has to be there for rendering."""
+    """Return the model file that rendering a recording needs; None if unknown."""
     model = facts.get("model") or {}
-    # The compiled one comes first; what it was made from may never come.
+    # The compiled model is written first; its sources may never be written.
     name = model.get("mjb") or model.get("xml")
     return None if name is None else directory / name
 
 
 def video_facts(facts: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Return what a recording says of its video; nothing where it has none."""
+    """Return a recording's facts about its video; empty if it has none."""
     return facts.get("video") or {}
 
 
 def video_path(recording: Path, facts: Mapping[str, Any]) -> Path:
-    """Return where the video of a trajectory, or of a part of a clip, belongs.
+    """Return the path of the video of a trajectory or of a clip's part.
 
     Raises:
-        UnreadableFile: the recording names none, or one that is not its own.
+        UnreadableFile: the recording names no video, or one that is not its own.
     """
     name = str(video_facts(facts).get("name"))
     clip = ClipPart.parse(recording.name)
     infix = clip.infix if clip else Infix.parse(infix_of(recording.name) or "")
-    # The name of a clip's video tells in which episode it began; no other file does.
+    # Only the name of a clip's video says in which episode it began.
     episode = episode_of(name if clip else recording.name)
     own: set[str] = set()
     if infix is not None and episode is not None:
@@ -120,16 +118,16 @@ def video_path(recording: Path, facts: Mapping[str, Any]) -> Path:
     if name not in own:
         raise UnreadableFile(
             recording,
-            f"the video that it names, {name!r:.200}, is not that of its own episode",
+            f"the video that it names, {name!r:.200}, does not belong to its episode",
         )
     return recording.with_name(name)
 
 
 def further_video_paths(recording: Path, facts: Mapping[str, Any]) -> list[Path]:
-    """Return where the videos of a recording's further cameras belong.
+    """Return the paths of the videos of a recording's other cameras.
 
     Raises:
-        UnreadableFile: as `video_path`.
+        UnreadableFile: see `video_path`.
     """
     video = video_facts(facts)
     cameras = video.get("cameras") or ()
@@ -142,11 +140,11 @@ def further_video_paths(recording: Path, facts: Mapping[str, Any]) -> list[Path]
 
 
 class ChosenFrames(NamedTuple):
-    """Some of a recording's frames.
+    """A selection of a recording's frames.
 
     Attributes:
-        indices: their numbers.
-        every: the usual number of frames from one to the next.
+        indices: the numbers of the frames.
+        every: the stride between them; the last one may be closer.
     """
 
     indices: list[int]
@@ -154,7 +152,7 @@ class ChosenFrames(NamedTuple):
 
 
 def check_has_frames(reader: TrajectoryReader) -> None:
-    """Raise NoPictures, with the reason, if a trajectory has nothing to be drawn."""
+    """Raise NoPictures, with the reason, if a trajectory has no frames to draw."""
     facts = reader.facts
     if facts.get("scene") is not None and reader.frame_count:
         return
@@ -162,17 +160,17 @@ def check_has_frames(reader: TrajectoryReader) -> None:
         "it ended before the first" if facts.get("scene") else "none were recorded"
     )
     raise NoPictures(
-        f"{reader.path} holds no snapshots to draw frames from: {reason}. If it has "
+        f"{reader.path} contains no snapshots to draw frames from: {reason}. If it has "
         "states, mjrec.render_states can draw those."
     )
 
 
 def warn_of_other_frames(name: str, facts: Mapping[str, Any]) -> None:
-    """Say so where the environment showed more than its scene."""
+    """Warn if a recording's environment showed more than its scene."""
     reason = video_facts(facts).get("reason")
     if reason:
         logger.warning(
-            "%s was recorded live, because %s. What is drawn here is the scene alone.",
+            "%s was recorded live, because %s. Only the scene is drawn here.",
             name,
             reason,
         )
@@ -181,62 +179,65 @@ def warn_of_other_frames(name: str, facts: Mapping[str, Any]) -> None:
 def chosen_frames(
     count: int, facts: Mapping[str, Any], max_fps: float | Fraction | None
 ) -> ChosenFrames:
-    """Return which of the recorded frames are no more than `max_fps`.
+    """Select recorded frames so that their rate does not exceed `max_fps`.
 
-    0, n, 2n ... with the smallest whole n that fits, and always the last.
+    The selection is 0, n, 2n ... with the smallest whole n that fits, and the last
+    frame.
 
     Args:
-        count: how many the recording has.
-        facts: the recording's, checked.
-        max_fps: frames per second of the simulation; None is all there are.
+        count: number of recorded frames.
+        facts: the recording's checked facts.
+        max_fps: maximum frames per second of simulated time. None selects all.
 
     Raises:
-        InvalidArgument: `max_fps` is no rate, or the recording does not know its own.
+        InvalidArgument: `max_fps` is not a valid rate, or the recording's own rate is
+            unknown.
     """
     every = 1
     if max_fps is not None:
         wanted, recorded = to_rate(max_fps), recorded_rate(facts)
         if recorded is not None:
             every = stride_for(recorded, wanted)
-        # An episode that ended before its second step has one frame, at any rate.
+        # A single frame, from an episode that ended before its second step, needs no
+        # rate.
         elif count > 1:
             raise InvalidArgument(
-                "max_fps needs to know how many control steps a second has, and this "
-                "recording ended before that was written. Leave max_fps out."
+                "max_fps needs the number of control steps per second, but this "
+                "recording ended before it was written. Omit max_fps."
             )
     last = [count - 1] if count else []
     return ChosenFrames([*range(0, count - 1, every), *last], every)
 
 
 def recorded_rate(facts: Mapping[str, Any]) -> Fraction | None:
-    """Return how many frames a second of the simulation has; None if unknown."""
+    """Return the recorded frames per second of simulated time; None if unknown."""
     if facts.get("rate") is None:
         return None
     return Fraction(facts["rate"]) / int(facts.get("stride", 1))
 
 
 def usual_fps(facts: Mapping[str, Any], chosen: ChosenFrames) -> Fraction:
-    """Return the rate at which a second of the file is as long as when recorded."""
+    """Return the frame rate at which the video plays at its recorded speed."""
     asked = video_facts(facts).get("fps")
     rate = recorded_rate(facts) if asked is None else Fraction(asked)
     return (_RATE_OF_ONE_FRAME if rate is None else rate) / chosen.every
 
 
 def captions(reader: TrajectoryReader, indices: Sequence[int]) -> Iterator[Caption]:
-    """Return the captions of some frames of a trajectory, in their order.
+    """Return the captions of some frames of a trajectory, in the order of `indices`.
 
-    The return is the sum of the rewards up to the frame's step. The time is that of
-    the simulation since the reset; where no states were recorded, of the steps; where
-    it is not known how long these are, there is none. A part of a clip may begin in the
-    midst of an episode, and says what was before it.
+    The return is the sum of the rewards up to the frame's step. The time is the
+    simulated time since the reset. Without recorded states it is computed from the
+    steps; if their duration is unknown, it is None. A clip's part may begin in the
+    middle of an episode; its facts contain what came before.
 
     Raises:
-        UnreadableFile: the file is damaged. All of it is read before this returns.
+        UnreadableFile: the file is damaged. It is read completely before this returns.
     """
     facts = reader.facts
     episode_id, before = int(facts.get("episode_id") or 0), facts.get("clip") or {}
     steps = reader.frame_steps[list(indices)]
-    # One after the other, as the monitor adds them up.
+    # Summed one by one, as the monitor does, so that rounding is the same.
     first = float(before.get("reward_before", 0.0))
     sums = np.cumsum(np.concatenate([[first], reader.rewards]))
     rewards = sums[np.minimum(steps, len(sums) - 1)]
@@ -269,13 +270,13 @@ def _times(
 
 
 def _clock(reader: TrajectoryReader) -> NDArray[np.float64] | None:
-    """Return the simulated time of each state, read in blocks; None without states."""
+    """Return the simulated time of each state; None without states."""
     clock = reader.columns.get("time")
     if clock is None or not reader.row_count:
         return None
     rows = max(1, _BLOCK_BYTES // reader.dtype["state"].itemsize)
     blocks = [
-        # A copy, so that the states themselves need not stay in memory.
+        # Copied, so that the states themselves can be freed.
         reader.states(start, min(start + rows, reader.row_count))[:, clock.start].copy()
         for start in range(0, reader.row_count, rows)
     ]
@@ -284,7 +285,7 @@ def _clock(reader: TrajectoryReader) -> NDArray[np.float64] | None:
 
 def _asked_rate(value: Any) -> Fraction:
     if not _ASKED_RATE.fullmatch(text(value)):
-        raise ValueError(f"{value!r:.80} is no rate")
+        raise ValueError(f"{value!r:.80} is not a valid rate")
     try:
         return to_rate(Fraction(value))
     except InvalidArgument as error:
@@ -293,26 +294,26 @@ def _asked_rate(value: Any) -> Fraction:
 
 def _count(value: Any) -> int:
     if isinstance(value, float) or integer(value) < 0:
-        raise ValueError(f"{value!r:.80} is no number of steps")
+        raise ValueError(f"{value!r:.80} is not a number of steps")
     return int(value)
 
 
 def _stride(value: Any) -> int:
     if _count(value) < 1:
-        raise ValueError("it is zero")
+        raise ValueError("it must be at least 1")
     return int(value)
 
 
 def _cameras(value: Any) -> tuple[PlainCamera | None, ...]:
     cameras = list_of(optional(plain_camera))(value)
     if not cameras or None in cameras[1:]:
-        raise ValueError("only the first can be what the environment itself shows")
+        raise ValueError("only the first can be the environment's own view")
     return cameras
 
 
 def _second_name(value: Any) -> str:
     if not is_second_name(text(value)):
-        raise ValueError(f"{value!r:.80} is no second name of a video")
+        raise ValueError(f"{value!r:.80} is not a valid second name of a video")
     return str(value)
 
 
@@ -344,7 +345,7 @@ _FACTS: Mapping[str, Callable[[Any], Any]] = {
     "exception": optional(mapping),
     "model": _object_of(mjb=optional(base_name), xml=optional(base_name)),
     "video": _object_of(
-        # Whether it is that of its own episode, `video_path` looks at.
+        # `video_path` checks that it belongs to the recording's episode.
         name=text,
         quality=one_of(*QUALITIES),
         recording=one_of("deferred", "live"),

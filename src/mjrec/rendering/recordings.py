@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The recordings of a directory, and what is left to do about each.
+"""The recordings of a directory, and the work left to do on each.
 
-A recording is an episode or a clip, a video that is counted in steps. Its rows are one
-part or more: an episode has one, and a clip that goes on across resets one for each
-episode. An episode's part may become a file and stay; those of a clip are dropped when
-its video is there.
+A recording is an episode, or a clip (a video counted in steps). Its rows are divided
+into parts: an episode has one, and a clip that continues across resets has one for each
+episode. An episode's part may become a file and stay; a clip's parts are dropped when
+its video is finished.
 """
 
 from __future__ import annotations
@@ -45,15 +45,15 @@ from .recorded_facts import (
 
 @dataclass(frozen=True, kw_only=True)
 class Plan:
-    """What is to be done about a recording.
+    """The work left to do on a recording.
 
     Attributes:
-        parts: its rows, by the names of their files, in order.
-        videos: those that are to be rendered, the first camera's first.
-        frame_count: how many frames are to be rendered, of all of these.
-        logs: where its rows are, if they are in logs still.
-        is_kept: the trajectory stays once the video is there.
-        model_file: what has to be there for rendering, if it is known.
+        parts: the paths of its parts, in order. Parts still in a log have no file.
+        videos: the videos to render, the first camera's first.
+        frame_count: number of frames to render, in all videos together.
+        logs: the logs that still contain its rows.
+        is_kept: whether the trajectory stays after the video is finished.
+        model_file: the model file that rendering needs, if known.
     """
 
     parts: tuple[Path, ...]
@@ -65,22 +65,22 @@ class Plan:
 
     @property
     def has_model(self) -> bool:
-        """Whether the model is there; while a simulation runs it may be on its way."""
+        """Whether the model file exists; a running simulation may still write it."""
         return self.model_file is None or self.model_file.exists()
 
 
 @dataclass(frozen=True, kw_only=True)
 class Recorded:
-    """What the parts of a recording say, all together.
+    """The facts of a recording, from all of its parts.
 
     Attributes:
         parts: the files, in order.
-        facts: of each part.
-        frame_counts: of each part.
-        frame_steps: the step of each frame; the frames themselves are counted for a
-            clip, because its resets have one and are no steps.
-        step_count: of all parts.
-        reward: the sum over all steps.
+        facts: the facts of each part.
+        frame_counts: the number of frames of each part.
+        frame_steps: the step of each frame. For a clip, the frame's own number, because
+            resets have a frame but are not steps.
+        step_count: number of steps in all parts.
+        reward: the sum of the rewards over all steps.
     """
 
     parts: tuple[Path, ...]
@@ -97,15 +97,15 @@ class Recorded:
 
     @property
     def timing(self) -> Mapping[str, Any]:
-        """The facts of the first part that has measured the time of a step."""
+        """The facts of the first part that has the duration of a step."""
         known = (facts for facts in self.facts if facts.get("timestep") is not None)
         return next(known, self.facts[0])
 
     def chosen(self, max_fps: float | Fraction | None = None) -> ChosenFrames:
-        """Return which of the frames are wanted, counted over all parts.
+        """Return the frames to render, numbered across all parts.
 
-        Of an episode only wanted frames are recorded, of a clip all: which of them are
-        0, n, 2n ... does not begin anew with each part.
+        An episode records only the frames that its video needs. A clip records all
+        frames, and the selection 0, n, 2n ... does not restart with each part.
         """
         if self.is_clip and recorded_rate(self.timing) is not None:
             max_fps = max_fps or video_facts(self.facts[0]).get("max_fps")
@@ -114,10 +114,10 @@ class Recorded:
 
 
 def read_recording(parts: Sequence[Path]) -> Recorded:
-    """Read what the parts of a recording say.
+    """Read the facts of a recording's parts.
 
     Raises:
-        UnreadableFile: one is missing or damaged.
+        UnreadableFile: a part is missing or damaged.
     """
     facts: list[Mapping[str, Any]] = []
     frame_counts: list[int] = []
@@ -125,7 +125,7 @@ def read_recording(parts: Sequence[Path]) -> Recorded:
     for number, path in enumerate(parts):
         clip = ClipPart.parse(path.name)
         if clip is not None and clip.number != number:
-            raise UnreadableFile(path, f"part {number} of its video is not there")
+            raise UnreadableFile(path, f"part {number} of its video is missing")
         with open_for_rendering(path) as reader:
             facts.append(reader.facts)
             frame_counts.append(reader.frame_count)
@@ -159,19 +159,19 @@ def recordings(directory: Path) -> list[RecordingKey]:
 
 
 def parts_of(directory: Path, key: RecordingKey) -> list[Path]:
-    """Return the rows of a recording, by the names of their files, in order."""
+    """Return the paths of a recording's parts, in order; see `Plan.parts`."""
     if not key.is_clip:
         path = find_trajectory(directory, key.infix, key.number)
         return [] if path is None else [path]
-    # In which they are in the logs, too.
+    # The logs have the same order.
     in_flight = (each.path for each in recordings_in_flight(directory, key.infix))
     return [path for path in in_flight if key_of(path.name) == key]
 
 
 def may_be_left(directory: Path, key: RecordingKey) -> bool:
-    """Return whether anything may be left to do about a recording, opening no file.
+    """Return whether a recording may need work, without opening a file.
 
-    Where it is not, `look_at` returns None.
+    If this is false, `look_at` returns None.
     """
     return not _is_done(directory, key) and bool(
         key.is_clip or parts_of(directory, key)
@@ -179,28 +179,28 @@ def may_be_left(directory: Path, key: RecordingKey) -> bool:
 
 
 def _is_done(directory: Path, key: RecordingKey) -> bool:
-    """Return whether an episode has all that it can have."""
+    """Return whether a recording is an episode whose trajectory and video are done."""
     if key.is_clip or not is_done(directory / key.video_name):
         return False
     return is_finished(directory / f"{key.name}{FINISHED}")
 
 
 def look_at(directory: Path, key: RecordingKey) -> Plan | None:
-    """Return what is left to do about a recording; None where it is nothing.
+    """Return the work left to do on a recording; None if there is none.
 
-    One that is still running, or whose monitor has not decided yet whether it
-    gets a video, is left to its monitor: its log does not say how it ended, or calls it
-    a candidate, and the monitor's lock is held.
+    A recording that is still running, or whose monitor has not decided yet whether it
+    gets a video, is left to its monitor. In both cases the monitor's lock is held, and
+    the log lacks the episode's end or marks it as a candidate.
 
     Raises:
-        UnreadableFile: its rows are missing or damaged, or of a newer format, or say
-            what cannot be.
-        OSError: its monitor's lock cannot be looked at.
+        UnreadableFile: the rows are missing or damaged, have a newer format, or contain
+            an invalid fact.
+        OSError: the monitor's lock cannot be examined.
     """
-    # Most of a directory is done, and need not be opened.
+    # Most recordings of a directory are done, and need not be opened.
     if _is_done(directory, key):
         return None
-    # Asked first: a part that comes later is of a monitor that is open.
+    # Checked first: a part that appears later belongs to an open monitor.
     is_open = is_locked(directory / lock_name(key.infix))
     parts = parts_of(directory, key)
     if not parts:
@@ -234,18 +234,19 @@ def _logs_of(parts: Iterable[Path]) -> frozenset[Path]:
 
 
 def claim(directory: Path, key: RecordingKey) -> Lock | None:
-    """Return the lock of a recording, or None where another process has it.
+    """Return the lock of a recording, or None if another process holds it.
 
     Raises:
-        DirectoryNotWritable: there can be no lock in the directory.
+        DirectoryNotWritable: a lock cannot be created in the directory.
     """
     return try_lock(directory / key.lock_name)
 
 
 def remove_unfinished(video: Path) -> None:
-    """Remove what a renderer that was killed has left of a deferred video.
+    """Remove the files that a killed renderer left of a deferred video.
 
-    To be called by the process that holds the recording's lock: no other is at it.
+    Only the process that holds the recording's lock may call this, so that no other
+    process is writing them.
     """
     for final in (video, frame_hash_path(video), metadata_path(video)):
         for part in unfinished_files(final):

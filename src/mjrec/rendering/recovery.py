@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`mjrec.recover`: all that killed processes have left in a directory, in order."""
+"""`mjrec.recover`: finish the files that killed processes left in a directory."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from ..formats.second_names import give_all_second_names
 from ..results.monitor_files import monitors_of
 from .leftovers import has_leftovers, is_at_work, stale_shared_files
 
-# One recovery of a directory at a time.
+# Only one process at a time recovers a directory.
 _LOCK = ".openaigym.recover.lock"
 _SECONDS = 5.0
 _MOMENT = 0.05
@@ -28,8 +28,8 @@ class RecoveredFile:
     """A file, and its state after a recovery.
 
     Attributes:
-        name: its base name, in the end.
-        what: what was done, in words.
+        name: the file's final base name.
+        what: a description of what was done, or why it failed.
     """
 
     name: str
@@ -41,12 +41,13 @@ class RecoveredFile:
 
 @dataclass(frozen=True)
 class Recovery:
-    """What `recover` did. It is false if there was nothing to do.
+    """The result of `recover`. It is false if there was nothing to do.
 
     Attributes:
         directory: the directory.
         files: files that were finished.
-        failures: files that could not be finished, with reasons. They are unchanged.
+        failures: files that could not be finished, with the reasons. They are
+            unchanged.
         open_monitors: infixes of monitors that are still recording. Their files were
             left alone.
     """
@@ -83,27 +84,27 @@ def recover(
 ) -> Recovery:
     """Finish what killed monitors or renderers left in a directory.
 
-    Live videos get their names and metadata with `complete: false` and `reason:
-    "killed"`; logs become trajectories that say the same; statistics and manifest are
-    written from the journal; unfinished files of dead processes are removed. Deferred
-    videos stay pending: `mjrec render DIR`. Files of open monitors and running
-    renderers are left alone. `docs/howto/recovery.md` has the details.
+    Live videos get their final names, and metadata with `complete: false` and `reason:
+    "killed"`. Logs become trajectories with the same facts. Statistics and manifest are
+    written from the journal. Unfinished files of dead processes are removed. Deferred
+    videos stay pending: render them with `mjrec render DIR`. Files of open monitors and
+    running renderers are left alone. `docs/howto/recovery.md` has the details.
 
     It can be killed at any moment and repeated. A second run does nothing.
 
     Args:
         directory: the monitor directory.
-        timeout: seconds to wait, in all, for encoders that are still finishing files of
-            a dead process.
-        bundle: put the trajectories made of a monitor's logs into one file, as an
+        timeout: total number of seconds to wait for encoders that are still finishing
+            a dead process's files.
+        bundle: put the trajectories from a monitor's logs into one file, as an
             evaluation does.
 
     Returns:
-        What was done. If something failed, everything else was done.
+        The finished files and the failures. A failure does not stop the rest.
 
     Raises:
-        InvalidArgument: there is no such directory.
-        DirectoryNotWritable: it is read-only, and there is something to do.
+        InvalidArgument: the directory does not exist, or `timeout` is invalid.
+        DirectoryNotWritable: the directory is read-only, and there is something to do.
     """
     path = Path(directory).absolute()
     is_number = isinstance(timeout, numbers.Real) and not isinstance(timeout, bool)
@@ -113,23 +114,24 @@ def recover(
         )
     deadline = time.monotonic() + timeout
     if not path.is_dir():
-        raise InvalidArgument(f"There is no directory {path} to recover.")
+        raise InvalidArgument(f"Cannot recover {path}: it is not a directory.")
     dead, open_monitors = _dead_and_open(path)
-    # A recovering process holds the locks of the dead, who look alive meanwhile.
+    # While another process recovers, it holds the locks of dead monitors, which then
+    # look open.
     if not (dead or stale_shared_files(path) or is_locked(path / _LOCK)):
         return Recovery(path, open_monitors=open_monitors)
-    # Not at the top: it loads HDF5, which a simulation that goes on where a closed
-    # monitor left off has no use for.
+    # Not imported at the top: it loads HDF5, which a simulation that resumes after a
+    # closed monitor does not need.
     from .killed_monitor import Report, finish_killed_monitor
 
     report = Report()
     if not os.access(path, os.W_OK | os.X_OK):
         raise DirectoryNotWritable(path, "permission denied")
-    # Nothing is locked meanwhile.
+    # Wait for encoders before taking any lock.
     while time.monotonic() < deadline and any(is_at_work(path, each) for each in dead):
         time.sleep(_MOMENT)
     with wait_for_lock(path / _LOCK):
-        # Once more, because another process may have done it meanwhile.
+        # Look again, because another process may have recovered them meanwhile.
         dead, open_monitors = _dead_and_open(path)
         for infix in dead:
             finish_killed_monitor(path, infix, report, bundles=bundle)
@@ -144,7 +146,7 @@ def recover(
 
 
 def _dead_and_open(directory: Path) -> tuple[list[Infix], tuple[str, ...]]:
-    """Return the monitors to be put in order, and the infixes of those open."""
+    """Return the dead monitors that need work, and the infixes of open monitors."""
     dead: list[Infix] = []
     still_open: list[str] = []
     for files in monitors_of(directory):

@@ -40,12 +40,12 @@ def render(
     quality: str | None = None,
     workers: int = 1,
 ) -> Iterator[Frame]:
-    """Return the frames of a recorded episode, one after the other.
+    """Return the frames of a recorded episode, one at a time.
 
-    By default they are, byte for byte, those that `env.render()` gave or would have
-    given on the same driver. Worker processes draw them until the iterator ends or is
-    dropped. Only a few frames are in memory at a time. The first is drawn before this
-    returns.
+    By default they are, byte for byte, the frames that `env.render()` returned, or
+    would have returned, on the same driver. Worker processes draw them until the
+    iterator ends or is dropped. Only a few frames are in memory at a time. The first
+    one is drawn before this function returns.
 
     ::
 
@@ -55,29 +55,29 @@ def render(
     Args:
         trajectory: from `mjrec.load_trajectory`, or its path. If it was loaded with
             `trust_models=True`, its compiled model is loaded too.
-        camera: name or number of a model's camera, -1 for the free camera where the
-            model places it, an `mujoco.MjvCamera`, or a mapping of its members. None is
-            as recorded.
-        width: in pixels. None is as recorded.
-        height: in pixels. None is as recorded.
+        camera: name or number of one of the model's cameras, -1 for the free camera
+            where the model places it, a `mujoco.MjvCamera`, or a mapping of its
+            members. None means as recorded.
+        width: width in pixels. None means as recorded.
+        height: height in pixels. None means as recorded.
         max_fps: draw only frames 0, n, 2n ... and the last, with at most this many per
             second of simulated time. None draws all recorded frames.
         quality: `"full"` or `"draft"` (no multisampling, shadow maps of at most
-            1024x1024). None is as recorded.
-        workers: number of worker processes. Frames do not depend on it.
+            1024x1024). None means as recorded.
+        workers: number of worker processes. The frames do not depend on it.
 
     Returns:
         New arrays, `(height, width, 3) uint8`, top row first.
 
     Raises:
         UnreadableFile: the trajectory or its model is missing, damaged, or from a
-            MuJoCo that this one cannot read.
+            MuJoCo version that this one cannot read.
         UntrustedModel: another user or machine compiled the model, and its sources are
             missing.
         NoPictures: the trajectory has states but no snapshots.
-        UnknownName: there is no such camera or quality.
-        InvalidArgument: another argument has a wrong value, or the driver cannot draw
-            this size.
+        UnknownName: the camera or quality does not exist.
+        InvalidArgument: another argument is invalid, or the driver cannot draw frames
+            of this size.
         GLError: no OpenGL backend works here.
         Error: workers died twice at the same frame.
     """
@@ -109,12 +109,12 @@ def render_states(
     quality: str = "full",
     workers: int = 1,
 ) -> Iterator[Frame]:
-    """Return frames of physics states, one after the other.
+    """Return frames of physics states, one at a time.
 
-    Each frame is what `mujoco.Renderer` shows of a new `MjData` after `mj_setState` of
-    the row and `mj_forward`. So you can draw states from anywhere: `mujoco.rollout`,
-    MJX, Warp. Worker processes draw, as in `render`; until the iterator ends or is
-    dropped, model and states are in a temporary directory.
+    Each frame is the one that `mujoco.Renderer` draws of a new `MjData` after
+    `mj_setState` of the row and `mj_forward`. This lets you draw states from anywhere:
+    `mujoco.rollout`, MJX, Warp. Worker processes draw them, as in `render`. Until the
+    iterator ends or is dropped, the model and the states are in a temporary directory.
 
     ::
 
@@ -128,11 +128,11 @@ def render_states(
     Args:
         model: a `mujoco.MjModel`, or dm_control's wrapper of one.
         states: `(n, size)`, a row per frame.
-        spec: the components of a row, a combination of `mujoco.mjtState`. Others are as
-            in a new `MjData`.
-        height: in pixels.
-        width: in pixels.
-        camera: name or number of a model's camera, -1 for the free camera, an
+        spec: the components of a row, a combination of `mujoco.mjtState`. All other
+            components are as in a new `MjData`.
+        height: height in pixels.
+        width: width in pixels.
+        camera: name or number of one of the model's cameras, -1 for the free camera, an
             `mujoco.MjvCamera`, or a mapping of its members.
         quality: `"full"` or `"draft"`.
         workers: number of worker processes.
@@ -141,12 +141,13 @@ def render_states(
         New arrays, `(height, width, 3) uint8`, top row first.
 
     Raises:
-        InvalidArgument: the states have a wrong shape, or a size or camera is wrong.
-        UnknownName: there is no such camera or quality.
-        FileNotWritten: the temporary directory is full.
-        GLError, Error: as `render`.
+        InvalidArgument: the states have the wrong shape, or the size or camera is
+            invalid.
+        UnknownName: the camera or quality does not exist.
+        FileNotWritten: the disk of the temporary directory is full.
+        GLError, Error: see `render`.
     """
-    # Here, because drawing recorded episodes needs no simulator in this process.
+    # Imported here, because `render` needs no simulator in this process.
     from ..simulation.recorded_scene import check_states, save_states
 
     view = View(
@@ -169,7 +170,7 @@ def _path(trajectory: Any) -> Path:
     path = getattr(trajectory, "path", trajectory)
     if not isinstance(path, str | os.PathLike):
         raise InvalidArgument(
-            "A trajectory is a path, or what mjrec.load_trajectory returned, got "
+            "A trajectory must be a path or a result of mjrec.load_trajectory, got "
             f"{trajectory!r}."
         )
     return Path(path)
@@ -180,14 +181,15 @@ def _started(
     begin: Callable[[], Iterator[Frame]],
     *resources: contextlib.AbstractContextManager[Any],
 ) -> Iterator[Frame]:
-    """Return an iterator that takes its workers and its files with it when it ends."""
+    """Return an iterator that closes its workers and resources when it ends."""
 
     def frames() -> Iterator[Any]:
         with contextlib.ExitStack() as stack:
             for resource in (*resources, pool):
                 stack.enter_context(resource)
             drawn = begin()
-            # Here it stands when the caller gets it: only what has begun is cleaned up.
+            # The caller gets the iterator at this point. A generator that was never
+            # started would not be cleaned up.
             yield None
             yield from drawn
 

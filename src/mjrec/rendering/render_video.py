@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The videos of one recording: its frames, drawn by workers, in a file for each camera.
+"""Rendering the videos of one recording, with one file for each camera.
 
-The frames come in order, whichever worker drew them, so a file does not depend on the
-number of workers. The metadata comes last: where it is, the video is there and whole.
-The video of the first camera comes last of all: where it is, all are.
+Frames arrive in order, whichever worker drew them, so the files do not depend on the
+number of workers. A video's metadata is written last: if it exists, the video is
+complete. The first camera's video is written after all others: if it exists, all do.
 """
 
 from __future__ import annotations
@@ -56,10 +56,10 @@ class _Shot:
     """One of the videos of a recording.
 
     Attributes:
-        path: the file.
-        view: how it is drawn.
-        facts: what its metadata says that others' does not.
-        cameras: all of them, where they are in one video.
+        path: the video's path.
+        view: its camera, size and quality.
+        facts: the metadata that only this video has.
+        cameras: all cameras, if one video shows them side by side.
     """
 
     path: Path
@@ -77,34 +77,34 @@ def render_video(
     strict: bool = False,
     on_frame: Callable[[], object] = lambda: None,
 ) -> RenderedVideos:
-    """Render the video of a recording, with its frame hashes and its metadata.
+    """Render the videos of a recording, with frame hashes and metadata.
 
-    Where several cameras were recorded, a video of each, or one of all side by side.
-    All files have temporary names until they are whole. Those that are there are
-    replaced. If it fails or is interrupted, nothing is left. An encoder that is killed
-    or hangs is given a second try.
+    If several cameras were recorded, each gets a video, or one video shows all side by
+    side. Files have temporary names until they are complete, and replace existing
+    files. If rendering fails or is interrupted, nothing is left behind. If the encoder
+    is killed or hangs, the video is tried a second time.
 
     Args:
-        parts: the trajectory of an episode, finished or not; or the parts of a clip.
-        variant: what is to be other than recorded. With a camera, there is one video,
-            of what that one shows.
-        workers: draw the frames.
-        out: the video, of the first camera or of all side by side; as the recording
-            says, beside it, if None.
-        strict: whether a video that shows nothing is among the `blank` of the result;
-            else it is a warning.
-        on_frame: called after every frame, once for each of every video.
+        parts: the trajectory of an episode, finished or not, or the parts of a clip.
+        variant: changes from the recording. If it names a camera, there is one video,
+            from that camera.
+        workers: the workers that draw the frames.
+        out: the video of the first camera, or of all side by side. None means the name
+            in the recording, next to it.
+        strict: whether a blank video is listed in the result's `blank`. Otherwise there
+            is only a warning.
+        on_frame: called once for every frame of every video.
 
     Returns:
-        The videos; none, and the name of the trajectory, where the recording broke
-        before there was a frame, which the metadata now says.
+        The videos. If the recording broke before its first frame, no videos, only the
+        trajectory's name; the metadata then says so.
 
     Raises:
-        NoPictures: it has no frames.
-        UnreadableFile: it is damaged.
-        MissingDependency: frames are to be written on, and there is no Pillow.
+        NoPictures: the recording has no frames.
+        UnreadableFile: the recording is damaged.
+        MissingDependency: captions are needed, but Pillow is not installed.
         FileNotWritten: the disk is full.
-        Error: its frames cannot be drawn or encoded.
+        Error: the frames cannot be drawn or encoded.
     """
     recorded = read_recording(parts)
     facts, variant = recorded.facts[0], variant or Variant()
@@ -135,7 +135,7 @@ def render_video(
     }
     shots = _shots(parts[0], facts, variant.view, out)
     if out is None:
-        # They would go on leading to what is replaced now.
+        # Otherwise the second names would keep pointing to the replaced videos.
         take_second_names(shots[-1].path)
     sinks: list[VideoSink] = []
     videos: dict[str, int] = {}
@@ -164,10 +164,11 @@ def render_video(
 
 
 def _note_that_it_broke(recorded: Recorded, out: Path | None) -> None:
-    """Write the metadata of a video that there will never be.
+    """Write metadata that marks a recording's video as broken, without a video.
 
     Raises:
-        NoPictures: nothing says that there will not.
+        NoPictures: the reason is unknown, the recording has no video, or `out` is
+            given.
     """
     path, facts = recorded.parts[0], recorded.facts[0]
     reason = facts.get("broken_reason")
@@ -177,7 +178,7 @@ def _note_that_it_broke(recorded: Recorded, out: Path | None) -> None:
         refusal = facts.get("refusal")
         why = f": {refusal}" if refusal else ""
         raise NoPictures(
-            f"{path} holds states, and nothing that frames can be made of{why}."
+            f"{path} contains states, but nothing to draw frames from{why}."
         )
     broken = {"broken_reason": reason, "empty": True, "broken": True}
     write_metadata(video_path(path, facts), {**_metadata(recorded), **broken})
@@ -186,7 +187,10 @@ def _note_that_it_broke(recorded: Recorded, out: Path | None) -> None:
 def _runs(
     recorded: Recorded, indices: Sequence[int]
 ) -> Iterator[tuple[Path, list[int]]]:
-    """Yield the parts, each with the numbers of those of its frames that are wanted."""
+    """Yield each part with the numbers of its wanted frames, counted within the part.
+
+    Parts without wanted frames are left out.
+    """
     begin = 0
     for path, count in zip(recorded.parts, recorded.frame_counts, strict=True):
         own = [index - begin for index in indices if begin <= index < begin + count]
@@ -202,7 +206,7 @@ def _drawn(
     *,
     annotate: bool,
 ) -> Iterator[tuple[Frame, Caption | None]]:
-    """Yield the frames of all parts, with what is written on them."""
+    """Yield the frames of all parts with their captions, or None without captions."""
     tiles = {} if shot.cameras is None else {"cameras": shot.cameras}
     for path, indices in runs:
         frames = workers.frames(path, indices, shot.view, **tiles)
@@ -216,13 +220,13 @@ def _drawn(
 def _fps(recorded: Recorded, chosen: ChosenFrames) -> Fraction:
     asked = video_facts(recorded.facts[0]).get("fps")
     if recorded.is_clip and asked is not None:
-        # All frames are recorded: `max_fps` has no part in the rate that was asked for.
+        # A clip records all frames, so `max_fps` does not affect the requested rate.
         return Fraction(asked)
     return usual_fps(recorded.timing, chosen)
 
 
 def _metadata(recorded: Recorded) -> dict[str, Any]:
-    """Return what the metadata says of what was recorded."""
+    """Return the metadata that describes the recording."""
     first, last = recorded.facts[0], recorded.facts[-1]
     complete = bool(last.get("complete"))
     description = {
@@ -245,7 +249,7 @@ def _metadata(recorded: Recorded) -> dict[str, Any]:
     elif complete:
         description |= {key: last.get(key) for key in ("terminated", "truncated")}
     if not complete:
-        # A process that was killed could not say why it ended.
+        # A killed process could not record why it ended.
         description["reason"] = last.get("reason", KILLED)
         if "exception" in last:
             description["exception"] = last["exception"]
@@ -257,7 +261,7 @@ def _metadata(recorded: Recorded) -> dict[str, Any]:
 def _shots(
     recording: Path, facts: Mapping[str, Any], view: View, out: Path | None
 ) -> list[_Shot]:
-    """Return the videos that are to be rendered, the first camera's last."""
+    """Return the videos to render, the first camera's last."""
     video = video_facts(facts)
     label = (facts.get("scene") or {}).get("label")
     further = list(video.get("cameras") or ())[1:]
@@ -271,7 +275,7 @@ def _shots(
         return {"also_named": name} if name else {}
 
     if video.get("tiled") and further:
-        # The first one is as recorded, which is more than its name.
+        # None draws the first camera as recorded, which its name alone cannot describe.
         tiles = (None, *map(plain_camera, further))
         rows, columns = grid_shape(len(tiles))
         description = {"camera": [label, *further], "tiled": True, **second_name(first)}
@@ -299,10 +303,10 @@ def _film(
     draw: Callable[[], Iterable[tuple[Frame, Caption | None]]],
     on_frame: Callable[[], object],
 ) -> VideoSink:
-    """Write a video, a second time where the encoder was ended from outside.
+    """Write a video; retry once if the encoder was killed.
 
     Returns:
-        What has written it; its metadata is still missing.
+        The sink that wrote the video. The metadata is still missing.
     """
     most = 0
     for is_last in (False, True):
@@ -316,11 +320,11 @@ def _film(
             sink.finish()
             break
         except BaseException as error:
-            # Half a video is of no use: all of it can be rendered again.
+            # Half a video is useless, because all of it can be rendered again.
             sink.discard()
-            # Killed, for lack of memory or for hanging.
+            # The encoder was killed, because memory ran out or because it hung.
             is_killed = isinstance(error, EncoderError) and (error.returncode or 0) < 0
             if is_last or not is_killed:
                 raise
-            logger.warning("The video %s is begun anew: %s", path.name, error)
+            logger.warning("Restarting the video %s: %s", path.name, error)
     return sink

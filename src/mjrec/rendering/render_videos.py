@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The videos of a monitor directory: those that are pending, or recorded ones again."""
+"""Rendering a directory's pending videos, or re-rendering recorded episodes."""
 
 from __future__ import annotations
 
@@ -56,47 +56,48 @@ def render_videos(
     engine: Executor | str | None = None,
     on_progress: _OnProgress | None = None,
 ) -> RenderedVideos:
-    """Render the pending videos of a directory, or recorded episodes once more.
+    """Render the pending videos of a directory, or re-render recorded episodes.
 
     Without options, pending videos are rendered as planned. Several calls, in any
     processes, share the work of a directory. With `camera`, `height`, `width`,
     `max_fps`, `quality`, `fps`, `annotate` or `out`, recorded episodes are rendered
-    once more, into new files beside the originals.
+    again, into new files next to the originals.
 
-    A failed video does not stop the others; the result has the reasons. Ctrl-C and
-    other exceptions keep what is finished.
+    A failed video does not stop the others; the result contains the reasons. After
+    Ctrl-C or another exception, finished videos stay.
 
     Args:
         target: a monitor directory; or a trajectory or video in one, for that episode
             only.
-        episode: number of the episode. None is all recorded ones.
-        camera: as in `mjrec.render`. None is as recorded, here and below.
-        height: in pixels.
-        width: likewise.
-        max_fps: most frames per second of simulated time; every n-th recorded frame is
-            drawn, and the last.
+        episode: number of the episode. None means all recorded episodes.
+        camera: see `mjrec.render`. None means as recorded, here and below.
+        height: height in pixels.
+        width: width in pixels.
+        max_fps: maximum frames per second of simulated time: every n-th recorded frame
+            and the last one are drawn.
         quality: `"full"` or `"draft"`.
         fps: frames per second written into the file. It does not select frames.
         annotate: write episode, step, time and return on the frames.
         out: the file to write, for one episode. Its suffix chooses the format.
-        workers: number of worker processes. None is one per free CPU. If `engine` is a
-            name, the number of its workers.
+        workers: number of worker processes. None means one per free CPU. If `engine`
+            is a name, the number of engine workers.
         strict: list videos that show nothing (black, one colour, no movement) in
             `blank`. They are kept.
         trust_models: load compiled models that another user or machine wrote. A crafted
-            model can run any code. Holds for the whole process during the call.
-        engine: where to render, instead of processes of this one: an executor, or
+            model can run any code. Applies to the whole process during the call.
+        engine: where to render, if not in this process's own workers: an executor, or
             `"local"`, `"ray"` or `"slurm"`. One worker draws each video. All workers
-            see the directory under the same path.
+            must see the directory under the same path.
         on_progress: called with the progress after every frame, or with an engine after
             every video.
 
     Returns:
-        The videos, and the reasons of failures.
+        The rendered videos, and the reasons for failures.
 
     Raises:
-        InvalidArgument: there are no such recordings, or an argument has a wrong value.
-        MissingDependency: the engine's package, or Pillow for captions, is missing.
+        InvalidArgument: no such recordings exist, or an argument is invalid.
+        MissingDependency: the engine's package, or Pillow for captions, is not
+            installed.
         UnreadableFile: a manifest is damaged.
         Error: the engine cannot work.
     """
@@ -138,23 +139,23 @@ def iter_rendered_videos(
     engine: Executor | str | None = None,
     on_progress: _OnProgress | None = None,
 ) -> Iterator[RenderedVideos]:
-    """Do what `render_videos` does, and yield each result when it is there.
+    """Do what `render_videos` does, but yield each result as soon as it exists.
 
-    What is asked for is checked before anything is begun, and before this returns.
+    Arguments are checked before the iterator is returned.
 
     Args:
-        target: as of `render_videos`, and so with all others.
-        variant: what is to be other.
-        episode: see there.
-        out: likewise.
-        workers: likewise.
-        strict: likewise.
-        trust_models: likewise.
-        engine: likewise.
-        on_progress: likewise.
+        target: see `render_videos`.
+        variant: the changes from the recordings; if none, pending videos are rendered.
+        episode: see `render_videos`.
+        out: see `render_videos`.
+        workers: see `render_videos`.
+        strict: see `render_videos`.
+        trust_models: see `render_videos`.
+        engine: see `render_videos`.
+        on_progress: see `render_videos`.
 
     Raises:
-        Error: as `render_videos`.
+        Error: see `render_videos`.
     """
     check_workers(workers)
     if variant.annotate:
@@ -165,9 +166,9 @@ def iter_rendered_videos(
     if variant == Variant() and out is None:
         if not keys and not target.is_dir():
             raise InvalidArgument(
-                f"No video of {target.name} is pending: no recording has such a name. "
-                "To render it once more, say what should change (camera, size, "
-                "max_fps, quality, fps, annotate) or where to write it (out, --out)."
+                f"No video of {target.name} is pending: no recording has that name. To "
+                "render it again, say what should change (camera, size, max_fps, "
+                "quality, fps, annotate) or where to write it (out, --out)."
             )
         results = finish(
             directory,
@@ -195,22 +196,23 @@ def _trusting(results: Iterator[RenderedVideos]) -> Iterator[RenderedVideos]:
 def _recordings_of(
     target: Path, episode: int | None
 ) -> tuple[Path, list[RecordingKey]]:
-    """Return a directory and those of its episodes and clips that were asked for.
+    """Return the directory, and the episodes and clips in it that were requested.
 
     Raises:
-        InvalidArgument: there are none.
+        InvalidArgument: the target does not exist or has no recordings, or the
+            directory lacks the episode.
     """
     if is_bundle(target.name):
         bundled = (key_of(path.name) for path in trajectories_in(target))
         return target.parent, [key for key in bundled if key is not None]
     if not target.exists() and not is_recorded(target):
-        raise InvalidArgument(f"There is no directory or file {target}.")
+        raise InvalidArgument(f"{target} does not exist.")
     if not target.is_dir():
         key = key_of(target.name)
         return target.parent, [] if key is None else [key]
     if not any(iter_monitor_files(target)):
         raise InvalidArgument(
-            f"{target} holds no recordings. {where_recordings_are(target)}"
+            f"{target} contains no recordings. {where_recordings_are(target)}"
         )
     keys = recordings(target)
     if episode is None:
@@ -220,7 +222,7 @@ def _recordings_of(
         numbers = sorted({key.number for key in keys if not key.is_clip})
         listed = ", ".join(map(str, numbers[:_SHOWN])) or "none"
         raise InvalidArgument(
-            f"{target} has no recorded states of episode {episode}. It has those of "
+            f"{target} has no recorded states of episode {episode}. Available: "
             f"{listed}{' ...' * (len(numbers) > _SHOWN)}."
         )
     return target, chosen
@@ -234,15 +236,15 @@ def _variant_jobs(
     *,
     strict: bool,
 ) -> list[VideoJob]:
-    """Return the jobs that render episodes another way.
+    """Return the jobs that re-render episodes with changes.
 
     Raises:
-        InvalidArgument: there are no trajectories; or `out` stands for several, or is
-            the name of an original.
+        InvalidArgument: there are no trajectories, or `out` is given for several
+            episodes or is the name of an original video.
     """
     directory = target if target.is_dir() else target.parent
     if target.suffix == ".h5" and directory != target and not is_bundle(target.name):
-        # Whatever its name is otherwise.
+        # A trajectory may have any name.
         names = [target.name]
     else:
         episodes = [key for key in keys if not key.is_clip]
@@ -254,15 +256,15 @@ def _variant_jobs(
     if out is not None:
         if len(names) > 1:
             raise InvalidArgument(
-                f"{out} is one file, and several episodes were asked for: choose one."
+                f"{out} is one file, but there are several episodes. Choose one."
             )
-        # By whatever ending: the metadata would have the original's name.
+        # With any suffix: the metadata file would have the name of the original's.
         name = out.with_suffix(".mp4").name
         key = key_of(name)
         if key is not None and name == key.video_name:
             raise InvalidArgument(
-                f"{out} is the name of a recorded video, which shows what its "
-                "recording saw. Choose another name."
+                f"{out} is the name of an episode's original video. Choose a different "
+                "name."
             )
     return [
         VideoJob(
@@ -277,13 +279,13 @@ def _variant_jobs(
 
 
 def name_of_variant(trajectory: str, variant: Variant) -> str:
-    """Return the name of the video that shows a trajectory this way.
+    """Return the name of a trajectory's video with changes.
 
-    It is the original's with what is other before its extension, such as
-    `openaigym.video.<infix>.video000027.side.1280x720.draft.mp4`. A camera whose
-    name could be another of these parts is there as `camera-draft`, and one that
-    has none by a hash of its members. Readers of a directory never take it for the
-    original, and those who clear the directory remove it too.
+    It is the original's name with the changes before the extension, such as
+    `openaigym.video.<infix>.video000027.side.1280x720.draft.mp4`. A camera name that
+    could be mistaken for one of the other parts gets a prefix, as in `camera-draft`. A
+    camera without a name is given by a hash of its members. Readers of a directory
+    never mistake the file for the original, and clearing the directory removes it.
     """
     view, parts = variant.view, []
     if isinstance(view.camera, Mapping):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How frames of a recording are wanted, as far as other than recorded."""
+"""Settings for rendering that differ from those of the recording."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from ..rates import to_rate
 
 PlainCamera: TypeAlias = str | int | dict[str, Any]
 
-# The public members of an `mujoco.MjvCamera`.
+# The public members of a `mujoco.MjvCamera`.
 CAMERA_MEMBERS = (
     *("type", "fixedcamid", "trackbodyid", "lookat", "distance"),
     *("azimuth", "elevation", "orthographic"),
@@ -25,21 +25,21 @@ CAMERA_MEMBERS = (
 
 @dataclass(frozen=True, kw_only=True)
 class View:
-    """From where, how large and how well frames are drawn; None is as recorded.
+    """The camera, size and quality of frames; None means as recorded.
 
     Attributes:
         camera: the name or number of one of the model's cameras, -1 for the free
-            camera in the place that the model gives it, or the members of an
-            `mujoco.MjvCamera` by their names (those left out are MuJoCo's default).
-            It may be given as `plain_camera` takes it.
-        height: in pixels.
-        width: in pixels.
+            camera where the model places it, or the members of a `mujoco.MjvCamera` by
+            name (MuJoCo's defaults for those left out). Any value that `plain_camera`
+            accepts may be passed.
+        height: height in pixels.
+        width: width in pixels.
         quality: `"full"` or `"draft"`.
 
     Raises:
-        UnknownName: there is no such quality, or an `MjvCamera` has no such member.
-        InvalidArgument: a size or a camera that cannot be. Whether the model has the
-            camera is not known here.
+        UnknownName: the quality, or a member of the `MjvCamera`, does not exist.
+        InvalidArgument: the size or the camera is invalid. Whether the model has the
+            camera is not checked here.
     """
 
     camera: PlainCamera | None = None
@@ -54,7 +54,7 @@ class View:
         )
         if self.quality is not None:
             check_quality(self.quality)
-        # A NumPy integer is as good as any, and so is an `MjvCamera`.
+        # Convert NumPy integers and an `MjvCamera` to plain values.
         plain: Mapping[str, Callable[[Any], object]]
         plain = {"camera": plain_camera, "height": int, "width": int}
         for name, make in plain.items():
@@ -64,18 +64,18 @@ class View:
 
 @dataclass(frozen=True, kw_only=True)
 class Variant:
-    """What is to be other than recorded; None is as recorded.
+    """Changes for re-rendering a recording; None means as recorded.
 
     Attributes:
-        view: from where, how large and how well it is drawn.
-        max_fps: the most frames per second of simulated time: frames 0, n, 2n ... of
-            those recorded, with the smallest n that fits, and the last.
-        fps: frames per second of the file. If None, a second of the video is as much
-            simulated time as when the episode was recorded.
+        view: the camera, size and quality.
+        max_fps: maximum frames per second of simulated time. Of the recorded frames,
+            0, n, 2n ... with the smallest n that fits, and the last are drawn.
+        fps: frames per second of the file. If None, the video plays at its recorded
+            speed.
         annotate: whether episode, step, time and return are written on the frames.
 
     Raises:
-        InvalidArgument: one is no rate.
+        InvalidArgument: `max_fps` or `fps` is not a valid rate.
     """
 
     view: View = field(default_factory=View)
@@ -90,14 +90,14 @@ class Variant:
 
 
 def plain_camera(camera: Any) -> PlainCamera:
-    """Return a camera in what JSON can hold.
+    """Return a camera in a JSON-serialisable form.
 
     Args:
-        camera: a name, a number, an `mujoco.MjvCamera`, or a mapping of its members.
+        camera: a name, a number, a `mujoco.MjvCamera`, or a mapping of its members.
 
     Raises:
-        UnknownName: the mapping has a key that is no member.
-        InvalidArgument: it is none of these.
+        UnknownName: a key of the mapping is not a member of `MjvCamera`.
+        InvalidArgument: `camera` has a different type, or a member's value is invalid.
     """
     if isinstance(camera, str):
         return camera
@@ -105,12 +105,12 @@ def plain_camera(camera: Any) -> PlainCamera:
         return int(camera)
     if isinstance(camera, Mapping):
         return {name: _plain_member(name, camera[name]) for name in camera}
-    # By its name: a caller who has one has imported mujoco, and others need not.
+    # Compared by type name, so that mujoco need not be imported here.
     if type(camera).__name__ == "MjvCamera":
         return {n: _plain_member(n, getattr(camera, n)) for n in CAMERA_MEMBERS}
     raise InvalidArgument(
-        "A camera is a name, a number, a mujoco.MjvCamera or a mapping of its members, "
-        f"got {camera!r} of type {type(camera).__name__}."
+        "A camera must be a name, a number, a mujoco.MjvCamera or a mapping of its "
+        f"members, got {camera!r} of type {type(camera).__name__}."
     )
 
 
@@ -124,7 +124,7 @@ def _plain_member(name: str, value: Any) -> Any:
     expected = (3,) if name == "lookat" else ()
     if numbers.shape != expected or not np.isfinite(numbers).all():
         what = "three numbers" if expected else "a number"
-        raise InvalidArgument(f"A camera's {name} is {what}, got {value!r}.")
+        raise InvalidArgument(f"A camera's {name} must be {what}, got {value!r}.")
     if name in ("lookat", "distance", "azimuth", "elevation"):
         return numbers.tolist()
     return int(numbers)

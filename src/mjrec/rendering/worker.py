@@ -3,21 +3,20 @@
 
 Its parent sends::
 
-    {"tries": true}                         it makes its context and, if true, looks at
-                                            a frame of its own
-    {"prepares": {...}}                     it loads what that will be drawn with
+    {"tries": true}                         create the context and, if true, check a
+                                            test frame
+    {"prepares": {...}}                     load the model of that drawing
     {"drawing": {...}, "indices": [1, 3, 5]}
 
-`drawing` and `prepares` are what `open_drawing` takes; `indices` are the frames. It
-sends the bytes of frames, `(height, width, 3) uint8`, and::
+`drawing` and `prepares` are arguments of `open_drawing`; `indices` are the numbers of
+the frames. The worker sends the bytes of frames, `(height, width, 3) uint8`, and::
 
     {"size": [48, 64], "gl": {...}}         before the frames of a job
-    {"error": {...}}                        instead of a frame and all that would follow
+    {"error": {...}}                        instead of a frame and all later ones
     {"log": ["mjrec.x", 30, "..."]}         for the parent's log
-    {"untried": "..."}                      its own frame is not what it should be:
-                                            then it ends
+    {"untried": "..."}                      the test frame is wrong; the worker exits
 
-It ends with its parent, in mid-drawing too.
+It ends when its parent does, even in the middle of a frame.
 """
 
 from __future__ import annotations
@@ -46,15 +45,15 @@ _SECONDS_BETWEEN_LOOKS = 0.02
 
 
 class Drawing:
-    """Frames of a scene, known by their numbers, from 0.
+    """The frames of a scene, numbered from 0.
 
-    Each is the same whatever was drawn before: the cameras are brought to where they
-    would be if all before had been drawn.
+    A frame does not depend on which others were drawn before: the cameras are moved to
+    where they would be if all earlier frames had been drawn.
 
     Args:
-        scene: what is drawn.
-        cameras: whose frames they are, in a grid where there are several. All draw
-            with one canvas.
+        scene: the scene to draw.
+        cameras: a renderer for each camera; several give a grid of frames. All use the
+            same canvas.
     """
 
     def __init__(
@@ -62,10 +61,10 @@ class Drawing:
     ) -> None:
         self._scene = scene
         self._cameras = cameras
-        # The frame whose cameras the renderers have in mind.
+        # The number of the frame that the renderers' cameras are at.
         self._last: int | None = None
         self._canvas_is_old = False
-        # Whether a frame depends on the one before, at any time.
+        # Whether a frame can depend on the one before.
         self._looks_back = not scene.is_constant or any(
             camera.shows_frame_before for camera in cameras
         )
@@ -79,21 +78,21 @@ class Drawing:
 
     @property
     def gl_facts(self) -> dict[str, Any]:
-        """Who draws, and on which device: `gl_context.current_gl_facts`."""
+        """Facts about the renderer and device; see `gl_context.current_gl_facts`."""
         return self._cameras[0].gl_facts
 
     def draw(self, index: int) -> Frame:
-        """Return a frame.
+        """Draw a frame, `(height, width, 3) uint8`.
 
         Raises:
-            InvalidArgument: there is no such frame.
+            InvalidArgument: the frame does not exist.
             UnreadableFile: the file is damaged.
             GLError: the driver hangs.
         """
         if not 0 <= index < self._scene.count:
             raise InvalidArgument(
-                f"There is no frame {index}: there are {self._scene.count}, numbered "
-                "from 0."
+                f"Frame {index} does not exist: there are {self._scene.count} frames, "
+                "numbered from 0."
             )
         last, self._last = self._last, None
         if self._looks_back and (last is None or index != last + 1):
@@ -111,7 +110,7 @@ class Drawing:
         self._scene.close()
 
     def _prepare(self, index: int, last: int | None) -> None:
-        """Bring the cameras to where they are before a frame."""
+        """Move the cameras to where they are just before a frame."""
         start = max(0, index - 1)
         if any(camera.is_following for camera in self._cameras):
             start = 0 if last is None or last >= index else last + 1
@@ -134,20 +133,20 @@ def trajectory_drawing(
     cameras: Sequence[PlainCamera | None] | None = None,
     canvas: Canvas | None = None,
 ) -> Drawing:
-    """Return the frames that `env.render()` would have given in a recorded episode.
+    """Return the frames that `env.render()` would have returned in a recorded episode.
 
     Args:
-        path: of the trajectory; its model is looked for beside it.
-        view: what of them is to be other than recorded.
-        cameras: several in place of that of the view; None among them is as recorded.
-            A frame is then all that they show, in a grid.
-        canvas: what to draw with; something new, if None.
+        path: the trajectory; its model is expected next to it.
+        view: changes from the recording.
+        cameras: cameras that replace that of the view; None among them means as
+            recorded. Each frame is then a grid of their frames.
+        canvas: the canvas to draw with; None creates a new one.
 
     Raises:
-        UnreadableFile: of the trajectory or its model.
-        NoPictures: it has no snapshots.
-        UnknownName, InvalidArgument: its model has no such camera, or a size that the
-            driver cannot draw.
+        UnreadableFile: the trajectory or its model cannot be read.
+        NoPictures: the trajectory has no snapshots.
+        UnknownName, InvalidArgument: the model lacks the camera, or the driver cannot
+            draw frames of this size.
         GLError: nothing can be drawn here.
     """
     reader = open_for_rendering(path, is_vetted=True)
@@ -165,7 +164,7 @@ def trajectory_drawing(
             "quality": view.quality or quality,
             "canvas": canvas or Canvas(),
         }
-        # Of a camera as recorded it is known how the frames have moved it.
+        # For a camera as recorded, the recording contains how it moved.
         as_recorded = {
             "camera": recorded.camera,
             "begins_at": scene.previous_cameras,
@@ -181,15 +180,15 @@ def trajectory_drawing(
 
 
 def open_drawing(drawing: Mapping[str, Any], canvas: Canvas) -> Drawing:
-    """Return what is described, for a worker, in plain JSON.
+    """Open a drawing that is described in plain JSON.
 
     Args:
-        drawing: `trajectory` (a path), or `states` (a directory of `save_states`) and
-            `spec`; and `view`; and, of a trajectory, `cameras`.
-        canvas: what to draw with.
+        drawing: `trajectory` (a path) and, optionally, `cameras`; or `states` (a
+            directory written by `save_states`) and `spec`. In both cases also `view`.
+        canvas: the canvas to draw with.
 
     Raises:
-        Error: as of `trajectory_drawing`.
+        Error: see `trajectory_drawing`.
     """
     log_mujoco_warnings()
     view = View(**drawing["view"])
@@ -197,13 +196,13 @@ def open_drawing(drawing: Mapping[str, Any], canvas: Canvas) -> Drawing:
         path, cameras = Path(drawing["trajectory"]), drawing.get("cameras")
         return trajectory_drawing(path, view, cameras=cameras, canvas=canvas)
     scene = GivenStates(Path(drawing["states"]), drawing["spec"])
-    # Nothing is left open.
+    # For given states, no setting of the view is None.
     look: dict[str, Any] = vars(view)
     return Drawing(scene, [SceneRenderer(scene.model, canvas=canvas, **look)])
 
 
 def main() -> None:
-    """Draw what the parent wants, until it ends."""
+    """Draw the frames that the parent requests, until the parent ends."""
     parent = Parent()
     parent.send_warnings()
     parent.listen()
@@ -223,21 +222,21 @@ def main() -> None:
                 draw_test_scene(canvas=canvas)
             except Exception as error:
                 parent.send(untried=str(error))
-                # Not `sys.exit`, which would wait for the driver.
+                # `sys.exit` would wait for the driver.
                 os._exit(1)
         else:
-            # What is in the way is said when there is something to draw.
+            # Errors are reported when there is something to draw.
             with contextlib.suppress(Error):
                 canvas.open()
 
 
 def _prepare(drawing: Mapping[str, Any], canvas: Canvas, parent: Parent) -> None:
-    """Load the model into the canvas, where it is there before there is more to do."""
+    """Load the model into the canvas, if it appears before there is more to do."""
     for _ in range(_LOOKS_FOR_RECORDING):
         if parent.has_said_something:
             return
-        # A recording is there from its first step on, its model a moment later. What
-        # else is in the way is said when there is something to draw.
+        # A recording exists from its first step on, its model a moment later. All other
+        # errors are reported when there is something to draw.
         with contextlib.suppress(Exception):
             open_drawing(drawing, canvas).close()
             return

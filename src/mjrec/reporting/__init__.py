@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Showing recordings: a page that opens from the disk, and film strips."""
+"""Reports on recordings: an offline web page, and film strips."""

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a report shows: `gathering` finds it, `media` copies videos, `page` shows it.
+"""The contents of a report, which `gathering` collects and `page` shows.
 
-All text may come from files of strangers; whatever writes it into a page escapes it.
+All strings may come from untrusted files. Code that writes them into a page must escape
+them.
 """
 
 from __future__ import annotations
@@ -17,10 +18,10 @@ from numpy.typing import NDArray
 from ..evaluation.statistics import Bootstrap
 from ..evaluation.summaries import AcrossTasks, TaskSummary
 
-# One episode: a million of them fit into little memory. `run` is the seed of an
-# evaluation, else the monitor, as an index into `ReportTask.runs`; `total_reward` and
-# `end_time` (wall clock, seconds) are NaN where they are not known; `outcome` is a sum
-# of the numbers below; `success` is 1, 0, or -1 where nothing is known.
+# One episode, as a row, so that a million of them need little memory. `run` is the seed
+# of an evaluation, otherwise the monitor as an index into `ReportTask.runs`.
+# `total_reward` and `end_time` (wall clock, in seconds) are NaN if unknown. `outcome`
+# is a sum of the numbers below. `success` is 1, 0, or -1 if unknown.
 EPISODE: Final = np.dtype(
     [
         ("run", "i8"),
@@ -42,26 +43,26 @@ class ReportVideo:
     """A video of the gallery.
 
     Attributes:
-        path: of the recorded file.
-        infix: of the monitor that recorded it.
-        episode_id: the number, in its monitor, of the one episode that it shows; None
-            where it shows several, or it is not known which.
-        index: of that episode in `ReportTask.episodes`; None where it is not known.
-        file: its address relative to the page, or a `data:` URL; empty where it is not
-            part of the report.
-        poster: likewise, of an image of it; empty where there is none.
+        path: the recorded file.
+        infix: the infix of the monitor that recorded it.
+        episode_id: the number, in its monitor, of the one episode that it shows. None
+            if it shows several, or if the number is unknown.
+        index: the index of that episode in `ReportTask.episodes`; None if unknown.
+        file: the address of the copy relative to the page, or a `data:` URL; empty if
+            the video is not part of the report.
+        poster: the address of a still image, in the same form; empty if there is none.
         roles: which of `"best"`, `"median"`, `"worst"` its episode is.
-        height: of the frames in pixels; None where it is not known.
-        width: likewise.
-        seconds: how long it plays; None where it is not known.
-        camera: what it was seen from; None where it is not known.
-        renderer: what OpenGL drew it with; None where it is not known.
-        sha256: of the file; None where the metadata does not say.
-        command: the shell command that renders it again; None where there is no
-            recorded state.
-        notes: what else is to be said, such as that it is incomplete.
-        trajectory: of the recorded states; None where there are none.
-        replay: the address of its page in 3D, relative to this one; empty without.
+        height: height of the frames in pixels; None if unknown.
+        width: width of the frames in pixels; None if unknown.
+        seconds: duration in seconds; None if unknown.
+        camera: a description of the camera; None if unknown.
+        renderer: the OpenGL renderer that drew it; None if unknown.
+        sha256: the SHA-256 of the file; None if the metadata lacks it.
+        command: the shell command that re-renders it; None without recorded states.
+        notes: remarks, for example that the video is incomplete.
+        trajectory: the file of the recorded states; None if there are none.
+        replay: the address of its 3D page, relative to the report's; empty if there is
+            none.
     """
 
     path: Path
@@ -85,21 +86,21 @@ class ReportVideo:
 
 @dataclass(kw_only=True)
 class ReportTask:
-    """One task, or one environment of a monitor directory, of one of the directories.
+    """A task of an evaluation, or an environment of a monitor directory.
 
     Attributes:
-        name: what it is called on the page; with its directory where others have the
-            same environment.
-        source: the directory, as it was given.
-        is_evaluation: the episodes are those of an evaluation, whose runs are seeds;
-            else of monitors, in the order of time, as of a training.
-        summary: of its episodes.
+        name: its name on the page, followed by the directory if several tasks have the
+            same name.
+        source: the directory, as given.
+        is_evaluation: whether the episodes are those of an evaluation, whose runs are
+            seeds. Otherwise they come from monitors, in order of time, as in training.
+        summary: the summary of its episodes.
         episodes: `(n,)` of dtype `EPISODE`.
-        runs: what the runs are called where they are monitors.
-        failures: the reasons, by index, of the episodes that failed.
-        videos: in the order of their episodes.
-        provenance: label and value, for people: versions, GL renderer, policy, seeds,
-            selection rule, protocol ...
+        runs: the names of the runs, if they are monitors.
+        failures: the reasons why episodes failed, by index.
+        videos: its videos, in the order of their episodes.
+        provenance: pairs of label and value, for people: versions, GL renderer, policy,
+            seeds, selection rule, protocol ...
     """
 
     name: str
@@ -115,13 +116,14 @@ class ReportTask:
 
 @dataclass(frozen=True, kw_only=True)
 class Verdict:
-    """What `mjrec verify --json` said of recordings.
+    """A verdict of `mjrec verify --json` about recordings.
 
     Attributes:
-        source: what was verified, and which file says so.
+        source: the path that was verified, and the file with the verdict.
         verdict: `PASS`, `PARTLY` or `FAIL`.
-        counts: how many findings say made again, within tolerance, believed, different.
-        level: how deep it went.
+        counts: number of findings by outcome: made again, within tolerance, believed,
+            different.
+        level: the level of the verification.
     """
 
     source: str
@@ -132,16 +134,15 @@ class Verdict:
 
 @dataclass(kw_only=True)
 class ReportContents:
-    """All of a report.
+    """The contents of a report.
 
     Attributes:
-        title: of the page.
-        tasks: in the order of the page.
-        across: what is said of all tasks together, one for each evaluation, by the
-            directory's name; empty where there is none.
-        bootstrap: how intervals were made.
-        problems: what could not be read or shown, in sentences.
-        verdicts: of verifications.
+        title: the page's title.
+        tasks: the tasks, in the order of the page.
+        across: the statistics across tasks of each evaluation, by directory.
+        bootstrap: the settings for intervals.
+        problems: sentences about things that could not be read or shown.
+        verdicts: the verdicts of verifications.
     """
 
     title: str = ""

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Figures for the page of a report, as SVG that takes the page's colours.
+"""SVG figures for a report's page, in the page's colours.
 
-Each function returns one `<svg>` element to stand inside an HTML page. It has no
-colours of its own but classes (`f-` for filling, `s-` for stroking, such as
-`s-accent`), so that one figure serves light, dark and paper; no `style` attribute, so
-that a strict content security policy leaves it alone; no reference to anything outside
-of it; and a title and a description in words. The same input gives the same bytes.
+Each function returns one `<svg>` element for an HTML page. Instead of colours it has
+classes (`f-` for fills, `s-` for strokes, such as `s-accent`), so that one figure works
+in light mode, dark mode and print. It has no `style` attributes, which a strict content
+security policy would block, and no external references. It contains a title and a
+description in words. The same input gives the same bytes.
 """
 
 from __future__ import annotations
@@ -25,35 +25,34 @@ from .page_text import counted, decimals_for, interval_text, number
 _Floats: TypeAlias = NDArray[np.float64]
 _Ticks: TypeAlias = Sequence[tuple[float, str]]
 
-# The classes that tell lines apart, each with a dash pattern of its own as well.
+# The number of classes that distinguish lines. Each also has its own dash pattern.
 SERIES: Final = 6
 
-# Width and height in SVG's units, which are CSS pixels where there is room: a phone's.
+# Width and height in SVG units (CSS pixels if there is room); small enough for a phone.
 _SMALL: Final = (340, 210)
 _WIDE: Final = (520, 260)
 _TOP: Final = 24
 _BELOW: Final = 38
 
-# More are neither seen apart nor laid out quickly.
+# More could not be told apart, and would be slow to lay out.
 _MOST_DOTS: Final = 600
 _MOST_POINTS: Final = 160
 _MOST_COLUMNS: Final = 40
-# Of a longer window this many episodes are used, evenly spread.
+# From a longer window, only this many episodes are used, evenly spaced.
 _WIDEST_WINDOW: Final = 1000
 _LARGEST: Final = 1e300
 _SMALLEST: Final = 1e-300
 
 
 def learning_curve(task: ReportTask, *, key: str) -> str:
-    """Return a figure of returns over episodes: a running mean and how they spread.
+    """Return a figure of returns over episodes: the running mean and the spread.
 
-    Episodes are in the order in which they ended, where that is known of all, else in
-    the order of the task; the first is 0, as in all that counts episodes. Where they
-    are few, each has a dot.
+    Episodes are in the order in which they ended, if that is known for all, otherwise
+    in the order of the task. They are numbered from 0. If they are few, each has a dot.
 
     Args:
-        task: episodes of monitors, such as those of a training.
-        key: makes the ids of this figure's elements unique on the page.
+        task: a task with episodes of monitors, such as a training run.
+        key: a prefix that makes the figure's element ids unique on the page.
     """
     _, returns, times = _drawable(task)
     if np.isfinite(times).all():
@@ -61,7 +60,7 @@ def learning_curve(task: ReportTask, *, key: str) -> str:
     count, window = len(returns), max(5, len(returns) // 20)
     middle, low, mean, high = _running(returns, window)
     has_dots = count <= _MOST_DOTS
-    # What is not drawn needs no room.
+    # The axis need not fit dots that are not drawn.
     y = _span(returns if has_dots else np.append(low, high))
     panel = _Panel(46, _SMALL[0] - 14, x=_span([0, count - 1], margin=0.01), y=y)
     if has_dots:
@@ -73,22 +72,22 @@ def learning_curve(task: ReportTask, *, key: str) -> str:
     return _svg(
         panel.elements,
         title=f"Returns of {task.name} over episodes",
-        description=f"{_in_words(task.summary)} Mean of {window} episodes in a row, "
-        "and the range of the middle 80 % of them.",
+        description=f"{_in_words(task.summary)} Running mean over {window} episodes, "
+        "and the range of the middle 80 %.",
         key=key,
     )
 
 
 def evaluation_curve(task: ReportTask, *, key: str) -> str:
-    """Return a figure of an evaluation's returns: by seed, and which share is how high.
+    """Return a figure of an evaluation's returns, by seed and by share reached.
 
-    On the left each episode is a dot over its seed, each seed's mean a short line, and
-    the mean of all a long one with its interval. On the right stands, for each return,
-    the share of episodes that reach it.
+    On the left, each episode is a dot above its seed, each seed's mean is a short line,
+    and the overall mean is a long line with its interval. On the right is, for each
+    return, the share of episodes that reach it.
 
     Args:
-        task: of an evaluation.
-        key: makes the ids of this figure's elements unique on the page.
+        task: a task of an evaluation.
+        key: a prefix that makes the figure's element ids unique on the page.
     """
     runs, returns, _ = _drawable(task)
     seeds, place = np.unique(runs, return_inverse=True)
@@ -110,7 +109,7 @@ def evaluation_curve(task: ReportTask, *, key: str) -> str:
     named = _spread(len(seeds), 6 if longest < 4 else 2)
     dots.label("Return", "Seed", [(i, str(seeds[i])) for i in named])
     shares = _Panel(228, 318, x=(0, 1), y=reach, y_labels=False)
-    # The corners of steps: shares of the episodes, and what they reach.
+    # The corners of a step curve: shares of the episodes, and the returns they reach.
     heights = np.sort(returns)[::-1][_spread(len(returns), _MOST_POINTS)]
     edges = np.linspace(0, 1, len(heights) + 1)
     shares.line(np.repeat(edges, 2)[1:-1], np.repeat(heights, 2), "accent")
@@ -124,15 +123,15 @@ def evaluation_curve(task: ReportTask, *, key: str) -> str:
 
 
 def profile_curve(across: Mapping[str, AcrossTasks], *, key: str) -> str:
-    """Return a figure of performance profiles, one line with its band for each.
+    """Return a figure of performance profiles, each a line with a band.
 
-    The share of scores above a threshold, over the threshold. Line i has the class
-    `s-series-<i>`, counted modulo `SERIES`; the page says which is which.
+    A profile is the share of scores above a threshold, as a function of the threshold.
+    Line i has the class `s-series-<i>`, modulo `SERIES`; the page has the legend.
 
     Args:
-        across: what is said of evaluations over all tasks; those without a profile are
-            left out, and count for i.
-        key: makes the ids of this figure's elements unique on the page.
+        across: the statistics across tasks of each evaluation. Those without a profile
+            are not drawn, but still counted in i.
+        key: a prefix that makes the figure's element ids unique on the page.
     """
     profiles = [each.profile for each in across.values()]
     x = _span([x for p in profiles if p for x in p.thresholds] or [0, 1], margin=0)
@@ -155,13 +154,13 @@ def profile_curve(across: Mapping[str, AcrossTasks], *, key: str) -> str:
     )
 
 
-# --- What is drawn ----------------------------------------------------------------
+# --- Data -------------------------------------------------------------------------
 
 
 def _drawable(task: ReportTask) -> tuple[NDArray[np.int64], _Floats, _Floats]:
-    """Return runs, returns and times of end where the return is a number.
+    """Return the runs, returns and end times of episodes with a finite return.
 
-    Returns are cut so that their sums are numbers, too.
+    Returns are clipped so that their sums are finite, too.
     """
     known = task.episodes[np.isfinite(task.episodes["total_reward"])]
     returns = np.clip(known["total_reward"], -_LARGEST, _LARGEST)
@@ -171,7 +170,7 @@ def _drawable(task: ReportTask) -> tuple[NDArray[np.int64], _Floats, _Floats]:
 def _running(
     returns: _Floats, window: int
 ) -> tuple[_Floats, _Floats, _Floats, _Floats]:
-    """Return episodes' numbers, and the 10 %, the mean and the 90 % around them."""
+    """Return the centres of running windows, and their 10 %, mean and 90 % values."""
     count = max(0, len(returns) - window + 1)
     if not count:
         return (np.empty(0),) * 4
@@ -179,20 +178,20 @@ def _running(
     inside = _spread(window, _WIDEST_WINDOW)
     windows = returns[starts[:, None] + inside[None, :]]
     low, high = np.quantile(windows, (0.1, 0.9), axis=1)
-    # The last window ends with the last episode.
+    # The last window ends at the last episode.
     middle = starts.astype(np.float64) + (window - 1) / 2
     return middle, low, windows.mean(axis=1), high
 
 
 def _spread(count: int, most: int) -> NDArray[np.intp]:
-    """Return up to `most` of `count` indices, the first and the last among them."""
+    """Return up to `most` of `count` indices, including the first and the last."""
     return np.linspace(0, count - 1, min(count, most)).round().astype(np.intp)
 
 
 def _draw_seeds(
     panel: _Panel, returns: _Floats, place: NDArray[np.intp], seeds: int
 ) -> None:
-    """Draw episodes from left to right in their seed's column, and its mean."""
+    """Draw each seed's episodes from left to right in its column, and their mean."""
     for seed in range(seeds):
         of_seed = returns[place == seed]
         chosen = _spread(len(of_seed), max(20, _MOST_DOTS // seeds))
@@ -201,7 +200,7 @@ def _draw_seeds(
         panel.line([seed - 0.34, seed + 0.34], [of_seed.mean()] * 2, "ink", width=1.5)
 
 
-# --- What is said -----------------------------------------------------------------
+# --- Descriptions -----------------------------------------------------------------
 
 
 def _in_words(summary: TaskSummary) -> str:
@@ -224,27 +223,27 @@ def _scores_in_words(name: str, across: AcrossTasks) -> str:
 
 
 def _short(value: float) -> str:
-    """Return a number as short as a label needs it: 12k for 12000."""
+    """Return a number as a short label, such as 12k for 12000."""
     for least, size, letter in ((1e9, 1e9, "G"), (1e6, 1e6, "M"), (1e4, 1e3, "k")):
         if abs(value) >= least:
             return f"{value / size:g}{letter}"
     return f"{value:g}"
 
 
-# --- How it is drawn --------------------------------------------------------------
+# --- Drawing ----------------------------------------------------------------------
 
 
 class _Panel:
-    """A part of a figure with scales of its own, and lines at the ticks of y.
+    """A part of a figure with its own scales, and grid lines at the ticks of y.
 
     Args:
-        left: edge of the panel, in pixels from the figure's left.
-        right: likewise.
-        height: of the figure.
-        x: from where to where its scale goes.
-        y: likewise.
-        ticks: of y, with what they are called.
-        y_labels: whether that is written.
+        left: the panel's left edge, in pixels from the figure's left edge.
+        right: the panel's right edge, in pixels from the figure's left edge.
+        height: the figure's height in pixels.
+        x: the range of the x axis.
+        y: the range of the y axis.
+        ticks: the ticks of y with their labels; by default chosen automatically.
+        y_labels: whether the labels of y are written.
     """
 
     def __init__(
@@ -268,7 +267,13 @@ class _Panel:
             self._text(left - 7, pixel + 4, label if y_labels else "", anchor="end")
 
     def label(self, up: str, right: str, ticks: _Ticks) -> None:
-        """Write what is below the panel, and above it what goes up."""
+        """Write the labels of the axes, and the ticks of x.
+
+        Args:
+            up: the label of y, above the panel.
+            right: the label of x, below the panel.
+            ticks: the ticks of x with their labels.
+        """
         for value, label in ticks:
             ((x, _),) = self._pixels([value], [self._y[0]])
             self._text(x, self._bottom + 16, label)
@@ -278,12 +283,12 @@ class _Panel:
     def line(
         self, x: ArrayLike, y: ArrayLike, role: str, *, width: float = 2, dash: int = 0
     ) -> None:
-        """Draw a line through points, with the page's dash pattern of that number."""
+        """Draw a line through points, with the page's dash pattern number `dash`."""
         look = f'stroke-width="{width}" stroke-linejoin="round"'
         self._path(_joined(self._pixels(x, y)), f"s-{role} dash-{dash}", look)
 
     def dots(self, x: ArrayLike, y: ArrayLike, *, opacity: float) -> None:
-        """Draw dots: lines of no length with round ends, all in one element."""
+        """Draw dots, as lines of zero length with round ends, all in one element."""
         data = "".join(f"M{x:g} {y:g}h0" for x, y in self._pixels(x, y))
         look = f'stroke-width="5" stroke-linecap="round" opacity="{opacity}"'
         self._path(data, "s-accent", look)
@@ -296,7 +301,7 @@ class _Panel:
         role: str,
         opacity: float = 0.18,
     ) -> None:
-        """Fill what lies between two lines."""
+        """Fill the area between two lines."""
         outline = [*self._pixels(x, low), *self._pixels(x, high)[::-1]]
         self._path(_joined(outline), f"f-{role}", f'opacity="{opacity}"')
 
@@ -316,13 +321,13 @@ class _Panel:
         size = np.array([self._right, _TOP]) - corner
         share = (np.column_stack((x, y)) - low) / (high - low)
         pixels = corner + np.clip(share, -0.01, 1.01) * size
-        # No zero has a sign.
+        # Adding 0.0 removes the sign of negative zeros.
         found: list[list[float]] = (pixels.round(2) + 0.0).tolist()
         return found
 
 
 def _joined(points: Sequence[Sequence[float]]) -> str:
-    """Return the data of a path through points; nothing for none."""
+    """Return the data of a path through points; empty if there are none."""
     joined = "L".join(f"{x:g} {y:g}" for x, y in points)
     return f"M{joined}" if joined else ""
 
@@ -345,7 +350,7 @@ def _svg(
 
 
 def _span(values: ArrayLike, *, margin: float = 0.06) -> tuple[float, float]:
-    """Return from where to where an axis goes that shows all values."""
+    """Return the range of an axis that shows all values."""
     values = np.clip(np.asarray(values, np.float64), -_LARGEST, _LARGEST)
     if not values.size:
         return 0.0, 1.0
@@ -357,7 +362,7 @@ def _span(values: ArrayLike, *, margin: float = 0.06) -> tuple[float, float]:
 
 
 def _ticks(span: tuple[float, float]) -> list[float]:
-    """Return a few round values inside of a span."""
+    """Return a few round values within a span."""
     low, high = span
     step = (high - low) / 5
     size = 10.0 ** math.floor(math.log10(step))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Episodes as rows of numbers: of monitors, as they are read, and of evaluations."""
+"""Episodes as rows of numbers, from monitors and from evaluations."""
 
 from __future__ import annotations
 
@@ -17,25 +17,25 @@ from .contents import EPISODE, FAILED, TERMINATED, TRUNCATED
 
 ROLES: Final = ("best", "median", "worst")
 
-# The end of 1979. Gym 0.21 and 0.22 counted from some moment of their own.
+# The end of 1979. gym 0.21 and 0.22 counted seconds from an arbitrary moment.
 _EARLIEST: Final = 315_532_800.0
 
 
 def rows_of_monitor(
     episodes: Iterable[Episode], *, run: int, wanted: Container[int | None]
 ) -> tuple[NDArray[np.void], dict[int, int]]:
-    """Return the episodes of a monitor as they are read, and where some of them are.
+    """Return a monitor's episodes as rows, and the row indices of some of them.
 
     Args:
-        episodes: read one after the other, and not kept.
-        run: the monitor, as a number.
-        wanted: the numbers of the episodes whose place is to be known.
+        episodes: the episodes, which are read one at a time and not kept.
+        run: the monitor's index.
+        wanted: numbers of the episodes whose indices are returned.
     """
     places: dict[int, int] = {}
 
     def row(index: int, episode: Episode) -> tuple[float | None, ...]:
         number = episode.episode_id
-        # One whose number is not certain has none of these, and gets no video.
+        # An episode whose number is uncertain has no files, and gets no video.
         files = episode.video or episode.metadata or episode.trajectory
         if files and number in wanted:
             places[number] = index
@@ -50,9 +50,9 @@ def rows_of_monitor(
 
 
 def in_time(rows: NDArray[np.void]) -> tuple[NDArray[np.void], NDArray[np.intp]]:
-    """Return episodes in the order of their ends, and where each has come.
+    """Return episodes in the order in which they ended, and the new index of each.
 
-    Episodes that ended at the same time stay in their order; those without a time come
+    Episodes that ended at the same time keep their order. Those without a time come
     last.
     """
     order = np.argsort(rows["end_time"], kind="stable")
@@ -64,7 +64,7 @@ def in_time(rows: NDArray[np.void]) -> tuple[NDArray[np.void], NDArray[np.intp]]
 
 
 def rows_of_results(results: TaskResults) -> NDArray[np.void]:
-    """Return the episodes of one task of an evaluation, in the order of its plan."""
+    """Return the episodes of one task of an evaluation as rows, in the plan's order."""
     given, rows = results.rows, np.empty(len(results), EPISODE)
     rows["run"] = given["seed"]
     for name in ("episode", "total_reward", "length", "success"):
@@ -79,12 +79,12 @@ def rows_of_results(results: TaskResults) -> NDArray[np.void]:
 def summary_of_rows(
     name: str, rows: NDArray[np.void], *, bootstrap: Bootstrap
 ) -> TaskSummary:
-    """Return what is said of the episodes of monitors, none of which failed.
+    """Return the summary of the episodes of monitors, none of which failed.
 
     Args:
-        name: of the environment.
+        name: the environment's name.
         rows: the episodes.
-        bootstrap: how intervals are made.
+        bootstrap: settings for the intervals.
     """
     success = rows["success"]
     return summarize_task(
@@ -101,10 +101,10 @@ def summary_of_rows(
 
 
 def episodes_with_roles(rows: NDArray[np.void]) -> dict[int, tuple[str, ...]]:
-    """Return which episode is the best, the median, and the worst, by index.
+    """Return the roles of the best, the median and the worst episode, by index.
 
-    Of equal returns the earlier one counts; the median of an even number is the lower
-    one; a return that is not a number is the worst. Failed episodes are none of them.
+    Among equal returns, the first episode counts. The median of an even number is the
+    lower one. NaN is the worst return. Failed episodes have no role.
     """
     completed = np.flatnonzero(rows["outcome"] != FAILED)
     if not len(completed):
@@ -112,7 +112,7 @@ def episodes_with_roles(rows: NDArray[np.void]) -> dict[int, tuple[str, ...]]:
     returns = rows["total_reward"][completed]
     is_number = ~np.isnan(returns)
     values = np.where(is_number, returns, 0.0)
-    # What is no number comes first of all.
+    # NaNs come first.
     ordered = np.lexsort((values, is_number))
     middle = ordered[(len(ordered) - 1) // 2]
     roles: dict[int, tuple[str, ...]] = {}

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Film strips for papers: some frames of an episode, each with its time.
+"""Film strips for papers: frames of an episode, each with its time.
 
-Frames come from a video, or, sharper and of any size, from a recorded trajectory,
-which is drawn again. Pillow writes the times; it is an extra and is imported when a
-strip is made.
+Frames come from a video, or from a recorded trajectory, which is rendered again and
+gives sharper frames of any size. Pillow, an optional package, writes the times. It is
+imported only when a strip is made.
 """
 
 from __future__ import annotations
@@ -40,16 +40,16 @@ _TRAJECTORY: Final = ".h5"
 _SIZE: Final = ("height", "width")
 _MOST_IN_A_ROW: Final = 8
 _DOTS_PER_INCH: Final = 300
-# Pixels of a whole strip; Pillow calls twice as many an attack.
+# Pixels of a whole strip. At twice as many, Pillow suspects an attack.
 _MOST_PIXELS: Final = 1 << 27
 
 _INK: Final = (32, 32, 32)
-# Of the smaller side of a frame.
+# As fractions of a frame's smaller side.
 _GAP: Final = 0.03
 _LETTERS: Final = 0.09
 _SMALLEST_LETTERS: Final = 9
 _LARGEST_LETTERS: Final = 96
-# Of the letters' size.
+# As a fraction of the letters' size.
 _LINE: Final = 1.25
 
 
@@ -65,28 +65,28 @@ def film_strip(
 ) -> Frame:
     """Return frames of an episode side by side on white, with their times.
 
-    They are evenly spread, first and last included. Times are simulated seconds since
-    the reset, if known, else the video's own.
+    Frames are evenly spaced, including the first and the last. Times are simulated
+    seconds since the reset if known, otherwise the video's own times.
 
     Args:
-        file: a trajectory (`.h5`), which is rendered; or a video, which is decoded.
-        frames: how many frames.
-        columns: frames per row. None is up to eight, else equal rows.
-        camera: of a trajectory, as in `mjrec.render`.
-        height: of each frame, likewise.
-        width: likewise.
-        quality: likewise.
+        file: a trajectory (`.h5`), which is rendered, or a video, which is decoded.
+        frames: number of frames.
+        columns: frames per row. None means up to eight, or several equal rows.
+        camera: see `mjrec.render` (trajectories only).
+        height: height of each frame in pixels (trajectories only).
+        width: width of each frame in pixels (trajectories only).
+        quality: `"full"` or `"draft"` (trajectories only).
 
     Returns:
         `(height, width, 3) uint8`.
 
     Raises:
-        InvalidArgument: there are not enough frames; or a camera, size or quality was
-            given for a video.
-        UnreadableFile: it is neither a video nor a trajectory, or is damaged.
+        InvalidArgument: there are not enough frames, an argument is invalid, or a
+            camera, size or quality was given for a video.
+        UnreadableFile: the file is neither a video nor a trajectory, or is damaged.
         MissingDependency: Pillow is not installed.
         EncoderError: the video cannot be decoded.
-        NoPictures, UntrustedModel, GLError: as `mjrec.render`.
+        NoPictures, UntrustedModel, GLError: see `mjrec.render`.
     """
     path = Path(file)
     _check_count("frames", frames)
@@ -96,8 +96,8 @@ def film_strip(
     if path.suffix != _TRAJECTORY:
         if any(option is not None for option in (camera, height, width, quality)):
             raise InvalidArgument(
-                f"{path} is shown as it is. Another camera, size or quality can be "
-                "drawn from its trajectory: name that file "
+                f"{path} is a video, so camera, size and quality cannot be changed. To "
+                "change them, give the trajectory instead "
                 "(openaigym.trajectory.*.h5)."
             )
         return _laid_out(*_of_video(path, frames), columns or _usual_columns(frames))
@@ -113,16 +113,16 @@ def film_strip(
 
 
 def write_film_strip(path: str | os.PathLike[str], strip: Frame) -> None:
-    """Write a film strip as PNG, of 300 dots per inch.
+    """Write a film strip as a PNG file with 300 dots per inch.
 
     Raises:
         InvalidArgument: the name does not end in `.png`.
-        FileNotWritten: the disk is full, or there is no such directory.
+        FileNotWritten: the disk is full, or the directory does not exist.
     """
     path = Path(path)
     if path.suffix.lower() != ".png":
         raise InvalidArgument(
-            f"A film strip is a PNG, and {path} is called otherwise: name it "
+            f"A film strip is a PNG file, but {path} does not end in .png. Name it "
             f"{path.with_suffix('.png')}."
         )
     dpi = (_DOTS_PER_INCH, _DOTS_PER_INCH)
@@ -136,7 +136,7 @@ def write_film_strip(path: str | os.PathLike[str], strip: Frame) -> None:
 
 
 def _of_video(path: Path, count: int) -> tuple[Iterator[Frame], Sequence[float]]:
-    """Return frames of a video, decoded when they are asked for, and their times."""
+    """Return frames of a video, which are decoded lazily, and their times."""
     if video_kind(path) is None:
         raise UnreadableFile(
             path, "it is neither a video (mp4, avi, mkv) nor a trajectory (.h5)"
@@ -147,7 +147,7 @@ def _of_video(path: Path, count: int) -> tuple[Iterator[Frame], Sequence[float]]
     height, width = stream.height, stream.width
     try:
         metadata = read_object(metadata_path(path))
-        # Of the frames before a row was added to make them even.
+        # The size before the encoder's padding to even numbers.
         own_height, own_width = (field(metadata, key, integer) for key in _SIZE)
         simulated = _simulated_times(metadata)
     except (OSError, ValueError):
@@ -161,7 +161,7 @@ def _of_video(path: Path, count: int) -> tuple[Iterator[Frame], Sequence[float]]
 
 
 def _simulated_times(metadata: Any) -> Sequence[float]:
-    """Return the simulated time of each frame; none where that is not said."""
+    """Return the simulated time of each frame; empty if the metadata has none."""
     if metadata.get("timestep") is None or metadata.get("first_step") is not None:
         return []
     timestep: Fraction = field(metadata, "timestep", rate)
@@ -173,20 +173,20 @@ def _simulated_times(metadata: Any) -> Sequence[float]:
     steps = itertools.chain.from_iterable(
         range(first, last + 1, stride) for first, last in runs
     )
-    # Never more than there are, whatever the runs say.
+    # Limited to the number of frames, whatever the runs claim.
     known = list(itertools.islice(steps, count + 1))
     return [float(step * timestep) for step in known] if len(known) == count else []
 
 
 def _spread(available: int, count: int, path: Path) -> list[int]:
-    """Return the numbers of frames spread evenly, the first and the last included.
+    """Return evenly spaced frame numbers, including the first and the last.
 
     Raises:
-        InvalidArgument: the episode has fewer.
+        InvalidArgument: the episode has fewer frames.
     """
     if count > available:
         raise InvalidArgument(
-            f"{path} has only {available} frames, not {count}: ask for at most "
+            f"{path} has only {available} frames, not {count}. Request at most "
             f"{available} (frames, --frames)."
         )
     return [int(index) for index in np.linspace(0, available - 1, count).round()]
@@ -208,8 +208,8 @@ def _check_count(name: str, count: object) -> None:
 def _laid_out(
     frames: Iterator[Frame], times: Sequence[float | None], columns: int
 ) -> Frame:
-    """Return frames in rows on white paper, the time of each under it."""
-    # Here, because it is an extra.
+    """Return an image of frames in rows on white, each with its time below."""
+    # Imported here, because Pillow is optional.
     from PIL import Image, ImageDraw, ImageFont
 
     first = next(frames)
@@ -228,7 +228,7 @@ def _laid_out(
     size = gap + columns * (width + gap), gap + rows * (height + below + gap)
     if size[0] * size[1] > _MOST_PIXELS:
         raise InvalidArgument(
-            f"The strip would have {size[0]}x{size[1]} pixels. Ask for fewer or "
+            f"The strip would have {size[0]}x{size[1]} pixels. Request fewer or "
             "smaller frames (frames, size)."
         )
     paper = Image.new("RGB", size, "white")
@@ -244,7 +244,7 @@ def _laid_out(
 
 
 def _labels(seconds: Sequence[float | None]) -> list[str]:
-    """Return the times as text, with as many digits as tell them apart."""
+    """Return the times as strings, with enough digits to tell them apart."""
     known = [time for time in seconds if time is not None]
     steps = [b - a for a, b in itertools.pairwise(known) if b > a]
     digits = 2

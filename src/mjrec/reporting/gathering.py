@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""All that a report shows, gathered from directories with recordings.
+"""Gathering the contents of a report from directories with recordings.
 
-Nothing of it needs a simulator, OpenGL or ffmpeg. A file that cannot be read is named
-among the problems, and the rest is shown.
+This needs no simulator, OpenGL or ffmpeg. Unreadable files are listed among the
+problems, and the rest is shown.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ _UNKNOWN_ENVIRONMENT: Final = "unknown environment"
 _LONGEST_NAME: Final = 1000
 _NO_MONITOR: Final = -2
 
-# Where a verdict is looked for, in each directory with recordings.
+# The file of a verdict, in a directory with recordings.
 _VERIFICATION_NAME: Final = "verification.json"
 _VERDICTS: Final = ("PASS", "PARTLY", "FAIL")
 _OUTCOMES: Final = ("made again", "within tolerance", "believed", "different")
@@ -73,18 +73,18 @@ def gather(
     title: str | None = None,
     verifications: Iterable[str | os.PathLike[str]] = (),
 ) -> ReportContents:
-    """Return all of a report, whose videos have no files in it yet.
+    """Return the contents of a report, without copies of the videos.
 
     Args:
-        directories: of evaluations, of monitors, or folders with such directories in
-            them (not deeper); one, or several.
-        title: of the page; a sentence about what was recorded, if None.
-        verifications: files that `mjrec verify --json` has printed, besides the
+        directories: one or several evaluations, monitor directories, or folders that
+            directly contain such directories.
+        title: the page's title. None derives it from the recordings.
+        verifications: outputs of `mjrec verify --json`, in addition to the
             `verification.json` of each directory.
 
     Raises:
-        InvalidArgument: a directory has no recordings, or is not there.
-        UnreadableFile: one of `verifications`.
+        InvalidArgument: a directory has no recordings, or does not exist.
+        UnreadableFile: a file in `verifications` cannot be read.
     """
     given = [_read_verdict(Path(path)) for path in verifications]
     found = _find_recordings(directories)
@@ -110,7 +110,7 @@ def gather(
 
 
 def _find_recordings(directories: Directories) -> list[Path]:
-    """Return the directories that have recordings, each once, in their order."""
+    """Return the directories that have recordings, each once, in the given order."""
     if isinstance(directories, str | os.PathLike):
         directories = [directories]
     found: dict[str, Path] = {}
@@ -119,35 +119,35 @@ def _find_recordings(directories: Directories) -> list[Path]:
             found.setdefault(os.path.realpath(each), each)
     if not found:
         raise InvalidArgument(
-            "A report needs at least one directory with recordings: that of `mjrec "
-            "evaluate` or `mjrec record`, or one that a Monitor wrote into."
+            "A report needs at least one directory with recordings: the output of "
+            "`mjrec evaluate` or `mjrec record`, or a Monitor's directory."
         )
     return [*found.values()]
 
 
 def _recordings_in(directory: Path) -> list[Path]:
-    """Return a directory that has recordings, or those directly in it that have."""
+    """Return the directory if it has recordings, otherwise its folders that have."""
     if not directory.is_dir():
-        what = "is a file" if directory.exists() else "is not there"
+        what = "is a file" if directory.exists() else "does not exist"
         raise InvalidArgument(
-            f"{directory} {what}. Name the directory that `mjrec evaluate` or `mjrec "
-            "record` wrote into (--out), or that a Monitor did."
+            f"{directory} {what}. Name the directory that `mjrec evaluate`, `mjrec "
+            "record` (--out) or a Monitor wrote to."
         )
     try:
-        # A link may lead anywhere, also to what is in the folder itself.
+        # Links are skipped: they may lead anywhere, even back into the folder.
         inside = (each for each in sorted(directory.iterdir()) if _is_folder(each))
         has_own = _has_recordings(directory)
         found = [directory] if has_own else [*filter(_has_recordings, inside)]
     except OSError as error:
         raise InvalidArgument(
-            f"{directory} cannot be looked into: {error.strerror}. Name one that this "
-            "user may read."
+            f"{directory} cannot be read: {error.strerror}. Name a directory that you "
+            "have permission to read."
         ) from error
     if not found:
         raise InvalidArgument(
-            f"{directory} holds no recordings, and neither do the folders directly in "
-            f"it. `mjrec record ENV --out {shlex.quote(str(directory))}` makes some; "
-            "`mjrec evaluate` makes some of many episodes."
+            f"{directory} contains no recordings, and neither do the folders directly "
+            f"in it. To record an episode, run `mjrec record ENV --out "
+            f"{shlex.quote(str(directory))}`; for many episodes, `mjrec evaluate`."
         )
     return found
 
@@ -169,7 +169,7 @@ def _has_episodes(files: MonitorFiles) -> bool:
 
 @dataclass
 class _Recorded:
-    """What monitors recorded of one environment, of whose files little is kept."""
+    """The recordings of one environment by all monitors, in compact form."""
 
     provenance: Provenance = field(default_factory=Provenance)
     videos: list[ReportVideo] = field(default_factory=list)
@@ -180,12 +180,12 @@ class _Recorded:
 def _add_monitors(
     contents: ReportContents, directory: Path, places: Iterable[Path]
 ) -> None:
-    """Add what monitors recorded: a task for each environment.
+    """Add the recordings of monitors, with one task for each environment.
 
     Args:
-        contents: to add to.
-        directory: that the page names.
-        places: where the monitors' files are.
+        contents: the contents to extend.
+        directory: the directory that the page names.
+        places: the directories of the monitors' files.
     """
     by_name: dict[str, _Recorded] = {}
     for place, monitor in _monitors(contents, places):
@@ -193,7 +193,7 @@ def _add_monitors(
         known = name[:_LONGEST_NAME] if isinstance(name, str) else ""
         recorded = by_name.setdefault(known or _UNKNOWN_ENVIRONMENT, _Recorded())
         _add_monitor(contents, recorded, monitor, place)
-    # Files that nothing can be read from are of no environment.
+    # Monitors of which nothing could be read are not an environment.
     unknown = by_name.get(_UNKNOWN_ENVIRONMENT)
     if unknown and not unknown.videos and not any(map(len, unknown.rows)):
         del by_name[_UNKNOWN_ENVIRONMENT]
@@ -218,27 +218,27 @@ def _add_monitors(
         )
     if len(by_name) > 1:
         contents.problems.append(
-            f"{directory} holds recordings of {len(by_name)} environments, "
-            f"{', '.join(by_name)}: each is shown by itself."
+            f"{directory} contains recordings of {len(by_name)} environments, "
+            f"{', '.join(by_name)}. Each is shown separately."
         )
 
 
 def _monitors(
     contents: ReportContents, places: Iterable[Path]
 ) -> Iterator[tuple[Path, MonitorResults]]:
-    """Yield the monitors of directories; the caller keeps none of them.
+    """Yield the monitors of directories, with the directory of each.
 
-    A page shows little of what a manifest says about the machine.
+    Callers should not keep them: a manifest contains much more than a page shows.
     """
     for place in places:
         try:
             found = monitors_of(place)
         except OSError as error:
-            problem = f"{place} cannot be looked into: {error.strerror}."
+            problem = f"{place} cannot be read: {error.strerror}."
             contents.problems.append(problem)
             continue
         for files in found:
-            # There may be no more of it than its lock.
+            # A monitor may have left nothing but its lock.
             if _has_episodes(files) or files.trajectories:
                 yield place, MonitorResults(files)
 
@@ -271,20 +271,20 @@ def _readable_episodes(
             yield episode
             read += 1
     except UnreadableFile as error:
-        kept = f" {read} episodes before that are shown." if read else ""
+        kept = f" The {read} episodes before it are shown." if read else ""
         contents.problems.append(f"{error}{kept}")
 
 
 def _renderers(videos: Iterable[ReportVideo]) -> list[tuple[str, str]]:
-    return [("OpenGL of the videos", video.renderer or "") for video in videos]
+    return [("OpenGL renderer", video.renderer or "") for video in videos]
 
 
 def _in_order(
     videos: Iterable[ReportVideo], rows: NDArray[np.void]
 ) -> list[ReportVideo]:
-    """Return videos in the order of their episodes, with the roles of these."""
+    """Return videos in the order of their episodes, and set their roles."""
     roles = episodes_with_roles(rows)
-    # Sorting keeps the order of views.
+    # Sorting is stable, so the order of cameras stays.
     ordered = sorted(videos, key=lambda video: (video.index is None, video.index or 0))
     for video in ordered:
         if video.index is not None:
@@ -297,10 +297,10 @@ def _in_order(
 
 def _add_evaluation(contents: ReportContents, directory: Path) -> None:
     try:
-        # Without times nothing tells which episode a video shows.
+        # Without the timing file, a video's episode is unknown.
         results = read_results(directory, needs_timing=True)
     except UnreadableFile as error:
-        problem = f"{error} What its monitors recorded is shown instead."
+        problem = f"{error} The recordings of its monitors are shown instead."
         contents.problems.append(problem)
         for folder in filter(_is_folder, sorted(directory.iterdir())):
             _add_monitors(contents, folder, _places_of_task(folder))
@@ -310,8 +310,8 @@ def _add_evaluation(contents: ReportContents, directory: Path) -> None:
     elif results.bootstrap != contents.bootstrap:
         how = results.bootstrap
         contents.problems.append(
-            f"The intervals of {directory} were made in another way: {how.resamples} "
-            f"resamples with seed {how.seed}, {how.confidence:g}."
+            f"The intervals of {directory} were computed differently: {how.resamples} "
+            f"resamples with seed {how.seed}, confidence {how.confidence:g}."
         )
     if results.across is not None:
         contents.across[str(directory)] = results.across
@@ -342,9 +342,10 @@ def _places_of_task(folder: Path) -> list[Path]:
 def _videos_of_task(
     contents: ReportContents, results: Evaluation, task: str, provenance: Provenance
 ) -> list[ReportVideo]:
-    """Return the videos of a task's episodes, with the places of these.
+    """Return the videos of a task's episodes, with the indices of these.
 
-    Others are of a batch that was begun, killed and done again.
+    Videos without an episode are left out: they come from a batch that was killed and
+    repeated.
     """
     columns, folder = results.by_task[task], results.folder(task)
     videos: list[ReportVideo] = []
@@ -362,13 +363,13 @@ def _videos_of_task(
     missing = len(columns.videos.keys() - {video.index for video in shown})
     if missing:
         contents.problems.append(
-            f"{missing} of {len(columns.videos)} videos of {task} are not there. Where "
-            f"they are pending, `mjrec render {shlex.quote(str(folder))}` makes them."
+            f"{missing} of {len(columns.videos)} videos of {task} are missing. If they "
+            f"are pending, run `mjrec render {shlex.quote(str(folder))}`."
         )
     return shown
 
 
-# --- Beside them ------------------------------------------------------------------
+# --- Verdicts and title -----------------------------------------------------------
 
 
 def _add_verdict(contents: ReportContents, directory: Path) -> None:
@@ -381,10 +382,11 @@ def _add_verdict(contents: ReportContents, directory: Path) -> None:
 
 
 def _read_verdict(path: Path) -> Verdict:
-    """Return what a file says that `mjrec verify --json` has printed.
+    """Return the verdict in an output of `mjrec verify --json`.
 
     Raises:
-        UnreadableFile: it is missing, damaged, something else, or contradicts itself.
+        UnreadableFile: the file is missing, damaged, of a different kind, or
+            contradicts itself.
     """
     with unreadable(path):
         verification = read_object(path)
@@ -393,7 +395,7 @@ def _read_verdict(path: Path) -> Verdict:
         outcomes = Counter(json_field(each, "outcome", text) for each in findings)
         if verdict != "FAIL" and outcomes["different"]:
             raise ValueError(
-                f"it says {verdict}, and that {outcomes['different']} items differ"
+                f"it says {verdict}, but also that {outcomes['different']} items differ"
             )
         return Verdict(
             source=f"{json_field(verification, 'path', text)} ({path})",
@@ -412,7 +414,7 @@ def _title(tasks: Iterable[ReportTask], found: Iterable[Path]) -> str:
 
 
 class _Noting(logging.Handler):
-    """Notes what the readers of files warn of in this thread: what they leave out."""
+    """A log handler that collects this thread's warnings about skipped contents."""
 
     def __init__(self, problems: list[str]) -> None:
         super().__init__(logging.WARNING)

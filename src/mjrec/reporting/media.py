@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The videos of a report, copied beside its page or put into it.
+"""The videos of a report, copied next to its page or embedded in it.
 
-What is copied is a copy and no link: a report is as good without the recordings. Its
-files have names that this module makes, whatever the recorded ones are called.
+Videos are copied, not linked, so that a report does not need the recordings. The copies
+get new names, which do not depend on the recorded ones.
 """
 
 from __future__ import annotations
@@ -45,12 +45,12 @@ _POSTER_QUALITY: Final = 85
 
 @dataclass(frozen=True)
 class ReportProgress:
-    """How far the making of a report is.
+    """The progress of writing a report.
 
     Attributes:
         what: `"posters"`, `"videos"` or `"replays"`.
-        done: how many.
-        total: of how many.
+        done: number of finished items.
+        total: number of items.
     """
 
     what: str
@@ -62,36 +62,37 @@ OnProgress = Callable[[ReportProgress], object]
 
 
 def is_own_name(name: str) -> bool:
-    """Return whether a report's video or poster may be called so."""
+    """Return whether a name has the form of a report's own video, poster or replay."""
     return _OWN_NAME.fullmatch(name) is not None
 
 
 def posters_of(contents: ReportContents, on_progress: OnProgress) -> list[bytes | None]:
-    """Return a JPEG of each video; None for text, and for what cannot be decoded.
+    """Return a JPEG for each video; None for text recordings and broken videos.
 
-    Videos learn how long they play; what cannot be decoded is a problem.
+    Missing durations of videos are filled in. Videos that cannot be decoded are added
+    to the problems.
 
     Args:
-        contents: whose videos have their recorded files.
+        contents: the contents, whose videos still have their recorded files.
         on_progress: called after each poster.
     """
     moving = [video for video in contents.videos if video.path.suffix != _TEXT]
     posters: dict[int, bytes | None] = {}
-    # Each is a short run of ffmpeg, on one CPU.
+    # Each poster is a short run of ffmpeg on one CPU.
     with ThreadPoolExecutor(usable_cpus()) as pool:
         for video, made in zip(moving, pool.map(_poster, moving), strict=True):
             posters[id(video)] = made if isinstance(made, bytes) else None
             if isinstance(made, Error):
-                contents.problems.append(f"There is no frame of a video: {made}")
+                contents.problems.append(f"A video has no poster: {made}")
             on_progress(ReportProgress(POSTERS, len(posters), len(moving)))
     return [posters.get(id(video)) for video in contents.videos]
 
 
 def _poster(video: ReportVideo) -> bytes | Error:
-    """Return the frame in the middle of a video.
+    """Return the middle frame of a video as a JPEG, or the error.
 
-    The first one is often a robot in its initial pose, alike in all videos of a task,
-    and the last one a fall; what happens is in between.
+    The first frame often shows the initial pose, which is the same in all videos of a
+    task, and the last one a fall. The action is in between.
     """
     try:
         stream = read_stream(video.path)
@@ -111,12 +112,12 @@ def copy_videos(
     folder: Path,
     on_progress: OnProgress,
 ) -> None:
-    """Copy videos and posters into a folder, and write their names into the contents.
+    """Copy videos and posters into a folder, and set their names in the contents.
 
     Args:
-        contents: whose videos have their recorded files.
-        posters: of the videos.
-        folder: of the page.
+        contents: the contents, whose videos still have their recorded files.
+        posters: the posters of the videos, in order.
+        folder: the page's folder.
         on_progress: called after each video.
 
     Raises:
@@ -141,18 +142,18 @@ def copy_videos(
 def write_replays(
     contents: ReportContents, folder: Path, on_progress: OnProgress
 ) -> None:
-    """Write a page in 3D of each best, median and worst episode whose states are there.
+    """Write a 3D page of each best, median and worst episode with recorded states.
 
     Args:
-        contents: its videos get the names of their pages.
-        folder: of the report.
+        contents: the contents, whose videos get the names of their pages.
+        folder: the report's folder.
         on_progress: called after each page.
 
     Raises:
         MissingDependency: viser is not installed.
         FileNotWritten: the disk is full.
     """
-    # Here, because it is an extra and needs MuJoCo: reports do without both.
+    # Imported here, because it needs viser and MuJoCo, which other reports do not.
     from ..simulation.trajectories import load_trajectory
     from ..viewing.replay import write_replay
 
@@ -170,7 +171,7 @@ def write_replays(
                 page = f"{REPLAYS}/{stem}.html"
                 write_replay(load_trajectory(path), folder / page)
                 done[path] = page
-            # The videos of further cameras show the same episode.
+            # Videos from several cameras show the same episode.
             video.replay = done[path]
         except (InvalidArgument, UnreadableFile) as error:
             contents.problems.append(f"An episode is not shown in 3D: {error}")
@@ -180,15 +181,16 @@ def write_replays(
 def with_embedded_videos(
     contents: ReportContents, posters: Sequence[bytes | None], *, room: int
 ) -> ReportContents:
-    """Return contents whose videos stand in the page itself, as far as there is room.
+    """Return contents with as many embedded videos as fit.
 
-    All posters come first, then the videos in their order. What is left out is shown
-    by its poster, and says so.
+    All posters come first, then the videos in order. A video that does not fit is shown
+    by its poster, with a note.
 
     Args:
-        contents: whose videos have their recorded files; they stay as they are.
-        posters: of the videos.
-        room: for how many characters, as they stand in the page.
+        contents: the contents, whose videos have their recorded files. They are not
+            changed.
+        posters: the posters of the videos, in order.
+        room: maximum number of characters for all embedded data.
     """
     contents = replace(
         contents,
@@ -218,22 +220,22 @@ def with_embedded_videos(
             room -= len(url)
         else:
             left_out += 1
-            note = f"Not embedded, for its size. It is the file {video.path}."
+            note = f"Not embedded because of its size. Its file is {video.path}."
             video.notes.append(note)
     if left_out:
         contents.problems.append(
             f"{left_out} of {len(contents.videos)} videos are not embedded, because "
-            "this one file would be too large: a report that is a folder has all of "
+            "this file would become too large. A report in a folder contains all of "
             "them."
         )
     return contents
 
 
 def _put(contents: ReportContents, video: ReportVideo, file: str, sha256: str) -> None:
-    """Let a video have its file in the report, with the hash that this has."""
+    """Set a video's file in the report and its hash; report a hash that changed."""
     if video.sha256 not in (None, sha256):
         note = (
-            "This is not the file that its metadata describe: they have the SHA-256 "
+            "This file does not match its metadata, which gives the SHA-256 "
             f"{video.sha256}."
         )
         video.notes.append(note)
@@ -242,7 +244,7 @@ def _put(contents: ReportContents, video: ReportVideo, file: str, sha256: str) -
 
 
 def _copy(source: Path, target: Path) -> str:
-    """Copy a file, and return its sha256."""
+    """Copy a file, and return its SHA-256."""
     digest = hashlib.sha256()
     with contextlib.ExitStack() as stack:
         with unreadable(source):
@@ -268,14 +270,14 @@ def _leave_out(
 
 
 def _ending(path: Path) -> str:
-    """Return the ending of a copy, by what the file is.
+    """Return the suffix for the copy of a file, from its contents.
 
     Raises:
-        UnreadableFile: it is nothing that a report shows, or cannot be read.
+        UnreadableFile: the file cannot be shown in a report, or cannot be read.
     """
     kind = video_kind(path) or (_TEXT if path.suffix == _TEXT else None)
     if kind is None:
-        raise UnreadableFile(path, "it is no video of a kind that is known here")
+        raise UnreadableFile(path, "it is not a video in a supported format")
     return kind
 
 
@@ -285,7 +287,7 @@ def _slug(name: str) -> str:
 
 
 def _length_of_url(size: int) -> int:
-    # Four characters for three bytes.
+    # Base64 has four characters for three bytes.
     return 4 * (size // 3 + 1) + 100
 
 

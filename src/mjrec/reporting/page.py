@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The page of a report: one HTML text that opens from the disk and needs no network.
+"""The HTML page of a report, which opens from disk without a network.
 
-All that it shows may come from files of strangers. It is shown as text: escaped, cut
-where it is long, and invisible characters are spelled out (`page_text`). A content
-security policy with the hashes of the page's own style and script lets nothing else
-run, and nothing be loaded but images and videos from the disk.
+Everything on it may come from untrusted files. It is shown as text: escaped, shortened
+if too long, with invisible characters spelled out. A content security policy with the
+hashes of the page's own style and script prevents anything else from running, and
+allows only images and videos from disk.
 """
 
 from __future__ import annotations
@@ -44,15 +44,15 @@ _LONGEST_NAME: Final = 120
 _LONGEST_REASON: Final = 300
 _LONGEST_COMMAND: Final = 8000
 
-# What a browser opens at once: rows of the table of episodes, which are numbers until
-# they are shown, and players and figures, which are elements of the page.
+# Limits of what a browser opens quickly: rows in the table of episodes, which are only
+# numbers until they are shown, and players and figures, which are elements of the page.
 _MOST_EPISODES: Final = 20_000
 _MOST_PLAYERS: Final = 300
 _MOST_FIGURES: Final = 120
 _MOST_PROBLEMS: Final = 200
 
 _ROLES: Final = ("best", "median", "worst")
-# By the number that an episode has for it: TERMINATED, TRUNCATED, both, FAILED.
+# By the number in `outcome`: none, TERMINATED, TRUNCATED, both, FAILED.
 _OUTCOMES: Final = (
     "",
     "terminated",
@@ -66,14 +66,14 @@ _Pairs = Sequence[tuple[str, str]]
 
 
 def page_of(contents: ReportContents) -> str:
-    """Return the page of a report.
+    """Return the HTML of a report's page.
 
-    The same contents give the same text. Where there are more than 20,000 episodes, the
-    page's table holds those with videos, those that failed, and each task's best and
-    worst, and says where all of them are.
+    The same contents give the same HTML. If there are more than 20,000 episodes, the
+    table contains only those with videos, those that failed, and each task's best and
+    worst, and says where to find the others.
 
     Raises:
-        MissingDependency: there is no Jinja2.
+        MissingDependency: Jinja2 is not installed.
     """
     environment = _environment()
     style, _, _ = environment.loader.get_source(environment, "report.css")
@@ -134,7 +134,7 @@ def _hash(text: str) -> str:
 @cache
 def _environment() -> Any:
     try:
-        # Here, because it is an extra: nothing else of the package needs it.
+        # Imported here, because it is optional: nothing else in mjrec needs it.
         import jinja2
     except ImportError as error:
         raise MissingDependency(
@@ -145,7 +145,7 @@ def _environment() -> Any:
     from markupsafe import Markup, escape
 
     def shown(value: Any) -> Any:
-        """Return what a template shows: texts of strangers as they may stand."""
+        """Return a template's value, with untrusted strings made safe to show."""
         is_text = isinstance(value, str) and not isinstance(value, Markup)
         return spelled_out(value) if is_text else value
 
@@ -159,12 +159,12 @@ def _environment() -> Any:
     )
     environment.filters.update(
         name=lambda text: spelled_out(text, _LONGEST_NAME),
-        # A name that may go on in the next line after each `/`.
+        # A name that may wrap after each `/`.
         broken=lambda text: escape(spelled_out(text, _LONGEST_NAME)).replace(
             "/", Markup("/<wbr>")
         ),
         command=lambda text: escape(spelled_out(text, _LONGEST_COMMAND)),
-        # However long it is: a `data:` URL is all of a video.
+        # Not shortened: a `data:` URL contains a whole video.
         address=lambda path: escape(address(path)),
         number=number,
         interval=interval_text,
@@ -194,7 +194,7 @@ def _subtitle(contents: ReportContents) -> str:
 
 
 def _bar(summary: TaskSummary) -> dict[str, Any] | None:
-    """Return a task's returns on their scale, in percent of it."""
+    """Return a task's returns as percentages of their scale; None without a scale."""
     scale = summary.score_range
     mean, minimum, maximum = summary.mean, summary.minimum, summary.maximum
     if scale is None or not scale[0] < scale[1]:
@@ -216,7 +216,7 @@ def _bar(summary: TaskSummary) -> dict[str, Any] | None:
 
 
 def _method(summary: TaskSummary, how: Bootstrap) -> str | None:
-    """Return how a task's intervals were made; None where there are none."""
+    """Return the method of a task's intervals; None if it has none."""
     if summary.mean_interval is None and summary.iqm_interval is None:
         return None
     return _in_words(summary.interval_method or PERCENTILE_BOOTSTRAP, how)
@@ -232,16 +232,16 @@ def _in_words(method: str | None, how: Bootstrap) -> str | None:
 def _notes(
     tasks: Iterable[ReportTask], methods: Iterable[str | None], usual: str | None
 ) -> dict[str, list[str]]:
-    """Return why figures are missing or made in another way, and for which tasks."""
+    """Return notes about missing or different statistics, each with its tasks."""
     notes: dict[str, list[str]] = {}
     for task, method in zip(tasks, methods, strict=True):
         if count := task.summary.not_finite:
             of = counted(task.summary.episodes, "return")
-            what = "is no finite number" if count == 1 else "are no finite numbers"
-            words = f"No figures of the returns: {number(count, 0)} of {of} {what}"
+            what = "is not finite" if count == 1 else "are not finite"
+            words = f"No figures for the returns: {number(count, 0)} of {of} {what}"
             notes.setdefault(words, []).append(task.name)
         if method not in (None, usual):
-            words = f"Intervals by another method, {method}"
+            words = f"Intervals by a different method, {method}"
             notes.setdefault(words, []).append(task.name)
     return notes
 
@@ -252,7 +252,7 @@ def _notes(
 def _profile(contents: ReportContents) -> str:
     if all(each.profile is None for each in contents.across.values()):
         return ""
-    # Its description is part of a figure: no markup, and nothing unseen.
+    # Names become part of the figure's description: no markup or invisible characters.
     across = {spelled_out(name): each for name, each in contents.across.items()}
     return profile_curve(across, key="profile")
 
@@ -271,7 +271,7 @@ def _figures(tasks: Sequence[ReportTask]) -> Iterator[tuple[str, str]]:
 
 @dataclass(frozen=True)
 class _Card:
-    """A video, and what is to be known of its episode."""
+    """A video in the gallery, with the facts about its episode."""
 
     number: int
     task: int
@@ -286,7 +286,7 @@ class _Card:
 def _cards(contents: ReportContents) -> list[_Card]:
     """Return the cards of the videos that are shown.
 
-    For each task the best comes first, then the median, the worst, and the others.
+    They are ordered by task, then best, median, worst, and all others.
     """
     tasks = [i for i, task in enumerate(contents.tasks) for _ in task.videos]
     videos = list(enumerate(zip(tasks, contents.videos, strict=True)))
@@ -342,7 +342,7 @@ def _card(
 
 
 def _selection(tasks: Iterable[ReportTask]) -> list[str]:
-    """Return the rules by which episodes got a video, as the provenance states them."""
+    """Return the rules that chose the episodes with videos, from the provenance."""
     said = (pair for task in tasks for pair in task.provenance)
     rules = (value for label, value in said if label == SELECTION)
     return list(dict.fromkeys(rules))[:10]
@@ -352,11 +352,11 @@ def _selection(tasks: Iterable[ReportTask]) -> list[str]:
 
 
 def _episodes(contents: ReportContents, shown: set[int]) -> dict[str, Any]:
-    """Return the columns of the episodes that the page can show.
+    """Return the data of the table of episodes, as columns.
 
     Args:
-        contents: all of them.
-        shown: ids of the videos that have a card.
+        contents: the report's contents.
+        shown: the `id()` of each video that has a card.
     """
     places = [
         f"#video-{i}" if id(video) in shown else video.file and address(video.file)
@@ -380,12 +380,12 @@ def _episodes(contents: ReportContents, shown: set[int]) -> dict[str, Any]:
 def _most_telling(
     task: ReportTask, videos: Mapping[int, object], most: int | None
 ) -> NDArray[np.intp]:
-    """Return which episodes have a video or failed, and the best and the worst.
+    """Return the indices of episodes with videos, failed ones, the best and the worst.
 
     Args:
-        task: whose they are.
-        videos: by index, of those that have one.
-        most: how many of each kind; None is all episodes.
+        task: the task.
+        videos: its videos, by the episode's index.
+        most: maximum number of each kind; None means all episodes.
     """
     if most is None:
         return np.arange(len(task.episodes))
@@ -419,8 +419,11 @@ def _columns(
 
 
 def _json_numbers(values: NDArray[np.float64], decimals: int) -> list[float | None]:
-    """Return numbers with two decimals more than are shown, so that they sort well."""
-    # Larger ones have no decimals, and rounding would multiply them.
+    """Return numbers with two more decimals than are shown, so that they sort well.
+
+    NaN and infinite numbers become None.
+    """
+    # Larger numbers have no decimals, and rounding would make them overflow.
     small = np.abs(values) < 1e15
     rounded = np.where(
         small, np.round(np.where(small, values, 0), decimals + 2), values
@@ -429,7 +432,7 @@ def _json_numbers(values: NDArray[np.float64], decimals: int) -> list[float | No
 
 
 def _where_all_are(tasks: Iterable[ReportTask]) -> list[str]:
-    """Return, for each directory, where all of its episodes are to be found."""
+    """Return, for each directory, the file or call that gives all of its episodes."""
     places = (
         f"{task.source.rstrip('/')}/results.csv"
         if task.is_evaluation
@@ -439,11 +442,11 @@ def _where_all_are(tasks: Iterable[ReportTask]) -> list[str]:
     return list(dict.fromkeys(places))[:20]
 
 
-# --- Where it comes from ----------------------------------------------------------
+# --- Provenance -------------------------------------------------------------------
 
 
 def _provenance(tasks: Sequence[ReportTask]) -> tuple[_Pairs, list[tuple[str, _Pairs]]]:
-    """Return what is so for all tasks, and what else is so for some of them."""
+    """Return the pairs that all tasks share, and the other pairs by task."""
     said = [list(task.provenance) for task in tasks]
     everywhere = set.intersection(*map(set, said)) if said else set()
     differing = [

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How recordings came about, as labels and values for people.
+"""The provenance of recordings, as labels and values for people.
 
-What a file does not say is left out; where several monitors say different things, all
-of them are there.
+Facts that are missing in the files are left out. If monitors differ in a fact, all
+values are listed.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ SELECTION: Final = "Selection of videos"
 
 # In the order of the page.
 _LABELS: Final = (
-    *("Environment", "Arguments of the environment", "Monitors", "Policy", "Protocol"),
-    *("Seeds", "Episodes of each seed", "Most steps of an episode", SELECTION),
-    *("Versions", "OpenGL of the videos", "Recorded on", "Recorded"),
+    *("Environment", "Environment arguments", "Monitors", "Policy", "Protocol"),
+    *("Seeds", "Episodes per seed", "Maximum steps per episode", SELECTION),
+    *("Versions", "OpenGL renderer", "Recorded on", "Recorded"),
 )
-# In this order, by the names of the packages.
+# Package names and how they are shown, in this order.
 _PACKAGES: Final = {
     "mjrec": "mjrec",
     "mujoco": "MuJoCo",
@@ -49,7 +49,7 @@ _SCHEDULES: Final = {
 _RULES: Final = {
     "all": "all episodes",
     "none": "none",
-    "cubic": "episodes 0, 1, 8, 27 ... and every 1000th, counted over the seeds",
+    "cubic": "episodes 0, 1, 8, 27 ... and every 1000th, counted across the seeds",
 }
 _KEPT: Final = "keep:"
 _LONGEST_TEXT: Final = 1000
@@ -57,20 +57,20 @@ _MOST_LISTED: Final = 20
 
 
 class Provenance:
-    """What is known of recordings, by label: each different value once."""
+    """Facts about recordings, by label, with each different value once."""
 
     def __init__(self, pairs: Pairs = ()) -> None:
         self._values: dict[str, dict[str, None]] = {label: {} for label in _LABELS}
         self.add(pairs)
 
     def add(self, pairs: Pairs) -> None:
-        """Add labels and values; of evaluations, what their plan says comes first."""
+        """Add pairs of label and value, in this order. Empty values are left out."""
         for label, value in pairs:
             if value:
                 self._values[label][value[:_LONGEST_TEXT]] = None
 
     def pairs(self) -> list[tuple[str, str]]:
-        """Return label and values, in the order of the page."""
+        """Return pairs of label and joined values, in the order of the page."""
         return [
             (label, _some(values, "; " if label != "Monitors" else ", "))
             for label, values in self._values.items()
@@ -79,14 +79,14 @@ class Provenance:
 
 
 def machine_of(monitor: MonitorResults) -> tuple[str, str]:
-    """Return what a monitor says of the machine that it recorded on."""
+    """Return the label and value for the machine that a monitor recorded on."""
     provenance = _mapping(_details(monitor).get("provenance"))
     cpu = _mapping(provenance.get("cpu")).get("model")
     return "Recorded on", _joined(cpu, provenance.get("system"))
 
 
 def pairs_of_monitor(monitor: MonitorResults) -> Pairs:
-    """Yield what a monitor says of how its recordings came about."""
+    """Yield the provenance of a monitor's recordings."""
     details = _details(monitor)
     yield machine_of(monitor)
     yield "Monitors", monitor.files.infix
@@ -102,31 +102,31 @@ def pairs_of_monitor(monitor: MonitorResults) -> Pairs:
 
 
 def pairs_of_results(results: Evaluation, task: str) -> Iterator[tuple[str, str]]:
-    """Yield how the episodes of one task of an evaluation came about."""
+    """Yield the provenance of the episodes of one task of an evaluation."""
     plan = results.plan
     yield "Environment", task
     kwargs = (f"{key}={value!r}" for key, value in plan.env_kwargs.items())
-    yield "Arguments of the environment", ", ".join(kwargs)
+    yield "Environment arguments", ", ".join(kwargs)
     yield "Policy", plan.policy + " (an object)" * plan.is_object
     seeded = "seeded: episode i of seed s starts from SeedSequence([s, i])"
-    suite = "suite: one random stream for each task and seed"
+    suite = "suite: one random stream per task and seed"
     yield "Protocol", seeded if plan.protocol == SEEDED else suite
     yield "Seeds", _some(map(str, plan.seeds), ", ")
-    yield "Episodes of each seed", str(plan.episodes)
-    limit = "the environment's own limit, 1000 where it has none"
-    yield "Most steps of an episode", str(plan.max_steps or limit)
+    yield "Episodes per seed", str(plan.episodes)
+    limit = "the environment's own limit, or 1000 if it has none"
+    yield "Maximum steps per episode", str(plan.max_steps or limit)
     chosen = f"{spaced(plan.keep)}; chosen after all episodes of the task had ended"
     yield SELECTION, _RULES.get(plan.keep, chosen)
     yield "Versions", _versions(results.versions)
 
 
 def spaced(rule: str) -> str:
-    """Return what a rule of selection says, with its parts apart."""
+    """Return a selection rule with a space after each comma."""
     return ", ".join(part.strip() for part in rule.split(","))
 
 
 def recorded_when(rows: NDArray[np.void]) -> str:
-    """Return from when to when episodes ended; nothing where that is not known."""
+    """Return the time range in which episodes ended; empty if unknown."""
     known = rows["end_time"][~np.isnan(rows["end_time"])]
     if not len(known):
         return ""
@@ -165,11 +165,11 @@ def _versions(versions: Any) -> str:
 def _schedule(details: Mapping[str, Any]) -> str:
     name = _mapping(details.get("schedule")).get("name")
     if not isinstance(name, str):
-        return "" if details else "as its schedule chose; gym did not write it down"
+        return "" if details else "chosen by a schedule that gym did not record"
     if name.startswith(_KEPT):
         rule = spaced(name.removeprefix(_KEPT))
         return f"{rule}; chosen after all episodes had ended"
-    return _SCHEDULES.get(name, f"as {name} chose, before each began")
+    return _SCHEDULES.get(name, f"chosen by {name} before each began")
 
 
 def _joined(*texts: Any) -> str:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The finished videos of monitors, and what their metadata says of them."""
+"""The finished videos of monitors, with facts from their metadata."""
 
 from __future__ import annotations
 
@@ -29,15 +29,15 @@ _MOST_PIXELS: Final = 1 << 15
 def recorded_videos(
     results: MonitorResults, directory: Path, problems: list[str]
 ) -> list[ReportVideo]:
-    """Return the videos of a monitor that are finished and there, each once.
+    """Return the finished videos of a monitor that exist, each once.
 
-    They are those that its manifest lists, and those that were finished after it was
-    written, with those of further cameras. Text recordings are among them.
+    These are the videos that its manifest lists, and those that were finished after the
+    manifest was written, from all cameras. Text recordings are included.
 
     Args:
-        results: of the monitor.
-        directory: of its files.
-        problems: is added to where one is listed and gone, or cannot be read.
+        results: the monitor's results.
+        directory: the directory of its files.
+        problems: a list to which missing and unreadable files are added.
     """
     found: list[ReportVideo] = []
     for name in sorted(set(_names(results)), key=_order):
@@ -53,7 +53,7 @@ def recorded_videos(
         except (OSError, ValueError) as error:
             problems.append(
                 f"The metadata of {path} cannot be read: {_reason(error)}. The video "
-                "is shown without them."
+                "is shown without it."
             )
         found.append(_video(path, facts, results))
     return found
@@ -63,7 +63,7 @@ def _names(results: MonitorResults) -> Iterator[str]:
     try:
         manifest = results.manifest
     except UnreadableFile:
-        # Its episodes cannot be read either; that is said there.
+        # Its episodes cannot be read either, and reading them reports the error.
         manifest = None
     if manifest is not None:
         yield from (video for video, _ in manifest.videos)
@@ -74,7 +74,7 @@ def _names(results: MonitorResults) -> Iterator[str]:
 
 
 def _order(name: str) -> tuple[int, str, str]:
-    # A further camera's follows the first one's.
+    # The first camera's video comes before those of the others.
     return episode_of(name) or 0, view_of(name), name
 
 
@@ -114,16 +114,16 @@ def _video(
 
 
 def _command(path: Path, facts: Mapping[str, Any], trajectory: Path) -> str | None:
-    """Return what a shell takes to render a video again, beside the recorded ones."""
+    """Return the shell command that re-renders a video into a new file."""
     camera = facts.get("camera")
     options = []
     if view_of(path.name) and "tiled" not in facts:
-        # A further camera's; without its name the first one is rendered.
+        # The video is not from the first camera, so the command must name its camera.
         is_name = isinstance(camera, str) and not _NUMBER.fullmatch(camera)
         if not is_name and type(camera) is not int:
             return None
         options = [f"--camera={camera}"]
-    # A name may look like an option.
+    # A file name may look like an option.
     target = f"./{trajectory}" if str(trajectory).startswith("-") else str(trajectory)
     return shlex.join(["mjrec", "render", target, *options, "--out", "again.mp4"])
 
@@ -131,16 +131,16 @@ def _command(path: Path, facts: Mapping[str, Any], trajectory: Path) -> str | No
 def _notes(facts: Mapping[str, Any]) -> Iterator[str]:
     if facts.get("complete") is False:
         reason = facts.get("reason")
-        why = reason if isinstance(reason, str) else "it is not known why"
+        why = reason if isinstance(reason, str) else "reason unknown"
         yield f"Incomplete: the episode was not over ({why[:_LONGEST_TEXT]})."
     if facts.get("first_step") is not None:
-        yield "Counted in steps: it may go on across episodes."
+        yield "A clip, counted in steps: it may span several episodes."
     if "sub_environments" in facts:
         yield "Shows several sub-environments side by side."
     if facts.get("recording") == "live":
         yield "Recorded live: it cannot be rendered again from recorded states."
     if facts.get("quality") == "draft":
-        yield "Drawn in draft quality."
+        yield "Rendered in draft quality."
     if "annotated" in facts:
         yield "Has captions on its frames."
     speed = facts.get("playback_speed")
@@ -160,7 +160,7 @@ def _notes(facts: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _known(facts: Mapping[str, Any], key: str, read: Callable[[Any], T]) -> T | None:
-    """Return what metadata says; None where that is nothing, or nonsense."""
+    """Return a field of the metadata; None if it is missing or invalid."""
     try:
         return field(facts, key, read)
     except ValueError:

@@ -4,13 +4,13 @@
 ::
 
     report/
-    ├── index.html      opens from the disk and needs no network
+    ├── index.html      opens from disk and needs no network
     ├── videos/         copies: 0000-dm-control-walker-walk.mp4 ...
     ├── posters/        a frame of each: 0000-dm-control-walker-walk.jpg ...
-    └── replays/        pages in 3D of some: 0000-dm-control-walker-walk.html ...
+    └── replays/        3D pages of some: 0000-dm-control-walker-walk.html ...
 
-The folder can be moved, and is whole without the recordings. It appears under its name
-when it is complete; one that was there is replaced then, if it was a report and nothing
+The folder can be moved, and does not need the recordings. It gets its name only when it
+is complete. It then replaces an existing folder, if that contains a report and nothing
 else.
 """
 
@@ -65,30 +65,30 @@ def write_report(
     """Write a web page about recordings, and return its path.
 
     It has a summary of each task, curves, videos, all episodes, and their provenance.
-    It works for evaluations and for any monitor directory, also of old gym, without
-    MuJoCo and OpenGL. An unreadable file is named on the page.
+    It works for evaluations and for any monitor directory, including old gym's, without
+    MuJoCo or OpenGL. Unreadable files are named on the page.
 
     Args:
-        directories: evaluations, monitor directories, or folders that contain some; one
-            or several.
-        path: the folder to write. An existing report is replaced; another folder that
-            is not empty is left alone. With `single_file` it may end in `.html`, and is
-            then the page.
-        title: of the page. None is what was recorded.
-        single_file: put images and videos into the page: posters first, then videos in
-            order, up to `max_single_file_bytes`; the rest is named.
+        directories: one or several evaluations, monitor directories, or folders that
+            contain them.
+        path: the folder to write. An existing report is replaced; any other non-empty
+            folder is left alone. With `single_file` it may end in `.html`, and is then
+            the page itself.
+        title: title of the page. None derives it from the recordings.
+        single_file: put images and videos into the page itself: posters first, then
+            videos in order, up to `max_single_file_bytes`. The others are only named.
         max_single_file_bytes: size limit of the page with `single_file`.
-        replays: put a 3D page (`write_replay`) beside the videos of the best, median
-            and worst episode. It is loaded when it is opened.
+        replays: add a 3D page (`write_replay`) next to the videos of the best, median
+            and worst episodes. It is loaded only when opened.
         verifications: outputs of `mjrec verify --json`. A `verification.json` in a
-            directory is found by itself.
-        on_progress: called with a `ReportProgress` for each poster and video.
+            directory is found automatically.
+        on_progress: called with a `ReportProgress` for each poster, video and replay.
 
     Raises:
-        InvalidArgument: a directory has no recordings, `path` is not a report, the
-            page alone is larger than `max_single_file_bytes`, or `replays` are wanted
-            in it.
-        UnreadableFile: one of `verifications` cannot be read.
+        InvalidArgument: a directory has no recordings, `path` exists and is not a
+            report, the page alone is larger than `max_single_file_bytes`, or `replays`
+            and `single_file` are combined.
+        UnreadableFile: a file in `verifications` cannot be read.
         MissingDependency: Jinja2 is not installed, or viser for replays.
         FileNotWritten, DirectoryNotWritable: the disk is full or read-only.
     """
@@ -96,12 +96,12 @@ def write_report(
     is_page = target.suffix.lower() in _PAGE_ENDINGS
     if is_page and not single_file:
         raise InvalidArgument(
-            f"{path} names a page, and a report is a folder: name the folder, or ask "
-            "for one file (single_file=True, --single-file)."
+            f"{path} names a page, but a report is a folder. Name a folder, or request "
+            "a single file (single_file=True, --single-file)."
         )
     if replays and single_file:
         raise InvalidArgument(
-            "Replays are pages of their own, beside the report: write a folder "
+            "Replays are separate pages next to the report. Write a folder "
             "(single_file=False, without --single-file)."
         )
     _check_target(target, is_page=is_page)
@@ -135,28 +135,28 @@ def _single_page(
             return page
         if room <= 0:
             raise InvalidArgument(
-                f"The page has {size} bytes without any image or video, and "
-                f"max_single_file_bytes allows {most_bytes}. Allow more, or write a "
-                "folder."
+                f"The page has {size} bytes without any image or video, but "
+                f"max_single_file_bytes allows only {most_bytes}. Raise the limit, or "
+                "write a folder."
             )
-        # The page has text, too.
+        # The page also contains text, so reduce the room for videos by the excess.
         room -= size - most_bytes
 
 
 def _check_target(target: Path, *, is_page: bool) -> None:
-    """Raise InvalidArgument if there is something that is not to be replaced."""
+    """Raise InvalidArgument if something exists there that must not be replaced."""
     if not os.path.lexists(target):
         return
     if is_page:
         if not _is_own_page(target):
             raise InvalidArgument(
-                f"{target} exists and is no report, so it is not replaced: choose "
-                "another name, or remove it."
+                f"{target} exists and is not a report, so it is not replaced. Choose a "
+                "different name, or remove it."
             )
         return
     if not target.is_dir():
         raise InvalidArgument(
-            f"{target} is a file, and a report is a folder: choose another name."
+            f"{target} is a file, but a report is a folder. Choose a different name."
         )
     names = {entry.name for entry in target.iterdir()}
     if not names:
@@ -173,9 +173,9 @@ def _check_target(target: Path, *, is_page: bool) -> None:
     if foreign:
         more = f" and {len(foreign) - _SHOWN} more" if len(foreign) > _SHOWN else ""
         raise InvalidArgument(
-            f"{target} holds files that are no report: "
-            f"{', '.join(foreign[:_SHOWN])}{more}. It is not replaced: choose another "
-            "folder, or move them away."
+            f"{target} contains files that do not belong to a report: "
+            f"{', '.join(foreign[:_SHOWN])}{more}. It is not replaced. Choose a "
+            "different folder, or move them away."
         )
 
 
@@ -196,9 +196,9 @@ def _make_parents(target: Path) -> None:
 
 @contextlib.contextmanager
 def _replacing_folder(target: Path) -> Iterator[Path]:
-    """Yield a new folder beside `target`, and put it there at the end of the block.
+    """Yield a new folder next to `target`; replace `target` with it after the block.
 
-    If the block raises, it is removed, and what was there stays as it was.
+    If the block raises, the new folder is removed, and an existing one is unchanged.
     """
     _make_parents(target)
     folder, before = temporary_path(target), temporary_path(target)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What there is to be seen in the file of a video, and frames out of it.
+"""Reading a video file: its stream facts, and decoded frames.
 
-ffmpeg (imageio's) reads a file as nothing but what its first bytes say that it is, and
-opens no other file for it.
+ffmpeg (imageio's) reads a file only in the format that its first bytes indicate, and
+opens no other files for it.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from ..formats.regular_files import open_regular, regular_path
 from ..frames import Frame
 
 _BEGIN: Final = 12
-# By ending: what ffmpeg calls them.
+# ffmpeg's names of the formats, by suffix.
 _KINDS: Final = {".mp4": "mp4", ".avi": "avi", ".mkv": "matroska"}
 
 _HEADER: Final = re.compile(rb"#(?P<key>tb|dimensions) 0: (?P<a>\d+)[/x](?P<b>\d+)")
@@ -32,24 +32,25 @@ _HEADER: Final = re.compile(rb"#(?P<key>tb|dimensions) 0: (?P<a>\d+)[/x](?P<b>\d
 _PACKET: Final = re.compile(
     rb"0, *(?P<decoded>-?\d+), *(?P<time>-?\d+), *(?P<duration>\d+), .*"
 )
-# What stands where a file, such as an AVI, has no presentation times.
+# ffmpeg's value for a missing presentation time, as in AVI files.
 _NO_TIME: Final = -(2**63)
 # A crafted file may claim any size.
 _MOST_PIXELS: Final = 16384 * 16384
-# How many frames are in memory.
+# The maximum number of frames in memory.
 _AT_ONCE: Final = 16
 
 
 @dataclass(frozen=True)
 class VideoStream:
-    """The frames of a video, none of them decoded.
+    """The facts of a video's stream, without decoded frames.
 
     Attributes:
-        path: of the file, no link.
-        height: in pixels.
-        width: likewise.
-        times: `(n,) float64`, rising: when each is shown, in seconds from the first.
-        seconds: how long the video plays.
+        path: the video file, which is not a link.
+        height: height in pixels.
+        width: width in pixels.
+        times: `(n,) float64`, ascending: the time of each frame, in seconds after the
+            first.
+        seconds: duration in seconds.
     """
 
     path: Path
@@ -63,10 +64,10 @@ class VideoStream:
 
 
 def video_kind(path: Path) -> str | None:
-    """Return the ending that fits the first bytes of a file; None if it is no video.
+    """Return the suffix for a file's first bytes; None if it is not a known video.
 
     Raises:
-        UnreadableFile: it cannot be read, or is no regular file of its directory.
+        UnreadableFile: the file cannot be read, or is not a regular file.
     """
     with unreadable(path), open_regular(path) as file:
         begin = file.read(_BEGIN)
@@ -78,11 +79,11 @@ def video_kind(path: Path) -> str | None:
 
 
 def read_stream(path: Path) -> VideoStream:
-    """Return what there is to be seen in a file.
+    """Return the facts of a video file's stream.
 
     Raises:
-        UnreadableFile: it is no video, or has no frame.
-        EncoderError: it is damaged.
+        UnreadableFile: the file is not a video, or has no frames.
+        EncoderError: the file is damaged.
         Error: ffmpeg cannot be started.
     """
     arguments = [*_reading(path), "-c", "copy", "-f", "framecrc", "pipe:1"]
@@ -99,8 +100,8 @@ def read_stream(path: Path) -> VideoStream:
         elif header is not None:
             headers[header["key"]] = (int(header["a"]), int(header["b"]))
     if not packets or len(headers) < 2 or not headers[b"tb"][1]:
-        raise UnreadableFile(path, "there is no frame in it")
-    # Frames are stored in the order in which they are decoded.
+        raise UnreadableFile(path, "it contains no frames")
+    # Packets come in decoding order; sort them by time.
     packets.sort()
     unit = float(Fraction(*headers[b"tb"]))
     width, height = headers[b"dimensions"]
@@ -113,16 +114,16 @@ def read_stream(path: Path) -> VideoStream:
 def frames_at(
     stream: VideoStream, indices: Sequence[int], *, most_width: int | None = None
 ) -> Iterator[Frame]:
-    """Yield some frames of a video, decoded, as `(height, width, 3) uint8`.
+    """Yield decoded frames of a video, `(height, width, 3) uint8`.
 
     Args:
-        stream: of `read_stream`.
-        indices: of the frames, rising.
-        most_width: in pixels; wider ones are made smaller.
+        stream: the stream from `read_stream`.
+        indices: the numbers of the frames, ascending.
+        most_width: maximum width in pixels; wider frames are scaled down.
 
     Raises:
-        EncoderError: it cannot be decoded so far.
-        UnreadableFile: it has fewer frames than it claims.
+        EncoderError: the video cannot be decoded up to these frames.
+        UnreadableFile: the video has fewer frames than it claims.
     """
     width, scale = stream.width, ""
     if most_width is not None and most_width < width:
@@ -141,16 +142,16 @@ def frames_at(
         )
         if not data or len(data) % (len(some) * width * 3):
             raise UnreadableFile(
-                stream.path, f"it has fewer than its {len(stream)} frames"
+                stream.path, f"it has fewer than the {len(stream)} frames it claims"
             )
         yield from np.frombuffer(data, np.uint8).reshape(len(some), -1, width, 3)
 
 
 def _reading(path: Path) -> list[str]:
-    """Return the arguments for reading a file."""
+    """Return ffmpeg's arguments for reading a file."""
     kind = video_kind(path)
     if kind is None:
-        raise UnreadableFile(path, "it is no video of a kind that is read here")
+        raise UnreadableFile(path, "it is not a video in a supported format")
     with unreadable(path):
         source = as_file(regular_path(path))
     return [

@@ -9,13 +9,13 @@
   function say(words) {
     const place = one("#said");
     place.textContent = "";
-    // A screen reader tells a change, not the same words again.
+    // A screen reader announces changes, not repeated text.
     setTimeout(() => { place.textContent = words; }, 50);
   }
 
   // --- Sorting --------------------------------------------------------------------
 
-  // Put a button into each heading; tell `sort` which column, and which way.
+  // Put a button into each heading that calls `sort` with the column and direction.
   function makeSortable(table, sort) {
     const headings = all("thead th", table);
     headings.forEach((heading, column) => {
@@ -51,7 +51,7 @@
     });
   }
 
-  // What is not known comes last, whichever way.
+  // Unknown values come last in either direction.
   function byNumber(a, b, way) {
     const aIs = a === a, bIs = b === b;
     if (aIs && bIs) return a < b ? -way : a > b ? way : 0;
@@ -78,7 +78,7 @@
     }
     form.addEventListener("change", show);
     form.addEventListener("submit", (event) => event.preventDefault());
-    // A browser may keep what was chosen before the page was loaded again.
+    // A browser may restore the selection when the page is reloaded.
     window.addEventListener("pageshow", show);
     form.hidden = false;
     show();
@@ -91,8 +91,8 @@
     }, true);
   }
 
-  // A player costs milliseconds to make, and there may be hundreds: each is made when
-  // it is wanted. Until then its place has a button, and without this script a link.
+  // Creating a player takes milliseconds, and there may be hundreds, so each is created
+  // on demand. Until then there is a button in its place; without this script, a link.
   function playWhenAsked() {
     for (const link of all("a.play")) {
       const button = document.createElement("button");
@@ -141,7 +141,7 @@
       await navigator.clipboard.writeText(element.textContent);
       return true;
     } catch {
-      // A page from the disk may not be allowed to.
+      // A page opened from disk may lack permission.
       select(element);
       try { return document.execCommand("copy"); } catch { return false; }
     }
@@ -177,7 +177,7 @@
       for (let j = 0; j < sizes[i]; j += 1) within[at + j] = j;
       at += sizes[i];
     });
-    // The place of each name in the alphabet, so that names sort as numbers do.
+    // The alphabetical rank of each name, so that names sort like numbers.
     const places = (names) => {
       const order = names.map((_, i) => i).sort((a, b) => text.compare(names[a], names[b]) || a - b);
       const place = new Array(names.length);
@@ -244,7 +244,7 @@
       name.className = "name";
       name.textContent = t.name;
       cell(row, "").append(name);
-      // Here, because on a phone the columns to the right are out of sight.
+      // Shown in this column, because on a phone those to the right are off-screen.
       const outcome = cell(row, outcomes[t.outcome[i]] || DASH);
       if (t.failures[i]) outcome.textContent += `: ${t.failures[i]}`;
       if (outcomes[t.outcome[i]] === "failed") outcome.className = "bad";
@@ -259,7 +259,7 @@
         link.href = place;
         link.textContent = k ? ` ${k + 1}` : "video";
         link.setAttribute("aria-label", `Video ${k + 1} of ${t.name}, episode ${t.episode[i]}`);
-        // No browser opens a page that is such an address.
+        // Browsers do not navigate to `data:` URLs.
         if (place.startsWith("data:")) link.download = "";
         if (place.startsWith("#")) link.addEventListener("click", () => showCard(place));
         videos.append(link);
