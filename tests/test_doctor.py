@@ -213,7 +213,7 @@ def test_what_is_no_ffmpeg(monkeypatch):
         (
             "raise AttributeError(\"'MjModel' object has no attribute "
             "'flex_vertedge'\")",
-            "does not know MuJoCo 4",
+            "does not support MuJoCo 4",
             'pip install "mujoco<4"',
         ),
         ("raise ValueError('of its own')", "ValueError: of its own", "pip install y"),

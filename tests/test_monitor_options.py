@@ -45,7 +45,7 @@ IMPOSSIBLE = {
             ({"on_error": value}, "InvalidArgument", '"raise", or "warn"')
             for value in ("ignore", True)
         ),
-        ({"render": "deferred"}, "PicturesDiffer", "no MuJoCo model"),
+        ({"render": "deferred"}, "PicturesDiffer", "no accessible MuJoCo model"),
         ({"step_trigger": 5}, "InvalidArgument", "step_trigger must be a function"),
         ({"step_trigger": lambda: True}, "InvalidArgument", "called with one argument"),
         ({"step_trigger": bool, "video_callable": bool}, "InvalidArgument", "one of"),
