@@ -63,7 +63,7 @@ def test_anonymous_is_a_flag(recorded: Path, tmp_path: Path) -> None:
     ("arguments", "part"),
     [
         (["--episodes", "one"], "--episodes is a list"),
-        (["--episodes", "7"], "There are: 0, 1."),
+        (["--episodes", "7"], "Available: 0, 1."),
         (["--max-size", "1k"], "The largest files"),
     ],
 )

@@ -215,7 +215,7 @@ def test_strict_fails_where_nothing_is_to_be_seen(again_at, tmp_path, mjrec, pai
     status, out, _ = mjrec(tmp_path, "--strict", *again_at)
     assert status == 1
     assert "1 video rendered, but blank:" in out
-    assert "all 5 frames are of a single colour" in out
+    assert "all 5 frames are a single colour" in out
     assert len(list(tmp_path.glob("*.mp4"))) == 1
     content = json.loads(manifest.read_text())
     assert len(content["mjrec"]["pending"]) == bool(again_at)

@@ -158,7 +158,7 @@ def test_links_inside_are_packed_as_files(directory: Path, tmp_path: Path) -> No
 def test_unknown_episodes_are_named(recorded: Path, place: Path) -> None:
     """With those that there are."""
     message = refusal(mjrec.UnknownName, recorded, place, episodes=[0, 9])
-    assert message.endswith("with the number 9. There are: 0, 1.")
+    assert message.endswith("with the number 9. Available: 0, 1.")
     for wrong in ([], [True], ["0"], [0.0]):
         refusal(mjrec.InvalidArgument, recorded, place, episodes=wrong)
 

@@ -48,7 +48,7 @@ def test_a_machine_that_renders():
     assert healthy.returncode == 0, healthy.stderr
     facts = json.loads(healthy.stdout)
     assert (facts["can_render"], facts["backend"]) == (True, "egl")
-    assert facts["reason"] == "the first that renders"
+    assert facts["reason"] == "the first that works"
     (note,) = facts["problems"]
     assert "MUJOCO_GL is not set" in note["cause"]
     assert "export MUJOCO_GL=egl" in note["fix"]
@@ -107,7 +107,7 @@ def report_of(**changed):
     report = MachineReport(
         can_render=True,
         backend="egl",
-        reason="the first that renders",
+        reason="the first that works",
         backends=(
             Probe(
                 "egl",
@@ -163,7 +163,7 @@ def test_what_people_see():
         "4.5 Mesa [22.3.6]",
         "EGL device 0: the CPU, /dev/dri/renderD128, CUDA device 3, used",
         "Cause: [bold]It[/bold] is missing.",
-        "uses egl (the first that renders)",
+        "uses egl (the first that works)",
         "Something is odd.",
         "not installed",
         "Cause: It is too new.",
@@ -213,7 +213,7 @@ def test_what_is_no_ffmpeg(monkeypatch):
         (
             "raise AttributeError(\"'MjModel' object has no attribute "
             "'flex_vertedge'\")",
-            "does not know MuJoCo 4",
+            "does not support MuJoCo 4",
             'pip install "mujoco<4"',
         ),
         ("raise ValueError('of its own')", "ValueError: of its own", "pip install y"),

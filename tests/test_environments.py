@@ -295,7 +295,7 @@ WRONG = [
     ("dm_control/-run", {}, mjrec.InvalidArgument, "dm_control/<domain>-<task>"),
     ("dm_control/", {}, mjrec.InvalidArgument, "dm_control/<domain>-<task>"),
     ("./robot.txt", {}, mjrec.InvalidArgument, r"\.xml or \.mjcf"),
-    ("robto.xml", {}, mjrec.UnknownName, r"MJCF file .*There are: .*robot.xml"),
+    ("robto.xml", {}, mjrec.UnknownName, r"MJCF file .*Available: .*robot.xml"),
     ("nowhere/robot.xml", {}, mjrec.UnknownName, "There are none"),
     # Nobody remembers every version; unlike any, how names are made.
     ("HalfCheeta-v5", {}, mjrec.UnknownName, CHEETAH),

@@ -561,7 +561,7 @@ WRONG = [
     ({"max_fps": -1}, InvalidArgument, "max_fps"),
     ({"env_kwargs": {"f": print}}, InvalidArgument, "JSON.* 'f' "),
     ({"env_kwargs": {"a": 1, "f": [math.nan]}}, InvalidArgument, "'f'.*nan"),
-    ({"env_kwargs": {"f": {1: 0, "1": 2}}}, InvalidArgument, "'f'.*'1' is there twice"),
+    ({"env_kwargs": {"f": {1: 0, "1": 2}}}, InvalidArgument, "'f'.*the key '1' twice"),
     ({"env_kwargs": {"no_such": 1}}, mjrec.EnvironmentNotMade, "no_such"),
     ({"score_ranges": {"Ant-v5": (0, 1)}}, UnknownName, PENDULUM),
     ({"score_ranges": {PENDULUM: (1, 1)}}, InvalidArgument, "higher"),

@@ -78,12 +78,12 @@ def test_mujoco_then_takes_the_choice():
         (
             "mjrec.use_gl('glfw')",
             {},
-            ["backend glfw (asked for) cannot", "DISPLAY is not set", "xvfb-run"],
+            ["backend glfw (requested) cannot", "DISPLAY is not set", "xvfb-run"],
         ),
         (
             "mjrec.use_gl()",
             {"MUJOCO_GL": "glfw"},
-            ["OpenGL backend glfw (MUJOCO_GL names it) cannot be used here."],
+            ["OpenGL backend glfw (set by MUJOCO_GL) cannot be used here."],
         ),
     ],
 )
@@ -115,8 +115,8 @@ def test_nothing_renders(tmp_path):
             (tmp_path / f"{name}{number}").touch()
     said = error_of("mjrec.use_gl()", LD_LIBRARY_PATH=str(tmp_path))
     assert said.startswith("GLError No OpenGL backend can be used here.\n")
-    assert "egl: EGL's library is there and cannot be loaded" in said
-    assert "osmesa: OSMesa's library is there and cannot be loaded" in said
+    assert "egl: EGL's library is installed but cannot be loaded" in said
+    assert "osmesa: OSMesa's library is installed but cannot be loaded" in said
     assert "glfw: GLFW needs a display" in said
     assert "apt-get install -y libegl1 " in said
     assert "apt-get install -y libosmesa6 " in said
@@ -128,7 +128,7 @@ def test_nothing_renders(tmp_path):
         (
             "import mujoco\nmjrec.use_gl('egl')",
             {},
-            ["mujoco was imported with glfw", "change to egl", "before anything"],
+            ["mujoco was imported with glfw", "switch to egl", "before anything"],
         ),
         (
             "import mujoco\ndel os.environ['MUJOCO_GL']\n"

@@ -117,16 +117,20 @@ def test_what_is_no_entry_is_refused(gpu):
 @pytest.mark.parametrize(
     ("gpu", "variables", "said"),
     [
-        ("None", {"CUDA_VISIBLE_DEVICES": ""}, "This process was given no GPU"),
-        ("None", {"CUDA_VISIBLE_DEVICES": "-1"}, "This process was given no GPU"),
+        ("None", {"CUDA_VISIBLE_DEVICES": ""}, "This process was not assigned a GPU"),
+        ("None", {"CUDA_VISIBLE_DEVICES": "-1"}, "This process was not assigned a GPU"),
         # `MUJOCO_GL` stands, and what that means is said.
-        ("'0'", {"MUJOCO_GL": "osmesa"}, "GPU 0 was given for rendering, but MUJOCO"),
+        (
+            "'0'",
+            {"MUJOCO_GL": "osmesa"},
+            "GPU 0 was assigned for rendering, but",
+        ),
         pytest.param(
-            *("'3'", {}, "GPU 3 was given for rendering, and EGL has only"),
+            *("'3'", {}, "GPU 3 was assigned for rendering, but EGL has only"),
             marks=needs_no_gpu,
         ),
         pytest.param(
-            *("'77'", {}, "GPU 77 was given for rendering, and none of EGL's"),
+            *("'77'", {}, "GPU 77 was assigned for rendering, but none of EGL's"),
             marks=needs_gpu,
         ),
     ],

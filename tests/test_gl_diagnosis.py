@@ -36,14 +36,14 @@ _NAMES = "MUJOCO_GL must be one of dict_keys(['glfw', 'egl', 'osmesa']): got 'EG
         ("'NoneType' object has no attribute 'glGetError'", {}, "libOSMesa.so.8, is"),
         ("Cannot initialize a EGL device display. This", {}, "EGL finds no device"),
         ("Cannot initialize a headless EGL display.", {}, "DRIVER_CAPABILITIES=all"),
-        (_NVIDIA, {}, "There is an NVIDIA GPU, and EGL finds no NVIDIA driver"),
+        (_NVIDIA, {}, "There is an NVIDIA GPU, but EGL finds no NVIDIA driver"),
         (_CANNOT, {}, "PYOPENGL_PLATFORM (another platform) contradicts MUJOCO"),
         (_CANNOT, _PLATFORM, "PYOPENGL_PLATFORM (osmesa) contradicts MUJOCO_GL (egl)"),
         ("'GLXPlatform' object has no attribute 'EGL'", {}, "with its GLX platform"),
         (f"{_NUMBER}0 and 3 (inclusive), got 7.", {}, "a number from 0 to 3"),
         (f"{_NUMBER}0 and -1 (inclusive), got 0.", {}, "EGL finds no device"),
         ("invalid value for environment variable MUJOCO_GL: gpu", {}, "MUJOCO_GL=gpu"),
-        (_NAMES, {}, "MUJOCO_GL=EGL is not a backend's name, or not in small letters"),
+        (_NAMES, {}, "MUJOCO_GL=EGL is not the name of a backend, or is not in"),
         (
             "module 'mujoco.rendering.classic.gl_context' has no attribute 'GLContext'",
             {"MUJOCO_GL": "Off"},
@@ -56,7 +56,7 @@ _NAMES = "MUJOCO_GL must be one of dict_keys(['glfw', 'egl', 'osmesa']): got 'EG
         ("EGLError(err = EGL_BAD_ACCESS, baseOperation", {}, "another thread"),
         ("failed to open /dev/dri/card0: Permission denied", {}, "open /dev/dri/card"),
         ("No module named 'OpenGL'", {}, "pip install pyopengl"),
-        ("EGLError: <exception str() failed>", {}, "was still open when Python ended"),
+        ("EGLError: <exception str() failed>", {}, "was still open when Python exited"),
     ],
 )
 def test_known_failures(text, environ, expected):

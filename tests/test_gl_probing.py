@@ -66,7 +66,7 @@ def test_an_answer_is_kept_for_its_environment(monkeypatch):
         (
             "egl",
             {"MUJOCO_EGL_DEVICE_ID": "99"},
-            "MUJOCO_EGL_DEVICE_ID=99, and EGL sees",
+            "MUJOCO_EGL_DEVICE_ID=99, but EGL sees",
             "Set MUJOCO_EGL_DEVICE_ID to",
         ),
         (
@@ -76,7 +76,7 @@ def test_an_answer_is_kept_for_its_environment(monkeypatch):
             "unset MUJOCO_EGL_DEVICE_ID",
         ),
         ("off", {}, "MUJOCO_GL=off turns rendering off", "Unset MUJOCO_GL"),
-        ("nonsense", {}, "MUJOCO_GL=nonsense is not a backend", "egl, osmesa, glfw"),
+        ("nonsense", {}, "MUJOCO_GL=nonsense is not the name", "egl, osmesa, glfw"),
         (
             "egl",
             {"__EGL_VENDOR_LIBRARY_FILENAMES": "/nonexistent"},
@@ -100,7 +100,7 @@ def test_driver_that_draws_nothing():
         pytest.skip(f"only Mesa can be told to draw nothing, not {usual.gl_renderer}")
     answer = probe_with("egl", GALLIUM_NOOP="1")
     assert not answer.renders
-    assert "The driver draws, and draws wrongly." in answer.cause
+    assert "The driver renders incorrect frames." in answer.cause
 
 
 @pytest.mark.parametrize(

@@ -121,10 +121,10 @@ def test_a_grid_is_as_square_as_can_be():
 
 def test_unknown_name_lists_what_there_is():
     """A few names are all listed; of many, those that look alike."""
-    assert "There are: side, top." in str(UnknownName("camera", "sid", ["side", "top"]))
+    assert "Available: side, top." in str(UnknownName("camera", "sid", ["side", "top"]))
     many = [f"Env-v{n}" for n in range(50)]
-    assert "Names like it: Env-v3" in str(UnknownName("environment", "env-v3", many))
-    assert "none with a like name" in str(UnknownName("environment", "zzz", many))
+    assert "Similar names: Env-v3" in str(UnknownName("environment", "env-v3", many))
+    assert "of the 50 known names is" in str(UnknownName("environment", "zzz", many))
     assert "There are none." in str(UnknownName("camera", "a", []))
     existing = str(ExistingRecordings(Path("d"), [f"file{n}" for n in range(8)]))
     assert "file4 and 3 more" in existing

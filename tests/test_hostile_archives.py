@@ -231,5 +231,5 @@ def test_words_about_a_bad_archive_say_what_to_do(tmp_path: Path) -> None:
     with pytest.raises(mjrec.UnreadableArchive) as raised:
         mjrec.verify(archive)
     assert str(raised.value).startswith(f"Cannot verify {archive}: it is no zip file.")
-    assert "ask for the file" in str(raised.value)
+    assert "ask for the original file" in str(raised.value)
     assert "directory" not in str(raised.value)

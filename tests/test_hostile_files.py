@@ -184,7 +184,7 @@ JSON = {
     "Exceeds the limit": b'{"a": %s}' % (b"9" * 1_000_000),
     "belongs there": b'{"stats": 0.%s}' % (b"9" * 10_000_000),
     "more than 16777216 values": b'{"a": [%s0]}' % (b"0," * 20_000_000),
-    "'a' is there twice": b'{"a": 1, "\\u0061": 2}',
+    "the key 'a' twice": b'{"a": 1, "\\u0061": 2}',
     "not UTF-8": b'{"a": "\xff"}',
     "an object belongs there": b"[]",
 }

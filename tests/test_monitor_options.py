@@ -45,7 +45,7 @@ IMPOSSIBLE = {
             ({"on_error": value}, "InvalidArgument", '"raise", or "warn"')
             for value in ("ignore", True)
         ),
-        ({"render": "deferred"}, "PicturesDiffer", "no MuJoCo model"),
+        ({"render": "deferred"}, "PicturesDiffer", "no accessible MuJoCo model"),
         ({"step_trigger": 5}, "InvalidArgument", "step_trigger must be a function"),
         ({"step_trigger": lambda: True}, "InvalidArgument", "called with one argument"),
         ({"step_trigger": bool, "video_callable": bool}, "InvalidArgument", "one of"),
@@ -66,8 +66,8 @@ IMPOSSIBLE = {
     "cheetah": [
         *(({"render": v}, "InvalidArgument", "deferred") for v in ("later", 3, "")),
         *(({"workers": v}, "InvalidArgument", "workers") for v in (-1, 1.5, True, "2")),
-        ({"keep": "wurst:3"}, "UnknownName", "'wurst:3'. There are: best"),
-        ({"keep": "median:2"}, "UnknownName", "There are: best"),
+        ({"keep": "wurst:3"}, "UnknownName", "'wurst:3'. Available: best"),
+        ({"keep": "median:2"}, "UnknownName", "Available: best"),
         ({"keep": "worst,worst:2"}, "InvalidArgument", "something twice"),
         *(
             ({"keep": rule}, "InvalidArgument", "1 or more")

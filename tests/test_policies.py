@@ -266,7 +266,7 @@ REFUSED = [
     ("", "bst.zip", mjrec.UnknownName, r"'bst.zip'.*best.zip"),
     (
         *("import math\ndef act(o): pass\nclass Other: pass\n_x = 1\n", "atc"),
-        *(mjrec.UnknownName, "'atc'.*There are: Other, act"),
+        *(mjrec.UnknownName, "'atc'.*Available: Other, act"),
     ),
     # Where it happened.
     (

@@ -134,8 +134,8 @@ def test_every_monitor_keeps_its_place_in_every_list(tmp_path, caplog):
     assert mjrec.load_results(tmp_path / "missing") is None
     assert mjrec.load_results(str(tmp_path)) is None
     assert [record.levelname for record in caplog.records] == ["ERROR", "ERROR"]
-    assert f"There is no directory {tmp_path / 'missing'}" in caplog.text
-    assert f"There are no manifests in {tmp_path}" in caplog.text
+    assert f"directory {tmp_path / 'missing'} does not exist" in caplog.text
+    assert f"There are no manifests or journals in {tmp_path}" in caplog.text
     write_saved(tmp_path, "0.7", start=None)
     write_saved(tmp_path, "1.7", start=0.1)
     third = write_journal(tmp_path, "2.7", 1)

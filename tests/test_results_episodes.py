@@ -105,7 +105,7 @@ def test_monitors_come_in_the_order_of_their_numbers(tmp_path):
 
 def test_a_missing_directory_is_an_error_at_once(tmp_path):
     """Before the first episode is asked for; an empty one has no episodes."""
-    with pytest.raises(UnreadableFile, match="no such directory"):
+    with pytest.raises(UnreadableFile, match="directory does not exist"):
         mjrec.iter_episodes(tmp_path / "missing")
     assert list(mjrec.iter_episodes(tmp_path)) == []
 

@@ -127,7 +127,7 @@ def test_damaged_files_are_named(finished, tmp_path):
     finished.video.metadata_path.write_text(json.dumps({"fps": "10"}))
     with pytest.raises(UnreadableFile, match=r"meta\.json: it has no 'frame_count'"):
         tracker.video(run, finished.video)
-    with pytest.raises(EncoderError, match=r"(?s)No preview .*mp4.*Invalid data"):
+    with pytest.raises(EncoderError, match=r"(?s)a preview of .*mp4.*Invalid data"):
         tracker.end(run)
     events = read(run.directory / "tensorboard" / "0.4711")
     assert events.Tags()["scalars"] == ["training/return", "training/length"]

@@ -315,7 +315,7 @@ def test_frames_must_be_one_for_each(tmp_path):
     ("options", "error", "message"),
     [
         ({"render": "deferred"}, PicturesDiffer, "inside"),
-        ({"camera": 0}, InvalidArgument, "Make them with the camera and size"),
+        ({"camera": 0}, InvalidArgument, "Create them with the camera and size"),
         ({"height": 64, "width": 64}, InvalidArgument, "height, width cannot"),
         ({}, NoPictures, "render_mode"),
     ],

@@ -180,7 +180,7 @@ def test_a_recorder_without_frames_does_nothing(make_corridor, path, mode, enabl
         (None, "NoneType"),
         (np.zeros((8, 10, 4), np.uint8), r"shape \(8, 10, 4\)"),
         (np.zeros((8, 10, 3)), "float64"),
-        (np.zeros((8, 12, 3), np.uint8), "one size"),
+        (np.zeros((8, 12, 3), np.uint8), "the same size"),
     ],
 )
 def test_a_bad_frame_keeps_the_good_ones(path, bad, reason, caplog):

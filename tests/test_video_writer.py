@@ -232,7 +232,7 @@ def test_a_file_has_its_name_at_the_end(tmp_path):
             buffer[:] = numbered(number)
             video.write(buffer)
         assert not path.exists()
-        with pytest.raises(InvalidFrame, match="one size"):
+        with pytest.raises(InvalidFrame, match="the same size"):
             video.write(numbered(1)[:8])
     assert sorted(one.name for one in tmp_path.iterdir()) == ["a.framehash", "a.mp4"]
     assert [number_of(frame) for frame in read(path)] == list(range(64))

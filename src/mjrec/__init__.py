@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """mjrec: a headless MuJoCo recorder.
 
-Importing this package imports no simulator, no OpenGL and no ffmpeg, and changes no
-environment variable; each name below is loaded when it is first used.
+Importing this package does not load a simulator, OpenGL or ffmpeg, and does not change
+environment variables; each name below is loaded on first use.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from . import errors
 
-# All its errors are public.
+# All errors are public.
 from .errors import *  # noqa: F403
 from .errors import MissingDependency
 
@@ -64,7 +64,7 @@ if TYPE_CHECKING:
     from .viewing.replay import Replay as Replay
     from .viewing.replay import write_replay as write_replay
 
-# Where each name is, which is imported when it is first used.
+# Public names by module; a module is imported when one of its names is first used.
 _NAMES = {
     "engines.local": "LocalEngine",
     "engines.ray": "RayEngine",
@@ -102,7 +102,7 @@ _NAMES = {
 }
 _LAZY = {name: module for module, names in _NAMES.items() for name in names.split()}
 
-# What can be had without any extra, so that `from mjrec import *` works there too;
+# Only names that need no extra, so that `from mjrec import *` always works.
 # `DmEnvMonitor` needs dm_env, and replays need viser.
 __all__ = sorted({*errors.KINDS, *_LAZY} - {"DmEnvMonitor", "Replay", "write_replay"})
 
@@ -121,7 +121,7 @@ def __getattr__(name: str) -> Any:
             "dm_env", purpose=name, install='pip install "mjrec[dm-control]"'
         ) from error
     value = getattr(module, name)
-    # Kept, so that later uses cost nothing.
+    # Cached, so that later uses cost nothing.
     globals()[name] = value
     return value
 

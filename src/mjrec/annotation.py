@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Episode, step, time and return, drawn on a frame.
+"""Captions drawn on frames: episode, step, time and return.
 
-Pillow draws the letters, in its own font, so that they are the same on every machine
-with the same Pillow, in white over a dark band at the frame's top.
+Pillow draws the text in its built-in font, so it looks the same on every machine that
+has the same Pillow version: white letters over a dark band at the top of the frame.
 
-Pillow is an extra and is imported when the first frame is annotated.
+Pillow is an optional dependency and is imported when the first frame is annotated.
 """
 
 from __future__ import annotations
@@ -19,32 +19,32 @@ import numpy as np
 from .errors import MissingDependency
 from .frames import Frame
 
-# Of a frame's height, in pixels of letters; and what can still be read.
+# The default font size is the frame's height divided by this, within the limits below.
 _LETTERS = 30
 _LARGEST_LETTERS = 64
 _USUAL_LETTERS = 11
 _SMALLEST_LETTERS = 8
-# How much of a frame's height the band may take.
+# The maximum fraction of a frame's height that the band may take.
 _MOST_OF_HEIGHT = 0.5
-# Under the band a pixel keeps so much of its brightness, in 256ths.
+# The brightness that a pixel keeps under the band, in 256ths.
 _LIGHT_UNDER_BAND = 96
 
 _LONG = ("episode ", "step ", "time ", "return ")
 _SHORT = ("ep ", "st ", "t ", "R ")
-# What a number has room for at least, so that texts rarely move when numbers grow.
+# The minimum width of each number in digits, so that items rarely move as numbers grow.
 _ROOM_LONG = (4, 5, 7, 9)
 _ROOM_SHORT = (1, 3, 4, 5)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Caption:
-    """What is written on a frame.
+    """The values written on a frame.
 
     Attributes:
         episode_id: the episode's number.
-        step: how many steps were made before the frame.
-        time: simulated seconds since the reset; None where unknown.
-        reward: the sum of the rewards so far.
+        step: number of steps before the frame.
+        time: simulated seconds since the reset; None if unknown.
+        reward: sum of the rewards so far.
     """
 
     episode_id: int
@@ -54,24 +54,25 @@ class Caption:
 
 
 def annotated(frame: Frame, caption: Caption) -> Frame:
-    """Return a frame with a caption on its top.
+    """Return a copy of a frame with a caption at the top.
 
-    The same frame and caption give the same frame, byte for byte, with the same
-    Pillow. Letters grow with the frame. In a small one they are abbreviated, stand in
-    several lines, or say less; in one of a few pixels there are none.
+    With the same Pillow version, the same frame and caption give the same bytes. The
+    font size grows with the frame. In a small frame, labels are abbreviated, items are
+    spread over several lines, or some items are left out. A frame of only a few pixels
+    gets no caption.
 
     Args:
-        frame: `(height, width, 3) uint8`; stays as it is.
-        caption: what to say.
+        frame: `(height, width, 3) uint8`; not modified.
+        caption: the values to write.
 
     Returns:
         A new array of the same size.
 
     Raises:
-        MissingDependency: there is no Pillow that can do it.
+        MissingDependency: Pillow is missing, is too old, or lacks FreeType.
     """
     check_annotation()
-    # Here, as in `_pillow`.
+    # Imported late, see `_pillow`.
     from PIL import Image, ImageDraw
 
     result = np.array(frame, order="C", subok=False)
@@ -89,7 +90,7 @@ def annotated(frame: Frame, caption: Caption) -> Frame:
         draw.text((left, bottom), text, fill=255, font=font, anchor="ls")
     band = result[: layout.height]
     np.take(_UNDER_BAND, band, out=band, mode="clip")
-    # 255 + 1, so that dividing by 256 leaves all of it.
+    # Adding 1 makes full cover 256, so that dividing by 256 keeps all of it.
     cover = np.asarray(written)[:, :, None].astype(np.uint16) + 1
     band[:, : layout.width] += ((255 - band[:, : layout.width]) * cover >> 8).astype(
         np.uint8
@@ -101,16 +102,16 @@ def check_annotation() -> None:
     """Raise an error if frames cannot be annotated here.
 
     Raises:
-        MissingDependency: there is no Pillow, or one that cannot do it.
+        MissingDependency: Pillow is missing, is too old, or lacks FreeType.
     """
     _pillow()
 
 
 def pillow_version() -> str:
-    """Return the version of the Pillow that draws the letters.
+    """Return the version of Pillow that draws the captions.
 
     Raises:
-        MissingDependency: as `check_annotation`.
+        MissingDependency: Pillow is missing, is too old, or lacks FreeType.
     """
     return str(_pillow().__version__)
 
@@ -118,30 +119,30 @@ def pillow_version() -> str:
 @functools.cache
 def _pillow() -> Any:
     try:
-        # Here, because it is an extra, and importing stays quick without it.
+        # Imported here because it is optional, and to keep mjrec quick to import.
         import PIL
         from PIL import ImageFont
 
-        # Before 10.1 its font had one size, and without FreeType it has none.
+        # Before 10.1 the font had a fixed size; without FreeType it cannot be scaled.
         ImageFont.load_default(size=_USUAL_LETTERS)
     except (ImportError, TypeError) as error:
         raise MissingDependency(
             "Pillow 10.1 or newer, with FreeType",
-            purpose="Writing on frames (annotate)",
+            purpose="Annotating frames (annotate)",
             install="pip install 'mjrec[annotate]'",
         ) from error
     return PIL
 
 
 class _Layout(NamedTuple):
-    """Where the items of captions stand in frames of one size.
+    """The positions of a caption's items in frames of one size.
 
     Attributes:
-        height: of the band.
-        width: of what is written.
-        letters: their size.
-        labels: of the items.
-        places: item, left and base line of each that there is room for.
+        height: the band's height.
+        width: the width of the written text.
+        letters: the font size.
+        labels: the items' labels.
+        places: item number, left edge and baseline of each item that fits.
     """
 
     height: int
@@ -151,7 +152,8 @@ class _Layout(NamedTuple):
     places: tuple[tuple[int, int, int], ...]
 
 
-# All items in as few lines as fit, then ever fewer of them.
+# Arrangements in order of preference: all items in as few lines as fit, then fewer
+# and fewer items.
 _ARRANGEMENTS = (
     (((0, 1, 2, 3),), ((0, 1), (2, 3)), ((0,), (1,), (2,), (3,))),
     (((0, 1), (3,)), ((0,), (1,), (3,))),
@@ -162,12 +164,12 @@ _ARRANGEMENTS = (
 
 @functools.lru_cache(maxsize=256)
 def _layout(height: int, width: int, lengths: tuple[int, ...]) -> _Layout | None:
-    """Return where items of these lengths stand; None where nothing fits.
+    """Return the layout for items of these lengths, or None if nothing fits.
 
     Args:
-        height: of the frame.
-        width: of the frame.
-        lengths: of the items' numbers; -1 for one that is left out.
+        height: the frame's height.
+        width: the frame's width.
+        lengths: the lengths of the items' numbers; -1 for an item that is left out.
     """
     usual = max(_USUAL_LETTERS, min(_LARGEST_LETTERS, round(height / _LETTERS)))
     for arrangements in _ARRANGEMENTS:
@@ -200,7 +202,7 @@ def _laid_out(
             places.append((item, left, top + ascent))
             text = labels[item] + "0" * digits[item]
             left += math.ceil(font.getlength(text)) + letters
-        # Behind the last one there is no gap but the margin.
+        # The last item is followed by the margin instead of a gap.
         widest = max(widest, left - letters + margin)
         top += (ascent + descent) * bool(line)
     return _Layout(top + margin // 2, widest, letters, labels, tuple(places))

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Files that appear whole or not at all.
+"""Atomic file writes: a file appears complete or not at all.
 
-A file is written under a temporary name in its own directory and then renamed, so
-that half of it never has its final name. The temporary name begins with
-a dot and ends in `.part`: `.<name>.<8 hex digits>.part`.
+A file is written under a temporary name in its own directory and then renamed, so an
+incomplete file never has the final name. The temporary name starts with a dot and ends
+in `.part`: `.<name>.<8 hex digits>.part`.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from .errors import FileNotWritten
 def temporary_path(path: Path) -> Path:
     """Return a new name for an unfinished `path`, in the same directory.
 
-    It is hidden by one dot, also where `path` is hidden itself: by that dot a program
-    that puts a directory in order knows the file.
+    The name starts with exactly one dot, even if `path` is hidden itself: programs that
+    clean up a directory recognize the file by that dot.
     """
     name = path.name.removeprefix(".")
     return path.with_name(f".{name}.{secrets.token_hex(4)}.part")
@@ -31,7 +31,7 @@ def temporary_path(path: Path) -> Path:
 def replacing(path: Path) -> Iterator[Path]:
     """Yield a temporary path; rename it to `path` at the end of the block.
 
-    If the block raises, the temporary file is removed and `path` stays as it was.
+    If the block raises, the temporary file is removed and `path` is unchanged.
     """
     temporary = temporary_path(path)
     try:
@@ -43,10 +43,10 @@ def replacing(path: Path) -> Iterator[Path]:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write `text`, in UTF-8, as the whole content of `path`.
+    """Replace the content of `path` with `text`, encoded as UTF-8.
 
     Raises:
-        FileNotWritten: the disk is full, or the directory is gone or read-only.
+        FileNotWritten: the disk is full, or the directory is missing or read-only.
     """
     try:
         with replacing(path) as temporary:
@@ -56,6 +56,6 @@ def write_text(path: Path, text: str) -> None:
 
 
 def file_sha256(path: Path) -> str:
-    """Return the sha256 of a file, in hex."""
+    """Return the SHA-256 digest of a file as a hex string."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()

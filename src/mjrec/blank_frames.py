@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Videos that show nothing: black, of one colour, or without any movement.
+"""Detection of videos that show nothing: all black, a single colour, or no movement.
 
-A lamp that is missing, a camera inside a wall, an OpenGL context of another thread: all
-of them give a video that is whole, counted, and of no use.
+With a missing light, a camera inside a wall, or an OpenGL context from another thread,
+a video has all of its frames and is still useless.
 """
 
 from __future__ import annotations
@@ -18,27 +18,27 @@ from .frames import Frame
 
 logger = logging.getLogger(__name__)
 
-# Of 255, the brightest that looks black.
+# The brightest value (0 to 255) that looks black.
 _BLACK = 4
-# Every n-th pixel of every n-th row is looked at first.
+# Every n-th pixel of every n-th row is checked first.
 _STEP = 16
 
 
 class BlankFrames:
-    """Takes the frames of a video and says at the end whether they show anything.
+    """A check whether the frames of a video show anything.
 
-    As soon as one frame has two colours and one differs from the first, nothing more is
-    looked at. Only frames that could be blank are looked at as a whole.
+    Once one frame has two colours and one differs from the first, no more frames are
+    checked. Only frames that could be blank are checked completely.
     """
 
     def __init__(self) -> None:
         self._count = 0
-        # What all frames so far are.
+        # The looks that all frames so far have.
         self._suspects = set(_LOOKS)
         self._first: Frame | None = None
 
     def add(self, frame: Frame) -> None:
-        """Look at the next frame, `(height, width, 3) uint8`; it is not kept."""
+        """Check the next frame, `(height, width, 3) uint8`, without keeping it."""
         self._count += 1
         if self._first is None and "equal" in self._suspects:
             self._first = frame.copy()
@@ -51,11 +51,11 @@ class BlankFrames:
             self._first = None
 
     def facts(self) -> dict[str, bool]:
-        """Return what a video's metadata says about it; nothing where all is well.
+        """Return the facts for the video's metadata; empty if nothing is wrong.
 
-        `suspect_black`: all frames are black. `suspect_constant`: all frames are of one
-        colour each, or there are several and all are the same. Black ones of exactly
-        one colour are both.
+        `suspect_black`: all frames are black. `suspect_constant`: each frame has a
+        single colour, or there are several frames and all are equal. Black frames of a
+        single colour are both.
         """
         if not self._count:
             return {}
@@ -65,21 +65,21 @@ class BlankFrames:
         return {name: True for name, is_so in facts.items() if is_so}
 
     def suspicion(self) -> str | None:
-        """Return what is wrong with the video, for a message; None where nothing is."""
+        """Return a phrase for what is wrong with the video; None if nothing is."""
         if not self.facts():
             return None
         frames = f"all {self._count} frames are" if self._count > 1 else "its frame is"
         if "black" in self._suspects:
             return f"{frames} black"
         if "plain" in self._suspects:
-            return f"{frames} of a single colour"
-        return f"{frames} the same frame"
+            return f"{frames} a single colour"
+        return f"{frames} identical"
 
     def judge(self, video: Path, *, strict: bool) -> None:
-        """Warn of a finished video that shows nothing, or raise.
+        """Warn about a finished video that shows nothing, or raise an error.
 
         Raises:
-            BlankVideo: `strict`, and it shows nothing.
+            BlankVideo: `strict` is True and the video shows nothing.
         """
         suspicion = self.suspicion()
         if suspicion is None:
@@ -90,13 +90,14 @@ class BlankFrames:
 
 
 def _is_plain(frame: Frame, first: Frame) -> bool:
-    # The first row with its first pixel, all rows with the first: whole rows compare
-    # many times faster than pixels.
+    # Compare the first row with its first pixel, then all rows with the first row:
+    # comparing whole rows is many times faster than comparing pixels.
     row = frame[:1]
     return bool((row == row[:, :1]).all()) and bool((frame == row).all())
 
 
-# What a frame, or a sample of it, may be; beside it the video's first.
+# Tests for the ways a frame (or a sample of it) may look blank; the second argument is
+# the video's first frame.
 _LOOKS: dict[str, Callable[[Frame, Frame], bool]] = {
     "black": lambda frame, first: int(frame.max()) <= _BLACK,
     "plain": _is_plain,

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Processes of ours that run a module of ours, which makes a `Parent` there.
+"""Child processes that run one of mjrec's modules, which creates a `Parent` there.
 
-Not with multiprocessing, whose children import the caller's main module (a script
-without a guard would run again), cannot be started from daemonic processes, and with
-"fork" inherit OpenGL's locks without its threads.
+multiprocessing is not used: its children import the caller's main module (which runs a
+script without a guard a second time), cannot be started from daemonic processes, and
+with "fork" inherit OpenGL's locks without its threads.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from .messages import (
 )
 from .timeouts import Timeout
 
-# What users may have without privileges: one frame of 480x480, and more.
+# The most that unprivileged users may have; it holds more than one 480x480 frame.
 _PIPE_BYTES = 1 << 20
 _MOST_WORDS_READ = 20_000
 _LOOKS_FOR_STACKS = 20
@@ -45,28 +45,30 @@ _LONGEST_PAUSE = 0.02
 
 
 class Child:
-    """A Python process that runs a module of ours, and makes a `Parent` there.
+    """A Python process that runs one of mjrec's modules, which creates a `Parent`.
 
-    It has a session of its own, so that Ctrl-C in the terminal reaches only the parent.
-    It is ended by `end`, by leaving `with`, by garbage collection and at interpreter
-    exit; and it notices the parent's end, however that dies.
+    The process has its own session, so Ctrl-C in the terminal reaches only the parent.
+    It ends on `end`, when the `with` block is left, on garbage collection, and at
+    interpreter exit. It also notices when the parent dies, for whatever reason.
 
     Args:
-        module: what to run.
-        arguments: its command line.
-        environ: its environment variables, besides the module search path.
-        cwd: its working directory; the parent's, if None.
-        is_heard: whether what it prints is to be read from `words`, a pipe, by the
-            caller. Else it goes into memory, and its end is one of `last_words`.
-        fork: what a fork of this process does in place of a new Python with the module.
-            Only where there is a single thread, and OpenGL was not used.
+        module: the module to run.
+        arguments: its command-line arguments.
+        environ: its environment variables, without the module search path.
+        cwd: its working directory; if None, the parent's.
+        is_heard: whether the caller reads the output from the pipe `words`. If False,
+            the output is kept in memory, and `last_words` includes the end of it.
+        fork: a function that a fork of this process calls, instead of starting a new
+            Python with the module. Only valid if this process has a single thread and
+            has not used OpenGL.
 
     Raises:
-        OSError: it cannot be started.
+        OSError: the process cannot be started.
 
     Attributes:
-        pid: the process's number.
-        most_bytes: of a message; what is longer ends them. No frame is.
+        pid: the process id.
+        most_bytes: maximum size of a message; a longer one, which no frame is, ends the
+            messages.
     """
 
     most_bytes = MOST_BYTES
@@ -100,7 +102,7 @@ class Child:
                 os.close(descriptor)
         for pipe in (orders, answers):
             os.set_blocking(pipe, False)
-            # The system may grant no more than it has.
+            # The system may refuse to enlarge the pipe.
             with contextlib.suppress(OSError):
                 fcntl.fcntl(pipe, fcntl.F_SETPIPE_SZ, _PIPE_BYTES)
         self._process = _Process(self.pid)
@@ -116,29 +118,34 @@ class Child:
         _children.add(self)
 
     def fileno(self) -> int:
-        """Return the descriptor that is readable where there is news of it."""
+        """Return the descriptor that is readable when the child has sent or ended."""
         return self._answers.fileno()
 
     def send(self, **message: Any) -> None:
-        """Send a message. Never waits: what its pipe does not take goes with the next.
+        """Send a message without blocking; what does not fit is sent with the next one.
 
-        That it has died is noticed where its messages are waited for.
+        If the child has died, this is noticed only when waiting for its messages.
         """
         self._unsent += b"".join(packed(message))
         self._send_on()
 
     def receive(self) -> Message | None:
-        """Return its next message; None where none is there yet.
+        """Return the child's next message, or None if it has not arrived yet.
 
         Raises:
-            EOFError: it has ended.
+            EOFError: the child has ended.
         """
         for message in self._messages:
             return message
         raise EOFError
 
     def messages(self, seconds: float) -> Iterator[dict[str, Any] | None]:
-        """Yield its messages until it ends; None once it was silent for so long."""
+        """Yield the child's messages until it ends.
+
+        Args:
+            seconds: timeout in seconds without a message. When it passes, None is
+                yielded and the iterator ends.
+        """
         timeout = Timeout(seconds)
         while not timeout.is_over:
             if not timeout.wait(lambda slice_: wait_for_news([self], slice_)):
@@ -152,9 +159,10 @@ class Child:
         yield None
 
     def stacks(self) -> str:
-        """Return what the threads of one that hangs are at, for the log."""
+        """Return the stacks of a hanging child's threads, for the log."""
         before = after = self._size_of_words()
-        # One that has not begun yet dies of it. It may only have been stopped.
+        # The signal kills a child that has not set its handler yet. SIGCONT is for a
+        # child that was only stopped.
         self._process.send_signal(STACKS_SIGNAL)
         self._process.send_signal(signal.SIGCONT)
         for _ in range(_LOOKS_FOR_STACKS):
@@ -166,19 +174,19 @@ class Child:
         return self._words_from(before) or "(no output)"
 
     def last_words(self) -> str:
-        """Return how it ended, and the end of its output."""
+        """Return how the child ended, and the end of its output."""
         how = self.how_it_ended()
-        # What Python says of a crash ends with the names of dozens of modules.
+        # Python's crash report ends with the names of dozens of modules.
         words = self.printed().partition("\nExtension modules:")[0].strip()
         end = words[-_END_OF_WORDS:] or "(nothing)"
         return f"{how}. Its last output: {end}"
 
     def printed(self) -> str:
-        """Return the end of what it has printed."""
+        """Return the end of the child's output."""
         return self._words_from(max(0, self._size_of_words() - _MOST_WORDS_READ))
 
     def how_it_ended(self) -> str:
-        """Return in words its exit status, for which it is waited some seconds."""
+        """Wait a few seconds for the exit status and return it in words."""
         status = self._process.wait(_SECONDS_TO_END)
         if status is None:
             return "is alive but silent"
@@ -190,23 +198,23 @@ class Child:
             return f"was killed by signal {-status}"
 
     def forget_words(self) -> None:
-        """Drop what it has printed, if that is much."""
+        """Drop the output so far if it is large."""
         if self._size_of_words() > _MOST_WORDS:
             os.ftruncate(self.words.fileno(), 0)
 
     def cpu_seconds(self) -> float:
-        """Return how many seconds it has used a CPU; 0 once it has ended."""
+        """Return the child's CPU time in seconds; 0 once it has ended."""
         with contextlib.suppress(OSError):
-            # The kernel's number for the CPU clock of another process.
+            # The kernel's id of the CPU clock of another process.
             return time.clock_gettime((~self.pid << 3) | 2)
         return 0.0
 
     def terminate(self) -> None:
-        """Ask it to end. It is not waited for."""
+        """Ask the child to end, without waiting for it."""
         self._process.send_signal(signal.SIGTERM)
 
     def kill(self) -> None:
-        """Kill it and its children, which may hang as well; `end` does the rest."""
+        """Kill the child and its children, which may hang too; `end` does the rest."""
         children = _pids_of_children(self.pid)
         self._process.send_signal(signal.SIGKILL)
         for pid in children:
@@ -214,7 +222,7 @@ class Child:
                 os.kill(pid, signal.SIGKILL)
 
     def end(self) -> None:
-        """End it, by force where it does not end by itself. Idempotent."""
+        """End the child, by force if it does not end on its own. Idempotent."""
         _children.discard(self)
         self._end()
 
@@ -243,13 +251,18 @@ class Child:
         return os.fstat(self.words.fileno()).st_size
 
     def _words_from(self, begin: int) -> str:
-        # Not by seeking: the position is the child's too.
+        # Without seeking, because the file position is shared with the child.
         output = os.pread(self.words.fileno(), _MOST_WORDS_READ, begin)
         return output.decode(errors="replace").strip()
 
 
 def wait_for_news(children: Iterable[Child], seconds: float) -> list[Child]:
-    """Wait until one of them sends something or ends; return those that did."""
+    """Wait until a child sends something or ends, and return the children that did.
+
+    Args:
+        children: the children to wait for.
+        seconds: maximum time to wait.
+    """
     poll, by_descriptor = select.poll(), {}
     for child in children:
         by_descriptor[child.fileno()] = child
@@ -268,19 +281,19 @@ def wait_for_news(children: Iterable[Child], seconds: float) -> list[Child]:
 
 
 class _Process:
-    """A process that this one has started, as far as it has to be waited for."""
+    """The exit status of a process that this one has started, and signals to it."""
 
     def __init__(self, pid: int) -> None:
         self._pid = pid
         self._status: int | None = None
 
     def send_signal(self, signum: int) -> None:
-        # One that was waited for may have given its number to another.
+        # After it has been waited for, its pid may belong to another process.
         if self.wait(0) is None:
             os.kill(self._pid, signum)
 
     def wait(self, seconds: float) -> int | None:
-        """Return the exit status, as `subprocess` gives it; None where it goes on."""
+        """Return the exit status as `subprocess` does, or None if still running."""
         deadline, pause = time.monotonic() + seconds, 0.0005
         while (status := self._poll()) is None:
             rest = deadline - time.monotonic()
@@ -295,7 +308,7 @@ class _Process:
             try:
                 pid, status = os.waitpid(self._pid, os.WNOHANG)
             except ChildProcessError:
-                # Where SIGCHLD is ignored, the system keeps no status.
+                # If SIGCHLD is ignored, the system keeps no status.
                 self._status = 0
             else:
                 self._status = os.waitstatus_to_exitcode(status) if pid else None
@@ -303,9 +316,10 @@ class _Process:
 
 
 def _pipe() -> tuple[int, int]:
-    """Return the ends of a pipe, not in the place of a standard stream that is closed.
+    """Return the two ends of a pipe, with descriptors above the standard streams'.
 
-    There the child's own would take its place.
+    If a standard stream is closed, a new pipe may get its number, and the child's own
+    standard stream would then replace it.
     """
     ends = os.pipe()
     reading, writing = (fcntl.fcntl(end, fcntl.F_DUPFD_CLOEXEC, 3) for end in ends)
@@ -315,9 +329,9 @@ def _pipe() -> tuple[int, int]:
 
 
 def _memory() -> tuple[int, int]:
-    """Return two descriptors of one file in memory."""
+    """Return two descriptors of a file in memory."""
     words = os.memfd_create("mjrec-words")
-    # So that the file can be emptied while the child writes into it.
+    # Appending lets the file be emptied while the child writes to it.
     fcntl.fcntl(words, fcntl.F_SETFL, os.O_APPEND)
     return words, os.dup(words)
 
@@ -339,7 +353,7 @@ def _started(
         pass_fds=pipes,
         start_new_session=True,
     )
-    # It is waited for here.
+    # `_Process` waits for it, so `subprocess` must not.
     process.returncode = 0
     return process.pid
 
@@ -358,7 +372,7 @@ def _forked(
         os.setsid()
         os.chdir(cwd or ".")
         os.environ.update(environ)
-        # Of the process that this is a copy of.
+        # Undo what was set in the process that this one is a copy of.
         signal.signal(signal.SIGTERM, signal.SIG_DFL)
         logging.getLogger().handlers.clear()
         for descriptor in (1, 2):
@@ -379,12 +393,12 @@ def _end_child(process: _Process, files: tuple[IO[bytes], ...], owner: int) -> N
     for file in files:
         with contextlib.suppress(OSError):
             file.close()
-    # A forked child has copies; the process is its parent's.
+    # A forked child has copies of the files, but the process belongs to its parent.
     if os.getpid() == owner:
         process.send_signal(signal.SIGTERM)
         if process.wait(_SECONDS_TO_END) is None:
             process.send_signal(signal.SIGKILL)
-            # One whose disk or driver does not answer cannot die.
+            # A process that is blocked in a disk or a driver does not die.
             process.wait(_SECONDS_TO_END)
 
 
@@ -400,7 +414,7 @@ _children: weakref.WeakSet[Child] = weakref.WeakSet()
 
 
 def _leave_all_to_parent() -> None:
-    """Close a forked child's copies of the pipes, which would not end otherwise."""
+    """Close a forked child's copies of the pipes, which would stay open otherwise."""
     for child in list(_children):
         child.end()
 
@@ -409,10 +423,11 @@ os.register_at_fork(after_in_child=_leave_all_to_parent)
 
 
 def python_command(module: str) -> list[str]:
-    """Return the command that runs `module`, which finds what this process finds.
+    """Return the command that runs `module` as a child process.
 
-    To be run with `environment_of_child`. `-P` keeps the working directory, which may
-    hold a file called `random.py`, from being searched first.
+    Run it with `environment_of_child`, so that it finds the same modules as this
+    process. `-P` keeps Python from searching the working directory first, which might
+    contain a file called `random.py`.
     """
     return [sys.executable, "-P", "-m", module]
 
@@ -420,20 +435,21 @@ def python_command(module: str) -> list[str]:
 def environment_of_child(environ: Mapping[str, str]) -> dict[str, str]:
     """Return `environ` with this process's module search path in `PYTHONPATH`.
 
-    The whole of it, in its order, so that the child has the same mujoco and the same
-    mjrec, by whatever means this process came to them. The directory of the main
-    script, or the working directory, which Python puts first, is searched last.
+    The path is complete and in order, so the child has the same mujoco and mjrec, no
+    matter how this process found them. The exception is the directory of the main
+    script, or the working directory: Python puts it first, and the child searches it
+    last.
     """
     first, rest = sys.path[:1], sys.path[1:]
     path = [*rest, *first] if first and _is_of_main(first[0]) else sys.path
     entries = (str(Path(entry).absolute()) for entry in path if isinstance(entry, str))
-    # What has the separator in its name cannot be said there.
+    # A path that contains the separator cannot be listed there.
     entries_said = [entry for entry in entries if os.pathsep not in entry]
     return {**environ, "PYTHONPATH": os.pathsep.join(entries_said)}
 
 
 def places_of_main() -> list[str]:
-    """Return the folder of the main script, where modules are found beside it."""
+    """Return the main script's folder if modules are imported from it."""
     first = sys.path[:1]
     return [str(Path(each).absolute()) for each in first if _is_of_main(each)]
 

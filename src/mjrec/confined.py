@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A process without network, home and other files; run as `python -m` with a module.
+"""A process without network, home folder or other files, run as `python -m` MODULE.
 
-It confines itself before it imports anything, because what confines a thread confines
-no other that is there already. What an unprivileged Linux process can have:
+The process confines itself before it imports anything, because confining a thread does
+not confine threads that already exist. An unprivileged Linux process can use:
 
-- Landlock (Linux 5.13): only Python, the system and what is named may be read, only
-  what is named may be written; from Linux 6.7 on no TCP connection either.
-- A network namespace without any network, where the system lets users make one.
+- Landlock (Linux 5.13): only Python, the system and the named paths can be read, and
+  only named paths can be written; since Linux 6.7, TCP connections are blocked too.
+- An empty network namespace, if the system lets users create one.
 
-Where the kernel has neither, the limits of the sandbox, an empty home and a short list
-of environment variables are all there is.
+If the kernel supports neither, only the sandbox's limits, an empty home folder and a
+short list of environment variables remain.
 """
 
 from __future__ import annotations
@@ -27,21 +27,21 @@ VARIABLE = "MJREC_CONFINED"
 
 _SYSTEM = (
     *("/usr", "/lib", "/lib64", "/bin", "/sbin", "/etc", "/proc", "/sys", "/opt"),
-    # Drivers and their lists are in some of these.
+    # On some systems, drivers and their lists are in these folders.
     *("/nix", "/run/opengl-driver", "/var/lib"),
 )
 _CLONE_NEWUSER, _CLONE_NEWNET = 0x1000_0000, 0x4000_0000
 _NO_NEW_PRIVILEGES = 38
 
-# The numbers of system calls are the same on every architecture of today.
+# These system calls have the same numbers on all current architectures.
 _CREATE, _ADD, _RESTRICT = 444, 445, 446
 _PATH_BENEATH = 1
 _READ = 0b1101  # execute, read a file, read a folder
-# By the version of Landlock: how many of its rights to files there are.
+# Number of Landlock's file access rights, by Landlock version.
 _RIGHTS = {1: 13, 2: 14, 3: 15, 4: 15, 5: 16}
 _NO_TCP = 0b11
 _SCOPES = 0b11  # abstract sockets and signals
-# Version 4 brought TCP, 6 the scopes.
+# Version 4 added TCP, version 6 the scopes.
 _WITH_TCP, _WITH_SCOPES = 4, 6
 
 
@@ -65,15 +65,17 @@ _libc = ctypes.CDLL(None, use_errno=True)
 def confine(
     readable: Iterable[str], writable: Iterable[str], hidden: Iterable[str] = ()
 ) -> dict[str, bool]:
-    """Confine this process, for good, and all that it starts.
+    """Permanently confine this process and the processes it starts.
 
     Args:
-        readable: files and folders besides Python's and the system's.
-        writable: folders.
-        hidden: where modules are not to be found: the folder of the caller's script.
+        readable: files and folders that may be read, in addition to Python's and the
+            system's.
+        writable: folders that may be written to.
+        hidden: folders that modules must not be imported from, such as the folder of
+            the caller's script.
 
     Returns:
-        `files` and `network`: whether the kernel keeps it from other files, and from
+        `files` and `network`: whether the kernel blocks access to other files and to
         the network.
     """
     without_network = _leave_network()
@@ -87,7 +89,7 @@ def confine(
         _NO_TCP if has_tcp else 0,
         _SCOPES if version >= _WITH_SCOPES else 0,
     )
-    # An older kernel knows a shorter one.
+    # Older kernels know a shorter structure.
     size = 8 if not has_tcp else 16 if version < _WITH_SCOPES else 24
     ruleset = _libc.syscall(_CREATE, ctypes.byref(rules), ctypes.c_size_t(size), 0)
     if ruleset < 0:
@@ -108,7 +110,7 @@ def _python() -> set[str]:
 
 def _leave_network() -> bool:
     user, group = os.getuid(), os.getgid()
-    # Who may not, may where it is root of a user namespace of its own.
+    # A process without the privilege may have it inside its own user namespace.
     if _libc.unshare(_CLONE_NEWNET) == 0:
         return True
     if _libc.unshare(_CLONE_NEWUSER | _CLONE_NEWNET) != 0:
@@ -129,7 +131,7 @@ def _allow(ruleset: int, path: str, rights: int) -> None:
     except OSError:
         return
     if not Path(path).is_dir():
-        # What belongs to folders is refused for files.
+        # The kernel rejects folder rights for a file.
         rights &= 0b101 | 1 << 1 | 1 << 14 | 1 << 15
     rule = _PathBeneath(rights, parent)
     _libc.syscall(_ADD, ruleset, _PATH_BENEATH, ctypes.byref(rule), 0)
@@ -137,7 +139,7 @@ def _allow(ruleset: int, path: str, rights: int) -> None:
 
 
 def main() -> None:
-    """Confine this process as the environment says, and run the module."""
+    """Confine this process as its environment variable says, then run the module."""
     said = json.loads(os.environ.pop(VARIABLE))
     holds = confine(**said)
     os.environ[f"{VARIABLE}_HOLDS"] = json.dumps(holds)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""All errors of mjrec, as a tree.
+"""mjrec's exceptions, as a tree.
 
 ::
 
@@ -7,36 +7,36 @@
     ├── InvalidArgument (also ValueError)   a wrong value
     │   ├── UnknownName                     no such environment, camera, policy ...
     │   └── InvalidFrame                    not a (height, width, 3) uint8 array
-    ├── ExistingRecordings                  neither force nor resume was asked for
-    ├── DirectoryInUse                      another live monitor writes there
+    ├── ExistingRecordings                  neither force nor resume was given
+    ├── DirectoryInUse                      another open monitor writes there
     ├── DirectoryNotWritable (also OSError) cannot be created or written to
-    ├── FileNotWritten (also OSError)       such as a full disk
-    ├── DifferentEnvironment                resume over another environment
-    ├── DifferentEvaluation                 resume with other options
-    ├── EnvironmentNotMade                  making a known environment failed
+    ├── FileNotWritten (also OSError)       for example, the disk is full
+    ├── DifferentEnvironment                resume with a different environment
+    ├── DifferentEvaluation                 resume with different options
+    ├── EnvironmentNotMade                  creating a known environment failed
     ├── NotPicklable (also TypeError)       a monitor belongs to its process
-    ├── NoPictures                          the environment cannot be drawn
-    ├── PicturesDiffer                      frames do not follow from the state
+    ├── NoPictures                          the environment provides no frames
+    ├── PicturesDiffer                      the state does not determine the frames
     ├── ResetNeeded                         step before reset or after the end
     ├── ResetNotAllowed                     reset in the middle of an episode
     ├── ClosedError                         used after close()
     ├── EncoderError                        ffmpeg failed or died
-    │   └── FrameCountError                 the finished file lacks or doubles frames
+    │   └── FrameCountError                 the finished file lacks or repeats frames
     ├── RenderError                         videos could not be rendered
     ├── BlankVideo                          strict=True: the video shows nothing
-    ├── GLError                             no backend renders, or the wrong one
-    ├── PolicyError                         a policy raised or gave a bad action
-    ├── ArchiveError                        write_archive's checks
-    ├── PackError                           a run cannot be packed as asked
+    ├── GLError                             no backend works, or the wrong one is loaded
+    ├── PolicyError                         a policy failed or gave an invalid action
+    ├── ArchiveError                        a check of write_archive failed
+    ├── PackError                           a run cannot be packed as requested
     │   ├── UnfinishedRecordings            render or recover first
     │   ├── ArchiveTooLarge                 exceeds max_size
-    │   └── IdentityLeft                    anonymous=True: a name is left
-    ├── UnreadableFile                      a damaged or foreign file
+    │   └── IdentityLeft                    anonymous=True: a name remains
+    ├── UnreadableFile                      a damaged file, or the wrong kind
     │   ├── UnreadableArchive               given to `mjrec verify`
-    │   └── UntrustedModel                  a stranger's, without its sources
+    │   └── UntrustedModel                  from a stranger, without its sources
     └── MissingDependency (also ImportError)  an extra is not installed
 
-Every message says what was asked, what is there, and what to do.
+Every message says what was requested, what was found, and what to do.
 """
 
 from __future__ import annotations
@@ -49,16 +49,16 @@ from typing import Any
 
 
 class Error(Exception):
-    """Base of every error that mjrec raises on purpose."""
+    """Base class of all errors that mjrec raises on purpose."""
 
     def __reduce__(self) -> tuple[Any, ...]:
-        # The subclasses take facts and make the message of them; pickle (an error
-        # that comes home from a worker process) would call them with the message.
+        # Subclasses take facts and build the message from them, but pickle (for an
+        # error from a worker process) would call them with the message.
         return rebuilt, (type(self), str(self), vars(self))
 
 
 def rebuilt(kind: type[Error], message: str, facts: Mapping[str, Any]) -> Error:
-    """Return an error that was carried from another process."""
+    """Rebuild an error that came from another process."""
     error = kind.__new__(kind)
     error.args = (message,)
     vars(error).update(facts)
@@ -69,23 +69,23 @@ _MOST_NAMES = 20
 
 
 def _first_of(names: Sequence[str], count: int, *, between: str = ", ") -> str:
-    """Return some names, and how many there are besides."""
+    """Return the first few names, and how many more there are."""
     more = len(names) - count
     shown = between.join(names[:count])
     return f"{shown} and {more} more" if more > 0 else shown
 
 
 class InvalidArgument(Error, ValueError):
-    """An argument has a value that cannot be."""
+    """An argument has an invalid value."""
 
 
 class UnknownName(InvalidArgument):
-    """A name that stands for nothing.
+    """A name that does not exist.
 
     Attributes:
-        kind: what was looked for, for example `"camera"`.
-        name: the name asked for.
-        available: the names there are.
+        kind: the kind of thing that was looked up, for example `"camera"`.
+        name: the requested name.
+        available: the names that exist.
     """
 
     def __init__(
@@ -94,15 +94,15 @@ class UnknownName(InvalidArgument):
         self.kind = kind
         self.name = name
         self.available = list(available)
-        shown, label = self.available, "There are"
+        shown, label = self.available, "Available"
         if len(shown) > _MOST_NAMES:
             shown = difflib.get_close_matches(str(name), self.available, _MOST_NAMES)
-            label = "Names like it"
+            label = "Similar names"
         listed = f"{label}: {', '.join(shown)}."
         if not self.available:
             listed = "There are none."
         elif not shown:
-            listed = f"There are {len(self.available)}, none with a like name."
+            listed = f"None of the {len(self.available)} known names is similar."
         super().__init__(f"There is no {kind} {name!r}. {listed} {hint}".rstrip())
 
 
@@ -111,10 +111,10 @@ class InvalidFrame(InvalidArgument):
 
 
 class ExistingRecordings(Error):
-    """The directory holds recordings and neither `force` nor `resume` was given.
+    """The directory contains recordings and neither `force` nor `resume` was given.
 
     Attributes:
-        directory: the directory asked for.
+        directory: the requested directory.
         names: the base names of the monitor files in it.
     """
 
@@ -122,24 +122,24 @@ class ExistingRecordings(Error):
         self.directory = directory
         self.names = list(names)
         super().__init__(
-            f"{directory} holds recordings already: {_first_of(names, 5)}. Use a "
-            "directory of its own for each run, resume=True (--resume) to add to these "
+            f"{directory} already contains recordings: {_first_of(names, 5)}. Use a "
+            "separate directory for each run, resume=True (--resume) to add to these "
             "recordings, or force=True (--force) to delete them."
         )
 
 
 class DirectoryInUse(Error):
-    """Another monitor, which is still open, writes into the directory."""
+    """Another monitor is still open and writing to the directory."""
 
 
 class DirectoryNotWritable(Error, OSError):
-    """The directory cannot be made or written to."""
+    """The directory cannot be created or written to."""
 
     def __init__(self, directory: Path, reason: object) -> None:
         self.directory = directory
         super().__init__(
-            f"Cannot write into {directory}: {reason}. Choose a directory that this "
-            "user may write to."
+            f"Cannot write to {directory}: {reason}. Choose a directory that you have "
+            "permission to write to."
         )
 
 
@@ -155,34 +155,34 @@ class FileNotWritten(Error, OSError):
         path: Path,
         reason: object,
         *,
-        then: str = "the next close() or `mjrec render` tries again",
+        then: str = "the next close() or `mjrec render` will retry",
     ) -> None:
         self.path = path
         super().__init__(
-            f"Cannot write {path}: {reason}. What is there stays as it is; where space "
-            f"was lacking, free some: {then}."
+            f"Cannot write {path}: {reason}. Existing files are unchanged. If the disk "
+            f"is full, free some space; {then}."
         )
 
 
 class DifferentEnvironment(Error):
-    """`resume=True` over recordings of another environment."""
+    """`resume=True` with recordings of a different environment."""
 
     def __init__(self, directory: Path, recorded: str, asked: str) -> None:
         self.recorded = recorded
         self.asked = asked
         super().__init__(
-            f"{directory} holds recordings of {recorded}, but this monitor records "
+            f"{directory} contains recordings of {recorded}, but this monitor records "
             f"{asked}. Use another directory: results of two environments cannot share "
             "one."
         )
 
 
 class DifferentEvaluation(Error):
-    """`resume=True` of an evaluation that was started with other options.
+    """`resume=True` for an evaluation that was started with different options.
 
     Attributes:
-        directory: of the evaluation.
-        differences: pairs of old and new value, by option.
+        directory: the evaluation's directory.
+        differences: pairs of old and new values, by option.
     """
 
     def __init__(
@@ -195,13 +195,13 @@ class DifferentEvaluation(Error):
             for name, (begun, asked) in self.differences.items()
         )
         super().__init__(
-            f"The evaluation in {directory} was started with other options: {listed}. "
-            "Use the same options, or another directory."
+            f"The evaluation in {directory} was started with different options: "
+            f"{listed}. Use the same options, or another directory."
         )
 
 
 class EnvironmentNotMade(Error):
-    """A known environment could not be made; the cause is kept.
+    """A known environment could not be created; the cause is chained.
 
     Attributes:
         name: the environment's name.
@@ -209,7 +209,7 @@ class EnvironmentNotMade(Error):
 
     def __init__(self, name: str, reason: object, *, hint: str = "") -> None:
         self.name = name
-        text = f"Making {name} failed: {reason}"
+        text = f"Could not create {name}: {reason}"
         super().__init__(f"{text.rstrip('. ')}. {hint}".rstrip())
 
 
@@ -218,19 +218,19 @@ class NotPicklable(Error, TypeError):
 
 
 class NoPictures(Error):
-    """Videos are wanted, but the environment gives no frames."""
+    """Videos were requested, but the environment provides no frames."""
 
 
 class PicturesDiffer(Error):
-    """What an environment shows cannot be drawn from its recorded state."""
+    """An environment's frames cannot be reproduced from its recorded state."""
 
 
 class RenderError(Error):
     """Videos could not be rendered from their recorded states.
 
     Attributes:
-        directory: where the recordings are.
-        failures: the reasons, by the names of the videos.
+        directory: the directory of the recordings.
+        failures: the reasons, by video name.
     """
 
     def __init__(self, directory: Path, failures: Mapping[str, str]) -> None:
@@ -242,15 +242,15 @@ class RenderError(Error):
         reasons = "; ".join(f"{listed}: {why}" for why, listed in names.items())
         super().__init__(
             f"{len(self.failures)} of the videos in {directory} could not be rendered: "
-            f"{reasons} Their states are kept. To try again: mjrec render {directory}"
+            f"{reasons} Their states are kept. To retry, run: mjrec render {directory}"
         )
 
 
 class BlankVideo(Error):
-    """With `strict=True`: a complete video shows nothing.
+    """A complete video shows nothing, and `strict=True` was given.
 
     Attributes:
-        path: the video; it is kept, with its metadata.
+        path: the video, which is kept together with its metadata.
         frame_count: number of frames.
         suspicion: what is wrong.
     """
@@ -261,17 +261,17 @@ class BlankVideo(Error):
         self.suspicion = suspicion
         super().__init__(
             f"{path} shows nothing: {suspicion}. The file is kept. Check the model's "
-            "lights and camera, and OpenGL with `mjrec doctor`. Without strict "
-            "(--strict) this is a warning."
+            "lights and camera, and run `mjrec doctor` to check OpenGL. Without strict "
+            "(--strict) this is only a warning."
         )
 
 
 class ResetNeeded(Error):
-    """`step` before the first `reset`, or after the end of an episode."""
+    """`step` was called before the first `reset` or after the end of an episode."""
 
 
 class ResetNotAllowed(Error):
-    """`reset` in the middle of an episode, without `allow_early_reset=True`."""
+    """`reset` was called during an episode, without `allow_early_reset=True`."""
 
 
 class ClosedError(Error):
@@ -283,7 +283,7 @@ class EncoderError(Error):
 
     Attributes:
         command: its arguments.
-        returncode: its exit status; negative is the signal that killed it.
+        returncode: its exit status; if negative, the signal that killed it.
         stderr: the end of its output.
     """
 
@@ -295,21 +295,21 @@ class EncoderError(Error):
         self.stderr = stderr
         output = stderr.strip() or "(nothing)"
         super().__init__(
-            f"{what} ffmpeg's exit status: {returncode}. It was started as: "
+            f"{what} ffmpeg's exit status: {returncode}. Command: "
             f"{' '.join(self.command)}. Its last output: {output}"
         )
 
 
 class FrameCountError(EncoderError):
-    """The finished video does not hold the frames that were written."""
+    """The finished video does not contain exactly the frames that were written."""
 
 
 class GLError(Error):
-    """No OpenGL backend renders here, or another one is already in use."""
+    """No OpenGL backend works here, or another one is already in use."""
 
 
 class PolicyError(Error):
-    """A policy cannot be built, raised, or gave an invalid action."""
+    """A policy could not be built, failed, or returned an invalid action."""
 
 
 class ArchiveError(Error):
@@ -317,15 +317,15 @@ class ArchiveError(Error):
 
 
 class PackError(Error):
-    """A run cannot be packed as asked; nothing was written."""
+    """A run cannot be packed as requested; nothing was written."""
 
 
 class UnfinishedRecordings(PackError):
     """Recordings are not finished.
 
     Attributes:
-        directory: where the recordings are.
-        names: base names of unfinished files.
+        directory: the directory of the recordings.
+        names: base names of the unfinished files.
     """
 
     def __init__(self, directory: Path, names: Sequence[str], *, advice: str) -> None:
@@ -341,7 +341,7 @@ class ArchiveTooLarge(PackError):
     """A packed run would exceed the limit, even with smaller videos.
 
     Attributes:
-        size: least size of the smallest archive that was tried, in bytes.
+        size: lower bound on the size of the smallest archive tried, in bytes.
         limit: the limit in bytes.
         largest: names and sizes of its largest files.
     """
@@ -354,18 +354,18 @@ class ArchiveTooLarge(PackError):
         self.largest = list(largest)
         listed = "".join(f"\n  {size:>12}  {name}" for name, size in self.largest)
         super().__init__(
-            f"The packed run would have {size} bytes at least, and max_size allows "
-            f"{limit}. "
-            f"{reason} Choose episodes (episodes=[0, 8], --episodes 0,8), or allow "
-            f"more. The largest files, in bytes:{listed}"
+            f"The packed run would take at least {size} bytes, but max_size allows "
+            f"only {limit}. "
+            f"{reason} Pack fewer episodes (episodes=[0, 8], --episodes 0,8), or raise "
+            f"max_size. The largest files, in bytes:{listed}"
         )
 
 
 class IdentityLeft(PackError):
-    """With `anonymous=True`: the archive would still name a person or machine.
+    """The archive would still name a person or machine despite `anonymous=True`.
 
     Attributes:
-        found: files, each with what was found in it.
+        found: pairs of a file and what was found in it.
     """
 
     def __init__(self, found: Sequence[tuple[str, str]]) -> None:
@@ -376,12 +376,12 @@ class IdentityLeft(PackError):
         super().__init__(
             f"The packed run would not be anonymous, so it was not written: {listed}. "
             "Record again without these names (uid, camera, body, title), or leave out "
-            "the episodes that have them."
+            "the episodes that contain them."
         )
 
 
 class UnreadableFile(Error):
-    """A file is damaged, or not what its name says.
+    """A file is damaged, or not what its name suggests.
 
     Attributes:
         path: the file.
@@ -389,40 +389,40 @@ class UnreadableFile(Error):
     """
 
     _message = "Cannot read {path}: {reason}."
-    _advice = " To read the other files of its directory, move this one away."
+    _advice = " To read the other files in its directory, move this one away."
 
     def __init__(self, path: Path, reason: object) -> None:
         self.path = path
         self.reason = str(reason)
-        # Nothing can be moved away that is not there.
+        # A file that does not exist cannot be moved away.
         advice = self._advice if os.path.lexists(path) else ""
         super().__init__(self._message.format(path=path, reason=reason) + advice)
 
 
 class UnreadableArchive(UnreadableFile):
-    """The file to verify is no packed run, or is damaged."""
+    """The file to verify is not a packed run, or is damaged."""
 
     _message = "Cannot verify {path}: {reason}."
     _advice = (
-        " It may be incomplete, or was packed again by another program: ask for the "
-        "file that `mjrec pack` wrote."
+        " It may be incomplete, or may have been repacked by another program: ask for "
+        "the original file from `mjrec pack`."
     )
 
 
 class UntrustedModel(UnreadableFile):
-    """A compiled model that a stranger may have written is not loaded.
+    """A compiled model from an untrusted source was not loaded.
 
     Attributes:
-        path: of the model.
+        path: the model's path.
         reason: why its sources cannot be used, and how to trust it.
     """
 
-    _message = "The model {path} is not loaded: {reason}."
+    _message = "The model {path} was not loaded: {reason}."
     _advice = ""
 
 
 class MissingDependency(Error, ImportError):
-    """An optional package is needed and not installed."""
+    """An optional package is needed but not installed."""
 
     def __init__(self, package: str, *, purpose: str, install: str) -> None:
         self.package = package
@@ -436,5 +436,5 @@ KINDS: Mapping[str, type[Error]] = {
     for name, kind in list(globals().items())
     if isinstance(kind, type) and issubclass(kind, Error)
 }
-# For the package, whose public names all of these are.
+# The package exports all of these.
 __all__ = [*KINDS]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a frame is: a `(height, width, 3) uint8` array of red, green and blue."""
+"""Frames: `(height, width, 3) uint8` RGB arrays."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from .errors import InvalidArgument, InvalidFrame, UnknownName
 
 Frame: TypeAlias = NDArray[np.uint8]
 
-# The model's own settings; or no multisampling and a small shadow map.
+# "full" uses the model's own settings, "draft" no multisampling and a small shadow map.
 QUALITIES = ("full", "draft")
 
-# H.264 level 6.2 ends here.
+# The limit of H.264 level 6.2.
 _MAX_SIDE = 16384
 
 
@@ -25,11 +25,11 @@ def check_frame(frame: object, *, size: tuple[int, int] | None = None) -> Frame:
     """Return `frame` if it is a frame.
 
     Args:
-        frame: what an environment gave.
-        size: the `(height, width)` that it must have; any, if None.
+        frame: the object that an environment returned.
+        size: the required `(height, width)`; if None, any size is valid.
 
     Raises:
-        InvalidFrame: it is not a `(height, width, 3) uint8` array of that size.
+        InvalidFrame: `frame` is not a `(height, width, 3) uint8` array of that size.
     """
     if not isinstance(frame, np.ndarray):
         raise InvalidFrame(
@@ -45,17 +45,17 @@ def check_frame(frame: object, *, size: tuple[int, int] | None = None) -> Frame:
         raise InvalidFrame(f"A frame must not be empty, got shape {frame.shape}.")
     if size is not None and frame.shape[:2] != size:
         raise InvalidFrame(
-            f"All frames of a video have one size: the first was (height, width) "
-            f"{size}, this one is {frame.shape[:2]}."
+            f"All frames of a video must have the same size: the first was (height, "
+            f"width) {size}, this one is {frame.shape[:2]}."
         )
     return frame
 
 
 def check_quality(quality: object) -> str:
-    """Return `quality` if frames can be drawn so: "full" or "draft".
+    """Return `quality` if it is "full" or "draft".
 
     Raises:
-        UnknownName: it is something else.
+        UnknownName: `quality` is anything else.
     """
     if quality not in QUALITIES:
         raise UnknownName("quality", str(quality), QUALITIES)
@@ -63,10 +63,10 @@ def check_quality(quality: object) -> str:
 
 
 def check_size(height: int, width: int) -> tuple[int, int]:
-    """Return `(height, width)` if a frame can have that size, in pixels.
+    """Return `(height, width)` if it is a valid frame size, in pixels.
 
     Raises:
-        InvalidArgument: one is not a whole number from 1 to 16384.
+        InvalidArgument: `height` or `width` is not a whole number from 1 to 16384.
     """
     for name, value in (("height", height), ("width", width)):
         whole = isinstance(value, int | np.integer) and not isinstance(value, bool)
@@ -79,10 +79,10 @@ def check_size(height: int, width: int) -> tuple[int, int]:
 
 
 def pad_to_even(frame: Frame) -> Frame:
-    """Return `frame` with its last row and column doubled where a side is odd.
+    """Return `frame` with an odd side extended by repeating its last row or column.
 
-    yuv420p has one colour sample for two by two pixels, so the sides of a video are
-    even. One repeated edge pixel keeps every other pixel where and as it is.
+    yuv420p stores one colour sample for two by two pixels, so a video's sides must be
+    even. Repeating an edge leaves all other pixels unchanged and in place.
     """
     height, width = frame.shape[:2]
     if height % 2 == 0 and width % 2 == 0:
@@ -91,9 +91,9 @@ def pad_to_even(frame: Frame) -> Frame:
 
 
 def grid_shape(count: int) -> tuple[int, int]:
-    """Return the rows and columns of the grid of N frames.
+    """Return the numbers of rows and columns of a grid for `count` frames.
 
-    It is as square as can be, and rather wide than high.
+    The grid is as square as possible, and never higher than wide.
 
     >>> [grid_shape(n) for n in (1, 2, 3, 4, 5, 7, 12)]
     [(1, 1), (1, 2), (2, 2), (2, 2), (2, 3), (3, 3), (3, 4)]
@@ -103,25 +103,25 @@ def grid_shape(count: int) -> tuple[int, int]:
 
 
 def grid_frame(frames: Sequence[Frame]) -> Frame:
-    """Return frames of one size as one frame, row by row.
+    """Arrange frames of the same size in a grid, row by row.
 
-    What is left of the last row is black.
+    Unused cells in the last row are black.
 
     Args:
-        frames: `(height, width, 3)` each, uint8; at least one.
+        frames: at least one `(height, width, 3) uint8` array.
 
     Returns:
-        `(rows * height, columns * width, 3)`, uint8; a new array.
+        A new `(rows * height, columns * width, 3) uint8` array.
 
     Raises:
-        InvalidArgument: there is none, or they differ in size.
+        InvalidArgument: `frames` is empty, or the frames differ in size.
     """
     sizes = {frame.shape for frame in frames}
     if len(sizes) != 1:
         shown = ", ".join(f"{shape[1]}x{shape[0]}" for shape in sorted(sizes)) or "none"
         raise InvalidArgument(
-            "Frames side by side in one video must be of one size, got "
-            f"{shown}. Give all the same height and width, or make a video of each."
+            "Frames that share a video must have the same size, got "
+            f"{shown}. Give all the same height and width, or make separate videos."
         )
     [(height, width, channels)] = sizes
     rows, columns = grid_shape(len(frames))

@@ -1,14 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""JSON that every reader accepts and that gives back what was written.
+"""JSON that every reader accepts and that can be read back without loss.
 
-JSON (RFC 8259) has no NaN and no infinity. Infinity is written as the number
-`1e999`, which is valid JSON and which every IEEE-754 reader, Python's among them,
-reads as infinity; NaN is written as `null`. NumPy's scalars and arrays are written
-as the numbers and lists that they hold.
+JSON (RFC 8259) has no NaN or infinity. Infinity is written as the number `1e999`, which
+is valid JSON and which every IEEE-754 reader, including Python's, reads as infinity.
+NaN is written as `null`. NumPy scalars and arrays are written as numbers and lists.
 
-What is read may have been written by anybody. Text that two readers could take for
-different things (a key that is there twice), and text that needs far more memory or
-stack than its length lets one expect, is refused.
+Text to be read may be untrusted. It is rejected if two readers could interpret it
+differently (a duplicate key), or if it needs far more memory or stack than its length
+suggests.
 """
 
 from __future__ import annotations
@@ -21,17 +20,17 @@ from typing import Any
 
 import numpy as np
 
-# Everything that can be read can also be written, compared and shown, which all
-# Python does recursively.
+# The maximum nesting depth. Python writes, compares and prints values recursively, and
+# everything that can be read must survive that.
 _DEEPEST = 100
 
-# Of lists, objects and what is in them; each takes at most some eighty bytes. The
-# statistics of four million episodes are as many.
+# The maximum number of lists, objects and their items; each takes about 80 bytes at
+# most. The statistics of four million episodes have as many.
 _MOST_VALUES = 1 << 24
 
 _FLAT = {str, int, float, bool, type(None)}
 
-# Texts, and what Python writes of numbers that JSON does not have.
+# Strings, and Python's tokens for numbers that JSON does not have.
 _TOKENS = re.compile(r'"(?:[^"\\]|\\.)*"|-?Infinity|NaN')
 _NUMBERS = {"NaN": "null", "Infinity": "1e999", "-Infinity": "-1e999"}
 
@@ -39,11 +38,11 @@ _NUMBERS = {"NaN": "null", "Infinity": "1e999", "-Infinity": "-1e999"}
 def dumps(value: object, *, indent: int | None = None) -> str:
     """Return `value` as JSON text.
 
-    Objects that JSON does not know (a path, an environment's own option type, an object
-    with the keys 1 and "1") are written as `{"repr": ...}`: what is recorded for people
-    must never stop a run.
+    Objects that JSON cannot represent (a path, an environment's own option type, a dict
+    with the keys 1 and "1") are written as `{"repr": ...}`, because information for
+    people must never stop a run.
     """
-    # Nearly everything is plain, and this is many times as fast.
+    # Nearly everything is plain, which is many times faster to write.
     try:
         text = json.dumps(
             value if _is_plain(value) else _made_plain(value), indent=indent
@@ -56,14 +55,15 @@ def dumps(value: object, *, indent: int | None = None) -> str:
 
 
 def loads(text: str | bytes) -> Any:
-    """Return the value that `text` holds.
+    """Return the value of the JSON text.
 
-    Gym's own `NaN` and `Infinity` tokens, which are not JSON, are accepted too.
+    The tokens `NaN` and `Infinity`, which are not JSON but which gym writes, are
+    accepted too.
 
     Raises:
-        ValueError: the text is not JSON, or not UTF-8, or an object in it has a key
-            twice, or it has far more values, or is nested far more deeply, than
-            anything that is recorded.
+        ValueError: the text is not JSON or not UTF-8, contains an object with a
+            duplicate key, or has far more values or much deeper nesting than any
+            recording.
     """
     if isinstance(text, bytes):
         text = text.decode("utf-8-sig")
@@ -80,7 +80,7 @@ def loads(text: str | bytes) -> Any:
 
 
 def float_from_json(value: float | None) -> float:
-    """Return a number as it was before `dumps`: `null` was NaN."""
+    """Return the number that `dumps` was given: None, from `null`, is NaN."""
     return math.nan if value is None else float(value)
 
 
@@ -89,12 +89,12 @@ def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     if len(values) < len(pairs):
         counts = Counter(key for key, _ in pairs)
         ((twice, _),) = counts.most_common(1)
-        raise ValueError(f"the key {twice!r:.100} is there twice")
+        raise ValueError(f"it contains the key {twice!r:.100} twice")
     return values
 
 
 def has_nan(value: object) -> bool:
-    """Return whether NaN, which comes back as `null`, is anywhere in a JSON value."""
+    """Return whether a JSON value contains NaN, which would be written as `null`."""
     match value:
         case float():
             return math.isnan(value)
@@ -106,14 +106,14 @@ def has_nan(value: object) -> bool:
 
 
 def _is_plain(value: object, room: int = _DEEPEST) -> bool:
-    """Return whether all keys are texts, and nothing is nested too deeply."""
+    """Return whether all keys are strings and nothing is nested too deeply."""
     if isinstance(value, dict):
         if not {str}.issuperset(map(type, value)):
             return False
         value = value.values()
     elif not isinstance(value, list | tuple):
         return True
-    # Statistics are long lists of numbers.
+    # Flat values are tested first because statistics are long lists of numbers.
     return room > 0 and (
         _FLAT.issuperset(map(type, value))
         or all(_is_plain(item, room - 1) for item in value)
@@ -121,11 +121,11 @@ def _is_plain(value: object, room: int = _DEEPEST) -> bool:
 
 
 def _made_plain(value: object, outer: tuple[int, ...] = ()) -> Any:
-    """Return `value` as what JSON knows.
+    """Return `value` converted to types that JSON supports.
 
     Args:
-        value: anything.
-        outer: the identities of what `value` is inside of.
+        value: any object.
+        outer: the ids of the objects that contain `value`.
     """
     if isinstance(value, np.ndarray | np.generic):
         value = value.tolist()

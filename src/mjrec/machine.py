@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What this machine is, and what it lets this process use.
+"""Facts about this machine, and the resources that this process may use.
 
-Of what it is, that counts on which the last bit of a simulation depends, besides
-MuJoCo's version. MuJoCo calls the C library's sines and exponentials, which choose
-their code by what the CPU can do: without FMA the same wheel on the same machine gives
-other trajectories.
+The facts are those that the last bits of a simulation depend on, apart from MuJoCo's
+version. MuJoCo calls the C library's sine and exponential functions, which choose their
+code by CPU features: without FMA, the same wheel on the same machine gives different
+trajectories.
 """
 
 from __future__ import annotations
@@ -22,16 +22,16 @@ from .errors import InvalidArgument
 _CGROUPS = Path("/sys/fs/cgroup")
 _OWN_CGROUPS = Path("/proc/self/cgroup")
 _CPUINFO = Path("/proc/cpuinfo")
-# What is said of a CPU on x86 and on ARM.
+# The names of these fields on x86 and on ARM.
 _FLAGS = ("flags", "Features")
 _MODELS = ("model name", "CPU part")
 
 
 def usable_cpus() -> int:
-    """Return how many CPUs this process can keep busy; at least 1.
+    """Return the number of CPUs that this process can keep busy; at least 1.
 
-    It is the number that the process may run on (its affinity), or the quota of its
-    cgroup where that is less: a container that is given 2.5 CPUs of 64 has 2.
+    This is the number of CPUs that the process may run on (its affinity), or its
+    cgroup's quota if that is less: a container with 2.5 of 64 CPUs can use 2.
     """
     allowed = len(os.sched_getaffinity(0))
     quota = cgroup_cpu_quota()
@@ -41,16 +41,16 @@ def usable_cpus() -> int:
 def cgroup_cpu_quota(
     *, root: Path = _CGROUPS, own: Path = _OWN_CGROUPS
 ) -> float | None:
-    """Return the CPUs that the cgroup grants, or None where nothing limits them.
+    """Return the number of CPUs that the cgroup allows, or None if unlimited.
 
-    A limit on any group above counts too. Those of version 2 are read.
+    Limits on parent groups count too. Only cgroups of version 2 are read.
 
     Args:
-        root: where the cgroup file system is mounted.
-        own: the file that names the groups of this process.
+        root: mount point of the cgroup file system.
+        own: the file that names this process's groups.
     """
-    # Inside a container the path may be the host's, which is not mounted; the
-    # root then is the container's own group.
+    # Inside a container the path may be the host's, which is not mounted. The root is
+    # then the container's own group.
     groups = [line.split("::", 1) for line in _lines(own)]
     quotas = [
         quota
@@ -63,7 +63,7 @@ def cgroup_cpu_quota(
 
 
 def gpu_device_files(*, root: Path = Path("/dev")) -> list[str]:
-    """Return the device files of the GPUs that there are, sorted.
+    """Return the device files of the machine's GPUs, sorted.
 
     Args:
         root: the directory of device files.
@@ -74,12 +74,12 @@ def gpu_device_files(*, root: Path = Path("/dev")) -> list[str]:
 
 @functools.cache
 def machine_fingerprint() -> Mapping[str, str]:
-    """Return what two machines must share for equal bits.
+    """Return the facts that must be equal on two machines for bit-identical results.
 
     Returns:
-        `architecture`, `libc` (name and version), `cpu_flags` (the sha256 of the sorted
-        names of what the CPU can do, joined by spaces; "" where the system does not
-        say) and `tunables` (the variable GLIBC_TUNABLES, which can mask them).
+        `architecture`, `libc` (name and version), `cpu_flags` (the SHA-256 of the
+        sorted names of the CPU's features, joined by spaces; "" if unknown) and
+        `tunables` (the variable GLIBC_TUNABLES, which can mask features).
     """
     flags = " ".join(cpu_flags())
     return MappingProxyType(
@@ -93,12 +93,12 @@ def machine_fingerprint() -> Mapping[str, str]:
 
 
 def cpu_model() -> str:
-    """Return what the system calls the first CPU; "" where it does not say."""
+    """Return the model name of the first CPU; "" if unknown."""
     return next((_cpuinfo()[name] for name in _MODELS if name in _cpuinfo()), "")
 
 
 def cpu_flags() -> tuple[str, ...]:
-    """Return the names of what the first CPU can do, sorted."""
+    """Return the names of the first CPU's features, sorted."""
     flags = next((_cpuinfo()[name] for name in _FLAGS if name in _cpuinfo()), "")
     return tuple(sorted(flags.split()))
 
@@ -128,15 +128,15 @@ def _cpuinfo() -> Mapping[str, str]:
 
 
 def check_workers(workers: int | None) -> int | None:
-    """Return `workers` if it is a number of processes, or None.
+    """Return `workers` if it is a positive whole number or None.
 
     Raises:
-        InvalidArgument: it is something else.
+        InvalidArgument: `workers` is anything else.
     """
     whole = isinstance(workers, int) and not isinstance(workers, bool)
     if workers is not None and not (whole and workers >= 1):
         raise InvalidArgument(
-            "workers must be a positive whole number, or None for one on each CPU that "
-            f"can be used, got {workers!r}."
+            "workers must be a positive whole number, or None for one per usable CPU, "
+            f"got {workers!r}."
         )
     return workers

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a recording needs from a machine, and whether it is there."""
+"""A check of everything that a recording needs from a machine."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ from .gl import BACKENDS, Diagnosis, Probe, choose, diagnose, probe
 from .gl.backends import platforms_contradict
 from .machine import cgroup_cpu_quota, gpu_device_files, usable_cpus
 
-# A distribution, a program that uses it as a recording does but draws nothing, and what
-# to run if it is missing.
+# A distribution, a program that uses it as a recording does but renders nothing, and
+# the command to run if it is missing.
 _PACKAGES = (
     ("mjrec", "", ""),
     ("mujoco", "import mujoco", "python -m pip install mujoco"),
@@ -39,7 +39,8 @@ _PACKAGES = (
     ),
     ("numpy", "", ""),
 )
-# What extras bring, and engines: name, distributions, and what installs them.
+# Optional packages and engines: name, distributions, and the requirement that installs
+# them.
 _EXTRAS = (
     ("SciPy", ("scipy",), "mjrec"),
     ("report", ("jinja2", "pillow"), "mjrec[report]"),
@@ -62,11 +63,11 @@ class Package:
     """A Python package.
 
     Attributes:
-        name: its name.
-        version: None if it is not installed.
-        works: whether its simplest task can be made. None if this was not tried.
+        name: the package's name.
+        version: its version; None if it is not installed.
+        works: whether a minimal program that uses it succeeds; None if not tried.
         cause: why it does not work.
-        fix: what to do, or how to install it.
+        fix: how to fix or install it.
     """
 
     name: str
@@ -78,14 +79,14 @@ class Package:
 
 @dataclass(frozen=True)
 class Ffmpeg:
-    """The ffmpeg that writes videos.
+    """The ffmpeg that encodes videos.
 
     Attributes:
-        path: None if there is none.
-        version: the first line of its output.
-        encodes: whether it just encoded a frame as H.264.
-        cause: why it did not.
-        fix: what to do.
+        path: path of the executable; None if it was not found.
+        version: the first line of its version output.
+        encodes: whether it encoded a test frame as H.264.
+        cause: why it failed.
+        fix: how to fix it.
     """
 
     path: str | None
@@ -97,13 +98,13 @@ class Ffmpeg:
 
 @dataclass(frozen=True)
 class Cpus:
-    """The CPUs.
+    """Numbers of CPUs.
 
     Attributes:
-        usable: how many this process can keep busy.
-        present: how many the machine has.
-        allowed: how many the process may run on (affinity).
-        quota: the cgroup's limit. None if there is none.
+        usable: CPUs that this process can keep busy.
+        present: CPUs of the machine; None if unknown.
+        allowed: CPUs that the process may run on (its affinity).
+        quota: the cgroup's limit; None if unlimited.
     """
 
     usable: int
@@ -114,19 +115,19 @@ class Cpus:
 
 @dataclass(frozen=True)
 class MachineReport:
-    """What `mjrec doctor` found.
+    """The results of `mjrec doctor`.
 
     Attributes:
-        can_render: whether a recording that starts now gets frames.
-        backend: the backend that `use_gl` would choose. None if it would raise.
-        reason: why this backend, or the error.
+        can_render: whether recordings can be rendered now.
+        backend: the backend that `use_gl` would choose; None if it would raise.
+        reason: why this backend was chosen, or the error.
         backends: the result of each backend's test.
-        problems: odd settings that stop nothing.
-        gpu_device_files: GPUs that the kernel shows.
+        problems: questionable settings that do not prevent rendering.
+        gpu_device_files: device files of the GPUs.
         ffmpeg: the encoder.
         packages: Python packages that recording uses.
         extras: optional packages, engines, and the GPU's driver.
-        cpus: the CPUs.
+        cpus: numbers of CPUs.
         python: the interpreter's version.
         platform: operating system and processor.
     """
@@ -146,9 +147,9 @@ class MachineReport:
 
 
 def examine_machine() -> MachineReport:
-    """Try everything that a recording needs, which takes some seconds.
+    """Test everything that a recording needs; this takes a few seconds.
 
-    Nothing is imported or changed in this process.
+    The tests run in other processes, so nothing is imported or changed in this one.
     """
     probes = {backend: probe(backend, measure=True) for backend in BACKENDS}
     chosen = None
@@ -183,28 +184,28 @@ def _problems(chosen: str | None, probes: dict[str, Probe]) -> Iterator[Diagnosi
     if chosen is None:
         for other in [name for name, tried in probes.items() if tried.renders][:1]:
             yield Diagnosis(
-                f"MUJOCO_GL={named} keeps mjrec from {other}, which renders here.",
-                f"Name that one:\n  export MUJOCO_GL={other}",
+                f"MUJOCO_GL={named} keeps mjrec from using {other}, which works here.",
+                f"Use {other}:\n  export MUJOCO_GL={other}",
             )
         return
-    # What mjrec puts right for itself and other programs do not.
+    # Settings that mjrec corrects for itself, but other programs do not.
     if platforms_contradict(os.environ, chosen):
         yield Diagnosis(
             f"PYOPENGL_PLATFORM={os.environ['PYOPENGL_PLATFORM']} contradicts "
-            f"{chosen}. mjrec puts it right; in other programs mujoco then has no "
-            "renderer.",
-            "Take the variable away:\n  unset PYOPENGL_PLATFORM",
+            f"{chosen}. mjrec corrects this for itself; in other programs, mujoco "
+            "will not be able to render.",
+            "Remove the variable:\n  unset PYOPENGL_PLATFORM",
         )
     if named not in ("", chosen):
         yield Diagnosis(
-            f"MUJOCO_GL={named} is not how Gymnasium and dm_control spell a backend. "
-            "mjrec puts it right; other programs may fail.",
-            f"Spell it so:\n  export MUJOCO_GL={chosen}",
+            f"MUJOCO_GL={named} is not a backend name that Gymnasium and dm_control "
+            "know. mjrec corrects this for itself; other programs may fail.",
+            f"Use their spelling:\n  export MUJOCO_GL={chosen}",
         )
     if not named and not probes["glfw"].renders:
         yield Diagnosis(
-            "MUJOCO_GL is not set. mjrec works without it; other programs choose "
-            "GLFW then, which does not render here.",
+            "MUJOCO_GL is not set. mjrec works without it, but other programs then "
+            "choose GLFW, which does not work here.",
             f"For other programs:\n  export MUJOCO_GL={chosen}",
         )
     if probes[chosen].warning():
@@ -212,7 +213,7 @@ def _problems(chosen: str | None, probes: dict[str, Probe]) -> Iterator[Diagnosi
 
 
 def examine_ffmpeg() -> Ffmpeg:
-    """Find ffmpeg and encode a frame as a recording does."""
+    """Find ffmpeg and encode a test frame as a recording does."""
     path, version = None, ""
     try:
         path = ffmpeg_executable()
@@ -223,7 +224,7 @@ def examine_ffmpeg() -> Ffmpeg:
         output = error.stderr.split("\n") if isinstance(error, EncoderError) else []
         cause = next(filter(None, map(str.strip, reversed(output))), str(error))
         fix = (
-            "Install the one that comes with imageio-ffmpeg, or name another:\n"
+            "Install the ffmpeg that comes with imageio-ffmpeg, or specify another:\n"
             "  python -m pip install --force-reinstall imageio-ffmpeg\n"
             "  export IMAGEIO_FFMPEG_EXE=/path/to/ffmpeg"
         )
@@ -236,9 +237,9 @@ def examine_package(name: str, program: str, install: str) -> Package:
 
     Args:
         name: the distribution's name.
-        program: Python code that uses it; run in a process of its own, without OpenGL.
-            Empty where the version is enough.
-        install: the command that installs it.
+        program: Python code that uses the package, run in a separate process without
+            OpenGL. If empty, only the version is looked up.
+        install: the command that installs the package.
     """
     try:
         version = importlib.metadata.version(name)
@@ -277,7 +278,7 @@ def _slurm() -> Package:
             check=True,
         )
     except (OSError, subprocess.SubprocessError):
-        fix = "Jobs are sent from a login node of the cluster, which has sbatch."
+        fix = "Submit jobs from a login node of the cluster, where sbatch is installed."
         return Package("Slurm", None, fix=fix)
     return Package("Slurm", done.stdout.decode(errors="replace").strip())
 
@@ -287,18 +288,18 @@ def _gpu() -> Package:
         output = _NVIDIA_VERSION.read_text(errors="replace")
     except OSError:
         if gpu_device_files():
-            return Package("GPU", "there is one, without NVIDIA's driver")
-        fix = "No device file in /dev: videos are drawn on the CPU."
+            return Package("GPU", "found, without NVIDIA's driver")
+        fix = "No GPU device file in /dev: videos are rendered on the CPU."
         return Package("GPU", None, fix=fix)
     return Package("GPU", output.partition("\n")[0].strip())
 
 
-# Whether a package works is another question than whether it can draw.
+# OpenGL is off because only the package itself is tested, not rendering.
 _WITHOUT_GL = {"MUJOCO_GL": "off"}
 
 
 def _run_in_child(program: str) -> str | None:
-    """Return what went wrong when `program` ran; None if nothing did."""
+    """Run `program` and return its error output, or None if it succeeds."""
     try:
         done = subprocess.run(
             [sys.executable, "-P", "-c", program],
@@ -309,8 +310,8 @@ def _run_in_child(program: str) -> str | None:
             check=False,
         )
     except subprocess.TimeoutExpired:
-        return f"It did not end within {_PROGRAM_TIMEOUT} seconds."
+        return f"It did not finish within {_PROGRAM_TIMEOUT} seconds."
     if done.returncode == 0:
         return None
     output = done.stderr.decode(errors="replace").strip()
-    return output or f"It ended with status {done.returncode}."
+    return output or f"It exited with status {done.returncode}."

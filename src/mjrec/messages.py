@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a process and its child send to each other: JSON objects, and bytes of frames.
+"""Messages between a process and its child: JSON objects and the bytes of frames.
 
-Errors come home as JSON (`carried`, `unpacked`): pickle would let a process that writes
-into the pipe run code here.
+Errors are sent as JSON (`carried`, `unpacked`), because pickle would let a process that
+writes into the pipe run code here.
 """
 
 from __future__ import annotations
@@ -24,21 +24,21 @@ logger = logging.getLogger(__name__)
 
 Message: TypeAlias = "dict[str, Any] | bytearray"
 
-# In the environment of a child: the descriptors that it receives from and sends to.
+# The variable that tells a child which descriptors to receive from and send to.
 PIPES_VARIABLE = "MJREC_PARENT"
-# What it is sent to write what its threads are at to its standard error.
+# The signal that makes a child write the stacks of its threads to standard error.
 STACKS_SIGNAL = signal.SIGUSR1
-# Of a message; what is longer ends them. No frame is.
+# The maximum size of a message. A longer one, which no frame is, ends the messages.
 MOST_BYTES = 1 << 32
 
-# Each message begins with whether it is the bytes of a frame, and its length.
+# Each message starts with a flag (whether it is the bytes of a frame) and its length.
 _HEADER = struct.Struct("=?Q")
 
 
 def packed(
     message: Mapping[str, Any] | memoryview,
 ) -> tuple[bytes, bytes | memoryview]:
-    """Return a message as the parts that are to be written into a pipe."""
+    """Return the parts of a message, to be written to a pipe one after another."""
     if isinstance(message, memoryview):
         return _HEADER.pack(True, message.nbytes), message.cast("B")
     content = json.dumps(message).encode()
@@ -46,12 +46,17 @@ def packed(
 
 
 def received(pipe: int, most_bytes: int) -> Generator[Message | None, None, None]:
-    """Yield what comes through a pipe until its end; None where it has to wait."""
+    """Yield the messages from a pipe until it ends, and None while none is complete.
+
+    Args:
+        pipe: the descriptor to read from.
+        most_bytes: maximum size of a message; a longer one ends the iterator.
+    """
     with contextlib.suppress(EOFError):
         while True:
             is_frame, size = _HEADER.unpack((yield from _taken(pipe, _HEADER.size)))
             if size > most_bytes:
-                logger.warning("A process of mjrec's sends what is not understood.")
+                logger.warning("An mjrec process sent invalid data.")
                 return
             content = yield from _taken(pipe, size)
             if is_frame:
@@ -65,7 +70,7 @@ def received(pipe: int, most_bytes: int) -> Generator[Message | None, None, None
                 yield message
             else:
                 logger.warning(
-                    "A process of mjrec's said what is not understood: %.200r", content
+                    "An mjrec process sent an invalid message: %.200r", content
                 )
 
 
@@ -85,7 +90,7 @@ def _taken(pipe: int, size: int) -> Generator[None, None, bytearray]:
 
 
 def log_message(message: Mapping[str, Any]) -> bool:
-    """Log here what a child has sent as `log`; return whether it is that."""
+    """Log a child's `log` message here; return whether the message is one."""
     if "log" in message:
         name, level, text = message["log"]
         logging.getLogger(name).log(level, "%s", text)
@@ -93,14 +98,14 @@ def log_message(message: Mapping[str, Any]) -> bool:
 
 
 def carried(error: BaseException) -> dict[str, Any]:
-    """Return what `unpacked` makes an error like `error` of, in plain JSON."""
+    """Return an error as plain JSON, from which `unpacked` rebuilds it."""
     if not isinstance(error, Error):
         told = "".join(traceback.format_exception(error)).strip()
         return {
             "type": "Error",
             "message": f"A worker failed with an unexpected error.\n{told}",
         }
-    # One that a module made of its own is known by the nearest that everybody knows.
+    # A module's private error class is sent as its nearest public base class.
     kinds = (kind.__name__ for kind in type(error).__mro__)
     return {
         "type": next(name for name in kinds if name in KINDS),
@@ -110,10 +115,10 @@ def carried(error: BaseException) -> dict[str, Any]:
 
 
 def unpacked(plain: Mapping[str, Any]) -> Error:
-    """Return the error that was carried.
+    """Rebuild the error that `carried` was given.
 
-    It has the class, the message and, of the attributes, numbers, texts, lists of them
-    and paths.
+    It has the error's class (or its nearest public base class), its message, and those
+    attributes that are numbers, strings, lists of these, paths or None.
     """
     facts = {
         key: Path(value["path"]) if isinstance(value, dict) else value

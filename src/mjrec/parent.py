@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The process that has started this one as its `Child`."""
+"""The parent side of a `Child`'s pipes: the process that started this one."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from .messages import MOST_BYTES, PIPES_VARIABLE, STACKS_SIGNAL, packed, receive
 
 
 class Parent:
-    """The process that started this one, as its `Child`.
+    """The connection to the process that started this one as a `Child`.
 
-    Not through the standard input, which is empty, and the standard output, which is
-    the standard error: libraries and drivers print whenever they like. What this
-    process starts or forks cannot speak to it.
+    Messages do not use standard input, which is empty, or standard output, which goes
+    to standard error: libraries and drivers print whenever they like. Processes that
+    this one starts or forks cannot use the connection.
 
-    Asked by `Child.stacks`, and when it dies of a signal such as SIGSEGV, this process
-    writes what its threads are at to the standard error.
+    This process writes the stacks of its threads to standard error when `Child.stacks`
+    requests it and when it dies of a signal such as SIGSEGV.
     """
 
     def __init__(self) -> None:
@@ -40,14 +40,14 @@ class Parent:
         os.register_at_fork(after_in_child=self._close)
 
     def receive(self, seconds: float | None = None) -> dict[str, Any]:
-        """Return its next message, waiting for it.
+        """Wait for the parent's next message and return it.
 
         Args:
-            seconds: to wait at most, where `listen` was called; None is for ever.
+            seconds: maximum time to wait, if `listen` was called; None for no limit.
 
         Raises:
-            queue.Empty: nothing has come in that time.
-            EOFError: it has ended, and `listen` was not called.
+            queue.Empty: no message arrived in that time.
+            EOFError: the parent has ended, and `listen` was not called.
         """
         if self._listens:
             return self._said.get(timeout=seconds)
@@ -58,15 +58,15 @@ class Parent:
 
     @property
     def has_said_something(self) -> bool:
-        """Whether `receive` would not wait, where `listen` was called."""
+        """Whether a message is waiting. Only valid after `listen`."""
         return not self._said.empty()
 
     def listen(self, at_end: Callable[[], object] | None = None) -> None:
-        """Receive on a thread from now on, to notice its end whatever is done here.
+        """Receive on a thread from now on, so that the parent's end is always noticed.
 
         Args:
-            at_end: called there when it has ended; ends this process. At once, if None:
-                the work here has no other use.
+            at_end: called on that thread when the parent has ended. Afterwards, or at
+                once if None, this process ends, because its work has no other use.
         """
         self._listens = True
         threading.Thread(
@@ -74,9 +74,9 @@ class Parent:
         ).start()
 
     def send(self, content: memoryview | None = None, **message: Any) -> None:
-        """Send a message, or the bytes of a frame; from any thread."""
+        """Send a message or the bytes of a frame. May be called on any thread."""
         parts = packed(message if content is None else content)
-        # Where it has ended, `listen` sees to it.
+        # If the parent has ended, `listen` handles it.
         with contextlib.suppress(OSError), self._one_at_a_time:
             for part in parts:
                 rest = memoryview(part)
@@ -84,18 +84,18 @@ class Parent:
                     rest = rest[os.write(self._answers, rest) :]
 
     def send_warnings(self) -> None:
-        """Send it what is logged here as a warning or worse, as `log`, from now on."""
+        """Send warnings and errors that are logged here as `log`, from now on."""
         logging.getLogger().addHandler(_ToParent(self))
 
     def _listen(self, at_end: Callable[[], object] | None) -> None:
-        # Reset, where it died before it had read everything.
+        # The connection is reset if the parent died before it had read everything.
         with contextlib.suppress(OSError):
             for message in self._messages:
                 assert isinstance(message, dict)
                 self._said.put(message)
         if at_end is not None:
             at_end()
-        # Not `sys.exit`, which would wait for a driver.
+        # `sys.exit` could wait for a driver.
         os._exit(0)
 
     def _close(self) -> None:
@@ -112,5 +112,5 @@ class _ToParent(logging.Handler):
         try:
             self._parent.send(log=[record.name, record.levelno, self.format(record)])
         except Exception:
-            # As all handlers: who logs is not disturbed by it.
+            # Like all handlers, do not let an error reach the code that logs.
             self.handleError(record)

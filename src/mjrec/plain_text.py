@@ -1,18 +1,23 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Texts for people: numbers of things, and what strangers wrote."""
+"""Text for people: counts with units, and escaped text from untrusted sources."""
 
 from __future__ import annotations
 
 from typing import Final
 
-# Spaces between figures, which are no stranger's trick, and the ends of lines.
+# Line ends, and the spaces between digits, are harmless although not printable.
 _SEEN: Final = "\n\N{NO-BREAK SPACE}\N{NARROW NO-BREAK SPACE}"
 
 
 def spelled_out(text: str, longest: int = 1000) -> str:
-    """Return a text with what is not seen spelled out, and cut where it is long.
+    """Return text with invisible characters escaped, truncated if it is too long.
 
-    Control characters and marks that turn the direction of writing are not seen.
+    Invisible characters are, for example, control characters and marks that change the
+    direction of the text.
+
+    Args:
+        text: the text to show.
+        longest: maximum number of characters to keep.
     """
     if len(text) > longest:
         text = f"{text[:longest]}…"
@@ -24,7 +29,7 @@ def spelled_out(text: str, longest: int = 1000) -> str:
 
 
 def counted(count: int, unit: str) -> str:
-    """Return a number of things: "1 step", "12 steps", "2 frame hashes"."""
+    """Return a count with its unit: "1 step", "12 steps", "2 frame hashes"."""
     if count == 1:
         return f"1 {unit}"
     if unit.endswith("y"):

@@ -1,14 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a recording was made with: packages, machine, variables, command line, code.
+"""Provenance of a recording: packages, machine, variables, command line and code.
 
-Looking takes a third of a second and more, nearly all of it in other processes. It is
-done once, on a thread, and asked for when a manifest is written.
+Collecting it takes a third of a second or more, nearly all of it in other processes. It
+is done once, on a thread, and requested when a manifest is written.
 
 Reading the files of a hundred packages keeps Python busy for a fifth of a second. On a
-thread of a process that simulates this costs more than its share: whenever a step lets
-go of the interpreter's lock, the thread keeps it for five milliseconds, and a
-simulation stands still until all is read (200 steps of HalfCheetah in a tenth of a
-second instead of 1600). So a process of its own, `python -m` this module, reads them.
+thread of a simulating process this would cost more than its share: whenever a step
+releases the interpreter lock, the thread keeps it for five milliseconds, which nearly
+stops the simulation until everything is read (200 steps of HalfCheetah in a tenth of a
+second instead of 1600). So a separate process (`python -m` with this module) reads
+them.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ from .parent import Parent
 
 logger = logging.getLogger(__name__)
 
-# What changes frames, the last bits of numbers, or which library is loaded.
+# Variables that change frames, the last bits of numbers, or which library is loaded.
 _VARIABLES = frozenset(
     {
         *("CUDA_VISIBLE_DEVICES", "DISPLAY", "GLIBC_TUNABLES", "LD_LIBRARY_PATH"),
@@ -46,22 +47,22 @@ _PREFIXES = (
     *("EGL_", "GALLIUM_", "GALLIVM_", "LIBGL_", "LP_", "MESA_", "MJREC_", "MKL_"),
     *("MUJOCO_", "NVIDIA_", "OMP_", "OPENBLAS_", "__EGL_"),
 )
-# What an installer adds to the files of a wheel, or changes.
+# Files that an installer adds to those of a wheel, or changes.
 _OF_INSTALLATION = ("INSTALLER", "REQUESTED", "RECORD", "direct_url.json")
 _NAME_OR_VERSION = re.compile(r"^(Name|Version): *(.*?) *$", re.MULTILINE)
 _SECONDS_FOR_PACKAGES = 60.0
 _SECONDS_FOR_GIT = 5.0
-# Leaving is quick.
+# Short, so that a program ends quickly.
 _SECONDS_AT_THE_END = 2.0
 
 
 def is_of_drawing(variable: str) -> bool:
-    """Return whether frames, or the last bits of numbers, may depend on a variable."""
+    """Return whether frames or the last bits of numbers may depend on a variable."""
     return variable in _VARIABLES or variable.startswith(_PREFIXES)
 
 
 class Provenance:
-    """What a process records with, found on a thread of its own.
+    """The provenance of this process, collected on a separate thread.
 
     Args:
         root: the directory of the user's code.
@@ -70,7 +71,7 @@ class Provenance:
     def __init__(self, root: Path) -> None:
         self._root = root
         self._found: dict[str, Any] | None = None
-        # What can be overwritten later is taken at once.
+        # These can change later, so they are read at once.
         self._command = list(sys.orig_argv)
         self._directory = str(Path.cwd())
         self._variables = {
@@ -84,19 +85,19 @@ class Provenance:
         self._thread.start()
 
     def found(self, *, wait: bool) -> Mapping[str, Any] | None:
-        """Return what was found.
+        """Return the provenance, if it has been collected.
 
         Args:
-            wait: whether to wait for it, two seconds at most.
+            wait: whether to wait for it, for at most two seconds.
 
         Returns:
-            None if it is not there yet, or could not be found. Else `command`,
+            None if it is not ready or could not be collected. Otherwise `command`,
             `working_directory`, `packages` (names to `version` and `record_sha256`,
-            the sha256 of what the wheel's own list of its files says, or None),
-            `machine` (see `machine_fingerprint`), `cpu` (`model`, `flags`, `usable`),
-            `system`, `python`, `variables`, and `code` (`root`, `commit`, `dirty`,
-            `remote`) or None where the user's code is in no git repository, or git
-            has not answered yet.
+            the SHA-256 of the wheel's own list of its files, or None), `machine` (see
+            `machine_fingerprint`), `cpu` (`model`, `flags`, `usable`), `system`,
+            `python`, `variables`, and `code` (`root`, `commit`, `dirty`, `remote`).
+            `code` is None if the user's code is not in a git repository, or git has not
+            answered yet.
         """
         if wait:
             self._thread.join(_SECONDS_AT_THE_END)
@@ -118,30 +119,30 @@ class Provenance:
                 "system": platform.platform(),
                 "variables": self._variables,
             }
-            # Of a large repository git says it late, or never.
+            # In a large repository git may answer late or never.
             self._found = {**found, "code": None}
             self._found = {**found, "code": _code(self._root)}
         except Exception:
-            # No recording fails because of it. A process that exits takes the child
+            # A recording must not fail because of this. A process that exits takes the child
             # with it that lists the packages, and has no more use for them.
             if threading.main_thread().is_alive():
-                logger.warning("The provenance is not known.", exc_info=True)
+                logger.warning("The provenance could not be collected.", exc_info=True)
 
 
 @functools.cache
 def look_around() -> Provenance:
-    """Return the provenance of this process, which is looked for from now on."""
+    """Start collecting this process's provenance, once, and return it."""
     return Provenance(_code_root())
 
 
-# A child that is forked while the thread looks has no such thread.
+# A child that is forked while the thread is running does not have that thread.
 os.register_at_fork(after_in_child=look_around.cache_clear)
 
 
 def _code_root() -> Path:
-    """Return where the user's program is: its script's directory, or the working one.
+    """Return the directory of the user's main script, or the working directory.
 
-    What is run by its name, or with `-m`, from among what is installed, is not it.
+    An installed program (run by name or with `-m`) does not count as the user's script.
     """
     file = getattr(sys.modules.get("__main__"), "__file__", None)
     if file is None:
@@ -168,7 +169,7 @@ def _code(root: Path) -> dict[str, Any] | None:
 
 
 def _git(root: Path, *arguments: str) -> str | None:
-    """Return what git says; None where there is none, no repository, or no answer."""
+    """Return git's output; None without git, a repository, or an answer."""
     try:
         done = subprocess.run(
             # A repository's own configuration could name a program to run.
@@ -186,16 +187,16 @@ def _git(root: Path, *arguments: str) -> str | None:
 
 
 def installed_packages() -> dict[str, Any]:
-    """Return what is installed where this process looks for modules.
+    """Return the packages installed on this process's module search path.
 
-    Waits for a process that finds it out, without keeping other threads from running.
+    Waits for a process that collects them, without blocking other threads.
 
     Returns:
-        By the names of the packages, in their order, `version` and `record_sha256`:
-        the sha256 of what the wheel's own list of its files says, None without one.
+        `version` and `record_sha256` by package name, sorted by name. `record_sha256`
+        is the SHA-256 of the wheel's own list of its files, or None if it has no list.
     """
     places = [entry for entry in sys.path if isinstance(entry, str)]
-    # One that is part of another program has no Python to start.
+    # A Python that is embedded in another program has no executable to start.
     if sys.executable and not getattr(sys, "frozen", False):
         with (
             contextlib.suppress(OSError),
@@ -205,7 +206,9 @@ def installed_packages() -> dict[str, Any]:
             for answer in child.messages(_SECONDS_FOR_PACKAGES):
                 if answer is not None:
                     return answer
-            logger.debug("Packages are looked for here: it %s", child.last_words())
+            logger.debug(
+                "Reading packages in this process: the child %s", child.last_words()
+            )
     return _packages_in(places)
 
 
@@ -213,7 +216,7 @@ def _packages_in(places: Sequence[str]) -> dict[str, Any]:
     found: dict[str, Any] = {}
     for distribution in importlib.metadata.distributions(path=list(places)):
         name, version = _name_and_version(distribution)
-        # The first on the path is the one that is imported.
+        # The first one on the path is the one that is imported.
         if name and name not in found:
             found[name] = {
                 "version": version,
@@ -225,17 +228,17 @@ def _packages_in(places: Sequence[str]) -> dict[str, Any]:
 def _name_and_version(
     distribution: importlib.metadata.Distribution,
 ) -> tuple[str | None, str | None]:
-    """Return what a package says first: parsing all that it says takes milliseconds."""
+    """Return a package's name and version, without the slow parsing of all metadata."""
     text = distribution.read_text("METADATA") or distribution.read_text("PKG-INFO")
     answer = dict(_NAME_OR_VERSION.findall((text or "").partition("\n\n")[0]))
     return answer.get("Name"), answer.get("Version")
 
 
 def _record_sha256(distribution: importlib.metadata.Distribution) -> str | None:
-    """Return the sha256 of the sorted lines of what a wheel says it consists of.
+    """Return the SHA-256 of the sorted lines of a wheel's list of files; None if empty.
 
-    Lines of what an installer adds, such as compiled Python, are left out, so that two
-    installations of one wheel have the same.
+    Files that an installer adds, such as compiled Python, are left out, so that two
+    installations of the same wheel have the same digest.
     """
     text = distribution.read_text("RECORD")
     if not text:
@@ -271,10 +274,10 @@ _PACKAGES = (
 
 @functools.cache
 def versions(*more: str) -> Mapping[str, str]:
-    """Return the versions of Python and of the packages that are installed.
+    """Return the versions of Python and of mjrec's main packages, if installed.
 
     Args:
-        *more: the names of further packages.
+        *more: names of additional packages.
     """
     found = {"python": platform.python_version()}
     for package in (*_PACKAGES, *more):

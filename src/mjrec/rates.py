@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Frame rates, as exact fractions."""
+"""Frame rates as exact fractions."""
 
 from __future__ import annotations
 
@@ -10,25 +10,25 @@ from fractions import Fraction
 
 from .errors import InvalidArgument
 
-# Floats are binary; this finds the fraction that was meant (0.05 is 1/20) and errs by
-# less than a millionth of a millionth of a second.
+# Floats are binary. This limit finds the intended fraction (0.05 is 1/20), with an
+# error of less than a millionth of a millionth of a second.
 MAX_DENOMINATOR = 10**6
 
 
 def to_rate(fps: float | Fraction, *, name: str = "fps") -> Fraction:
     """Return `fps` frames per second as an exact fraction.
 
-    A `Fraction` and an integer are taken as they are. A float is taken as the simplest
-    fraction that has the same float value to within a millionth: 29.97 is 2997/100 and
-    30000/1001 given as a float is 30000/1001.
+    A `Fraction` or an integer is used as it is. A float is converted to the simplest
+    fraction with the same float value to within a millionth: 29.97 becomes 2997/100,
+    and the float 30000/1001 becomes 30000/1001.
 
     Args:
         fps: frames per second.
-        name: what the error calls it.
+        name: the argument's name in the error message.
 
     Raises:
         InvalidArgument: `fps` is not a number, is a bool, NaN, infinite, zero or
-            negative, or is outside what a video file can say (1/1000 to 1000000).
+            negative, or is outside the range of a video file (1/1000 to 1000000).
     """
     if isinstance(fps, bool) or not isinstance(fps, numbers.Real):
         raise InvalidArgument(
@@ -41,7 +41,7 @@ def to_rate(fps: float | Fraction, *, name: str = "fps") -> Fraction:
     rate = (
         Fraction(fps)
         if isinstance(fps, numbers.Rational)
-        # By its shortest text, so that float32's 29.97 is 2997/100 too.
+        # Via the shortest decimal string, so that 29.97 in float32 is 2997/100 too.
         else Fraction(str(fps)).limit_denominator(MAX_DENOMINATOR)
     )
     if not Fraction(1, 1000) <= rate <= MAX_DENOMINATOR:
@@ -51,14 +51,14 @@ def to_rate(fps: float | Fraction, *, name: str = "fps") -> Fraction:
     return rate
 
 
-# The same few timesteps come at the beginning of every episode.
+# Cached because every episode starts with one of the same few timesteps.
 @functools.lru_cache(maxsize=256)
 def rate_from_timestep(timestep: float) -> Fraction:
     """Return the rate of one frame every `timestep` seconds.
 
     Raises:
         InvalidArgument: `timestep` is not a finite number, or is less than a
-            microsecond, which no video file can say.
+            microsecond, which no video file can represent.
     """
     if not math.isfinite(timestep) or timestep < 1 / MAX_DENOMINATOR:
         raise InvalidArgument(
@@ -66,19 +66,19 @@ def rate_from_timestep(timestep: float) -> Fraction:
             f"{1 / MAX_DENOMINATOR:g}, got {timestep}."
         )
     rate = 1 / Fraction(timestep).limit_denominator(MAX_DENOMINATOR)
-    # Steps of more than a second have numerators that no video file takes.
+    # Steps longer than a second would have numerators too large for a video file.
     return to_rate(rate.limit_denominator(MAX_DENOMINATOR))
 
 
 def stride_for(rate: Fraction, max_fps: float | Fraction | None) -> int:
-    """Return the smallest whole number of steps from one video frame to the next.
+    """Return the smallest number of steps between video frames that obeys `max_fps`.
 
     Args:
         rate: steps per second.
-        max_fps: the most frames per second that are wanted; None for every step.
+        max_fps: maximum frames per second; None for a frame at every step.
 
     Raises:
-        InvalidArgument: `max_fps` is no rate.
+        InvalidArgument: `max_fps` is not a valid rate.
     """
     if max_fps is None:
         return 1

@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A process with limits, in which a module of ours reads what strangers have written.
+"""A process with resource limits, in which an mjrec module reads untrusted files.
 
-Whatever a hostile file does to HDF5's, MuJoCo's, OpenGL's or ffmpeg's code, it does it
-there. The parent sends one request; the child starts by calling `enter`, and says what
-it finds.
+Whatever a hostile file does to HDF5, MuJoCo, OpenGL or ffmpeg happens in that process.
+The parent sends one request; the child first calls `enter` and then sends its answers.
 """
 
 from __future__ import annotations
@@ -29,9 +28,9 @@ from .provenance import is_of_drawing
 logger = logging.getLogger(__name__)
 
 _GIB = 1 << 30
-# Of each process that takes part. What is mapped and never touched counts for the
-# address space only, and OpenGL's drivers map a lot. Drawing 1280x720 frames with
-# llvmpipe takes 0.35 GiB of the one and 0.9 GiB of the other (measured).
+# The limits of each process. Memory that is mapped but never touched counts only as
+# address space (AS), and OpenGL drivers map a lot. Rendering 1280x720 frames with
+# llvmpipe takes 0.35 GiB of DATA and 0.9 GiB of AS (measured).
 LIMITS: Final[Mapping[str, int]] = {
     "RLIMIT_DATA": 8 * _GIB,
     "RLIMIT_AS": 128 * _GIB,
@@ -42,35 +41,38 @@ LIMITS: Final[Mapping[str, int]] = {
     "RLIMIT_CPU": 86_400,
 }
 
-# Says that a stranger's compiled models may be loaded.
+# Allows loading compiled models from untrusted sources.
 _TRUST_VARIABLE = "MJREC_TRUST_MODELS"
-# Says to what runs in a sandbox, and to what that starts, that it does.
+# Tells a process, and the processes it starts, that it runs in a sandbox.
 _INSIDE_VARIABLE = "MJREC_SANDBOX"
 
 _CONFINED = "mjrec.confined"
-# Of the variables, what Python, OpenGL and ffmpeg need to be found: a token is none.
+# The variables that Python, OpenGL and ffmpeg need. All others, such as access tokens,
+# are removed.
 _KEPT = frozenset({"PATH", "LANG", "LD_LIBRARY_PATH", "TZ", "IMAGEIO_FFMPEG_EXE"})
 
 _NOTHING: Mapping[str, str] = {}
 
 
 class Sandbox(Child):
-    """The process, seen from its parent. Leaving `with` ends it and its group.
+    """The sandboxed process, seen from its parent.
+
+    Leaving the `with` block ends the process and its process group.
 
     Args:
-        module: what runs in it; it calls `enter`.
-        request: what it is asked for, JSON.
-        place: an empty folder for what it leaves behind: its working directory, and
-            where its temporary files are.
-        limits: by their names in `resource`.
-        more_environ: environment variables besides this process's.
-        readable: where given, it can read nothing but Python, the system and these,
-            write nothing but `place` and `writable`, and has no network and no home,
-            as far as `confined` can have it here.
-        writable: folders besides `place`.
+        module: the module to run, which must call `enter`.
+        request: the JSON request for the module.
+        place: an empty folder, which is the process's working directory and holds its
+            temporary files.
+        limits: resource limits, by their names in `resource`.
+        more_environ: environment variables in addition to this process's.
+        readable: if given, the process can read only Python, the system and these
+            paths, can write only to `place` and `writable`, and has no network or home
+            folder, as far as `confined` can enforce this here.
+        writable: more folders that it can write to.
 
     Raises:
-        Error: it cannot be started.
+        Error: the process cannot be started.
     """
 
     most_bytes = 1 << 24
@@ -99,38 +101,44 @@ class Sandbox(Child):
             command = [_CONFINED, module]
         environ |= {**more_environ, "TMPDIR": str(place), _INSIDE_VARIABLE: "1"}
         try:
-            # MuJoCo's own log appears where it runs.
+            # MuJoCo writes its log file to the working directory.
             super().__init__(*command, environ=environ, cwd=str(place))
         except OSError as error:
             raise Error(
-                f"No process with limits could be started: {sys.executable!r}: {error}."
+                f"Could not start a sandboxed process: {sys.executable!r}: {error}."
             ) from error
         self.send(request=_plain(request), limits=dict(limits))
 
     def answers(self, timeout_s: float) -> Iterator[Mapping[str, Any] | None]:
-        """Yield what it says until it ends; None once it was silent for so long."""
+        """Yield the process's answers until it ends.
+
+        Args:
+            timeout_s: timeout in seconds without an answer. When it passes, None is
+                yielded and the iterator ends.
+        """
         for message in self.messages(timeout_s):
             if message is None:
-                logger.warning("A process with limits hangs: %s", self.stacks())
+                logger.warning("A sandboxed process hangs: %s", self.stacks())
             yield message
 
     def __exit__(self, *error: object) -> None:
-        # Those with a session of their own (who draw, ffmpeg) end with the pipes to it.
+        # Children with their own session (render workers, ffmpeg) end when their pipes
+        # close.
         with contextlib.suppress(ProcessLookupError, PermissionError):
             os.killpg(self.pid, signal.SIGKILL)
         self.end()
 
 
 def is_inside() -> bool:
-    """Return whether this process runs in a sandbox already."""
+    """Return whether this process already runs in a sandbox."""
     return _INSIDE_VARIABLE in os.environ
 
 
 def enter() -> tuple[Any, Callable[..., None]]:
-    """Keep this process to its limits, and let it end with its parent.
+    """Apply the limits to this process, and make it end with its parent.
 
     Returns:
-        The request; and what says its keyword arguments to the parent.
+        The request, and a function that sends its keyword arguments to the parent.
     """
     parent = Parent()
     told = parent.receive()
@@ -139,7 +147,7 @@ def enter() -> tuple[Any, Callable[..., None]]:
         _, most = resource.getrlimit(kind)
         allowed = wanted if most == resource.RLIM_INFINITY else min(wanted, most)
         resource.setrlimit(kind, (allowed, allowed))
-    # With those of its group.
+    # When the parent ends, kill the whole process group.
     parent.listen(lambda: os.killpg(0, signal.SIGKILL))
     return told["request"], lambda **answers: parent.send(**_plain(answers))
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Schedules: which episodes get a video. A schedule is a function `(int) -> bool`."""
+"""Schedules: functions `(int) -> bool` that choose the episodes that get a video."""
 
 from __future__ import annotations
 
@@ -41,39 +41,39 @@ def disable_videos(episode_id: int) -> bool:
 
 
 def to_schedule(video_callable: object) -> Schedule:
-    """Return the schedule that gym's `video_callable` argument means.
+    """Return the schedule for gym's `video_callable` argument.
 
-    None is the capped cubic schedule; False, and whatever equals it, records nothing;
-    a function decides itself, by the truth of what it returns.
+    None means the capped cubic schedule; False, or a number equal to it, means no
+    videos; a function is used as it is, and its result is tested for truth.
 
     Raises:
-        InvalidArgument: it is something else, True for example.
+        InvalidArgument: `video_callable` is anything else, such as True.
     """
     if video_callable is None:
         return capped_cubic_video_schedule
     if callable(video_callable):
         return video_callable
-    # gym takes 0 and NumPy's False too.
+    # gym also accepts 0 and NumPy's False.
     if isinstance(video_callable, Number | np.bool_) and not video_callable:
         return disable_videos
     raise InvalidArgument(
         "video_callable must be a function from an episode's number to a bool, None "
         "(the cubes 0, 1, 8, 27 ... and every 1000th) or False (no videos), got "
         f"{type(video_callable).__name__}: {video_callable!r}. For a video of every "
-        "episode use video_callable=lambda episode_id: True."
+        "episode, use video_callable=lambda episode_id: True."
     )
 
 
 def check_takes_one(function: Callable[..., Any], name: str, what: str) -> None:
-    """Check that a function can be called with one thing, as far as that can be seen.
+    """Check that a function can be called with one argument, if its signature is known.
 
     Args:
-        function: given by the user.
-        name: of the option that it was given as.
-        what: it will be called with.
+        function: the user's function.
+        name: the option that it was given as.
+        what: a description of the argument that it will be called with.
 
     Raises:
-        InvalidArgument: it takes more, or nothing.
+        InvalidArgument: the function cannot be called with exactly one argument.
     """
     try:
         signature = inspect.signature(function)
@@ -84,13 +84,13 @@ def check_takes_one(function: Callable[..., Any], name: str, what: str) -> None:
         signature.bind(None)
     except TypeError as error:
         raise InvalidArgument(
-            f"{name} is called with one argument, {what}, and "
-            f"{schedule_name(function)}{signature} cannot be: {error}."
+            f"{name} is called with one argument, {what}, but "
+            f"{schedule_name(function)}{signature} cannot be called like this: {error}."
         ) from error
 
 
 def schedule_name(schedule: Schedule) -> str:
-    """Return the name under which a schedule is written into the manifest."""
+    """Return the name of a schedule that is written to the manifest."""
     name = getattr(schedule, "__qualname__", None) or type(schedule).__qualname__
     return str(name)
 
@@ -101,13 +101,13 @@ def record_all(episode_id: int) -> bool:
 
 
 def schedule_from_text(text: str) -> Schedule:
-    """Return the schedule that a command line names.
+    """Return the schedule for a command-line option.
 
     Args:
         text: `cubic`, `all`, `none`, `every:N` or `at:0,5,9`.
 
     Raises:
-        InvalidArgument: it is none of these.
+        InvalidArgument: `text` is anything else.
     """
     named: dict[str, Schedule] = {
         "cubic": capped_cubic_video_schedule,

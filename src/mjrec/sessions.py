@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """A recording session: N episodes of a named environment under a policy.
 
-This is what `mjrec record` does. Episode i of a session with the seed S starts from
-`SeedSequence([S, i])` (`environments.episode_seeds` has the recipe), so any episode
-can be recorded again without those before it.
+`mjrec record` runs one. Episode i of a session with seed S starts from
+`SeedSequence([S, i])` (see `environments.episode_seeds`), so any episode can be
+recorded again without the episodes before it.
 """
 
 from __future__ import annotations
@@ -38,22 +38,23 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True, kw_only=True)
 class Session:
-    """What is to be recorded.
+    """The options of a recording session.
 
     Attributes:
         environment: a Gymnasium id, `dm_control/<domain>-<task>`, or the path of an
             MJCF file.
         directory: the monitor directory.
-        seed: of the session, a whole number from 0 to 2**32 - 1.
-        episodes: how many.
-        policy: see `environments.policies`.
-        policy_kwargs: more arguments for it.
-        schedule: which episodes get a video: `cubic`, `all`, `none`, `every:N` or
-            `at:0,5,9`; None is `cubic`, unless `monitor` has a `keep`.
-        further_cameras: of more videos of the same episodes.
-        made: how the environment is made; the session sets `frames` and `seed`.
-        monitor: how it is recorded; the session sets which episodes, and the policy's
-            file.
+        seed: the session's seed, a whole number from 0 to 2**32 - 1.
+        episodes: number of episodes.
+        policy: the policy's name, see `environments.policies`.
+        policy_kwargs: extra arguments for the policy.
+        schedule: the episodes that get a video: `cubic`, `all`, `none`, `every:N` or
+            `at:0,5,9`. None means `cubic`, unless `monitor` has a `keep`.
+        further_cameras: cameras for additional videos of the same episodes.
+        made: options for creating the environment; the session sets `frames` and
+            `seed`.
+        monitor: options for recording it; the session sets the choice of episodes and
+            the policy's file.
     """
 
     environment: str
@@ -70,15 +71,15 @@ class Session:
 
 @dataclass(frozen=True)
 class SessionEpisode:
-    """An episode that was recorded.
+    """A recorded episode.
 
     Attributes:
-        episode_id: its number.
+        episode_id: the episode's number.
         length: number of steps.
         reward: sum of the rewards.
-        video: its video, where the schedule chose it: where it is, or will be when
-            it has been rendered. With `keep` also where it may still be chosen, or
-            not: `with_chosen_videos` tells in the end.
+        video: path of the video, which may still have to be rendered; None if the
+            schedule did not choose the episode. With `keep`, the choice may not be
+            final: see `with_chosen_videos`.
     """
 
     episode_id: int
@@ -92,20 +93,20 @@ def record_session(
 ) -> Generator[SessionEpisode, None, None]:
     """Record a session, and yield each episode as it ends.
 
-    Of an environment that cannot be drawn here there are statistics and no videos,
-    unless `render` asks for them; the log says why.
+    If the environment cannot be rendered here, only statistics are recorded, and the
+    log says why. If `render` requests videos, this is an error instead.
 
-    The recordings are closed when the iterator ends, is closed, or raises; so close
-    it, best with `contextlib.closing`. Only when it ends by itself are the videos
-    waited for that are still to be rendered; else they are left pending.
+    The recordings are closed when the iterator ends, is closed, or raises. So make sure
+    to close it, preferably with `contextlib.closing`. Pending videos are waited for
+    only if the iterator is exhausted; otherwise they stay pending.
 
     Args:
-        session: what is to be recorded.
+        session: the session's options.
         on_step: called after every step.
 
     Raises:
-        Error: the environment, policy, schedule, camera or directory cannot be; what
-            they are is checked before anything is written.
+        Error: the environment, policy, schedule, camera or directory is invalid. These
+            are checked before anything is written.
     """
     options = session.monitor
     _check(session)
@@ -125,7 +126,7 @@ def record_session(
         policy = load_policy(session.policy, named.environment, session.policy_kwargs)
         view = dict(named.view)
         if session.further_cameras:
-            # An environment that was made with its camera shows it by itself.
+            # An environment that was created with its camera already shows it.
             view["camera"] = [view.get("camera"), *session.further_cameras]
         recorded = monitored(
             named.environment,
@@ -134,14 +135,14 @@ def record_session(
                 options,
                 seed=session.seed,
                 video_callable=schedule,
-                # Without videos it is still the schedule that chooses what is kept.
+                # Even without videos, the schedule chooses the trajectories to keep.
                 trajectory_callable=schedule if options.render == OFF else None,
                 policy_file=policy_file(session.policy),
             ),
             env_id=named.env_id,
             **view,
         )
-        # A name is that of one environment, never of a vector environment.
+        # A name never refers to a vector environment.
         monitor = cast("GymnasiumMonitor | DmEnvMonitor", recorded)
         # From here on the monitor closes the environment.
         closing.pop_all()
@@ -168,12 +169,12 @@ def record_session(
 
 
 def with_chosen_videos(episodes: Sequence[SessionEpisode]) -> list[SessionEpisode]:
-    """Return the episodes of a session with `keep`, which has ended.
+    """Return the episodes of a finished session with `keep`, with their final videos.
 
-    They are as before, without the videos that were not chosen.
+    `video` is None for episodes whose video was not kept.
 
     Raises:
-        UnreadableFile: the manifest, which tells that, is missing or damaged.
+        UnreadableFile: the manifest, which lists the choice, is missing or damaged.
     """
     video = next((each.video for each in episodes if each.video), None)
     if video is None:
@@ -189,7 +190,7 @@ def with_chosen_videos(episodes: Sequence[SessionEpisode]) -> list[SessionEpisod
 
 
 def _check(session: Session) -> None:
-    """Check what can be checked before anything is imported or made."""
+    """Check everything that can be checked before importing or creating anything."""
     keep = session.monitor.keep
     if session.episodes < 1:
         raise InvalidArgument(
@@ -197,8 +198,9 @@ def _check(session: Session) -> None:
         )
     if keep is not None and session.schedule is not None:
         raise InvalidArgument(
-            f"Either keep (--keep {keep}) chooses the episodes that get a video, or a "
-            f"schedule does (--schedule {session.schedule}): leave one of them out."
+            "Episodes that get a video are chosen either by keep (--keep "
+            f"{keep}) or by a schedule (--schedule {session.schedule}), not by both: "
+            "omit one."
         )
     parse_environment_name(session.environment)
     episode_seeds(session.seed, 0)
@@ -207,15 +209,15 @@ def _check(session: Session) -> None:
 def _environment(session: Session, *, frames: bool) -> NamedEnvironment:
     render, workers = session.monitor.render, session.monitor.workers
     no_gl = None
-    # Does this process draw, or one that it starts?
+    # Will this process, or one that it starts, render?
     if frames and (render == LIVE or (render is None and workers != 0)):
-        # A text environment, or one that draws by itself, needs no OpenGL, and only the
-        # environment tells which it is.
+        # A text environment, or one with its own renderer, needs no OpenGL, but this is
+        # known only once the environment exists. So keep the error for later.
         try:
             use_gl()
         except GLError as error:
             no_gl = error
-    # Not before: MuJoCo takes its backend when it is loaded.
+    # Imported late, because MuJoCo reads the backend when it is loaded.
     from .simulation.warnings import log_mujoco_warnings
 
     log_mujoco_warnings()
@@ -228,7 +230,7 @@ def _environment(session: Session, *, frames: bool) -> NamedEnvironment:
         if render == LIVE or not named.can_be_deferred():
             raise no_gl
         raise GLError(
-            f"{no_gl}\nRecording itself needs no OpenGL: with --workers 0 (workers=0) "
-            f"the states are recorded, and `mjrec render {session.directory}` draws "
-            "the videos from them on a machine where OpenGL works."
+            f"{no_gl}\nRecording itself needs no OpenGL: use --workers 0 (workers=0) "
+            f"to record the states, and `mjrec render {session.directory}` to render "
+            "the videos on a machine where OpenGL works."
         )

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Signals that end a process, turned into exceptions, so that files are closed."""
+"""Handlers that turn deadly signals into exceptions, so that files are closed."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ from types import FrameType
 
 from .errors import Error
 
-# What schedulers and CI send at a time limit, and terminals when they are closed.
+# Schedulers and CI send these at a time limit, terminals when they are closed.
 _SIGNALS = (signal.SIGTERM, signal.SIGHUP)
 
 
 class Terminated(SystemExit):
     """A signal asked the process to end.
 
-    Like KeyboardInterrupt it leaves `with` blocks, runs `finally` clauses, and is not
+    Like KeyboardInterrupt, it leaves `with` blocks, runs `finally` clauses, and is not
     caught by `except Exception`. If it is not caught, the exit status is 128 plus the
     signal's number.
 
     Attributes:
-        signal: its number.
+        signal: the signal.
     """
 
     def __init__(self, signum: int) -> None:
@@ -37,23 +37,24 @@ class Terminated(SystemExit):
 
 
 def exit_on_signals() -> None:
-    """Let SIGTERM and SIGHUP end this process like Ctrl-C.
+    """Make SIGTERM and SIGHUP end this process like Ctrl-C.
 
     By default these signals kill the process, and `mjrec recover` finishes its files.
     After this call they raise `Terminated` in the main thread, so monitors close their
     files. Pending videos are not rendered; one line says how many there are. The
-    command line calls it.
+    `mjrec` command calls this function.
 
     Signals that are ignored (`nohup`) or that have a handler are left alone.
 
     Raises:
-        Error: not called in the main thread, where Python handles signals.
+        Error: the function is called outside the main thread, where Python handles
+            signals.
     """
     if threading.current_thread() is not threading.main_thread():
         raise Error(
             "exit_on_signals() was called in the thread "
-            f"{threading.current_thread().name!r}, and Python sets handlers of signals "
-            "in the main thread only: call it there, before the recording begins."
+            f"{threading.current_thread().name!r}, but Python sets signal handlers "
+            "only in the main thread: call it there, before the recording starts."
         )
     for signum in _deadly():
         signal.signal(signum, _raise)
@@ -64,9 +65,9 @@ def exit_on_signals() -> None:
 
 @contextlib.contextmanager
 def exiting_on_signals() -> Iterator[None]:
-    """Do what `exit_on_signals` does inside a `with` block; elsewhere nothing.
+    """Apply `exit_on_signals` inside a `with` block only.
 
-    In another thread than the main one it does nothing at all.
+    Outside the main thread, this does nothing.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
@@ -83,14 +84,14 @@ def exiting_on_signals() -> Iterator[None]:
 
 
 def _deadly() -> list[signal.Signals]:
-    """Return those of the signals that would end the process at once."""
+    """Return the signals that would end the process at once."""
     return [s for s in _SIGNALS if signal.getsignal(s) is signal.SIG_DFL]
 
 
 def received() -> Terminated | None:
-    """Return what the first signal raised; None where there was none.
+    """Return the exception that the first signal raised, or None without a signal.
 
-    At exit the interpreter does not report an uncaught `SystemExit`.
+    At exit, the interpreter does not report an uncaught `SystemExit`.
     """
     return _received[0] if _received else None
 
@@ -107,15 +108,15 @@ def _raise(signum: int, frame: FrameType | None) -> None:
 
 
 def _send_again(unraisable: sys.UnraisableHookArgs) -> None:
-    """Send a signal again whose exception has been lost.
+    """Resend a signal whose exception was lost.
 
-    It was raised between two instructions of a finaliser, or of a callback, where
-    Python reports exceptions and goes on. There is no second SIGTERM, but a SIGKILL.
+    The exception was raised inside a finalizer or a callback, where Python only reports
+    exceptions and continues. Schedulers send no second SIGTERM, but SIGKILL.
     """
     error = unraisable.exc_value
     if not isinstance(error, Terminated):
         _hooks[0](unraisable)
         return
-    # Not here, where it would be lost once more.
+    # Send it a little later: here, the exception would be lost again.
     signum = error.signal
     threading.Timer(_MOMENT, lambda: os.kill(os.getpid(), signum)).start()

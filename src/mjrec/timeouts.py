@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How long something may make no progress before it counts as hanging."""
+"""Timeouts without progress, after which something counts as hanging."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ _LONGEST_SLICE_S = 1.0
 
 
 def timeout_s() -> float:
-    """Return the seconds without progress, such as a frame, that are waited for.
+    """Return the maximum time without progress (such as a new frame), in seconds.
 
-    120, or what the environment variable `MJREC_TIMEOUT` says.
+    It is 120 unless the environment variable `MJREC_TIMEOUT` is set.
 
     Raises:
-        InvalidArgument: the variable is no positive number of seconds.
+        InvalidArgument: the variable is not a positive, finite number.
     """
     text = os.environ.get(_ENVIRONMENT_VARIABLE)
     if not text:
@@ -32,18 +32,19 @@ def timeout_s() -> float:
         seconds = math.nan
     if not 0 < seconds < math.inf:
         raise InvalidArgument(
-            f"{_ENVIRONMENT_VARIABLE} is {text!r}. It is the number of seconds after "
-            f"which a process that makes no progress is ended, such as {_DEFAULT_S:g}."
+            f"{_ENVIRONMENT_VARIABLE} is {text!r}. It must be the number of seconds "
+            "after which a process without progress is ended, such as "
+            f"{_DEFAULT_S:g}."
         )
     return seconds
 
 
 class Timeout:
-    """Waits for progress in slices, and says when it has been long enough.
+    """A timeout that waits for progress in short slices.
 
-    A slice counts for no more than it was to last: where the waiting process itself was
-    stopped, suspended or starved, so was most likely what it waits for, and gets its
-    time once more.
+    A slice never counts for more than its planned duration: if the waiting process was
+    stopped, suspended or starved, the process that it waits for probably was too, and
+    gets that time again.
 
     ::
 
@@ -53,7 +54,7 @@ class Timeout:
                 ...
 
     Args:
-        seconds: without progress; `timeout_s()` if None.
+        seconds: maximum time without progress; `timeout_s()` if None.
     """
 
     def __init__(self, seconds: float | None = None) -> None:
@@ -62,18 +63,22 @@ class Timeout:
 
     @property
     def is_over(self) -> bool:
-        """Whether it has been long enough."""
+        """Whether the timeout has passed without progress."""
         return self._waited >= self.seconds
 
     def renew(self) -> None:
-        """Begin again: there was progress."""
+        """Restart the timeout because there was progress."""
         self._waited = 0.0
 
     def wait(self, look: Callable[[float], object]) -> bool:
-        """Wait for a slice of the time, and begin again where there was progress.
+        """Wait for a slice of the time, and restart the timeout if there was progress.
 
         Args:
-            look: waits at most this many seconds; returns whether there was progress.
+            look: waits for at most the number of seconds it is given, and returns
+                whether there was progress.
+
+        Returns:
+            Whether there was progress.
         """
         seconds = max(0.0, min(_LONGEST_SLICE_S, self.seconds - self._waited))
         began = time.monotonic()

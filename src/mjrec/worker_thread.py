@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One background thread behind a bounded queue."""
+"""A background thread with a bounded queue."""
 
 from __future__ import annotations
 
@@ -15,22 +15,22 @@ T = TypeVar("T")
 
 
 class WorkerThread(Generic[T]):
-    """Hands items, in order, to one function on one thread of its own.
+    """A background thread that passes items to a function, in order.
 
-    The queue is bounded: `put` waits for room and never drops an item. What the
-    function raises comes home: the same exception is raised in the caller's thread.
-    The thread is a daemon, so that it never keeps the interpreter from ending; only
-    `close` promises that every item was consumed.
+    The queue is bounded: `put` waits for room and never drops an item. An exception in
+    the function is raised again in the caller's thread. The thread is a daemon, so it
+    never keeps the interpreter from exiting; only `close` guarantees that all items
+    were consumed.
 
     Args:
         consume: called with each item, always on the same thread.
-        capacity: how many items may wait.
-        name: what the thread is for. Its name is this behind `mjrec-`.
-        finish: called on the thread after the last item; not after an error or
+        capacity: maximum number of waiting items.
+        name: the thread's purpose; `mjrec-` is added in front to form its name.
+        finish: called on the thread after the last item, but not after an error or
             `abort`.
 
     Raises:
-        RuntimeError: no thread can be started (beyond the system's limit).
+        RuntimeError: the thread cannot be started (the system's limit is reached).
     """
 
     def __init__(
@@ -46,9 +46,10 @@ class WorkerThread(Generic[T]):
         self._capacity = capacity
         self._name = name
         self._waiting: collections.deque[T] = collections.deque()
-        # Reentrant: a garbage collection while the thread holds it may run a finaliser
-        # that calls `leave`. Taken by itself, not through the condition, whose
-        # `__enter__` is Python: Ctrl-C at its end would leave it locked.
+        # Reentrant, because a garbage collection while the thread holds it may run a
+        # finalizer that calls `leave`. Acquire the lock directly, not through the
+        # condition: its `__enter__` is Python code, and Ctrl-C at its end would leave
+        # the lock held.
         self._lock = threading.RLock()
         self._changed = threading.Condition(self._lock)
         self._closing = False
@@ -56,8 +57,8 @@ class WorkerThread(Generic[T]):
         self._error: BaseException | None = None
         self._error_was_raised = False
         self._process_id = os.getpid()
-        # Waited for before the thread is: Python 3.11 and 3.12 take a thread for ended
-        # when Ctrl-C interrupts `Thread.join`.
+        # Waited for before `Thread.join`, because Python 3.11 and 3.12 consider a
+        # thread ended if Ctrl-C interrupts `join`.
         self._has_ended = threading.Event()
         self._thread = threading.Thread(
             target=self._work, name=f"mjrec-{name}", daemon=True
@@ -66,21 +67,21 @@ class WorkerThread(Generic[T]):
 
     @property
     def failed(self) -> bool:
-        """Whether the function has raised; no further item will be consumed."""
+        """Whether the function has raised; no more items will be consumed."""
         return self._error is not None
 
     def put(self, item: T) -> None:
-        """Queue `item`, waiting for room if need be.
+        """Queue `item`, waiting for room if necessary.
 
         Raises:
             ClosedError: after `close`, `leave` or `abort`, or in a forked child, which
                 has no copy of the thread.
-            BaseException: whatever the function raised for an earlier item.
+            BaseException: the exception that the function raised for an earlier item.
         """
         if os.getpid() != self._process_id:
             raise ClosedError(
-                f"{self._name} lives in process {self._process_id} and cannot be used "
-                "after a fork: make it in the process that uses it."
+                f"{self._name} belongs to process {self._process_id} and cannot be "
+                "used after a fork: create it in the process that uses it."
             )
         with self._lock:
             self._changed.wait_for(self._has_room_or_ended)
@@ -93,12 +94,13 @@ class WorkerThread(Generic[T]):
     def close(self) -> None:
         """Wait until every item is consumed and the thread has ended.
 
-        May be called again, also after it was interrupted. Called on the thread itself,
-        as by a finaliser during a garbage collection there, it is `leave`.
+        May be called again, even after an interrupted call. If it is called on the
+        thread itself (for example by a finalizer during garbage collection), it does
+        the same as `leave`.
 
         Raises:
-            BaseException: whatever the function raised, unless `put` or an earlier
-                `close` has raised it already.
+            BaseException: the exception that the function raised, unless `put` or an
+                earlier `close` has already raised it.
         """
         self.leave()
         self._wait_for_end()
@@ -106,16 +108,16 @@ class WorkerThread(Generic[T]):
             self._raise_error()
 
     def leave(self) -> None:
-        """Let the thread consume what waits and end by itself. Never blocks."""
+        """Close the queue; the thread consumes waiting items and ends. Never blocks."""
         with self._lock:
             self._closing = True
             self._changed.notify_all()
 
     def abort(self) -> None:
-        """Drop what waits, wait for the item in hand, end the thread; raise nothing.
+        """Drop waiting items, wait for the current item, and end the thread.
 
-        Idempotent. Whatever the function may be blocked on has to be released first.
-        Called on the thread itself it does not wait.
+        Idempotent; raises nothing. If the function may be blocked, unblock it first.
+        If called on the thread itself, it does not wait.
         """
         with self._lock:
             self._aborted = True
@@ -124,7 +126,7 @@ class WorkerThread(Generic[T]):
         self._wait_for_end()
 
     def _wait_for_end(self) -> None:
-        # Neither waits for itself; and a forked child has no such thread.
+        # The thread cannot wait for itself, and a forked child does not have it.
         is_own = self._thread is threading.current_thread()
         if not is_own and os.getpid() == self._process_id:
             self._has_ended.wait()
@@ -144,7 +146,7 @@ class WorkerThread(Generic[T]):
                 self._consume(item[0])
             if self._finish is not None and not self._aborted:
                 self._finish()
-        # Every error belongs to the caller; this thread has no reader.
+        # All errors are kept for the caller; no one would see them on this thread.
         except BaseException as error:
             with self._lock:
                 self._error = error
@@ -154,7 +156,7 @@ class WorkerThread(Generic[T]):
             self._has_ended.set()
 
     def _next(self) -> tuple[T] | None:
-        """Wait for the next item; None once there will be none."""
+        """Wait for the next item and return it in a tuple; None after the last one."""
         with self._lock:
             self._changed.wait_for(lambda: self._closing or bool(self._waiting))
             if not self._waiting:

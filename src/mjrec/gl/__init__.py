@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""OpenGL without a screen: which backend to use, and what is wrong with the others.
+"""OpenGL without a screen: choice of the backend, and diagnosis of failures.
 
-Nothing here imports mujoco or OpenGL; what must is tried in child processes.
+Nothing here imports mujoco or OpenGL; tests that need them run in child processes.
 """
 
 from __future__ import annotations

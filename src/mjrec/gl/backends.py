@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The OpenGL backends: their names, and the environment variables that choose one."""
+"""Names of the OpenGL backends, and the environment variables that select one."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ BACKENDS = ("egl", "osmesa", "glfw")
 
 _KIND = "OpenGL backend"
 _SYNONYMS = {"glx": "glfw"}
-# What mujoco understands besides names. "On" names no backend.
+# Other values that mujoco accepts. Those of `_ON` do not name a backend.
 _ON = frozenset({"", "enable", "enabled", "on", "true", "1"})
 _OFF = frozenset({"disable", "disabled", "off", "false", "0"})
 
 
 def backend_name(text: object) -> str:
-    """Return the backend that `text` names, as every program spells it.
+    """Return the backend that `text` names, in the spelling that all programs accept.
 
-    Case and surrounding blanks do not count: mujoco takes `EGL`, Gymnasium and
+    Case and surrounding whitespace are ignored: mujoco accepts `EGL`, Gymnasium and
     dm_control do not.
 
     Raises:
-        UnknownName: there is no such backend.
+        UnknownName: no such backend exists.
     """
     name = _normalised(text)
     if name not in BACKENDS:
@@ -35,14 +35,14 @@ def backend_name(text: object) -> str:
 
 
 def backend_in_environment(environ: Mapping[str, str] | None = None) -> str | None:
-    """Return the backend that `MUJOCO_GL` names; None where it names none.
+    """Return the backend that `MUJOCO_GL` names, or None if it does not name one.
 
     Args:
-        environ: the environment variables; this process's, if None.
+        environ: the environment variables; if None, this process's.
 
     Raises:
-        UnknownName: it names one that does not exist.
-        GLError: it turns rendering off.
+        UnknownName: `MUJOCO_GL` names an unknown backend.
+        GLError: `MUJOCO_GL` turns rendering off.
     """
     environ = os.environ if environ is None else environ
     text = environ.get("MUJOCO_GL", "")
@@ -77,7 +77,7 @@ def platforms_contradict(environ: Mapping[str, str], backend: str | None) -> boo
 
 
 def environment_for(backend: str, environ: Mapping[str, str]) -> dict[str, str]:
-    """Return `environ` with the variables set, or left out, that mean `backend`."""
+    """Return a copy of `environ` whose variables select `backend`."""
     changed = {**environ, "MUJOCO_GL": backend}
     if backend in ("egl", "osmesa"):
         changed["PYOPENGL_PLATFORM"] = backend

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Choosing the backend of this process."""
+"""Choice of this process's OpenGL backend."""
 
 from __future__ import annotations
 
@@ -32,10 +32,10 @@ class Choice:
     """The backend to use.
 
     Attributes:
-        backend: its name.
-        reason: where the name comes from.
-        probe: the result of trying it.
-        rejected: the backends tried before it, and why they were not taken.
+        backend: the backend's name.
+        reason: why it was chosen.
+        probe: the result of its test.
+        rejected: the backends that were considered before, and why they were rejected.
     """
 
     backend: str
@@ -47,24 +47,25 @@ class Choice:
 def use_gl(backend: str | None = None) -> str:
     """Choose the OpenGL backend of this process and return its name.
 
-    The choice is `backend`, else the environment variable `MUJOCO_GL`, else the first
-    of EGL, OSMesa and GLFW that renders. A child process draws a test frame with it
-    first, which takes about a second, once per process. So the result is a backend that
-    works, and one that does not is an error with its cause and fix. To skip the test,
-    set `MUJOCO_GL` and do not call this function.
+    The choice is `backend` if given, otherwise the environment variable `MUJOCO_GL` if
+    set, otherwise the first of EGL, OSMesa and GLFW that works. A child process first
+    renders a test frame with it, which takes about a second, once per process. So a
+    returned backend works, and a backend that does not work is an error with its cause
+    and fix. To skip the test, set `MUJOCO_GL` and do not call this function.
 
     It sets `MUJOCO_GL` and `PYOPENGL_PLATFORM`; after an error both are unchanged. Call
     it before anything imports mujoco, dm_control or OpenGL. If mujoco is already
     imported, only the backend that it uses can be chosen.
 
     Args:
-        backend: `"egl"`, `"osmesa"` or `"glfw"`, in any case. None lets mjrec choose.
+        backend: `"egl"`, `"osmesa"` or `"glfw"`, in upper or lower case. If None, mjrec
+            chooses.
 
     Raises:
-        UnknownName: there is no backend of this name, or of `MUJOCO_GL`'s.
+        UnknownName: `backend` or `MUJOCO_GL` is not the name of a backend.
         GLError: `MUJOCO_GL` turns rendering off; mujoco, dm_control or PyOpenGL was
-            imported with another backend; or no backend, or not this one, renders. The
-            message has the cause and fix of each.
+            imported with another backend; or neither the requested backend nor, without
+            a request, any backend works. The message has the cause and fix for each.
     """
     choice = choose(backend)
     _log(choice)
@@ -73,24 +74,24 @@ def use_gl(backend: str | None = None) -> str:
 
 
 def backend_for_children() -> str:
-    """Return the first backend that renders, for processes that draw for this one.
+    """Return the first backend that works, for processes that render for this one.
 
-    Whatever this process has imported, and whatever its `MUJOCO_GL` says.
+    This process's imports and its `MUJOCO_GL` do not matter.
 
     Raises:
-        GLError: as `use_gl`.
+        GLError: no backend works.
     """
-    choice = _first_that_renders(BACKENDS, None, "the first that renders")
+    choice = _first_that_renders(BACKENDS, None, "the first that works")
     _log(choice)
     return choice.backend
 
 
 def choose(backend: str | None = None) -> Choice:
-    """Return what `use_gl` would choose, and change nothing.
+    """Return the choice that `use_gl` would make, without changing anything.
 
     Raises:
-        UnknownName: as `use_gl`.
-        GLError: as `use_gl`.
+        UnknownName: see `use_gl`.
+        GLError: see `use_gl`.
     """
     asked, reason = _asked_for(backend)
     return _first_that_renders(
@@ -127,32 +128,32 @@ def _log(choice: Choice) -> None:
 
 def _asked_for(backend: str | None) -> tuple[str | None, str]:
     if backend is not None:
-        return backend_name(backend), "asked for"
+        return backend_name(backend), "requested"
     named = backend_in_environment()
     if named:
-        return named, "MUJOCO_GL names it"
-    return None, "the first that renders"
+        return named, "set by MUJOCO_GL"
+    return None, "the first that works"
 
 
 def conflict_with(backend: str) -> Diagnosis | None:
-    """Return why this process cannot use `backend` any more, if so."""
+    """Return why this process can no longer use `backend`, or None if it can."""
     for package, taken in _taken().items():
         if taken == backend or (package == "PyOpenGL" and backend == "glfw"):
             continue
         with_what = f"with {taken}" if taken else "without a backend"
         return Diagnosis(
-            f"{package} was imported {with_what} in this process, and cannot change "
-            f"to {backend} any more.",
+            f"{package} was imported {with_what} in this process and can no longer "
+            f"switch to {backend}.",
             _EARLIER,
         )
     return None
 
 
 def _taken() -> dict[str, str | None]:
-    """Return the backend that each package imported so far has taken.
+    """Return the backend in use by each of the packages that are imported.
 
-    None stands for one that was imported without any: `MUJOCO_GL` turned rendering
-    off, or the import of the backend failed.
+    None means that a package was imported without a backend: `MUJOCO_GL` turned
+    rendering off, or importing the backend failed.
     """
     taken: dict[str, str | None] = {}
     mujoco = sys.modules.get("mujoco")
@@ -179,10 +180,10 @@ def _nothing_renders(
 ) -> str:
     if asked:
         first = f"OpenGL backend {asked} ({reason}) cannot be used here."
-        last = "`mjrec doctor` shows which backends render here."
+        last = "Run `mjrec doctor` to see which backends work here."
     else:
         first = "No OpenGL backend can be used here."
-        last = "`mjrec doctor` shows all of it again."
+        last = "Run `mjrec doctor` to see the details again."
     lines = [first]
     for name, why in rejected:
         lines.append(f"{name}: {why.cause}")
@@ -191,7 +192,7 @@ def _nothing_renders(
 
 
 def set_backend(backend: str) -> None:
-    """Let `MUJOCO_GL` and `PYOPENGL_PLATFORM` say `backend`."""
+    """Set `MUJOCO_GL` and `PYOPENGL_PLATFORM` to `backend`."""
     wanted = environment_for(backend, os.environ)
     for name in ("MUJOCO_GL", "PYOPENGL_PLATFORM"):
         if name in wanted:

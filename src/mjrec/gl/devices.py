@@ -1,14 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rendering on the GPU that a worker was given.
+"""Rendering on the GPU that a worker was assigned.
 
-Schedulers hand out GPUs in `CUDA_VISIBLE_DEVICES`, and EGL does not heed it: unless
-told otherwise, every worker of a machine draws on the same GPU, the first. Which of
-EGL's devices is the given one is not computed but asked, because the numbers are those
-of three programs: the scheduler's entry is CUDA's, or a GPU's UUID; EGL has an order of
-its own; and `MUJOCO_EGL_DEVICE_ID` counts EGL's devices in mujoco 3, and CUDA's where
-it can in mujoco 4. A child process sees the given GPU alone, and its driver says which
-of EGL's devices has a CUDA number then; another one draws, and its driver says on which
-device.
+Schedulers assign GPUs with `CUDA_VISIBLE_DEVICES`, which EGL ignores: by default, all
+workers on a machine render on the same GPU, the first one. The EGL device of the
+assigned GPU cannot be computed, because three numberings are involved. The scheduler's
+entry is CUDA's number or a UUID; EGL has its own order; and `MUJOCO_EGL_DEVICE_ID`
+counts EGL's devices in mujoco 3, but CUDA's, if possible, in mujoco 4. So a child
+process that sees only the assigned GPU asks the driver which EGL device has a CUDA
+number. Another child process then renders, and its driver reports the device.
 """
 
 from __future__ import annotations
@@ -36,27 +35,27 @@ _DOCTOR = "`mjrec doctor` shows EGL's devices; `nvidia-smi -L` shows the GPUs."
 def render_on_given_gpu(
     gpu: str | None = None, *, required: bool = False
 ) -> EglDevice | None:
-    """Let this process and its children render on the GPU that they were given.
+    """Make this process and its children render on the GPU that they were assigned.
 
     Sets `MUJOCO_EGL_DEVICE_ID` to the EGL device of that GPU, and `MUJOCO_GL` to `egl`
     unless it turns rendering off in this process. If the GPU cannot be used, nothing is
-    set and one warning says why. Takes a second or two, in child processes. Call it
-    before anything imports mujoco, dm_control or OpenGL.
+    set and one warning says why. This takes a second or two, in child processes. Call
+    it before anything imports mujoco, dm_control or OpenGL.
 
     Args:
         gpu: one entry as in `CUDA_VISIBLE_DEVICES`: a number ("3"), or the UUID of a
-            GPU ("GPU-1a2b...") or of a part of one ("MIG-..."). None is the first entry
-            of that variable, else CUDA's first GPU.
+            GPU ("GPU-1a2b...") or of a part of one ("MIG-..."). None means the first
+            entry of that variable or, if it is not set, CUDA's first GPU.
         required: raise an error if the GPU cannot be used.
 
     Returns:
-        The EGL device. None if it is not the given GPU, or EGL cannot tell.
+        The EGL device, or None if the GPU cannot be used.
 
     Raises:
         InvalidArgument: `gpu` is not exactly one entry.
         UnknownName: `MUJOCO_GL` names an unknown backend.
         GLError: mujoco, dm_control or PyOpenGL was imported with another backend or has
-            drawn already; or the GPU is required and cannot be used.
+            already rendered; or the GPU is required but cannot be used.
     """
     entry = _entry(gpu)
     _refuse_latecomers()
@@ -77,15 +76,15 @@ def render_on_given_gpu(
 def visible_gpus(
     environ: Mapping[str, str] | None = None, *, devices: Path = Path("/dev")
 ) -> list[str]:
-    """Return the NVIDIA GPUs of this machine that may be handed out to workers.
+    """Return this machine's NVIDIA GPUs that can be assigned to workers.
 
     Each is an entry for a worker's `CUDA_VISIBLE_DEVICES`. They are this process's own
-    entries; where the variable is not set, CUDA's numbers of the GPUs whose device
-    files this process may open. A container or a job sees only its own of these, and
-    CUDA counts them from 0.
+    entries or, if the variable is not set, CUDA's numbers of the GPUs whose device
+    files this process may open. A container or a job sees only its own device files,
+    and CUDA counts them from 0.
 
     Args:
-        environ: the environment variables; this process's, if None.
+        environ: the environment variables; if None, this process's.
         devices: the directory of device files.
     """
     entries = _entries(os.environ if environ is None else environ)
@@ -96,12 +95,12 @@ def visible_gpus(
 
 
 def device_of_gpu(devices: Sequence[EglDevice], gpu: str) -> EglDevice | None:
-    """Return EGL's device of a GPU; None where that cannot be told.
+    """Return the EGL device of a GPU, or None if it is unknown.
 
     Args:
-        devices: EGL's, as a process sees them to which CUDA shows only that GPU. So
-            the one that has a CUDA number is meant, whichever number that is.
-        gpu: an entry of `CUDA_VISIBLE_DEVICES`. CUDA takes the beginning of a UUID.
+        devices: EGL's devices, as seen by a process that CUDA shows only that GPU. So
+            the right device is the one that has a CUDA number, no matter which.
+        gpu: an entry of `CUDA_VISIBLE_DEVICES`. CUDA accepts the beginning of a UUID.
     """
     named = [
         device
@@ -126,18 +125,18 @@ def _entry(gpu: str | None) -> str:
         return entry
     raise InvalidArgument(
         f"gpu must be one entry as in {CUDA_VISIBLE_DEVICES}, a number or a UUID that "
-        f"begins with GPU- or MIG-, got {gpu!r}."
+        f"starts with GPU- or MIG-, got {gpu!r}."
     )
 
 
 def _entries(environ: Mapping[str, str]) -> list[str] | None:
-    """Return the entries of `CUDA_VISIBLE_DEVICES`; None where it is not set."""
+    """Return the entries of `CUDA_VISIBLE_DEVICES`; None if it is not set."""
     text = environ.get(CUDA_VISIBLE_DEVICES)
     if text is None:
         return None
     entries = []
     for entry in (part.strip() for part in text.split(",")):
-        # CUDA ignores whatever follows an entry that it does not understand.
+        # CUDA ignores everything after an invalid entry.
         if not (entry.isdecimal() or entry.startswith(_UUIDS)):
             break
         entries.append(entry)
@@ -145,7 +144,7 @@ def _entries(environ: Mapping[str, str]) -> list[str] | None:
 
 
 def _can_be_opened(file: Path) -> bool:
-    # What a control group forbids is seen only by trying.
+    # A cgroup's restriction shows only when opening the file.
     try:
         os.close(os.open(file, os.O_RDWR | os.O_CLOEXEC))
     except OSError:
@@ -154,33 +153,33 @@ def _can_be_opened(file: Path) -> bool:
 
 
 def _refuse_latecomers() -> None:
-    """Raise GLError where the choice would come too late in this process."""
+    """Raise GLError if it is too late for this process to choose a device."""
     conflict = conflict_with("egl")
     if conflict and not rendering_is_off(os.environ):
         raise GLError(f"{conflict.cause} {conflict.fix}")
-    # Mujoco reads the number when it makes its first context, dm_control at import.
+    # mujoco reads the number when it creates its first context, dm_control at import.
     mujoco_draws = getattr(sys.modules.get("mujoco.egl"), "EGL_DISPLAY", None)
     dm_control = "dm_control._render.pyopengl.egl_renderer" in sys.modules
     if mujoco_draws is not None or dm_control:
         raise GLError(
-            "This process has begun to draw by EGL, and cannot change to another GPU "
-            "any more. Call render_on_given_gpu before anything imports dm_control or "
-            "draws with mujoco."
+            "This process has already rendered with EGL and can no longer switch to "
+            "another GPU. Call render_on_given_gpu before anything imports dm_control "
+            "or renders with mujoco."
         )
 
 
 def _found(gpu: str, environ: Mapping[str, str]) -> tuple[EglDevice, int]:
-    """Return EGL's device of a GPU, and what `MUJOCO_EGL_DEVICE_ID` has to be for it.
+    """Return the EGL device of a GPU, and its value of `MUJOCO_EGL_DEVICE_ID`.
 
     Raises:
-        GLError: it cannot be drawn on.
+        GLError: the GPU cannot be used for rendering.
     """
     if not gpu:
         raise GLError(
-            "This process was given no GPU for rendering: CUDA_VISIBLE_DEVICES is "
-            "empty. Ask your scheduler for one."
+            "This process was not assigned a GPU for rendering: CUDA_VISIBLE_DEVICES "
+            "is empty. Request one from your scheduler."
         )
-    asked = f"GPU {gpu} was given for rendering"
+    asked = f"GPU {gpu} was assigned for rendering"
     backend = None if rendering_is_off(environ) else backend_in_environment(environ)
     if backend not in (None, "egl"):
         raise GLError(
@@ -189,21 +188,21 @@ def _found(gpu: str, environ: Mapping[str, str]) -> tuple[EglDevice, int]:
         )
     device, alone = _device(gpu, environ)
     if device is None:
-        raise GLError(f"{asked}, and {_lack_of_device(alone)}")
+        raise GLError(f"{asked}, but {_lack_of_device(alone)}")
     tried = alone
     for number, tried in _tries(device, gpu, alone, environ):
         for used in tried.devices:
             is_it = used.in_use and used.index == device.index
             if is_it and tried.renders and not tried.software:
                 return used, number
-    why = f"it does not render. {tried.cause} {tried.fix}".strip()
+    why = f"it does not work. {tried.cause} {tried.fix}".strip()
     if tried.renders:
-        why = "mujoco draws on another device whatever MUJOCO_EGL_DEVICE_ID is."
-    raise GLError(f"{asked}, which is EGL's {_shown(device)}, and {why} {_DOCTOR}")
+        why = "mujoco uses another device, whatever MUJOCO_EGL_DEVICE_ID is."
+    raise GLError(f"{asked}, which is EGL's {_shown(device)}, but {why} {_DOCTOR}")
 
 
 def _device(gpu: str, environ: Mapping[str, str]) -> tuple[EglDevice | None, Probe]:
-    """Return EGL's device of a GPU, and what a process found that sees it alone."""
+    """Return the EGL device of a GPU, and the probe of a process that sees only it."""
     alone = probe("egl", environ={**environ, CUDA_VISIBLE_DEVICES: gpu, _CHOSEN: "0"})
     device = device_of_gpu(alone.devices, gpu)
     hardware = [device for device in alone.devices if not device.software]
@@ -234,20 +233,20 @@ def _tries(
 
 
 def _lack_of_device(alone: Probe) -> str:
-    """Return why none of EGL's devices is the given GPU."""
+    """Return why none of EGL's devices is the assigned GPU."""
     hardware = [device for device in alone.devices if not device.software]
     if not alone.devices:
         return f"EGL has no device. {alone.cause} {alone.fix}".strip()
     if not hardware:
         on = f" ({alone.gl_renderer})" if alone.gl_renderer else ""
         way = alone.warning() or (
-            "There is no GPU here that EGL finds: no device file in /dev."
+            "EGL finds no GPU here: /dev contains no device file of a GPU."
         )
         return f"EGL has only the CPU{on}. {way}"
     return (
-        f"none of EGL's {len(hardware)} GPUs is that: "
-        f"{'; '.join(map(_shown, hardware))}. Parts of a GPU (MIG) mostly have no "
-        f"graphics; what CUDA does not show cannot be found. {_DOCTOR}"
+        f"none of EGL's {len(hardware)} GPUs is that one: "
+        f"{'; '.join(map(_shown, hardware))}. Parts of a GPU (MIG) usually do not "
+        f"support graphics, and GPUs that CUDA does not show cannot be found. {_DOCTOR}"
     )
 
 

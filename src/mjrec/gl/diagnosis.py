@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From what MuJoCo and the drivers say to its cause and the exact fix.
+"""Diagnosis of rendering failures: from an error message to its cause and exact fix.
 
-Their messages rarely name either: a missing library shows as `'NoneType' object has no
-attribute 'eglQueryString'`, a wrong environment variable as `module 'mujoco' has no
-attribute 'Renderer'`. What they mean stands in one table, `diagnosis.toml`.
+Messages of MuJoCo and the drivers rarely name either: a missing library shows as
+`'NoneType' object has no attribute 'eglQueryString'`, a wrong environment variable as
+`module 'mujoco' has no attribute 'Renderer'`. Their meanings are listed in one table,
+`diagnosis.toml`.
 """
 
 from __future__ import annotations
@@ -21,12 +22,12 @@ from .backends import platforms_contradict, rendering_is_off
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """Why something does not render.
+    """The cause of a problem and its fix.
 
     Attributes:
         cause: what is wrong, in a sentence or two.
-        fix: what to do; empty if unknown. Commands are on lines of their own, indented
-            by two spaces.
+        fix: what to do; empty if unknown. Commands are on separate lines, indented by
+            two spaces.
     """
 
     cause: str
@@ -42,9 +43,9 @@ def diagnose(
     """Return the cause and fix of an OpenGL failure, or None if it is unknown.
 
     Args:
-        text: the exception's text, or everything that a process printed.
+        text: the exception's text, or a process's whole output.
         backend: the backend in use, if known.
-        environ: the environment variables at that time. None is this process's.
+        environ: the environment variables at that time; if None, this process's.
     """
     environ = os.environ if environ is None else environ
     wanted = backend or environ.get("MUJOCO_GL", "").strip().lower()
@@ -73,7 +74,7 @@ def diagnose(
             and known.get("needs") in needed
         ):
             words = {**facts, **found.groupdict()}
-            # mujoco writes its backends with capitals.
+            # mujoco capitalizes backend names.
             words["wanted"] = words["wanted"].lower()
             return Diagnosis(
                 known["cause"].format(**words), known["fix"].format(**words)
@@ -83,7 +84,7 @@ def diagnose(
 
 @functools.cache
 def _table() -> list[dict[str, str]]:
-    """Return the rows of `diagnosis.toml`, with its words put in."""
+    """Return the rows of `diagnosis.toml`, with its words filled in."""
     file = Path(__file__).with_name("diagnosis.toml")
     content = tomllib.loads(file.read_text("utf-8"))
     words: dict[str, str] = content["words"]

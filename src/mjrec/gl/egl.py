@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""EGL's devices, as its library tells of them.
+"""EGL's devices, as listed by its library.
 
-By ctypes alone: this also answers where neither mujoco nor PyOpenGL can be imported.
+This uses only ctypes, so it works even if mujoco and PyOpenGL cannot be imported.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ _DRM_DEVICE_FILE = 0x3233
 _DRM_RENDER_NODE_FILE = 0x3377
 _DEVICE_UUID = 0x335C
 _UUID_LENGTH = 16
-# mujoco 3 itself asks for ten.
+# More than enough: mujoco 3 itself asks for ten.
 _MOST_DEVICES = 256
 
 
@@ -29,12 +29,12 @@ class EglDevice:
     Attributes:
         index: position in EGL's list, as in `MUJOCO_EGL_DEVICE_ID` for MuJoCo 3 (and
             for MuJoCo 4 if no device has a CUDA number).
-        device_file: such as `/dev/dri/renderD128`; empty if unknown.
-        cuda_id: CUDA's number of the device. None if it has none, or if
+        device_file: the device file, such as `/dev/dri/renderD128`; empty if unknown.
+        cuda_id: CUDA's number of the device; None if it has none, or if
             `CUDA_VISIBLE_DEVICES` hides it.
-        software: whether it is the CPU.
-        in_use: whether the current context draws on it.
-        uuid: of the GPU, as in `nvidia-smi -L`; empty if unknown.
+        software: whether the device is the CPU.
+        in_use: whether the current context renders on the device.
+        uuid: the GPU's UUID, as in `nvidia-smi -L`; empty if unknown.
     """
 
     index: int
@@ -46,13 +46,13 @@ class EglDevice:
 
 
 def egl_devices(*, with_cuda: bool = True) -> list[EglDevice]:
-    """Return what EGL tells about its devices, in the order of its list.
+    """Return EGL's devices, in the order of its list.
 
-    Empty where it does not tell, or is not there.
+    The list is empty if EGL is not installed or cannot list its devices.
 
     Args:
-        with_cuda: ask for CUDA's numbers. The driver begins CUDA for that, which a
-            process that is forked afterwards cannot use any more.
+        with_cuda: ask for CUDA's numbers. For this the driver initializes CUDA, which
+            processes that are forked afterwards can no longer use.
     """
     try:
         address_of = ctypes.CDLL("libEGL.so.1").eglGetProcAddress
@@ -62,7 +62,7 @@ def egl_devices(*, with_cuda: bool = True) -> list[EglDevice]:
     address_of.argtypes = [ctypes.c_char_p]
 
     def call(name: str, *arguments: Any, result: Any = ctypes.c_uint) -> Any:
-        """Return what a function returns; None where there is no such function."""
+        """Call an EGL function; return its result, or None if it does not exist."""
         address = address_of(name.encode())
         if not address:
             return None

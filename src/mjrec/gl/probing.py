@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Trying a backend: in a child process, so that a crash or a hang is an answer too."""
+"""Tests of OpenGL backends in a child process, which may crash or hang."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from .backends import backend_name, environment_for
 from .diagnosis import Diagnosis, diagnose
 from .egl import EglDevice
 
-# Drivers of machines with many GPUs take ten seconds and more to wake up.
+# On machines with many GPUs, drivers can take more than ten seconds to initialize.
 TIMEOUT = 60.0
 
 _END_OF_OUTPUT = 4000
@@ -26,20 +26,20 @@ _SOFTWARE = re.compile(r"llvmpipe|softpipe|swrast|SwiftShader|software", re.IGNO
 
 @dataclass(frozen=True)
 class Probe:
-    """The result of a test with one backend.
+    """The result of testing one backend.
 
     Attributes:
-        backend: its name.
-        renders: whether a frame of several colours was correct.
-        gl_renderer: what draws, as OpenGL names it; empty if unknown.
-        gl_vendor: its vendor.
-        gl_version: OpenGL's version, with the driver's.
-        frames_per_second: of a small scene, 480x480, at MuJoCo's default quality. None
-            if it was not measured.
-        devices: EGL's devices, if known; also if none renders.
-        cause: why it does not render.
+        backend: the backend's name.
+        renders: whether a test frame with several colours was correct.
+        gl_renderer: the renderer's name in OpenGL; empty if unknown.
+        gl_vendor: the renderer's vendor.
+        gl_version: the version of OpenGL, including the driver's.
+        frames_per_second: speed for a small 480x480 scene at MuJoCo's default quality;
+            None if not measured.
+        devices: EGL's devices, if known, even if none of them works.
+        cause: why the backend does not work.
         fix: what to do; empty if unknown.
-        output: the end of the child process's output, if it does not render.
+        output: the end of the child process's output, if the backend does not work.
     """
 
     backend: str
@@ -55,13 +55,13 @@ class Probe:
 
     @property
     def software(self) -> bool:
-        """Whether the CPU draws."""
+        """Whether the backend renders on the CPU."""
         return self.renders and bool(
             self.backend == "osmesa" or _SOFTWARE.search(self.gl_renderer)
         )
 
     def warning(self) -> str:
-        """Return what is odd about a backend that renders; mostly nothing."""
+        """Return a warning if the backend uses the CPU despite a GPU; usually empty."""
         files = gpu_device_files() if self.software else []
         if not files:
             return ""
@@ -69,16 +69,19 @@ class Probe:
         if self.backend == "osmesa":
             way = "OSMesa always does; EGL can use the GPU."
         elif closed:
-            way = f"This user may not open {closed[0]}: add it to the group of that."
+            way = (
+                f"This user has no permission to open {closed[0]}: add the user to the "
+                "file's group."
+            )
         else:
             way = (
-                "EGL finds no driver for it, or MUJOCO_EGL_DEVICE_ID names another "
+                "EGL finds no driver for it, or MUJOCO_EGL_DEVICE_ID selects another "
                 "device. A container with an NVIDIA GPU needs "
                 "NVIDIA_DRIVER_CAPABILITIES=all."
             )
         return (
-            f"{self.backend} draws on the CPU ({self.gl_renderer or self.backend}) "
-            f"though there is a GPU ({', '.join(files)}). {way}"
+            f"{self.backend} renders on the CPU ({self.gl_renderer or self.backend}) "
+            f"although there is a GPU ({', '.join(files)}). {way}"
         )
 
 
@@ -89,19 +92,18 @@ def probe(
     measure: bool = False,
     timeout: float = TIMEOUT,
 ) -> Probe:
-    """Try `backend` as `use_gl` would set it; the answer is kept for this process.
+    """Test `backend` as `use_gl` would set it, and cache the result in this process.
 
-    Another environment is another question: the answer is not used again after an
-    environment variable has changed.
+    A cached result is used only if all environment variables are unchanged.
 
     Args:
-        backend: its name.
-        environ: the environment variables; this process's, if None.
-        measure: measure its speed too.
-        timeout: how many seconds to wait for the frame.
+        backend: the backend's name.
+        environ: the environment variables; if None, this process's.
+        measure: measure the speed too.
+        timeout: maximum time to wait for a frame, in seconds.
 
     Raises:
-        UnknownName: there is no such backend.
+        UnknownName: no such backend exists.
     """
     environ = environment_for(
         backend_name(backend), os.environ if environ is None else environ
@@ -120,12 +122,12 @@ _answers: dict[tuple[str, frozenset[tuple[str, str]]], Probe] = {}
 def probe_environment(
     environ: Mapping[str, str], *, measure: bool = False, timeout: float = TIMEOUT
 ) -> Probe:
-    """Try the backend that `environ` names in `MUJOCO_GL`, with just these variables.
+    """Test the backend that `environ` names in `MUJOCO_GL`, with only these variables.
 
     Args:
-        environ: the child's environment variables, none of which is put right.
-        measure: measure its speed too.
-        timeout: how many seconds to wait for the frame.
+        environ: the child's environment variables, none of which is corrected.
+        measure: measure the speed too.
+        timeout: maximum time to wait for a frame, in seconds.
     """
     backend = environ["MUJOCO_GL"]
     facts, output = _ask_child(environ, measure=measure, timeout=timeout)
@@ -136,7 +138,7 @@ def probe_environment(
     # A failure that the table does not know is its own cause.
     words = "\n".join(list(filter(str.strip, output.splitlines()))[-3:])
     found = diagnose(output, backend=backend, environ=environ) or Diagnosis(
-        words or "The child process said nothing.", ""
+        words or "The child process printed nothing.", ""
     )
     return Probe(
         *(backend, False),
@@ -150,7 +152,7 @@ def probe_environment(
 def _ask_child(
     environ: Mapping[str, str], *, measure: bool, timeout: float
 ) -> tuple[dict[str, Any], str]:
-    """Return what the child reported, and in words all that points to a failure."""
+    """Return the facts from the child, and all text that may explain a failure."""
     facts: dict[str, Any] = {}
     is_silent = False
     try:

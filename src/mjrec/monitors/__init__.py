@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Monitors: thin translations of an environment's calls into the recorder's.
+"""Monitors, which translate an environment's calls into those of the recorder.
 
-Each framework has a file of its own here, and is imported only when one of its
+Each framework has its own module here, which is imported only when one of its
 environments is monitored.
 """
 

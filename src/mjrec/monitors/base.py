@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What every monitor has beside the environment's own interface: gym's names."""
+"""Base classes of the monitors, with the methods that gym's monitor had."""
 
 from __future__ import annotations
 
@@ -35,17 +35,17 @@ from .progress import render_progress
 
 logger = logging.getLogger(__name__)
 
-NO_SIMULATION = "it has no MuJoCo model and data that can be seen"
+NO_SIMULATION = "it has no accessible MuJoCo model and data"
 
 
 class MonitorBase:
-    """Gym's names, and one way to close: of one environment or of several.
+    """Base class of the monitors of single and of vector environments.
 
-    A context manager that waits for its videos unless it is left by an exception.
+    It has gym's methods and is a context manager. Leaving the `with` block waits for
+    the videos, unless an exception was raised.
 
     Attributes:
-        allows_early_reset: whether the framework's contract allows a reset in
-            mid-episode.
+        allows_early_reset: whether the framework allows a reset during an episode.
     """
 
     allows_early_reset: ClassVar[bool]
@@ -58,23 +58,23 @@ class MonitorBase:
 
     @property
     def directory(self) -> Path:
-        """The monitor directory, absolute."""
+        """The absolute path of the monitor directory."""
         return self._recorders[0].directory
 
     def set_monitor_mode(self, mode: str | None) -> None:
-        """Set the type of the episodes from the next resets on.
+        """Set the type of episodes, starting with the next reset.
 
         Args:
             mode: "training", "evaluation", or None for training.
 
         Raises:
-            InvalidArgument: it is something else.
+            InvalidArgument: `mode` is anything else.
         """
         for recorder in self._recorders:
             recorder.set_mode(mode)
 
     def get_total_steps(self) -> int:
-        """Return the number of all steps, those of unfinished episodes too."""
+        """Return the total number of steps, including those of unfinished episodes."""
         return sum(each.stats_recorder.total_steps for each in self._recorders)
 
     def close(self, *, wait: bool = True) -> None:
@@ -82,15 +82,16 @@ class MonitorBase:
 
         Args:
             wait: whether to wait, with a progress bar on a terminal, until all videos
-                are rendered; else what is not rendered yet is left pending, and
-                `mjrec render DIR` makes it. Ctrl-C while it waits is the same.
+                are rendered. If False, or after Ctrl-C during the wait, the remaining
+                videos stay pending, and `mjrec render DIR` renders them.
 
         Raises:
-            EncoderError: a running video could not be finished; all else is.
-            RenderError: videos could not be rendered; all else is done, and their
-                trajectories are kept.
-            FileNotWritten: the disk is full; the next call tries again.
-            Error: in a process forked from the one that made the monitor.
+            EncoderError: a running video could not be finished; everything else is
+                finished.
+            RenderError: videos could not be rendered; everything else is finished, and
+                their trajectories are kept.
+            FileNotWritten: the disk is full; the next call will retry.
+            Error: this process was forked from the one that created the monitor.
         """
         for recorder in self._recorders:
             recorder.check_process()
@@ -116,12 +117,12 @@ class MonitorBase:
         call_all(functools.partial(r.finish, on_progress) for r in self._recorders)
 
     def _note_error(self, error: BaseException) -> None:
-        """Note that the environment, or its user, has raised."""
+        """Note an exception from the environment or from the user's code."""
         for recorder in self._recorders:
             recorder.note_error(error)
 
     def _guard_by(self, closings: Iterable[Callable[[], object]]) -> None:
-        """Call all of `closings` once, whatever comes first: `close` or the end."""
+        """Call all `closings` once, in `close` or when the process ends."""
         self._guard = ExitGuard(
             self,
             functools.partial(call_all, list(closings)),
@@ -136,58 +137,61 @@ class MonitorBase:
         if first is not None:
             self._note_error(first)
         try:
-            # Leaving by an exception waits for no videos.
+            # After an exception, do not wait for videos.
             self.close(wait=first is None)
         except Exception as second:
             if first is None:
                 raise
-            # What went wrong first is what the user needs to see.
+            # The user needs to see the first error.
             first.add_note(f"Closing the monitor failed too: {second}")
         return False
 
     def __reduce_ex__(self, protocol: SupportsIndex) -> NoReturn:
         raise NotPicklable(
-            f"A {type(self).__name__} cannot be pickled or copied: it writes files, "
-            "and two would write the same ones. Make it in the process that uses it, "
-            "inside the function that makes the environment: "
+            f"A {type(self).__name__} cannot be pickled or copied, because both copies "
+            "would write the same files. Create it in the process that uses it, "
+            "inside the function that creates the environment: "
             "lambda: mjrec.Monitor(gymnasium.make(...), directory, resume=True)."
         )
 
 
 class EnvironmentMonitor(MonitorBase):
-    """What all monitors of one environment have."""
+    """Base class of the monitors of single environments."""
 
     _recorder: Recorder
-    # Closed with the monitor; empty where its user closes it.
+    # Closed with the monitor; empty if its user closes the environment.
     _environments: list[Any]
 
     @property
     def recorder(self) -> Recorder:
-        """What writes the files."""
+        """The recorder that writes the files."""
         return self._recorder
 
     def leave_environment_open(self) -> None:
-        """Let `close` end the recording only: the environment is used again."""
+        """Make `close` keep the environment open, because it will be used again."""
         self._environments.clear()
 
     @property
     def infix(self) -> str:
-        """What the names of this monitor's files have in the middle."""
+        """The middle part of the names of this monitor's files."""
         return self._recorder.infix
 
     @property
     def episode_id(self) -> int:
-        """The number of the next episode; it rises at each reset, as in gym."""
+        """The number of the next episode; it increases at each reset, as in gym."""
         return self._recorder.episode_id
 
     @property
     def stats_recorder(self) -> StatsRecorder:
-        """Counts steps and rewards."""
+        """The recorder of steps and rewards."""
         return self._recorder.stats_recorder
 
     @property
     def video_recorder(self) -> VideoRecorder | DeferredVideo | None:
-        """Records the running episode (or not); None before the first reset."""
+        """The running episode's video recorder, which may be disabled.
+
+        It is None before the first reset.
+        """
         return self._recorder.video_recorder
 
     def get_episode_rewards(self) -> list[float]:
@@ -195,31 +199,31 @@ class EnvironmentMonitor(MonitorBase):
         return list(self._recorder.stats_recorder.episode_rewards)
 
     def get_episode_lengths(self) -> list[int]:
-        """Return the steps of each complete episode."""
+        """Return the number of steps of each complete episode."""
         return list(self._recorder.stats_recorder.episode_lengths)
 
     def model_changed(self) -> None:
         """Report that a texture, height field or mesh changed during an episode.
 
-        All other changes that a frame shows are found without this, and at a reset all
-        are. The next recorded frame shows the change. Physical constants (masses,
-        damping) then go into the trajectory too, for replays.
+        All other visible changes are detected automatically, and at a reset these are
+        too. The next recorded frame shows the change. Changed physical constants
+        (masses, damping) are then also stored in the trajectory, for replays.
         """
         self._recorder.model_changed()
 
     def forget_frames(self) -> None:
-        """Make the next episode look as in a fresh environment.
+        """Make the next episode look like the first one of a new environment.
 
-        Gymnasium places its free camera at the first frame; infinite planes and
-        tracking cameras depend on the frame before. So an episode can look different as
-        the tenth than as the first. Call this between two episodes. It has no effect on
-        live frames.
+        Gymnasium places its free camera at the first frame, and infinite planes and
+        tracking cameras depend on the previous frame. So the same episode can look
+        different as the first and as the tenth. Call this between two episodes. It has
+        no effect on live frames.
         """
         self._recorder.forget_frames()
 
     @contextlib.contextmanager
     def _resetting(self) -> Iterator[None]:
-        """Put this around the environment's reset, which is noted where it raises."""
+        """Wrap the environment's reset, and note an exception in it."""
         try:
             with self._recorder.resetting():
                 yield
@@ -239,20 +243,21 @@ class EnvironmentMonitor(MonitorBase):
         rendering: Callable[[Path], Finisher] | None = None,
         **subject: Any,
     ) -> None:
-        """Open the directory; from here on the environment is this monitor's.
+        """Open the directory and take over the environment.
 
         Args:
             env: the environment.
-            directory: where the recordings go.
-            options: what was asked for.
-            scenes: returns how states are recorded, for one reader.
+            directory: the monitor directory.
+            options: the monitor's options.
+            scenes: returns the scenes, whose states have a single reader.
             close_environment: closes `env`.
-            no_simulation: why there are no states, where there are none.
-            rendering: makes what renders; a service of this monitor's own if None.
-            **subject: `env_id` and others of `RecordedEnvironment`.
+            no_simulation: the reason to give if the environment has no states.
+            rendering: creates the finisher that renders videos; if None, the monitor
+                has its own background finisher.
+            **subject: `env_id` and other arguments of `RecordedEnvironment`.
         """
         known = scenes()
-        # Clips run beside episodes, and a source of states has one reader only.
+        # Clips overlap with episodes, and a source of states has only one reader.
         clip_states = scenes().states if options.has_clips else None
         choice = rendering_choice(
             options.render, known, subject["env_id"], no_simulation=no_simulation
@@ -297,7 +302,7 @@ class EnvironmentMonitor(MonitorBase):
         self._recorder.reset(seed=seed, options=options, observation=observation)
         video = self._recorder.video_recorder
         if isinstance(video, VideoRecorder) and video.enabled:
-            # Drawing has loaded OpenGL by now, which tears itself down at exit.
+            # Rendering has loaded OpenGL by now, which shuts itself down at exit.
             self._guard.run_first_at_exit()
 
 
@@ -308,17 +313,18 @@ def rendering_choice(
     *,
     no_simulation: str = NO_SIMULATION,
 ) -> RenderingChoice:
-    """Return when the frames of an environment are drawn.
+    """Return whether an environment's frames are rendered live, later, or not at all.
 
     Args:
-        asked: `"deferred"`, `"live"`, `"off"`, or None for deferred where it is known
-            that the frames follow from the states, else live.
-        scenes: what is known of the environment.
-        env_id: its name, for messages.
-        no_simulation: why there are no states, where there are none.
+        asked: `"deferred"`, `"live"`, `"off"`, or None. None means deferred if the
+            states are known to determine the frames, otherwise live.
+        scenes: the facts known about the environment's rendering.
+        env_id: the environment's name, for messages.
+        no_simulation: the reason to give if the environment has no states.
 
     Raises:
-        PicturesDiffer: deferred was asked for, and the frames do not follow.
+        PicturesDiffer: deferred was requested, but the states do not determine the
+            frames.
     """
     if asked in (LIVE, OFF):
         return RenderingChoice(mode=str(asked), is_forced=True)
@@ -328,16 +334,16 @@ def rendering_choice(
         return RenderingChoice(mode=DEFERRED, is_forced=asked == DEFERRED)
     if asked == DEFERRED:
         raise PicturesDiffer(
-            f'render="deferred" was asked for, and what {env_id} shows cannot be made '
-            f'from its recorded state: {obstacle}. Use render="live" (or None, which '
-            "chooses)."
+            f'render="deferred" was requested, but the frames of {env_id} cannot be '
+            f'reproduced from its recorded state: {obstacle}. Use render="live" (or '
+            "None, to choose automatically)."
         )
-    logger.info("The videos of %s are drawn live: %s.", env_id, obstacle)
+    logger.info("The videos of %s are rendered live: %s.", env_id, obstacle)
     return RenderingChoice(mode=LIVE, reason=obstacle)
 
 
 def call_all(calls: Iterable[Callable[[], object]]) -> None:
-    """Call all, also where one raises; then raise what the first has raised."""
+    """Call all functions, even if some raise; then raise the first exception."""
     first: BaseException | None = None
     for call in calls:
         try:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The frames of a monitor with one camera or several."""
+"""Frames for monitors with one or several cameras."""
 
 from __future__ import annotations
 
@@ -19,21 +19,22 @@ _RGB_ARRAY = "rgb_array"
 def camera_frames(
     camera: Any, frames_from: Callable[[Any], EpisodeFrames], *, tiled: bool
 ) -> tuple[Any, dict[str, Any]]:
-    """Return the frames from a camera, or from each of several.
+    """Return the frames from one or several cameras.
 
     Args:
-        camera: a name, a number, an `mujoco.MjvCamera`, None for what the environment
-            itself shows, or a list of these.
-        frames_from: makes the frames from one camera.
-        tiled: those of several cameras side by side, in one video.
+        camera: a name, a number, an `mujoco.MjvCamera`, None for the environment's own
+            view, or a list of these.
+        frames_from: returns the frames from one camera.
+        tiled: whether to put several cameras side by side in one video.
 
     Returns:
-        The only camera, or the first, the one that scenes are recorded with; and what
-        `RecordedEnvironment` gets: `frames`, `further_frames` and `cameras`.
+        The only or first camera, which scenes are recorded with; and arguments for
+        `RecordedEnvironment`: `frames`, and with several cameras `further_frames` or
+        `cameras`.
 
     Raises:
-        InvalidArgument: the list is empty, or has one camera twice, or None in another
-            place than the first; or there is nothing to lay side by side.
+        InvalidArgument: the list is empty, contains a camera twice, or contains None
+            after its first item; or `tiled` is True with a single camera.
         UnknownName: the model has no such camera.
     """
     several = isinstance(camera, Sequence) and not isinstance(camera, str)
@@ -43,9 +44,9 @@ def camera_frames(
     if len(cameras) == 1:
         if tiled:
             raise InvalidArgument(
-                "tiled=True lays the frames of several cameras, or those of the "
-                "sub-environments of a vector environment, side by side, and here is "
-                f"one of each: got the camera {camera!r}. Give several."
+                "tiled=True puts the frames of several cameras, or of a vector "
+                "environment's sub-environments, side by side, but there is only one "
+                f"of each: got the camera {camera!r}. Give several cameras."
             )
         return cameras[0], {"frames": frames_from(cameras[0])}
     plain = tuple(None if each is None else plain_camera(each) for each in cameras)
@@ -53,7 +54,7 @@ def camera_frames(
     view: dict[str, Any] = {"frames": sources[0], "cameras": plain}
     without = [source for source in sources if not can_give_frames(source)]
     if without:
-        # All are drawn by workers, or none is.
+        # Either all are rendered by workers or none is.
         view["frames"] = without[0]
     elif tiled:
         view["frames"] = _CameraTiles(sources)
@@ -66,13 +67,13 @@ def camera_frames(
 def recorded_view(
     camera: Any, *, height: int | None, width: int | None, own: Any = None
 ) -> dict[str, Any]:
-    """Return what a journal says of how a run is shown; what is the default is not.
+    """Return the journal's facts about a run's view, without default values.
 
     Args:
-        camera: as of `camera_frames`.
-        height: that was asked for.
-        width: likewise.
-        own: number or name of the camera that the environment shows by itself.
+        camera: see `camera_frames`.
+        height: the requested height.
+        width: the requested width.
+        own: number or name of the camera that the environment itself shows.
     """
     several = isinstance(camera, Sequence) and not isinstance(camera, str)
     plain = [
@@ -91,25 +92,25 @@ def recorded_view(
 def _check(cameras: list[Any]) -> None:
     if not cameras:
         raise InvalidArgument(
-            "camera=[] is no camera: name one or more, or give None for what the "
-            "environment itself shows."
+            "camera=[] contains no camera: name one or more, or give None for the "
+            "environment's own view."
         )
     plain = [None if each is None else plain_camera(each) for each in cameras]
     if None in plain[1:]:
         raise InvalidArgument(
-            "In a list of cameras only the first may be None, what the environment "
-            f"itself shows, got {cameras!r}."
+            "In a list of cameras, only the first may be None (the environment's own "
+            f"view), got {cameras!r}."
         )
     twice = [each for place, each in enumerate(plain) if each in plain[:place]]
     if twice:
-        raise InvalidArgument(f"The camera {twice[0]!r} is there twice in {cameras!r}.")
+        raise InvalidArgument(f"The camera {twice[0]!r} appears twice in {cameras!r}.")
 
 
 class Tiles:
     """The frames of several sources, side by side.
 
     Args:
-        sources: of the frames.
+        sources: the sources of the frames.
     """
 
     def __init__(self, sources: Sequence[EpisodeFrames]) -> None:
@@ -117,20 +118,20 @@ class Tiles:
 
     @property
     def render_mode(self) -> str | None:
-        """`rgb_array` where all sources have it; None else."""
+        """`rgb_array` if all sources have it, otherwise None."""
         modes = {source.render_mode for source in self.sources}
         return _RGB_ARRAY if modes == {_RGB_ARRAY} else None
 
     def render(self) -> Frame:
-        """Return the frame of this moment.
+        """Return the current frame.
 
         Raises:
-            InvalidArgument: the frames are not of one size, or one is none.
+            InvalidArgument: the frames differ in size, or one is not a valid frame.
         """
         return grid_frame([check_frame(source.render()) for source in self.sources])
 
     def facts(self) -> dict[str, Any]:
-        """Return what the metadata of a video says about its frames."""
+        """Return the facts about the frames for a video's metadata."""
         rows, columns = grid_shape(len(self.sources))
         facts = self.sources[0].facts()
         return {**facts, "tiled": True, "rows": rows, "columns": columns}

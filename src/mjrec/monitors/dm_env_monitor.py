@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The monitor of dm_env environments."""
+"""The monitor for dm_env environments."""
 
 from __future__ import annotations
 
@@ -22,24 +22,24 @@ logger = logging.getLogger(__name__)
 _MID = dm_env.StepType.MID
 
 _NO_PHYSICS = (
-    "it has no physics that could be rendered, as dm_control's environments have. "
-    "Record a dm_control environment"
+    "it has no physics to render, unlike dm_control's environments. Record a "
+    "dm_control environment"
 )
 
 
 class DmEnvMonitor(EnvironmentMonitor, dm_env.Environment):  # type: ignore[misc]  # untyped
-    """Records a dm_env environment; made by `mjrec.Monitor`, which has the options.
+    """A monitor for a dm_env environment. Create it with `mjrec.Monitor`.
 
-    It follows dm_env's contract: `reset` is allowed at any time; `step` before the
+    It follows dm_env's contract: `reset` is allowed at any time. A `step` before the
     first reset or after the last time step ignores its action, starts an episode, and
-    is recorded as its reset. Other attributes of the environment (`physics`, `task`,
-    `control_timestep` ...) are available here too.
+    is recorded as a reset. Other attributes of the environment (`physics`, `task`,
+    `control_timestep` ...) are available too.
 
     After `close`, calls go straight to the closed environment, and nothing is recorded.
 
     Attributes:
-        seed: the next episode's seed, for journal and metadata. dm_env's `reset` takes
-            none, so set it if you seed the environment in your own way.
+        seed: the next episode's seed, for the journal and the metadata. dm_env's
+            `reset` takes no seed, so set this if you seed the environment yourself.
     """
 
     allows_early_reset = True
@@ -59,8 +59,8 @@ class DmEnvMonitor(EnvironmentMonitor, dm_env.Environment):  # type: ignore[misc
         self.seed: Any = None
         if options.episode_info:
             raise InvalidArgument(
-                "episode_info adds to the info of Gymnasium's steps, and dm_env's time "
-                "steps have none. The journal has every episode's return and length."
+                "episode_info adds to the info of Gymnasium's steps, but dm_env's time "
+                "steps have no info. The journal has every episode's return and length."
             )
         size = {"height": height, "width": width}
         first, frames = camera_frames(
@@ -80,11 +80,11 @@ class DmEnvMonitor(EnvironmentMonitor, dm_env.Environment):  # type: ignore[misc
         )
 
     def reset(self) -> dm_env.TimeStep:
-        """Reset the environment and begin an episode.
+        """Reset the environment and start an episode.
 
         Raises:
-            ResetNotAllowed: in the middle of an episode, with
-                `allow_early_reset=False`.
+            ResetNotAllowed: an episode is running and `allow_early_reset=False` was
+                given.
         """
         if self._recorder.closed:
             return self._env.reset()
@@ -95,7 +95,7 @@ class DmEnvMonitor(EnvironmentMonitor, dm_env.Environment):  # type: ignore[misc
         return timestep
 
     def step(self, action: Any) -> dm_env.TimeStep:
-        """Step the environment and record what happened."""
+        """Step the environment and record the result."""
         recorder = self._recorder
         fast = recorder.fast
         if fast is None or not fast.before_step(action):
@@ -110,7 +110,7 @@ class DmEnvMonitor(EnvironmentMonitor, dm_env.Environment):  # type: ignore[misc
             recorder.note_error(error)
             raise
         if fast is not recorder.fast:
-            # Within the step this monitor was closed, or its process forked.
+            # The monitor was closed, or its process forked, during the step.
             fast = None
         is_between = timestep.step_type is _MID
         if fast is None or not is_between or not fast.step(timestep.reward):
@@ -134,8 +134,8 @@ class DmEnvMonitor(EnvironmentMonitor, dm_env.Environment):  # type: ignore[misc
         return self._env.discount_spec()
 
     def __getattr__(self, name: str) -> Any:
-        # Called only for what is not found here. `_env` itself is missing where the
-        # constructor failed, or while an object is copied.
+        # Called only for attributes not found here. `_env` itself is missing if the
+        # constructor failed, or while an object is being copied.
         if name.startswith("_"):
             raise AttributeError(f"{type(self).__name__} has no attribute {name!r}")
         return getattr(self._env, name)
@@ -144,7 +144,7 @@ class DmEnvMonitor(EnvironmentMonitor, dm_env.Environment):  # type: ignore[misc
         if self._recorder.closed:
             return
         if timestep.first():
-            # The environment was reset behind the monitor's back.
+            # The environment was reset without the monitor.
             self._recorder.before_reset()
             self._begin(seed=self.seed, observation=timestep.observation)
             return
@@ -165,8 +165,8 @@ def _frames(
         return dm_control_frames(env, camera=camera, height=height, width=width)
     if (camera, height, width) != (None, None, None):
         raise InvalidArgument(
-            "camera, height and width choose among the frames of a dm_control "
-            f"environment, and {type(env).__name__} has no physics."
+            "camera, height and width apply only to dm_control environments, but "
+            f"{type(env).__name__} has no physics."
         )
     return NoFrameSource(_NO_PHYSICS)
 
@@ -182,8 +182,8 @@ def _scenes(env: dm_env.Environment, **known: Any) -> Scenes:
 def _env_id(env: dm_env.Environment) -> str:
     unknown = f"(unknown:{type(getattr(env, 'task', env)).__name__})"
     logger.warning(
-        "dm_env environments do not know their names, so the recordings say %s. Give "
-        'Monitor(..., env_id="dm_control/cheetah-run") to name it.',
+        "dm_env environments do not know their names, so the recordings say %s. To set "
+        'the name, use Monitor(..., env_id="dm_control/cheetah-run").',
         unknown,
     )
     return unknown

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The monitor of Gymnasium environments."""
+"""The monitor for Gymnasium environments."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ _Step = tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]
 
 
 class GymnasiumMonitor(EnvironmentMonitor, gymnasium.Wrapper[Any, Any, Any, Any]):
-    """Records a Gymnasium environment; made by `mjrec.Monitor`, which has the options.
+    """A monitor for a Gymnasium environment. Create it with `mjrec.Monitor`.
 
-    An episode ends when it is terminated or truncated. A reset in the middle of an
-    episode is an error unless early resets are allowed; so is a step before the first
-    reset or after the end. A reset before any step keeps the episode's number and
-    replaces its first frame. Inside Gymnasium's `Autoreset` wrapper, the step after the
+    An episode ends when it is terminated or truncated. A reset during an episode is an
+    error unless early resets are allowed. A step before the first reset or after the
+    end is always an error. A reset before any step keeps the episode's number and
+    replaces its first frame. With Gymnasium's `Autoreset` wrapper, the step after the
     end is a reset and starts the next episode.
 
     After `close`, calls go straight to the closed environment, and nothing is recorded.
@@ -56,7 +56,7 @@ class GymnasiumMonitor(EnvironmentMonitor, gymnasium.Wrapper[Any, Any, Any, Any]
         no_simulation: str = NO_SIMULATION,
     ) -> None:
         super().__init__(env)
-        # gym's own convention: the step that ends an episode begins the next.
+        # gym's convention: the step that ends an episode starts the next one.
         self._same_step_autoreset = bool(env.metadata.get("semantics.autoreset"))
         self._next_step_autoreset = _has_autoreset(env)
         size = {"height": height, "width": width}
@@ -79,20 +79,19 @@ class GymnasiumMonitor(EnvironmentMonitor, gymnasium.Wrapper[Any, Any, Any, Any]
             **frames,
         )
 
-    # Gymnasium's own wrappers override the attribute by a property too.
+    # Gymnasium's own wrappers also override the attribute with a property.
     @property
     def spec(self) -> EnvSpec | None:  # type: ignore[override]
-        """The environment's own: one made from it again is not monitored."""
+        """The environment's own spec; creating from it gives no second monitor."""
         return self.env.spec
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        """Reset the environment and begin an episode.
+        """Reset the environment and start an episode.
 
         Raises:
-            ResetNotAllowed: in the middle of an episode, unless early resets are
-                allowed.
+            ResetNotAllowed: an episode is running and early resets are not allowed.
         """
         if self._recorder.closed:
             return self.env.reset(seed=seed, options=options)
@@ -103,10 +102,10 @@ class GymnasiumMonitor(EnvironmentMonitor, gymnasium.Wrapper[Any, Any, Any, Any]
         return result
 
     def step(self, action: Any) -> _Step:
-        """Step the environment and record what happened.
+        """Step the environment and record the result.
 
         Raises:
-            ResetNeeded: before the first reset, or after the end of an episode.
+            ResetNeeded: there was no reset yet, or none since the end of an episode.
         """
         recorder = self._recorder
         fast = recorder.fast
@@ -124,7 +123,7 @@ class GymnasiumMonitor(EnvironmentMonitor, gymnasium.Wrapper[Any, Any, Any, Any]
             recorder.note_error(error)
             raise
         if fast is not recorder.fast:
-            # Within the step this monitor was closed, or its process forked.
+            # The monitor was closed, or its process forked, during the step.
             fast = None
         _, reward, terminated, truncated, _ = result
         if fast is None or terminated or truncated or not fast.step(reward):
@@ -132,7 +131,7 @@ class GymnasiumMonitor(EnvironmentMonitor, gymnasium.Wrapper[Any, Any, Any, Any]
         return result
 
     def _before_step(self, action: Any) -> bool:
-        """Note an action; return whether the coming step is a reset instead."""
+        """Note an action; return whether the next step will be a reset instead."""
         if self._next_step_autoreset and self._recorder.done:
             self._recorder.before_reset()
             return True
@@ -154,16 +153,16 @@ class GymnasiumMonitor(EnvironmentMonitor, gymnasium.Wrapper[Any, Any, Any, Any]
         info: dict[str, Any],
         first_observation: Any = None,
     ) -> None:
-        """Record a step, and the reset that it was besides, if it was.
+        """Record a step, and a reset if the step also was one.
 
         Args:
-            observation: of the step, as all up to `info`.
-            reward: likewise.
-            terminated: likewise.
-            truncated: likewise.
-            info: likewise; what it says of the episode is added to it.
-            first_observation: of the episode that the step begins; `observation`, if
-                None.
+            observation: the step's observation.
+            reward: the step's reward.
+            terminated: whether the step terminated the episode.
+            truncated: whether the step truncated the episode.
+            info: the step's info, to which `episode` may be added.
+            first_observation: the first observation of the episode that the step
+                starts; if None, `observation`.
         """
         if self._recorder.closed:
             return
@@ -197,22 +196,22 @@ def env_id_of(env: gymnasium.Env[Any, Any]) -> str:
         return env.spec.id
     unknown = f"(unknown:{type(env.unwrapped).__name__})"
     logger.warning(
-        "The environment has no spec, so the recordings cannot name it; they say %s. "
-        "An environment made with gymnasium.make has one.",
+        "The environment has no spec, so its name is unknown and the recordings say "
+        "%s. Environments created with gymnasium.make have a spec.",
         unknown,
     )
     return unknown
 
 
 def success_in(info: Mapping[str, Any]) -> bool | None:
-    """Return whether an episode was a success; None where nothing is said.
+    """Return whether an episode was a success; None if unknown.
 
     Args:
-        info: of its last step. `is_success` is looked at, else `success`: a truth
-            value or a number, or an array of one.
+        info: the info of the episode's last step. `is_success` is used or, without it,
+            `success`: a bool, a number, or an array with one of these.
     """
-    # Gymnasium-Robotics' Fetch and Hand environments say the first, its Adroit and maze
-    # environments the second, as MetaWorld and others do.
+    # Gymnasium-Robotics' Fetch and Hand environments use the first key; its Adroit and
+    # maze environments, MetaWorld and others use the second.
     for key in ("is_success", "success"):
         value = info.get(key)
         if isinstance(value, np.ndarray) and value.size == 1:
@@ -223,7 +222,7 @@ def success_in(info: Mapping[str, Any]) -> bool | None:
 
 
 def _has_autoreset(env: gymnasium.Env[Any, Any]) -> bool:
-    # A sub-environment that is seen from outside says so itself.
+    # This attribute is set for sub-environments in other processes.
     if getattr(env, "resets_in_next_step", False):
         return True
     while isinstance(env, gymnasium.Wrapper):

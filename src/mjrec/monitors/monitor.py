@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`mjrec.Monitor`: the monitor that fits an environment."""
+"""`mjrec.Monitor`, which creates the right kind of monitor for an environment."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ logger = logging.getLogger(__name__)
 
 
 # The positional arguments are gym's, in gym's order.
-def Monitor(  # noqa: N802  named as the class that it was in gym
+def Monitor(  # noqa: N802  named like gym's class
     env: Any,
     directory: str | os.PathLike[str],
     video_callable: Callable[[int], Any] | bool | None = None,
@@ -59,17 +59,17 @@ def Monitor(  # noqa: N802  named as the class that it was in gym
     policy_file: str | os.PathLike[str] | None = None,
     env_id: str | None = None,
 ) -> GymnasiumMonitor | VectorMonitor | DmEnvMonitor:
-    """Record an environment into a monitor directory.
+    """Record an environment to a monitor directory.
 
-    Use the monitor instead of `env`, and close it, best with `with`::
+    Use the monitor instead of `env`, and close it, preferably with `with`::
 
         with mjrec.Monitor(env, "recordings/run1") as env:
             observation, info = env.reset(seed=0)
 
-    If the frames of a MuJoCo environment follow from its state, `step` only saves the
-    state, and worker processes draw the frames: byte for byte those of `env.render()`
-    at that moment. Any recorded episode can be rendered again (`mjrec.render`). Other
-    environments are drawn in `step`, through their own `render()`.
+    If the state of a MuJoCo environment determines its frames, `step` only saves the
+    state, and worker processes render the frames, byte for byte as `env.render()` would
+    at that moment. Any recorded episode can be re-rendered (`mjrec.render`). Other
+    environments are rendered in `step`, with their own `render()`.
 
     Args:
         env: a Gymnasium environment, a vector environment (see `VectorMonitor`), or a
@@ -77,105 +77,111 @@ def Monitor(  # noqa: N802  named as the class that it was in gym
             needs `render_mode="rgb_array"` (or `"rgb_array_list"`, `"ansi"`); deferred
             rendering needs no `render_mode`, and no OpenGL in this process.
         directory: the monitor directory. It is created if needed.
-        video_callable: maps an episode number, from 0, to whether it gets a video. None
-            is `capped_cubic_video_schedule`, False is no videos.
+        video_callable: maps an episode number (from 0) to whether it gets a video. None
+            means `capped_cubic_video_schedule`, False means no videos.
         force: delete the monitor files in the directory first. Overrides `resume`.
-        resume: add to existing recordings. Recovers killed monitors first, as
-            `mjrec.recover` does. Episode numbers continue from the highest number of
-            closed or dead monitors (with `uid`: of this `uid`). Monitors that share a
-            directory at the same time all need it, and number independently. `"join"`
-            reads no other monitor's files, so it is as fast among thousands: it
-            recovers nothing, numbers from 0, and does not check that environments are
-            the same.
+        resume: add to existing recordings. Killed monitors are recovered first, as by
+            `mjrec.recover`. Episode numbers continue from the highest number of all
+            closed or dead monitors (with `uid`, only of those with this `uid`).
+            Monitors that use a directory at the same time all need `resume`, and number
+            their episodes independently. `"join"` does not read other monitors' files,
+            so it is fast even among thousands of monitors: it recovers nothing, numbers
+            episodes from 0, and does not check that the environments are the same.
         write_upon_reset: write statistics and manifest at every reset, not only at the
             end. The journal always gets a line when an episode ends.
         uid: used in file names instead of the process id.
-        mode: "training" or "evaluation", the type of the episodes.
-        fps: frame rate of the video files. None is real time: one frame per step.
-        camera: a camera's name or number, or an `mujoco.MjvCamera`. None is what the
-            environment shows. A list makes a video per camera: `....video000027.mp4`
-            for the first, `....video000027.<camera>.mp4` for the others. Live frames
-            come from the environment's `render()`, so with `render="live"` another
-            camera or size is an error.
-        width: of the videos, in pixels. None is the environment's own.
-        height: likewise.
-        max_fps: most frames per second of simulated time: steps 0, n, 2n ... and the
-            last. None is every step.
-        quality: "full", the model's own settings; or "draft", several times faster,
-            without multisampling and with small shadow maps. Deferred rendering only.
-        render: "deferred" (states now, frames later), "live" (frames in `step`), "off"
-            (statistics and trajectories only), or None: deferred if the frames are
-            known to follow from the states, else live. Log and metadata say which, and
-            why.
-        workers: processes that draw deferred frames. None is one per usable CPU, shared
-            by all monitors of a directory. 0 draws nothing now and leaves the videos
-            pending: `mjrec render DIR` draws them.
+        mode: type of the episodes, "training" or "evaluation".
+        fps: frame rate of the video files. None means real time, one frame per step.
+        camera: a camera's name or number, or an `mujoco.MjvCamera`. None means the
+            environment's own view. A list gives a video per camera:
+            `....video000027.mp4` for the first, `....video000027.<camera>.mp4` for the
+            others. Live frames come from the environment's `render()`, so with
+            `render="live"` a different camera or size is an error.
+        width: width of the videos in pixels; if None, the environment's own.
+        height: height of the videos in pixels; if None, the environment's own.
+        max_fps: maximum frames per second of simulated time: steps 0, n, 2n ... and the
+            last one are recorded. None means every step.
+        quality: "full" (the model's own settings), or "draft" (several times faster,
+            without multisampling and with small shadow maps). Deferred rendering only.
+        render: "deferred" (save states now, render later), "live" (render in `step`),
+            "off" (only statistics and trajectories), or None: deferred if the states
+            are known to determine the frames, otherwise live. The log and the metadata
+            name the mode and the reason.
+        workers: number of processes that render deferred frames. None means one per
+            usable CPU, shared by all monitors of a directory. 0 renders nothing now and
+            leaves the videos pending for `mjrec render DIR`.
         trajectory_callable: maps an episode number to whether its trajectory is kept.
-            True is all; False is none, and a video's trajectory is removed once the
-            video exists. None is all evaluation episodes and those with a video.
+            True keeps all. False keeps none, and a video's trajectory is removed once
+            the video exists. None keeps those of evaluation episodes and of episodes
+            with a video.
         observations: record observations in trajectories too.
-        allow_early_reset: allow resets in the middle of an episode. A cut episode is
-            not in the statistics, and its video is marked incomplete. None is the
-            framework's rule: no for Gymnasium, yes for its vector environments and for
-            dm_env.
-        on_error: "raise"; or "warn": if something cannot be recorded (full disk, dead
-            encoder, failed video), the simulation continues, the log says so once, and
-            `mjrec.faults` in the manifest lists what is missing. Errors of the
-            environment, wrong use, and a `close()` that cannot write results always
-            raise.
-        strict: a video that shows nothing (black, one colour, no movement) is an error:
-            `BlankVideo` at the end of its episode, or for a deferred one `RenderError`
-            in `close`. The video is always kept; its metadata has `suspect_black` or
-            `suspect_constant`, and the log a warning.
-        keep: choose the videos after episodes have ended, instead of `video_callable`:
-            "best:3" or "worst:3" (by return), "failures" or "failures:20" (the first
-            20), "median", several of these joined by commas, or a function from the
-            finished episodes (`mjrec.trackers.FinishedEpisode`) to the numbers to
-            keep. A failure has `info["is_success"]` or `info["success"]` false in its
-            last step; without either, it terminated. Other episodes are deleted as soon
-            as the rule allows; "median" and functions keep all states on disk until
-            `close`. Incomplete episodes are never chosen. Trajectories kept for another
-            reason stay, without their video. Manifest and metadata name the rule. After
-            a kill, all candidates are pending. If the function raises or names unknown
-            episodes, `close` says so and keeps all.
-        step_trigger: maps the number of steps so far to whether a clip starts, before
-            each step; instead of `video_callable`. Its first frame is the one before
-            the step.
-        video_length: steps of a clip after its first frame, across resets. None is
-            until the end of the episode.
+        allow_early_reset: allow resets during an episode. An interrupted episode is not
+            included in the statistics, and its video is marked incomplete. None follows
+            the framework: not allowed for Gymnasium, allowed for its vector
+            environments and for dm_env.
+        on_error: "raise" or "warn". With "warn", if something cannot be recorded (full
+            disk, dead encoder, failed video), the simulation continues, the log has one
+            warning, and `mjrec.faults` in the manifest lists what is missing. Errors in
+            the environment, incorrect calls, and a `close()` that cannot write results
+            always raise.
+        strict: treat a video that shows nothing (black, one colour, no movement) as an
+            error: `BlankVideo` at the end of its episode or, for a deferred video,
+            `RenderError` in `close`. In any case the video is kept, its metadata has
+            `suspect_black` or `suspect_constant`, and the log has a warning.
+        keep: choose the videos after episodes have ended, instead of with
+            `video_callable`: "best:3" or "worst:3" (by return), "failures" or
+            "failures:20" (the first 20), "median", several of these separated by
+            commas, or a function from the finished episodes
+            (`mjrec.trackers.FinishedEpisode`) to the numbers to keep. An episode failed if `info["is_success"]` or `info["success"]` is false in its
+            last step or, without either, if it terminated. Other episodes are deleted
+            as soon as the rule allows; "median" and functions keep all states on disk
+            until `close`. Incomplete episodes are never chosen. Trajectories that are
+            kept for another reason remain, without their video. The manifest and
+            metadata name the rule. After a kill, all candidates are pending. If the
+            function raises or names unknown episodes, `close` reports it and keeps all.
+        step_trigger: maps the number of steps so far, before each step, to whether a
+            clip starts. Replaces `video_callable`. A clip's first frame is the one
+            before the step.
+        video_length: number of steps in a clip after its first frame, across resets.
+            None means until the end of the episode.
         name_prefix: also link finished videos under Gymnasium's names:
             `<name_prefix>-episode-27.mp4` or `<name_prefix>-step-1000.mp4`.
         episode_info: add `info["episode"]` to the last step of an episode: return "r",
             length "l" and seconds "t", as Gymnasium's RecordEpisodeStatistics does. An
-            existing key stays. Gymnasium environments only.
-        annotate: write episode, step, simulated time and return on the frames. They
+            existing key is kept. Gymnasium environments only.
+        annotate: write episode, step, simulated time and return on the frames, which
             then differ from those of `env.render()`.
-        tiled: one video with all cameras side by side, instead of one per camera. For a
-            vector environment: also a video of all sub-environments side by side.
-        trackers: are notified of finished episodes and videos, see `mjrec.trackers`.
-        policy_file: the policy's file, such as a checkpoint. Its sha256 goes into the
-            manifest, as evidence.
-        env_id: the environment's name in the recordings. None is the name in its spec.
-            dm_env environments have none, so give theirs: `dm_control/<domain>-<task>`.
+        tiled: record one video with all cameras side by side, instead of one per
+            camera. For a vector environment, also record a video of all
+            sub-environments side by side.
+        trackers: trackers to notify of finished episodes and videos, see
+            `mjrec.trackers`.
+        policy_file: the policy's file, such as a checkpoint. Its SHA-256 is stored in
+            the manifest, as evidence.
+        env_id: the environment's name in the recordings. None means the name in its
+            spec. dm_env environments have no spec, so give a name:
+            `dm_control/<domain>-<task>`.
 
     Returns:
         A `GymnasiumMonitor`, a `VectorMonitor` or a `DmEnvMonitor`.
 
     Raises:
-        InvalidArgument: `env` is none of these, or an argument has a wrong value.
-        NoPictures: videos are wanted, but the environment gives no frames.
-        MissingDependency: `annotate` without Pillow.
-        PicturesDiffer: `render="deferred"`, but the frames do not follow from the
-            state; the message names the reason.
-        ExistingRecordings: the directory holds recordings, and neither `force` nor
+        InvalidArgument: `env` is not a supported environment, or an argument has an
+            invalid value.
+        NoPictures: videos were requested, but the environment provides no frames.
+        MissingDependency: `annotate` was given, but Pillow is not installed.
+        PicturesDiffer: `render="deferred"` was given, but the state does not determine
+            the frames; the message gives the reason.
+        ExistingRecordings: the directory contains recordings, and neither `force` nor
             `resume` was given.
-        DirectoryInUse: `force`, but another monitor is recording there.
-        DifferentEnvironment: `resume` over recordings of another environment.
+        DirectoryInUse: `force` was given, but another monitor is recording there.
+        DifferentEnvironment: `resume` was given, but the recordings are of a different
+            environment.
         DirectoryNotWritable: the directory cannot be created or written to.
 
-    If it raises, `env` is unchanged and no file is left.
+    If an error is raised, `env` is unchanged and no files are left.
     """
-    # First of all: the arguments by their names, before there are others.
+    # This must come first: `locals()` must contain only the arguments.
     options = dict(locals())
     for name in ("env", "directory", "camera", "height", "width", "env_id"):
         del options[name]
@@ -198,17 +204,17 @@ def monitored(
     options: RecorderOptions,
     **view: Any,
 ) -> GymnasiumMonitor | VectorMonitor | DmEnvMonitor:
-    """Do what `Monitor` does.
+    """Create a monitor, as `Monitor` does, from an options object.
 
     Args:
-        env: likewise.
-        directory: likewise.
-        options: likewise, in one.
+        env: see `Monitor`.
+        directory: see `Monitor`.
+        options: the other options of `Monitor`.
         **view: `camera`, `height`, `width` and `env_id`.
     """
     monitor = _monitor_class(env)
     if options.resume is True and not options.force and Path(directory).is_dir():
-        # What killed monitors have left is put in order first.
+        # Recover the files of killed monitors first.
         recovery = recover(directory)
         if recovery.failures:
             logger.warning("%s", recovery)
@@ -220,7 +226,7 @@ def monitored(
 def _monitor_class(
     env: Any,
 ) -> type[GymnasiumMonitor] | type[VectorMonitor] | type[DmEnvMonitor]:
-    # An instance of a framework's class exists only where the framework is loaded.
+    # Instances of a framework's classes exist only if the framework is imported.
     gymnasium = sys.modules.get("gymnasium")
     if gymnasium is not None and isinstance(env, gymnasium.vector.VectorEnv):
         from .vector_monitor import VectorMonitor
@@ -236,7 +242,7 @@ def _monitor_class(
 
         return DmEnvMonitor
     raise InvalidArgument(
-        "Monitor goes around a Gymnasium environment (gymnasium.Env), a vector "
-        "environment (gymnasium.vector.VectorEnv) or a dm_env one "
-        f"(dm_env.Environment), got {type(env).__module__}.{type(env).__qualname__}."
+        "Monitor records a Gymnasium environment (gymnasium.Env), a vector environment "
+        "(gymnasium.vector.VectorEnv) or a dm_env environment (dm_env.Environment), "
+        f"got {type(env).__module__}.{type(env).__qualname__}."
     )

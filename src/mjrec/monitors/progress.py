@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The progress bar of all that takes long: on a terminal, nothing elsewhere."""
+"""Progress bars for long operations, shown only on a terminal."""
 
 from __future__ import annotations
 
@@ -14,27 +14,27 @@ from ..rendering.jobs import Progress
 if TYPE_CHECKING:
     import rich.console
 
-# Shows how far something is: what it is, how much is done, of how much (None where that
-# is not known), and that in words.
+# Shows the progress of an operation: its name, the amount done, the total amount (None
+# if unknown), and the same in words.
 ShowProgress: TypeAlias = Callable[[str, int, int | None, str], None]
 
 
 @contextlib.contextmanager
 def progress_bar(console: rich.console.Console | None = None) -> Iterator[ShowProgress]:
-    """Yield a function that shows a bar for each thing that it gets.
+    """Yield a function that shows a progress bar for each operation it is called with.
 
-    The bars vanish at the end: what a program prints is its own business.
+    The bars are removed at the end, so they do not remain in the program's output.
 
     Args:
-        console: where to, standard error if None; lines that are printed to it
-            meanwhile stand above the bars.
+        console: the console to use; if None, standard error. Lines printed to it in the
+            meantime appear above the bars.
     """
     is_terminal = sys.stderr.isatty() if console is None else console.is_terminal
     if not is_terminal:
         yield lambda what, done, total, words: None
         return
-    # Rich draws random numbers when it is imported, and the user's are not ours. Loaded
-    # only where there is a bar to show.
+    # Imported only if there is a bar to show. Importing Rich draws random numbers,
+    # which must not change the user's random state.
     state = random.getstate()
     import rich.console
     import rich.progress
@@ -65,16 +65,16 @@ def progress_bar(console: rich.console.Console | None = None) -> Iterator[ShowPr
 def render_progress(
     console: rich.console.Console | None = None, *, title: str = "rendering"
 ) -> Iterator[Callable[[Progress], None]]:
-    """Yield a function that shows how far a rendering is.
+    """Yield a function that shows the progress of rendering.
 
     Args:
-        console: as for `progress_bar`.
-        title: what is rendered.
+        console: see `progress_bar`.
+        title: the bar's label.
     """
     with progress_bar(console) as show:
 
         def show_rendering(progress: Progress) -> None:
-            """Count frames, or videos where the number of frames is not known."""
+            """Count frames, or videos if the number of frames is unknown."""
             videos, frames = progress.videos_done, progress.frames_done
             words = f"{videos}/{progress.videos} videos, {frames}"
             if progress.frames is None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One video of all sub-environments of a vector environment, side by side."""
+"""Tiled videos of all sub-environments of a vector environment, side by side."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ logger = logging.getLogger(__name__)
 
 
 def has_videos(options: RecorderOptions) -> bool:
-    """Return whether there are videos at all."""
+    """Return whether any videos are recorded."""
     schedule = to_schedule(options.video_callable)
     return options.render != OFF and schedule is not disable_videos
 
@@ -32,24 +32,24 @@ def has_videos(options: RecorderOptions) -> bool:
 def vector_tiles(
     envs: Sequence[Any], options: RecorderOptions, view: Mapping[str, Any]
 ) -> Tiles | None:
-    """Return what tiled videos of sub-environments show; None where there are none.
+    """Return the frames of tiled videos of sub-environments; None without such videos.
 
     Args:
         envs: the sub-environments.
-        options: what was asked for.
-        view: `camera`, `height` and `width`; of several cameras the first is taken.
+        options: the monitor's options.
+        view: `camera`, `height` and `width`; only the first of several cameras is used.
 
     Raises:
-        InvalidArgument: nothing says which episodes the videos are to follow.
-        NoPictures: not all sub-environments can be drawn.
+        InvalidArgument: `keep` or `step_trigger` chooses the videos.
+        NoPictures: a sub-environment provides no frames.
     """
     if not options.tiled:
         return None
     if options.keep is not None or options.step_trigger is not None:
         raise InvalidArgument(
-            "tiled=True records all sub-environments during the episodes that "
-            "video_callable chooses of the first, and with keep or step_trigger no "
-            "episode is chosen when it begins. Use video_callable."
+            "tiled=True records all sub-environments during the first one's episodes "
+            "that video_callable chooses, but with keep or step_trigger no episode is "
+            "chosen when it starts. Use video_callable."
         )
     if not has_videos(options):
         return None
@@ -59,22 +59,22 @@ def vector_tiles(
     tiles = Tiles([gymnasium_frames(each, **view) for each in envs])
     if tiles.render_mode is None:
         raise NoPictures(
-            "tiled=True was asked for, and a tiled video is drawn while the "
-            "environments step, which needs frames of each of them: make them with "
-            'render_mode="rgb_array", and with the camera and the size that are wanted.'
+            "tiled=True was requested, and a tiled video needs the frames of all "
+            "environments while they step: create them with "
+            'render_mode="rgb_array", and with the required camera and size.'
         )
     return tiles
 
 
 class TiledVideo:
-    """Records all sub-environments while the schedule has an episode of the first.
+    """A recorder of all sub-environments during the first one's scheduled episodes.
 
     Args:
         first: the monitor of the first sub-environment, whose manifest lists the
             videos.
-        tiles: of all.
-        options: what was asked for.
-        env: the first sub-environment, which tells the rate.
+        tiles: the frames of all sub-environments.
+        options: the monitor's options.
+        env: the first sub-environment, which determines the frame rate.
     """
 
     def __init__(
@@ -89,13 +89,13 @@ class TiledVideo:
         self._options = options
         self._env = env
         self._live: LiveVideos | None = None
-        # The episode that the frames are of.
+        # The episode that the frames belong to.
         self._episode_id = -1
         self._ending: dict[str, Any] | None = None
 
     @property
     def is_recording(self) -> bool:
-        """Whether a video is running."""
+        """Whether a video is being recorded."""
         return self._live is not None
 
     def take_last(self) -> None:
@@ -104,10 +104,11 @@ class TiledVideo:
             self._live.take_last()
 
     def after_reset(self) -> None:
-        """Follow the first sub-environment, which has just been reset."""
+        """Start or end videos after a reset of the first sub-environment."""
         episode_id = self._first.episode_id - 1
         if self._live is not None and episode_id == self._episode_id:
-            # Reset before any step: the number stays, the frame is another.
+            # After a reset before any step, the number is the same but the frame is
+            # not.
             self._live.discard()
             self._live = None
         self._end_early(RESET)
@@ -117,8 +118,8 @@ class TiledVideo:
         """Record a step of all sub-environments.
 
         Args:
-            terminated: the task has ended the episode of the first.
-            truncated: a limit from outside has.
+            terminated: whether the task ended the first sub-environment's episode.
+            truncated: whether a limit outside the task ended it.
         """
         episode_id = self._first.episode_id - 1
         is_over = terminated or truncated
@@ -130,7 +131,7 @@ class TiledVideo:
                 length, reward = stats.episode_lengths[-1], stats.episode_rewards[-1]
             self._live.say(length=length, reward=reward)
             if episode_id != self._episode_id:
-                # SAME_STEP: the first tile shows the next episode already.
+                # With SAME_STEP, the first tile already shows the next episode.
                 self._live.say(final_frame="missing")
             self._live.take(is_there=True, last=is_over)
         if is_over:
@@ -139,7 +140,7 @@ class TiledVideo:
             self._begin(episode_id)
 
     def note_error(self, error: BaseException) -> None:
-        """Note that something was raised; the video is marked with it if it ends so."""
+        """Note an exception, which marks the video if nothing is recorded after it."""
         if self._ending is None:
             self._ending = ending(error)
 
@@ -177,7 +178,7 @@ class TiledVideo:
     def _tolerates(self, error: Exception) -> bool:
         if self._options.on_error != WARN:
             return False
-        logger.warning("A tiled video of %s: %s", self._first.directory, error)
+        logger.warning("A tiled video in %s failed: %s", self._first.directory, error)
         return True
 
     def _end_early(self, reason: str) -> None:

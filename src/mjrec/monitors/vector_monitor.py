@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The monitor of Gymnasium's vector environments."""
+"""The monitor for Gymnasium's vector environments."""
 
 from __future__ import annotations
 
@@ -43,36 +43,36 @@ from .vector_slots import (
 
 logger = logging.getLogger(__name__)
 
-# Of the tails of all sub-environments' row logs, in bytes.
+# Total size of the tails of all sub-environments' row logs, in bytes.
 _TAILS = 4 << 20
 
 
 class VectorMonitor(MonitorBase, gymnasium.vector.VectorWrapper):
-    """Records a Gymnasium vector environment; made by `mjrec.Monitor`.
+    """A monitor for a Gymnasium vector environment. Create it with `mjrec.Monitor`.
 
     Each sub-environment has its own monitor, with its own infix, statistics, schedule,
     numbering and manifest, all in one directory.
 
-    Sub-environments that are objects in this process (`SyncVectorEnv`, also inside
+    Sub-environments that are objects in this process (`SyncVectorEnv`, even inside
     vector wrappers) are recorded like single environments: every frame of every episode
-    in every autoreset mode, rendered from states where possible. Rewards and actions
-    are the sub-environment's, not those of vector wrappers.
+    in every autoreset mode, rendered from states if possible. Rewards and actions are
+    those of the sub-environment, not of vector wrappers.
 
-    Others (`AsyncVectorEnv`, vectorised simulators) are recorded from outside: frames
-    are drawn live, through `render()`, and trajectories have no states. If such an
+    Others (`AsyncVectorEnv`, vectorized simulators) are recorded from outside: frames
+    are rendered live, with `render()`, and trajectories have no states. If such an
     environment resets itself in the step that ends an episode (SAME_STEP), the last
     frame is missing, and the metadata says `final_frame: missing`. To avoid this, put a
     Monitor inside the environment functions.
 
-    A reset in the middle of an episode is allowed unless `allow_early_reset=False`,
-    because sub-environments end their episodes at different times. Cut episodes are not
-    in the statistics.
+    A reset during an episode is allowed unless `allow_early_reset=False`, because
+    sub-environments end their episodes at different times. Interrupted episodes are not
+    included in the statistics.
 
     `tiled=True` adds a video of all sub-environments side by side,
-    `....video000027.tiled.mp4`, for the scheduled episodes of the first. It is drawn
-    live and needs `render_mode="rgb_array"`. In the SAME_STEP mode its last frame shows
-    the first sub-environment after the reset, and its metadata says `final_frame:
-    missing`.
+    `....video000027.tiled.mp4`, for the scheduled episodes of the first one. It is
+    rendered live and needs `render_mode="rgb_array"`. In the SAME_STEP mode, its last
+    frame shows the first sub-environment after the reset, and its metadata says
+    `final_frame: missing`.
 
     After `close`, calls go straight to the closed environment, and nothing is recorded.
 
@@ -113,7 +113,7 @@ class VectorMonitor(MonitorBase, gymnasium.vector.VectorWrapper):
             shared = Background(
                 directory, workers=options.workers, strict=options.strict
             )
-        # How a sub-environment is closed; until all have monitors, not at all.
+        # Closes a sub-environment; does nothing until all of them have monitors.
         closing: dict[str, Callable[[Env], None]] = {"by": lambda env: None}
         self.monitors: tuple[GymnasiumMonitor, ...] = _all_or_none(
             directory,
@@ -137,18 +137,18 @@ class VectorMonitor(MonitorBase, gymnasium.vector.VectorWrapper):
         self._recorders = [monitor._recorder for monitor in self.monitors]
         self._shared = shared
         self._tiled = None
-        # What `close` passes on to the environment's own.
+        # Options that `close` passes on to the environment's own `close`.
         self._closing: dict[str, Any] = {}
         options_of_close = self._closing
         closings: list[Callable[[], object]] = []
         if tiles is not None:
             self._tiled = TiledVideo(self.monitors[0], tiles, options, envs[0])
-            # Its videos stand in the manifest of the first.
+            # Closed first, because the first monitor's manifest lists its videos.
             closings.append(self._tiled.close)
         if shared is not None:
-            # Before anything is closed: what is done by then, all manifests say.
+            # Before the monitors, so that their manifests list all rendered videos.
             closings.append(shared.stop)
-        # The vector environment closes them itself.
+        # The vector environment itself closes its sub-environments.
         closings.append(lambda: closing.update(by=free_viewers))
         closings += [monitor._guard.close for monitor in self.monitors]
         if inside is not None:
@@ -159,11 +159,11 @@ class VectorMonitor(MonitorBase, gymnasium.vector.VectorWrapper):
         self._guard_by(closings)
 
     def get_episode_rewards(self) -> list[list[float]]:
-        """Return, by sub-environment, the sum of rewards of each complete episode."""
+        """Return the rewards sum of each complete episode, by sub-environment."""
         return [monitor.get_episode_rewards() for monitor in self.monitors]
 
     def get_episode_lengths(self) -> list[list[int]]:
-        """Return, by sub-environment, the steps of each complete episode."""
+        """Return the number of steps of each complete episode, by sub-environment."""
         return [monitor.get_episode_lengths() for monitor in self.monitors]
 
     def reset(
@@ -175,8 +175,8 @@ class VectorMonitor(MonitorBase, gymnasium.vector.VectorWrapper):
         """Reset the environment, or the sub-environments that `options` select.
 
         Raises:
-            ResetNotAllowed: in the middle of an episode, with
-                `allow_early_reset=False`. Nothing was reset.
+            ResetNotAllowed: an episode is running and `allow_early_reset=False` was
+                given. Nothing was reset.
         """
         if self._is_closed:
             return self._env_reset(seed, options)
@@ -198,13 +198,13 @@ class VectorMonitor(MonitorBase, gymnasium.vector.VectorWrapper):
         """Step the environment and record the result.
 
         Raises:
-            ResetNeeded: before the first reset, or if a sub-environment's episode is
-                over and nothing resets it.
+            ResetNeeded: there was no reset yet, or a sub-environment's episode is over
+                and was not reset.
         """
         if self._is_closed:
             return self.env.step(actions)
         with self._noting_errors():
-            # Monitors inside the vector environment record by themselves.
+            # Monitors inside the vector environment record on their own.
             step = self.env.step if self._is_inside else self._step_slots
             result: tuple[Any, Any, Any, Any, dict[str, Any]] = step(actions)
         if self._tiled is not None:
@@ -219,18 +219,18 @@ class VectorMonitor(MonitorBase, gymnasium.vector.VectorWrapper):
         """Finish the recordings, then close the environment. Idempotent.
 
         Args:
-            wait: as a `GymnasiumMonitor`.
-            **options: of the environment's own `close`: `timeout` and `terminate` of
-                `AsyncVectorEnv`.
+            wait: see `GymnasiumMonitor.close`.
+            **options: options of the environment's own `close`, such as `timeout` and
+                `terminate` of `AsyncVectorEnv`.
 
         Raises:
-            Error: as a `GymnasiumMonitor`.
+            Error: see `GymnasiumMonitor.close`.
         """
         self._closing.update(options)
         super().close(wait=wait)
 
     def __del__(self) -> None:
-        # Gymnasium 1.0 would call `close`, which waits; the guard sees to the end.
+        # Gymnasium 1.0 would call `close`, which waits. The guard closes it instead.
         pass
 
     @property
@@ -257,10 +257,10 @@ class VectorMonitor(MonitorBase, gymnasium.vector.VectorWrapper):
         result = self._env_reset(seed, options)
         if any(self._recorders[index].done is None for index in which):
             raise Error(
-                f"{type(self.env.unwrapped).__name__} was reset, and did not reset "
-                "the environments in its list `envs`, so that nothing could be "
-                "recorded. Put Monitor around each of them, inside the functions that "
-                "make them, with resume=True."
+                f"{type(self.env.unwrapped).__name__} was reset without resetting the "
+                "environments in its list `envs`, so nothing could be recorded. Put "
+                "Monitor around each of them, inside the functions that create them, "
+                "with resume=True."
             )
         return result
 
@@ -268,7 +268,7 @@ class VectorMonitor(MonitorBase, gymnasium.vector.VectorWrapper):
         self, which: list[int], seed: Any, options: dict[str, Any] | None
     ) -> tuple[Any, dict[str, Any]]:
         slots = {i: slot for i, slot in self._open_slots().items() if i in which}
-        # A copy: the reset takes the mask out of the original.
+        # Copied, because the reset removes the mask from the original.
         noted = options and {k: v for k, v in options.items() if k != "reset_mask"}
         for slot in slots.values():
             slot._recorder.before_reset()
@@ -332,17 +332,17 @@ class VectorMonitor(MonitorBase, gymnasium.vector.VectorWrapper):
         return list(gymnasium.vector.utils.iterate(space, observations))
 
     def _check_reset(self, which: list[int]) -> None:
-        """Check before anything is reset that all may be."""
+        """Check, before anything is reset, that all these resets are allowed."""
         if self._options.allow_early_reset or self._had_error:
             return
         stats = [recorder.stats_recorder for recorder in self._recorders]
         running = [i for i in which if stats[i].done is False and stats[i].steps]
         if running:
             raise ResetNotAllowed(
-                f"reset() was called, and the episodes of the sub-environments "
-                f"{running} are not over. Choose those to be reset with "
-                'options={"reset_mask": ...}, or allow it with allow_early_reset=True; '
-                "the episodes are then no part of the statistics."
+                f"reset() was called, but the episodes of the sub-environments "
+                f"{running} are not over. Select the ones to reset with "
+                'options={"reset_mask": ...}, or use allow_early_reset=True; the '
+                "statistics then do not include these episodes."
             )
 
     @contextlib.contextmanager
@@ -354,7 +354,7 @@ class VectorMonitor(MonitorBase, gymnasium.vector.VectorWrapper):
             raise
 
     def _note_error(self, error: BaseException) -> None:
-        # Calls that were not allowed have changed nothing.
+        # Rejected calls have not changed anything.
         if isinstance(error, ResetNeeded | ResetNotAllowed):
             return
         self._had_error = True
@@ -364,18 +364,18 @@ class VectorMonitor(MonitorBase, gymnasium.vector.VectorWrapper):
 
     def _run_first_at_exit(self, tiled: TiledVideo) -> None:
         if tiled.is_recording:
-            # Drawing has loaded OpenGL by now, which tears itself down at exit.
+            # Rendering has loaded OpenGL by now, which shuts itself down at exit.
             self._guard.run_first_at_exit()
 
 
 def _reset_indices(options: Mapping[str, Any] | None, count: int) -> list[int]:
-    """Return which sub-environments a reset with these options resets.
+    """Return the sub-environments that a reset with these options will reset.
 
-    To be asked before the reset, which takes the mask out of the options.
+    Call this before the reset, which removes the mask from the options.
     """
     mask = None if options is None else options.get("reset_mask")
     if mask is None or np.shape(mask) != (count,):
-        # The vector environment says what is wrong with it.
+        # If the mask is invalid, the vector environment will raise an error.
         return list(range(count))
     return [int(index) for index in np.flatnonzero(mask)]
 
@@ -385,14 +385,14 @@ def _seed_of(env: VectorEnv, index: int, seed: Any) -> Any:
         return seed[index]
     if isinstance(seed, int) and is_async(env):
         return seed + index
-    # One generator for all: it is the vector environment's seed.
+    # All sub-environments share one generator, seeded with the vector environment's.
     return seed
 
 
 def _add_episode_info(
     infos: dict[str, Any], last_infos: Mapping[int, Mapping[str, Any]], ends: Any
 ) -> None:
-    """Say of the episodes that are over what Gymnasium's own wrapper says."""
+    """Add the info about ended episodes that Gymnasium's own wrapper would add."""
     if not last_infos:
         return
     zeros = {"r": 0.0, "l": 0, "t": 0.0}
@@ -413,17 +413,17 @@ def _options_of(
 ) -> RecorderOptions:
     """Return the options of one sub-environment's monitor.
 
-    The first opens the directory as was asked for, and the others come to it.
+    The first one opens the directory as requested, and the others join it.
     """
     changed: dict[str, Any] = {
-        # A tiled video of several cameras is each sub-environment's own.
+        # With several cameras, each sub-environment has its own tiled video of them.
         "tiled": options.tiled and isinstance(view["camera"], list | tuple),
         "tail_bytes": min(options.tail_bytes, _TAILS // count),
     }
     if index > 0:
         changed |= {"force": False, "resume": options.resume or True}
     if options.name_prefix is not None:
-        # One name for all would be one file for all.
+        # With the same prefix, all would use the same file names.
         changed["name_prefix"] = f"{options.name_prefix}-env-{index}"
     return dataclasses.replace(options, **changed)
 
@@ -431,9 +431,9 @@ def _options_of(
 def _all_or_none(
     directory: str | os.PathLike[str], opens: Iterable[Callable[[], GymnasiumMonitor]]
 ) -> tuple[GymnasiumMonitor, ...]:
-    """Return the monitors that the functions open; undo all if one fails.
+    """Return the monitors that the functions open; undo everything if one fails.
 
-    Their files are removed, and the directories made for them.
+    This removes their files and the directories created for them.
     """
     path = Path(directory).absolute()
     opened: list[GymnasiumMonitor] = []
@@ -443,7 +443,7 @@ def _all_or_none(
                 opened.append(open_one())
         except BaseException:
             for monitor in opened:
-                # What was raised first is what the user needs to see.
+                # The user needs to see the first error.
                 with contextlib.suppress(Exception):
                     monitor._guard.close()
             infixes = {monitor.infix for monitor in opened}
@@ -466,6 +466,6 @@ def _warn_of_missing_frames(env: VectorEnv, is_outside: bool, is_tiled: bool) ->
     if is_tiled:
         logger.warning(
             "The last frame of each tiled video shows the first sub-environment, and "
-            "others that have ended likewise, after the reset: with SAME_STEP they can "
-            "be drawn together only then."
+            "any others whose episode has ended, after the reset: with SAME_STEP, all "
+            "can be rendered together only then."
         )

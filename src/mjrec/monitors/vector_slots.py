@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The sub-environments of a vector environment, one by one.
+"""The individual sub-environments of a vector environment.
 
-Those that are objects in this process are found in the vector environment's list. All
-others are seen from outside only: each is a slot of what goes into the vector
-environment and comes out of it.
+Sub-environments that are objects in this process are in the vector environment's list.
+All others are visible only from outside: each is a slot in the inputs and outputs of
+the vector environment.
 """
 
 from __future__ import annotations
@@ -28,18 +28,19 @@ Env = gymnasium.Env[Any, Any]
 NEXT_STEP, SAME_STEP = "NEXT_STEP", "SAME_STEP"
 
 UNSEEN = "its sub-environments are not objects in this process"
-# How Gymnasium writes an environment that has a spec, under its wrappers.
+# Gymnasium's string form of a wrapped environment that has a spec.
 _WITH_SPEC = re.compile(r"(?:<\w+)+<([\w./:-]+)>+")
 
 
 def autoreset_mode(env: VectorEnv) -> str:
-    """Return when sub-environments are reset: `DISABLED`, `NEXT_STEP` or `SAME_STEP`.
+    """Return the autoreset mode: `DISABLED`, `NEXT_STEP` or `SAME_STEP`.
 
     Raises:
-        InvalidArgument: the vector environment does not say.
+        InvalidArgument: the vector environment does not name its mode.
     """
     mode = (env.metadata or {}).get("autoreset_mode")
-    # Gymnasium 1.0 has no such thing: its own reset in the step after the end.
+    # Gymnasium 1.0 has no modes: its vector environments reset in the step after the
+    # end.
     known = getattr(gymnasium.vector, "AutoresetMode", None)
     if known is not None and isinstance(mode, known):
         return str(mode.name)
@@ -47,19 +48,19 @@ def autoreset_mode(env: VectorEnv) -> str:
     if known is None and isinstance(env.unwrapped, own):
         return NEXT_STEP
     raise InvalidArgument(
-        f"When {type(env.unwrapped).__name__} resets its sub-environments is not "
-        f'known: metadata["autoreset_mode"] is {mode!r}, and must be a '
-        "gymnasium.vector.AutoresetMode (of Gymnasium 1.1 or later). Set it, for "
+        f"The autoreset mode of {type(env.unwrapped).__name__} is unknown: "
+        f'metadata["autoreset_mode"] is {mode!r}, but must be a '
+        "gymnasium.vector.AutoresetMode (in Gymnasium 1.1 or later). Set it, for "
         'example env.metadata["autoreset_mode"] = '
         "gymnasium.vector.AutoresetMode.NEXT_STEP, or put Monitor around each of the "
-        "environments, inside the functions that make them, with resume=True."
+        "environments, inside the functions that create them, with resume=True."
     )
 
 
 def environments_inside(env: VectorEnv) -> list[Env] | None:
-    """Return the list of a vector environment's sub-environments.
+    """Return a vector environment's own list of its sub-environments.
 
-    It is the vector environment's own list. None where they are elsewhere, or nowhere.
+    The result is None if they are not objects in this process.
     """
     envs = getattr(env.unwrapped, "envs", None)
     if not isinstance(envs, list) or not envs or len(envs) != env.num_envs:
@@ -68,38 +69,39 @@ def environments_inside(env: VectorEnv) -> list[Env] | None:
 
 
 def common_env_id(envs: Sequence[Env]) -> str:
-    """Return the name of sub-environments that are objects in this process.
+    """Return the common name of sub-environments that are objects in this process.
 
     Raises:
-        InvalidArgument: they have several.
+        InvalidArgument: the sub-environments have different names.
     """
     ids = {None if each.spec is None else each.spec.id for each in envs}
     if len(ids) > 1:
         names = ", ".join(sorted(str(name) for name in ids))
         raise InvalidArgument(
-            f"The sub-environments are not all of one name: {names}. Results in one "
-            "directory belong to one environment: give env_id= a name for them all, or "
-            "put Monitor around each of them, with a directory of its own."
+            f"The sub-environments have different names: {names}. All results in one "
+            "directory must belong to one environment: set a common name with env_id=, "
+            "or put Monitor around each of them, with separate directories."
         )
     return env_id_of(envs[0])
 
 
 class Frames:
-    """What a vector environment's `render()` gives, asked once for each moment."""
+    """The frames of a vector environment, which is rendered only once per step."""
 
     def __init__(self, env: VectorEnv) -> None:
         self._env = env
         self._frames: Sequence[Any] | None = None
 
     def forget(self) -> None:
-        """Take note that the environment has gone on."""
+        """Drop the cached frames after the environment has changed."""
         self._frames = None
 
     def of(self, index: int) -> Any:
-        """Return the frame of a sub-environment now, or the list of its frames.
+        """Return a sub-environment's current frame, or the list of its frames.
 
         Raises:
-            InvalidArgument: there is not one for each sub-environment.
+            InvalidArgument: `render()` does not return a frame for each
+                sub-environment.
         """
         if self._frames is None:
             frames: Any = self._env.render()
@@ -107,10 +109,10 @@ class Frames:
             there = len(frames) if hasattr(frames, "__len__") else repr(frames)
             if there != count:
                 raise InvalidArgument(
-                    f"render() of {type(self._env.unwrapped).__name__} must give a "
-                    f"frame for each of its {count} sub-environments, and gave "
+                    f"render() of {type(self._env.unwrapped).__name__} must return a "
+                    f"frame for each of its {count} sub-environments, but returned "
                     f"{there}. Record without videos (video_callable=False), or put "
-                    "Monitor around each environment, inside the functions that make "
+                    "Monitor around each environment, inside the functions that create "
                     "them."
                 )
             self._frames = frames
@@ -118,10 +120,10 @@ class Frames:
 
 
 class SubEnvironment(Env):
-    """A sub-environment that is seen from outside, as if it stood alone.
+    """A stand-in for a sub-environment that is visible only from outside.
 
-    Its monitor gets what the vector environment was given and returned, and calls
-    only `render`.
+    Its monitor gets the inputs and outputs of the vector environment, and calls only
+    `render`.
     """
 
     control_timestep: Callable[[], float] | None = None
@@ -139,15 +141,15 @@ class SubEnvironment(Env):
             self.control_timestep = lambda: timestep
 
     def render(self) -> Any:
-        """Return the frame of this moment, or the list of those since the last."""
+        """Return the current frame, or the list of frames since the last call."""
         return self._frames.of(self._index)
 
     def close(self) -> None:
-        """Do nothing: the vector environment is closed by its own monitor."""
+        """Do nothing: the vector environment's monitor closes it."""
 
 
 def slots_outside(env: VectorEnv, frames: Frames) -> list[SubEnvironment]:
-    """Return the sub-environments of one that can be seen from outside only."""
+    """Return stand-ins for sub-environments that are visible only from outside."""
     return [
         SubEnvironment(env, frames, index, timestep=timestep)
         for index, timestep in enumerate(_timesteps(env))
@@ -155,34 +157,34 @@ def slots_outside(env: VectorEnv, frames: Frames) -> list[SubEnvironment]:
 
 
 def check_outside(env: VectorEnv, asked: str | None, view: Mapping[str, Any]) -> None:
-    """Check that nothing is asked for that cannot be had from outside.
+    """Check that no option needs sub-environments that are objects in this process.
 
     Args:
         env: the vector environment.
-        asked: when frames are to be drawn.
+        asked: the requested rendering mode.
         view: `camera`, `height` and `width`.
 
     Raises:
-        InvalidArgument: the view was to be another.
-        PicturesDiffer: rendering was to be deferred.
+        InvalidArgument: a camera or size was requested.
+        PicturesDiffer: deferred rendering was requested.
     """
     name = type(env.unwrapped).__name__
     chosen = [name for name, value in view.items() if value is not None]
     if chosen:
         raise InvalidArgument(
-            f"{', '.join(chosen)} cannot be chosen for {name}: {UNSEEN}, and show what "
-            "they show. Make them with the camera and size that the videos are to "
-            f"have, or: {way_out(env)}"
+            f"{', '.join(chosen)} cannot be chosen for {name}: {UNSEEN}, so their view "
+            "is fixed. Create them with the camera and size for the videos, or: "
+            f"{way_out(env)}"
         )
     if asked == DEFERRED:
         raise PicturesDiffer(
-            f'render="deferred" was asked for, and the states of {name} cannot be '
+            f'render="deferred" was requested, but the states of {name} cannot be '
             f'recorded: {UNSEEN}. {way_out(env)} Or use render="live" (or None).'
         )
 
 
 def env_id_outside(env: VectorEnv) -> str:
-    """Return the name of sub-environments that can be seen from outside only."""
+    """Return the name of sub-environments that are visible only from outside."""
     if env.spec is not None:
         return env.spec.id
     if is_async(env):
@@ -193,37 +195,37 @@ def env_id_outside(env: VectorEnv) -> str:
             return str(name)
     unknown = f"(unknown:{type(env.unwrapped).__name__})"
     logger.warning(
-        "The vector environment has no spec, so the recordings cannot name it; they "
-        'say %s. Give Monitor(..., env_id="...") to name it.',
+        "The vector environment has no spec, so its name is unknown and the recordings "
+        'say %s. To set the name, use Monitor(..., env_id="...").',
         unknown,
     )
     return unknown
 
 
 def way_out(env: VectorEnv) -> str:
-    """Return how states, and all frames, can be recorded all the same."""
+    """Return advice on how to record states and all frames anyway."""
     if is_async(env):
         return (
-            "Put Monitor around each of them, inside the functions that make them: "
+            "Put Monitor around each of them, inside the functions that create them: "
             "AsyncVectorEnv([lambda: mjrec.Monitor(gymnasium.make(...), directory, "
             "resume=True), ...])."
         )
     return (
-        "Where they can be made one by one (gymnasium.make_vec(..., "
+        "If they can be created one by one (gymnasium.make_vec(..., "
         'vectorization_mode="sync"), or a Monitor inside each of the functions that '
-        "make them), everything can be recorded."
+        "create them), everything can be recorded."
     )
 
 
 def is_async(env: VectorEnv) -> bool:
-    """Return whether there is an AsyncVectorEnv below all wrappers."""
+    """Return whether the innermost environment is an AsyncVectorEnv."""
     return isinstance(env.unwrapped, gymnasium.vector.AsyncVectorEnv)
 
 
 def _timesteps(env: VectorEnv) -> Sequence[float | None]:
-    """Return the seconds of a step of each sub-environment, as far as they can say."""
+    """Return each sub-environment's seconds per step; None if unknown."""
     base: Any = env.unwrapped
-    # In another process there is no asking for what may be missing: the process ends.
+    # Asking another process for a missing attribute would end that process.
     if is_async(env) and all(
         all(base.call("has_wrapper_attr", name)) for name in ("model", "data", "dt")
     ):
@@ -232,7 +234,7 @@ def _timesteps(env: VectorEnv) -> Sequence[float | None]:
 
 
 def info_of(infos: Mapping[str, Any], index: int) -> dict[str, Any]:
-    """Return what a step's `infos` say of one sub-environment, values only."""
+    """Return one sub-environment's values from a step's `infos`."""
     return {
         name: values[index]
         for name, values in infos.items()

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The read half: what monitors wrote, found, merged and listed.
+"""Reading results: finding, merging and listing the files of monitors.
 
-It needs no simulator, no OpenGL and no ffmpeg, and reads what this package and every
-gym from 0.7.4 to 0.22 wrote.
+This needs no simulator, OpenGL or ffmpeg, and reads files of this package and of gym
+0.7.4 to 0.22.
 """
 
 from __future__ import annotations

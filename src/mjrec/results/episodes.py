@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The episodes of a directory, one after the other."""
+"""Iteration over the episodes in a directory."""
 
 from __future__ import annotations
 
@@ -19,26 +19,27 @@ from .monitor_files import MonitorFiles, monitors_of
 
 @dataclass(frozen=True, kw_only=True)
 class Episode:
-    """One completed episode. What gym's files do not say is None.
+    """A completed episode. Facts that gym's files do not contain are None.
 
     Attributes:
-        episode_id: its number in its monitor's run; in gym's files its index.
+        episode_id: its number in the monitor's run; in gym's files, its index.
         length: number of steps.
         reward: sum of the rewards.
         type: `"t"` for training, `"e"` for evaluation.
-        start_time: wall clock just before the reset.
-        end_time: when it ended. Wall clock, except in files of gym 0.21 and 0.22.
-        seed: as given to `reset`.
-        options: as given to `reset`.
-        terminated: the task ended the episode.
-        truncated: a limit outside the task ended it.
+        start_time: wall-clock time just before the reset.
+        end_time: time of its end; wall-clock time, except in files of gym 0.21 and
+            0.22.
+        seed: the seed given to `reset`.
+        options: the options given to `reset`.
+        terminated: whether the task ended the episode.
+        truncated: whether a limit outside the task ended the episode.
         monitor: infix of its monitor's files.
-        video: its video, if there is one.
-        metadata: its video's metadata, if there is a video.
+        video: its video, if it has one.
+        metadata: its video's metadata, if it has a video.
         trajectory: its trajectory, if it has one. The file may not exist yet:
             `load_trajectory` then reads the monitor's log.
-        pending: whether its video is still to be rendered (`mjrec render`).
-        success: as reported by the environment.
+        pending: whether its video must still be rendered (`mjrec render`).
+        success: the success that the environment reported.
         evaluation: in an evaluation, its `seed` and `episode` there, and MuJoCo's
             `warnings`.
     """
@@ -78,27 +79,27 @@ class Episode:
 
 
 def iter_episodes(directory: str | os.PathLike[str]) -> Iterator[Episode]:
-    """Yield the completed episodes of a directory, monitor by monitor.
+    """Yield the completed episodes in a directory, monitor by monitor.
 
     Monitors are ordered by infix, their episodes by end. Monitors that never closed are
     included, from their journals. Episodes are read one by one, so memory does not
     grow.
 
-    If a journal lacks episodes that the statistics file has, the latter is used, and
-    the journal adds what it knows. Damaged lines of a journal are left out with a
+    If a journal lacks episodes that the statistics file has, the statistics file is
+    used, with details from the journal. Damaged lines in a journal are skipped with a
     warning.
 
-    gym's files do not say which video belongs to which episode if an environment was
-    reset twice in a row; these episodes have no video. Neither have episodes whose
-    journal line is lost; they get the lowest possible number.
+    If an environment was reset twice in a row, gym's files do not say which video
+    belongs to which episode; these episodes have no video. Episodes whose journal line
+    is lost have no video either, and get the lowest possible number.
 
     Raises:
-        UnreadableFile: there is no such directory (at once), or a file is damaged and
-            no other has the same episodes (when it is read).
+        UnreadableFile: the directory does not exist (raised at once), or a file is
+            damaged and no other file has the same episodes (raised during iteration).
     """
     directory = Path(directory)
     if not directory.is_dir():
-        raise UnreadableFile(directory, "there is no such directory")
+        raise UnreadableFile(directory, "the directory does not exist")
     return _iter_monitors(monitors_of(directory))
 
 
@@ -111,7 +112,7 @@ def episodes_of(results: MonitorResults) -> Iterator[Episode]:
     """Yield the completed episodes of one monitor, as `iter_episodes` does.
 
     Raises:
-        UnreadableFile: its files are damaged, and no other has the same episodes.
+        UnreadableFile: a file is damaged and no other file has the same episodes.
     """
     saved, journal, count = results.saved, results.files.journal, results.run.count
     entries = read_journal(journal) if journal and (count or not saved) else iter(())
@@ -119,7 +120,7 @@ def episodes_of(results: MonitorResults) -> Iterator[Episode]:
         for entry in entries:
             yield _of_journal(results, entry)
         return
-    # Both are written from the same numbers, which JSON gives back exactly.
+    # Both files are written from the same numbers, which JSON preserves exactly.
     by_end = {(entry.end_time, entry.length): entry for entry in entries}
     number = results.details.get("first_episode_id", 0)
     is_certain = not by_end and _is_every_one(results, saved, number)
@@ -135,12 +136,12 @@ def episodes_of(results: MonitorResults) -> Iterator[Episode]:
 
 
 def _is_every_one(results: MonitorResults, stats: StatsFile, first: int) -> bool:
-    """Return whether every episode that began was completed, so that numbers follow."""
+    """Return whether all started episodes were completed (numbers have no gaps)."""
     count, following = len(stats.timestamps), results.details.get("next_episode_id")
     if results.details:
         return following is not None and following - first == count
-    # Gym noted a type at each reset, and numbered the videos by resets. One more than
-    # episodes is the last one, which did not end; two more are resets in a row.
+    # gym noted a type at each reset, and numbered videos by resets. One type more than
+    # there are episodes is an unfinished last episode; two more mean resets in a row.
     return len(stats.episode_types or ()) <= count + 1
 
 
@@ -157,7 +158,7 @@ def _of_stats(
     *,
     is_certain: bool,
 ) -> Episode:
-    # A video is never shown for another episode.
+    # A video must never be shown for the wrong episode.
     files = _files(results, number) if is_certain else {"monitor": results.files.infix}
     return Episode(
         episode_id=number,
@@ -173,9 +174,9 @@ def _files(results: MonitorResults, number: int) -> dict[str, Any]:
     files = results.files
     video, metadata = files.videos.get(number), files.metadata.get(number)
     trajectory = files.trajectories.get(number)
-    # Metadata without a video is what is left of one that could not be made.
+    # Metadata without a video is left from a video that could not be created.
     is_missing = trajectory is not None and video is None and metadata is None
-    # A packed run may have the actions alone of an episode that was not chosen.
+    # A packed run may contain only the actions of an episode that was not chosen.
     packed = results.details.get("packed_episodes")
     is_left_out = isinstance(packed, list) and number not in packed
     return {

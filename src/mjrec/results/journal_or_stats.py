@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which of a monitor's files its results are taken from.
+"""A monitor's results, read from its journal or from its statistics file.
 
-A monitor writes each episode twice: into its journal as the episode ends, and into its
-statistics file, which belongs to the manifest, when it closes (or at each reset). A
-killed monitor leaves a journal alone, or an older manifest beside it. The file with
-more episodes wins, and never are episodes taken from both.
+A monitor writes each episode twice: to its journal when the episode ends, and to the
+statistics file that its manifest names when the monitor closes (or at each reset). A
+killed monitor leaves only a journal, or a journal and an older manifest. The file with
+more episodes is used; episodes are never taken from both.
 """
 
 from __future__ import annotations
@@ -28,21 +28,21 @@ from .run import Run
 
 logger = logging.getLogger(__name__)
 
-# A lock holds a line; this bounds what may have been put in its place.
+# A lock contains one line. This limits how much of a planted file is read.
 _LONGEST_LOCK = 1 << 16
 
 
 class MonitorResults:
-    """What one monitor recorded, as far as its files still tell.
+    """The results of one monitor, as far as its files can be read.
 
-    Where a manifest or a statistics file is damaged or missing, the journal stands in
-    for it, and the other way round; the log then has a warning that names the file.
+    The journal replaces a damaged or missing manifest or statistics file, and vice
+    versa. A warning in the log names the file.
 
     Args:
-        files: of the monitor.
+        files: the monitor's files.
 
     Attributes:
-        files: as given.
+        files: the monitor's files.
     """
 
     def __init__(self, files: MonitorFiles) -> None:
@@ -51,10 +51,10 @@ class MonitorResults:
 
     @functools.cached_property
     def manifest(self) -> Manifest | None:
-        """What the manifest says; None where there is none.
+        """The manifest, or None if it is missing or damaged.
 
         Raises:
-            UnreadableFile: it is damaged, and there is no journal either.
+            UnreadableFile: the manifest is damaged and the journal is missing.
         """
         path = self.files.manifest
         if path is None:
@@ -67,11 +67,11 @@ class MonitorResults:
 
     @functools.cached_property
     def saved(self) -> StatsFile | None:
-        """What the statistics file holds; None where there is none.
+        """The content of the statistics file, or None if it is missing or damaged.
 
         Raises:
-            UnreadableFile: it is missing though a manifest names it, or damaged, and
-                there is no journal either.
+            UnreadableFile: the file is damaged, or missing although a manifest names
+                it, and the journal is missing too.
         """
         path = self.files.stats
         if self.manifest is not None and self.files.manifest is not None:
@@ -86,10 +86,10 @@ class MonitorResults:
 
     @functools.cached_property
     def run(self) -> Run:
-        """What the journal says, or where its beginning is gone, the manifest.
+        """The run, from the journal or, if the journal's start is lost, the manifest.
 
         Raises:
-            UnreadableFile: it cannot be read, and there are no statistics either.
+            UnreadableFile: the journal cannot be read, and there are no statistics.
         """
         run = Run()
         try:
@@ -110,19 +110,19 @@ class MonitorResults:
         """The episodes whose videos are rendered from their states, now or later.
 
         Raises:
-            UnreadableFile: as `run`.
+            UnreadableFile: see `run`.
         """
         return self.run.promised
 
     @property
     def details(self) -> Mapping[str, Any]:
-        """What this package adds to a manifest; nothing where there is none."""
+        """The facts that this package adds to a manifest; empty without a manifest."""
         manifest = self.manifest
         return {} if manifest is None or manifest.mjrec is None else manifest.mjrec
 
     @property
     def env_info(self) -> Mapping[str, Any] | None:
-        """What was recorded, as manifest, journal or lock say it; None where none."""
+        """The recorded environment, from manifest, journal or lock; None if unknown."""
         with contextlib.suppress(UnreadableFile):
             if self.manifest is not None:
                 return self.manifest.env_info
@@ -147,10 +147,10 @@ class MonitorResults:
         return saved is None or self.run.count > len(saved.timestamps)
 
     def stats(self) -> StatsFile:
-        """Return the statistics of the source with more episodes.
+        """Return the statistics from the journal or the file with more episodes.
 
         Raises:
-            UnreadableFile: no source can be read.
+            UnreadableFile: neither can be read.
         """
         saved, journal = self.saved, self.files.journal
         if journal is not None and self.is_behind:
@@ -165,16 +165,16 @@ class MonitorResults:
     def _say(self, error: UnreadableFile, instead: str) -> None:
         if error.path not in self._said:
             self._said.add(error.path)
-            logger.warning("%s Its monitor's %s is used instead.", error, instead)
+            logger.warning("%s The monitor's %s is used instead.", error, instead)
 
 
 def locked_run(path: Path) -> Mapping[str, Any]:
-    """Return what the lock of a monitor says of its run.
+    """Return the facts about a monitor's run in its lock.
 
     Raises:
-        OSError, ValueError: it cannot be read.
+        OSError, ValueError: the lock cannot be read.
     """
-    # Empty for a moment after it was made. A link is no lock.
+    # A lock is empty for a moment after it is created. Links are not followed.
     descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
     try:
         run = json_object(os.read(descriptor, _LONGEST_LOCK)).get("run")
@@ -184,8 +184,8 @@ def locked_run(path: Path) -> Mapping[str, Any]:
 
 
 def _stats_of(entries: list[JournalEntry], saved: StatsFile | None) -> StatsFile:
-    """Return the statistics that a journal amounts to."""
-    # The first reset may have been one whose episode never ended.
+    """Return the statistics of a journal's episodes."""
+    # Prefer the saved time: the episode of the first reset may never have ended.
     start = None if saved is None else saved.initial_reset_timestamp
     if start is None:
         starts = (entry.start_time for entry in entries)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Statistics file and manifest: what a monitor's journal and files amount to.
+"""Statistics files and manifests, written from a monitor's journal and files.
 
-Both are written here and nowhere else: by the monitor, by a process that has rendered
-some of its videos, by one that puts a dead monitor in order.
+Both are written only here: by the monitor, by a process that has rendered some of its
+videos, or by a process that recovers a dead monitor's files.
 """
 
 from __future__ import annotations
@@ -59,13 +59,14 @@ _FORMAT_VERSION = 1
 
 @dataclass(frozen=True)
 class Written:
-    """What was written.
+    """The result of writing a manifest and statistics.
 
     Attributes:
-        manifest: as it is now.
-        stats: the statistics, as they are now; None where they cannot be had.
-        is_new_manifest: it had to be written.
-        is_new_stats: they were not there; a monitor writes its own in any case.
+        manifest: the current manifest.
+        stats: the current statistics; None if they cannot be recovered.
+        is_new_manifest: whether the manifest had to be written.
+        is_new_stats: whether the statistics had to be written; always False for a
+            monitor, which writes its own.
     """
 
     manifest: Manifest
@@ -75,24 +76,24 @@ class Written:
 
     @property
     def pending(self) -> list[Mapping[str, Any]]:
-        """The videos that are still to be rendered."""
+        """The videos that must still be rendered."""
         return list((self.manifest.mjrec or {}).get("pending", ()))
 
 
 def update_manifests(directory: Path) -> None:
-    """Bring the manifests of closed monitors up to date that call videos pending.
+    """Update the manifests of closed monitors that list pending videos.
 
     Raises:
-        UnreadableFile: one is damaged; the others are updated.
-        DirectoryNotWritable: there can be no lock in the directory.
-        FileNotWritten: the disk is full; manifests stay as they were.
+        UnreadableFile: a manifest is damaged; the others are updated.
+        DirectoryNotWritable: no lock can be created in the directory.
+        FileNotWritten: the disk is full; existing manifests are unchanged.
     """
     damaged: UnreadableFile | None = None
     for path in iter_monitor_files(directory):
         infix = Infix.parse(infix_of(path.name) or "")
         if infix is not None and is_manifest(path.name):
             try:
-                # Of the others nothing can be new; those of gym have no such key.
+                # Other manifests are up to date; gym's do not have this key.
                 if (read_manifest(path).mjrec or {}).get("pending"):
                     write_manifest_and_stats(directory, infix)
             except UnreadableFile as error:
@@ -109,35 +110,34 @@ def write_manifest_and_stats(
     stats: StatsFile | None = None,
     is_own: bool = False,
 ) -> Written | None:
-    """Write statistics and manifest of a monitor, unless they are there already.
+    """Write the statistics and manifest of a monitor, if they are missing or outdated.
 
     Args:
         directory: the monitor directory.
-        infix: the monitor's.
-        run: what is known of its run; its journal is read if None.
-        stats: its statistics; if None, those of the journal or of the statistics file,
-            whichever has more episodes.
-        is_own: the caller is the monitor, or holds its lock. No other process touches
-        the
-            manifest of a monitor that is open.
+        infix: the monitor's infix.
+        run: the monitor's run; if None, it is read from the journal.
+        stats: the monitor's statistics; if None, those of the journal or of the
+            statistics file, whichever has more episodes.
+        is_own: whether the caller is the monitor or holds its lock. No other process
+            changes the manifest of an open monitor.
 
     Returns:
-        What is there now; None where the monitor is open.
+        The current manifest and statistics; None if the monitor is open.
 
     Raises:
-        UnreadableFile: journal or manifest are damaged, and nothing stands in for them.
-        DirectoryNotWritable: there can be no lock in the directory.
-        FileNotWritten: the disk is full; what was there before still is.
+        UnreadableFile: the journal or manifest is damaged, and nothing can replace it.
+        DirectoryNotWritable: no lock can be created in the directory.
+        FileNotWritten: the disk is full; existing files are unchanged.
     """
     name = f"{stats_prefix(infix)}.stats.json"
     if run is not None and stats is not None:
-        # First of all: it tells a directory that is full, or gone.
+        # Written first, because it reveals a full disk or a missing directory.
         write_stats_file(directory / name, stats)
-    # No other process writes beside an open monitor.
+    # While a monitor is open, no other process writes these files.
     with contextlib.nullcontext() if run else manifest_lock(directory, infix):
         if not is_own and is_locked(directory / lock_name(infix)):
             return None
-        # By their names: a folder may hold the files of thousands of monitors.
+        # By name, because a folder may contain the files of thousands of monitors.
         names = (manifest_name(infix), name, journal_name(infix))
         paths = [directory / each for each in names if (directory / each).exists()]
         results = MonitorResults(MonitorFiles(str(infix), paths))
@@ -147,7 +147,7 @@ def write_manifest_and_stats(
             try:
                 stats = results.stats()
             except UnreadableFile:
-                # They may be gone, and no journal be there.
+                # Accept missing statistics if there is no journal either.
                 if results.files.journal is not None:
                     raise
             else:
@@ -159,10 +159,10 @@ def write_manifest_and_stats(
 
 
 def manifest_lock(directory: Path, infix: Infix) -> Lock:
-    """Return the lock for writing a manifest, or a journal once its monitor is closed.
+    """Return the lock for writing a manifest, or a closed monitor's journal.
 
     Raises:
-        DirectoryNotWritable: there can be no lock in the directory.
+        DirectoryNotWritable: no lock can be created in the directory.
     """
     return wait_for_lock(directory / manifest_lock_name(infix))
 
@@ -173,7 +173,7 @@ def _manifest(directory: Path, infix: Infix, run: Run, *, stats_name: str) -> Ma
     keep, name, chosen = _keep(run), run.facts.get("schedule"), set(run.chosen)
     if keep is not None:
         name = f"keep:{keep.get('rule')}"
-        # A process that was killed had not chosen: what is there are candidates.
+        # A killed process had not made its choice: existing videos are candidates.
         names = [*(video for video, _ in finished), *broken]
         numbers = [*map(episode_of, names), *(e["episode_id"] for e in pending)]
         chosen.update(number for number in numbers if number is not None)
@@ -201,7 +201,7 @@ def _manifest(directory: Path, infix: Infix, run: Run, *, stats_name: str) -> Ma
 
 
 def _keep(run: Run) -> dict[str, Any] | None:
-    """Return what is said of the videos that are kept; None where all are."""
+    """Return the facts about the choice of kept videos; None if all are kept."""
     if run.keep is not None:
         return dict(run.keep)
     if run.facts.get("keep") is None:
@@ -217,10 +217,10 @@ def _keep(run: Run) -> dict[str, Any] | None:
 def finished_and_broken(
     directory: Path, infix: Infix | str, run: Run
 ) -> tuple[list[tuple[str, str]], list[str]]:
-    """Return finished videos, each with its metadata, and the metadata of broken ones.
+    """Return pairs of finished videos and their metadata, and metadata of broken ones.
 
-    A video of further cameras is there once its first video is, whose metadata comes
-    last of all. The tiled one of a vector environment is there by itself.
+    Videos from further cameras exist once the first camera's video does, because its
+    metadata is written last. A vector environment's tiled video does not depend on it.
     """
     names = {f"{video_prefix(infix, number)}.mp4" for number in run.filmed}
     finished: set[tuple[str, str]] = set()
@@ -243,7 +243,7 @@ def finished_and_broken(
 
 
 def _pending(directory: Path, infix: Infix, run: Run) -> list[Mapping[str, Any]]:
-    """Return how a manifest names the videos that are still to be rendered."""
+    """Return the manifest's entries for the videos that must still be rendered."""
     entries: list[Mapping[str, Any]] = [
         {
             "episode_id": number,
@@ -277,5 +277,5 @@ def _is_recorded(directory: Path, entry: Mapping[str, Any]) -> bool:
     try:
         return is_finished(path) or is_in_flight(path)
     except UnreadableFile:
-        # It may be in the list that cannot be read.
+        # The unreadable list may contain it.
         return True

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The results of all monitors of a directory, merged by time as gym merged them."""
+"""Merging of all monitors' results in a directory by time, as gym does."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from .monitor_files import monitors_of
 
 logger = logging.getLogger(__name__)
 
-# Of gym's `load_results`, in its order.
+# The keys of gym's `load_results`, in its order.
 _KEYS = (
     *("manifests", "env_info", "data_sources", "timestamps", "episode_lengths"),
     *("episode_rewards", "episode_types", "initial_reset_timestamps"),
@@ -27,20 +27,20 @@ _KEYS = (
 
 
 class MergedStats(NamedTuple):
-    """The episodes of several statistics files, in the order of their ends.
+    """The episodes of several statistics files, ordered by their ends.
 
     Attributes:
-        data_sources: for each episode the index of its file, which is also an index
-            into `initial_reset_timestamps`.
-        initial_reset_timestamps: for each file when its first reset began; None
-            where there was none.
-        timestamps: when each episode ended.
-        episode_lengths: steps of each episode.
+        data_sources: index of each episode's file, which is also an index into
+            `initial_reset_timestamps`.
+        initial_reset_timestamps: start time of each file's first reset; None if there
+            was no reset.
+        timestamps: end time of each episode.
+        episode_lengths: number of steps of each episode.
         episode_rewards: sum of the rewards of each episode.
-        episode_types: `"t"` or `"e"` for each episode; None where no file with
-            episodes in it has types.
-        initial_reset_timestamp: the first of all, of the files with episodes in
-            them; 0 where there are none.
+        episode_types: `"t"` or `"e"` for each episode; None if no file with episodes
+            has types.
+        initial_reset_timestamp: the earliest first reset of the files with episodes; 0
+            if there is none.
     """
 
     data_sources: list[int]
@@ -53,25 +53,25 @@ class MergedStats(NamedTuple):
 
 
 def load_results(directory: str | os.PathLike[str]) -> dict[str, Any] | None:
-    """Return the merged results of all monitors of a directory.
+    """Return the merged results of all monitors in a directory.
 
     The dictionary has gym's keys: `manifests`, `env_info`, `data_sources`,
     `timestamps`, `episode_lengths`, `episode_rewards`, `episode_types`,
-    `initial_reset_timestamps`, `initial_reset_timestamp` and `videos`. An item of
+    `initial_reset_timestamps`, `initial_reset_timestamp` and `videos`. An item in
     `data_sources` is an index into `manifests` and `initial_reset_timestamps`. `videos`
-    has pairs of video path and metadata path.
+    contains pairs of video path and metadata path.
 
-    A monitor that never closed (killed, or still open) counts with the episodes of its
-    journal, if these are more than in its statistics file. Without a manifest, the
-    journal's path is among `manifests`, and videos are those on disk and not broken.
-    Damaged lines of a journal are left out with a warning.
+    For a monitor that never closed (killed, or still open), the episodes in its journal
+    are used if there are more than in its statistics file. Without a manifest, the
+    journal's path is listed in `manifests`, and videos are those on disk that are not
+    broken. Damaged lines in a journal are skipped with a warning.
 
-    Monitors of different environments or versions give a warning, and `env_info` is the
-    newest one's. Missing videos are left out with a warning.
+    If monitors recorded different environments or versions, there is a warning, and
+    `env_info` is that of the newest one. Missing videos are left out with a warning.
 
     Returns:
-        The results. None, with an error in the log, if there is no such directory or
-        neither a manifest nor a journal in it.
+        The results. None, with an error in the log, if the directory does not exist or
+        contains neither a manifest nor a journal.
 
     Raises:
         UnreadableFile: a manifest or statistics file is missing or damaged, and there
@@ -79,15 +79,15 @@ def load_results(directory: str | os.PathLike[str]) -> dict[str, Any] | None:
     """
     directory = Path(directory)
     if not directory.is_dir():
-        logger.error("There is no directory %s.", directory)
+        logger.error("The directory %s does not exist.", directory)
         return None
     monitors = [
         each for each in monitors_of(directory) if each.manifest or each.journal
     ]
     if not monitors:
-        logger.error("There are no manifests in %s, and no journals.", directory)
+        logger.error("There are no manifests or journals in %s.", directory)
         return None
-    # In the order of the manifests' names, as gym has it.
+    # In the order of the manifests' names, as in gym.
     monitors.sort(key=lambda files: f"{files.infix}.manifest.json")
     kept = [_kept(MonitorResults(files)) for files in monitors]
     found = {
@@ -109,7 +109,7 @@ def merge_stats_files(paths: Iterable[str | os.PathLike[str]]) -> MergedStats:
 
 
 class _Kept(NamedTuple):
-    """What is kept of a monitor, of whose manifest that is a small part."""
+    """The part of a monitor's results that is kept in memory while merging."""
 
     path: str
     stats: StatsFile
@@ -128,7 +128,7 @@ def _kept(results: MonitorResults) -> _Kept:
 
 def _merge(files: Sequence[StatsFile]) -> MergedStats:
     rows = [row for source, stats in enumerate(files) for row in _rows(source, stats)]
-    # NaN, which is not less or greater than anything, comes last.
+    # NaN, which has no order, comes last.
     rows.sort(key=lambda row: (math.isnan(row[1]), row[1]))
     sources, times, lengths, rewards, types = (
         [row[column] for row in rows] for column in range(5)
@@ -150,8 +150,8 @@ def _merge(files: Sequence[StatsFile]) -> MergedStats:
 
 
 def _rows(source: int, stats: StatsFile) -> Iterable[tuple[Any, ...]]:
-    # Before there were types every episode was a training episode. Gym noted a type
-    # at each reset, also of an episode that never ended, so there may be more.
+    # In files without types, every episode is a training episode. gym noted a type at
+    # each reset, even for episodes that never ended, so there may be more types.
     types = (
         itertools.repeat("t") if stats.episode_types is None else stats.episode_types
     )
@@ -166,7 +166,7 @@ def _rows(source: int, stats: StatsFile) -> Iterable[tuple[Any, ...]]:
 
 
 def _env_info(directory: Path, monitors: Sequence[_Kept]) -> dict[str, Any]:
-    # Of a killed monitor there may be nothing left that says it.
+    # A killed monitor may have left no file that contains it.
     known = [each for each in monitors if each.env_info is not None]
     if not known:
         return {"gym_version": GYM_VERSION}
@@ -176,8 +176,8 @@ def _env_info(directory: Path, monitors: Sequence[_Kept]) -> dict[str, Any]:
         values.setdefault(repr(dict(each.env_info or {})), []).append(each.path)
     if len(values) > 1:
         logger.warning(
-            "The monitors of %s recorded different things: %s. Their results are "
-            "merged; env_info is that of %s.",
+            "The monitors in %s recorded different environments or versions: %s. Their "
+            "results are merged; env_info is that of %s.",
             directory,
             "; ".join(f"{Path(p[0]).name} has {value}" for value, p in values.items()),
             Path(newest.path).name,
@@ -199,7 +199,7 @@ def _videos(directory: Path, monitors: Sequence[_Kept]) -> list[tuple[str, str]]
     gone = [video.name for video, _ in listed if not video.is_file()]
     if gone:
         logger.warning(
-            "%d of %d videos listed in the manifests of %s are gone and left out: %s",
+            "%d of %d videos in the manifests in %s are missing and left out: %s",
             len(gone),
             len(listed),
             directory,
@@ -209,7 +209,7 @@ def _videos(directory: Path, monitors: Sequence[_Kept]) -> list[tuple[str, str]]
 
 
 def _names_of_videos(results: MonitorResults) -> list[tuple[str, str]]:
-    """Return what the manifest lists; where it is older, what is there."""
+    """Return the videos that the manifest lists or, if outdated, those on disk."""
     manifest, journal = results.manifest, results.files.journal
     if manifest is not None and not results.is_behind:
         return list(dict.fromkeys(manifest.videos))

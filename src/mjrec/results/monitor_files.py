@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The files of a directory, monitor by monitor: found, sorted, and removed."""
+"""Finding, sorting and removing a directory's files, monitor by monitor."""
 
 from __future__ import annotations
 
@@ -33,24 +33,24 @@ class MonitorFiles:
     """The files of one monitor.
 
     Args:
-        infix: what their names have in common.
+        infix: the infix that their names share.
         paths: the files.
-        in_flight: the files that recordings in flight will become.
+        in_flight: the files that recordings in progress will become.
 
     Attributes:
-        infix: as given.
-        paths: as given.
-        manifest: its manifest, where there is one; likewise:
-        stats: its statistics file.
-        journal: its journal.
-        lock: what it claimed its infix with; it is left where the monitor was killed.
-        videos: its videos, by the numbers of their episodes.
-        metadata: their metadata, likewise.
-        trajectories: the own files of recorded states, likewise; also what is in
-            flight, or in a bundle.
-        logs: its row logs; one counts as long as a file beside it is left.
-        last_episode_id: the highest number of an episode in a name, also of a file
-            that was never finished; -1 where there is none.
+        infix: the infix that the files' names share.
+        paths: the files.
+        manifest: the manifest, if it exists.
+        stats: the statistics file, if it exists.
+        journal: the journal, if it exists.
+        lock: the lock that claims the infix, if it exists; a killed monitor leaves it.
+        videos: the videos, by episode number.
+        metadata: the videos' metadata, by episode number.
+        trajectories: the trajectories, by episode number, including those that are in
+            progress or in a bundle.
+        logs: the row logs; a log is included as long as one of its files remains.
+        last_episode_id: the highest episode number in a file name, including unfinished
+            files; -1 if there is none.
     """
 
     def __init__(
@@ -77,13 +77,13 @@ class MonitorFiles:
         Raises:
             OSError: the lock cannot be opened.
         """
-        # Locks that are no monitor's are called alike.
+        # Other locks have similar names.
         is_monitor = Infix.parse(self.infix) is not None
         return is_monitor and self.lock is not None and is_locked(self.lock)
 
     def _sort_in(self, path: Path) -> None:
         number = episode_of(path.name)
-        # A name may hold any number of digits, and be anybody's.
+        # The name may be a stranger's, with any number of digits.
         if number is not None and number < MOST_EPISODES:
             self.last_episode_id = max(self.last_episode_id, number)
         video = VideoName.parse(path.name)
@@ -112,10 +112,10 @@ class MonitorFiles:
 
 
 def monitors_of(directory: Path) -> list[MonitorFiles]:
-    """Return the files of each monitor, hidden ones too, in the order of the infixes.
+    """Return each monitor's files, including hidden ones, sorted by infix.
 
-    Files that recordings in flight will become are among their trajectories, and
-    monitors with nothing but a lock or an unfinished file among them.
+    Trajectories include the files that recordings in progress will become. Monitors
+    that have only a lock or an unfinished file are included.
     """
     files, in_flight = (
         _by_infix(iter_monitor_files(directory, hidden=True)),
@@ -128,8 +128,9 @@ def monitors_of(directory: Path) -> list[MonitorFiles]:
 
 
 def files_of(directory: Path, infix: Infix) -> MonitorFiles:
-    """Return the files of one monitor as they are now, hidden ones too."""
-    # Many names are compared, of whole directories, once for each dead monitor.
+    """Return the current files of one monitor, including hidden ones."""
+    # Test for the infix first: all names in the directory are compared, once for each
+    # dead monitor.
     own = f".{infix}."
     names = [n for n in names_in(directory) if own in n and infix_of(n) == str(infix)]
     paths = [path for n in sorted(names) if (path := directory / n).is_file()]
@@ -149,7 +150,7 @@ def _order(infix: str) -> tuple[int, int, int, str]:
     parsed = Infix.parse(infix)
     if parsed is None:
         return (1, 0, 0, infix)
-    # Process ids are numbers: 9 comes before 10.
+    # Process ids are compared as numbers: 9 comes before 10.
     number = int(parsed.uid) if parsed.uid.isdecimal() else 0
     return (0, parsed.monitor_id, number, parsed.uid)
 
@@ -159,11 +160,12 @@ def detect_training_manifests(
 ) -> list[str]:
     """Return the paths of the manifests in `directory`, sorted.
 
-    Unfinished files and similar names are left out. A missing directory has none.
+    Unfinished files and files with similar names are left out. For a missing directory
+    the list is empty.
 
     Args:
-        directory: where to look, not below it.
-        files: names to choose from, instead of the directory's.
+        directory: the directory to search; its subdirectories are not searched.
+        files: names to choose from, instead of those in the directory.
     """
     directory = Path(directory)
     if files is None:
@@ -180,23 +182,23 @@ def detect_monitor_files(directory: str | os.PathLike[str]) -> list[str]:
 
 
 def clear_monitor_files(directory: str | os.PathLike[str]) -> None:
-    """Remove the files of all monitors in `directory`, also unfinished ones.
+    """Remove the files of all monitors in `directory`, including unfinished ones.
 
-    Also removes links to their videos (`rl-video-episode-27.mp4`), and nothing else: no
+    Also removes links to their videos (`rl-video-episode-27.mp4`), but nothing else: no
     directory, and no other file with a similar name.
 
     Raises:
-        DirectoryInUse: a monitor there is open. Nothing was removed.
+        DirectoryInUse: a monitor in the directory is open; nothing was removed.
     """
     paths = list(iter_monitor_files(Path(directory), hidden=True))
     for path in paths:
         if path.suffix == ".lock" and is_locked(path):
             raise DirectoryInUse(
-                f"Cannot clear {directory}: a monitor that is still open writes there "
-                f"(it holds {path.name}). Close it first, or use another directory."
+                f"Cannot clear {directory}: an open monitor is writing to it (it holds "
+                f"{path.name}). Close the monitor first, or use another directory."
             )
-    # Names that would lead nowhere first, then manifests and journals: if this is
-    # interrupted, none lists what is gone.
+    # Remove links first, then manifests and journals, so that after an interruption
+    # nothing refers to missing files.
     listings_first = sorted(paths, key=lambda path: not _is_listing(path.name))
     for path in (*_second_names(Path(directory), paths), *listings_first):
         path.unlink(missing_ok=True)
@@ -204,8 +206,8 @@ def clear_monitor_files(directory: str | os.PathLike[str]) -> None:
 
 
 def _second_names(directory: Path, paths: Iterable[Path]) -> list[Path]:
-    """Return the other names in a directory of these files."""
-    # A link's target is not the monitor's file.
+    """Return the other names that these files have in the directory."""
+    # If a listed path is itself a link, its target is not the monitor's file.
     files = {file for path in paths if (file := _file(path, follow=False))}
     return [
         path
@@ -215,7 +217,7 @@ def _second_names(directory: Path, paths: Iterable[Path]) -> list[Path]:
 
 
 def _file(path: Path, *, follow: bool) -> tuple[int, int] | None:
-    """Return which file a name leads to; None where it leads to none."""
+    """Return the identity of the file at a path; None if it does not exist."""
     try:
         stat = path.stat(follow_symlinks=follow)
     except OSError:

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A run, as its journal tells it.
+"""The state of a run, built from the events in its journal.
 
-The monitor adds each event to its `Run` when it writes it down; every other process
-reads the same events from the journal. So results and manifests that are made while the
-run goes on and years later follow from the same facts.
+The monitor adds each event to its `Run` when it writes the event to the journal; other
+processes read the same events from there. So results and manifests are based on the
+same facts, whether they are created during the run or years later.
 """
 
 from __future__ import annotations
@@ -19,30 +19,30 @@ from ..formats.json_fields import base_name
 from ..formats.manifest import Manifest
 from ..formats.monitor_directory import episode_of
 
-# `scope` of a choice that was made among the episodes of several monitors.
+# The `scope` of a choice among the episodes of several monitors.
 EVALUATION = "evaluation"
 
 
 @dataclass
 class Run:
-    """What is known of a run.
+    """The facts known about a run.
 
     Attributes:
-        facts: what the journal's first line says: `env_info`, `schedule` (its name),
-            `keep` (`rule`), `first_episode_id`, `versions`, and `views`,
-            what the names of further cameras' videos have before their ending.
-        provenance: its provenance; None where that is not known.
-        count: how many episodes were completed.
-        last_episode_id: the highest number of an episode that has begun; -1 before.
+        facts: the facts in the journal's first line: `env_info`, `schedule` (its name),
+            `keep` (`rule`), `first_episode_id`, `versions`, and `views` (the parts
+            before the ending in the names of further cameras' videos).
+        provenance: the run's provenance; None if unknown.
+        count: number of completed episodes.
+        last_episode_id: the highest number of a started episode; -1 if there is none.
         chosen: the episodes that the schedule chose.
-        filmed: those that have a video of their own, or will have one.
-        deferred: those of them whose video is to be rendered from their states.
-        clips: the clips, by the names of their videos. One that is to be rendered says
-            what its first part is called, `clip`.
-        faults: what could not be recorded.
-        keep: the latest word on which videos are kept; None before there is one.
-        dropped: episodes whose video fell out, though their trajectory stays.
-        recovered: another process has put it in order.
+        filmed: the episodes that have, or will have, their own video.
+        deferred: the filmed episodes whose video is rendered from their states.
+        clips: the clips, by video name. For a clip that must be rendered, `clip` is the
+            name of its first part.
+        faults: the parts of the run that could not be recorded.
+        keep: the latest choice of the videos to keep; None before the first choice.
+        dropped: episodes whose video was dropped, although their trajectory is kept.
+        recovered: whether another process has recovered the run.
     """
 
     facts: Mapping[str, Any] = field(default_factory=dict)
@@ -60,10 +60,10 @@ class Run:
 
     @classmethod
     def read(cls, journal: Path) -> Run:
-        """Return the run of a journal.
+        """Read a run from its journal.
 
         Raises:
-            UnreadableFile: there is no such file, or it cannot be read.
+            UnreadableFile: the journal does not exist or cannot be read.
         """
         run = cls()
         reader = JournalReader(journal, on_event=run.note)
@@ -74,7 +74,7 @@ class Run:
 
     @classmethod
     def of_manifest(cls, manifest: Manifest) -> Run:
-        """Return what a manifest says of a run whose journal is gone."""
+        """Rebuild a run from its manifest, when the journal is lost."""
         details = manifest.mjrec or {}
         schedule, keep = details.get("schedule") or {}, details.get("keep")
         recorded = schedule.get("recorded") or ()
@@ -115,16 +115,16 @@ class Run:
         return self.deferred - self.dropped
 
     def begin(self, number: int, *, chosen: bool) -> None:
-        """Take note of an episode that has begun; the journal hears of its end."""
+        """Add a started episode, which the journal lists only when it ends."""
         self._add(number, chosen, None)
 
     def add(self, entry: JournalEntry) -> None:
-        """Take note of a completed episode."""
+        """Add a completed episode."""
         self.count += 1
         self._add(entry.episode_id, entry.chosen, entry.recording)
 
     def note(self, kind: str, facts: Any) -> None:
-        """Take note of another event; one that makes no sense says nothing."""
+        """Add any other event; an invalid event is ignored."""
         match kind, facts:
             case "run", dict():
                 self.facts = facts
@@ -144,7 +144,7 @@ class Run:
             case "keep", dict():
                 self.keep = facts
                 if facts.get("scope") == EVALUATION:
-                    # Each was chosen when it had ended, and promised nothing before.
+                    # These were chosen only after they had ended.
                     for number in facts.get("recorded") or ():
                         self._add(number, None, facts.get("recording"))
             case "closed", {"next_episode_id": int(following)}:

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Notifying experiment trackers of finished episodes and videos.
+"""Experiment trackers, which are notified of finished episodes and videos.
 
-`mjrec.Monitor(..., trackers=...)` takes one of these, or several. To make one for
-another service, subclass `Tracker` and override what it is to hear of. Importing this
-package imports none of the services' packages.
+`mjrec.Monitor(..., trackers=...)` takes one or more of these. To support another
+service, subclass `Tracker` and override the methods for the events you need. Importing
+this package does not import the services' packages.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ def __getattr__(name: str) -> Any:
     if name not in _LAZY:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     value = getattr(importlib.import_module(f".{_LAZY[name]}", __name__), name)
-    # Kept, so that later uses cost nothing.
+    # Cached, so that later uses cost nothing.
     globals()[name] = value
     return value
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""New files that grow by whole pieces."""
+"""New files that grow by complete pieces."""
 
 from __future__ import annotations
 
@@ -12,17 +12,18 @@ from ..formats.appending import append_whole, open_for_appending
 
 
 class AppendOnlyFile:
-    """A new file, to which a piece is added whole or not at all, and at once.
+    """A new file to which whole pieces are appended immediately.
 
-    Half a row would be read as another one, and nothing behind half a record would be
-    read. What is added outlives this process.
+    A piece is appended completely or not at all: half a row would be read as a
+    different row, and nothing after half a record would be read. Appended pieces
+    survive the end of this process.
 
     Args:
-        names: of these, the first that is not there yet; each is given once.
-            Their directory is made.
+        names: candidate paths; the first that does not exist is created, together with
+            its directory. It may be an iterator.
 
     Raises:
-        DirectoryNotWritable: the directory cannot be made or written to.
+        DirectoryNotWritable: the directory cannot be created or written to.
 
     Attributes:
         path: the file.
@@ -39,13 +40,13 @@ class AppendOnlyFile:
                 raise DirectoryNotWritable(path.parent, error.strerror) from error
             self.path = path
             return
-        raise ValueError("names must hold a free one")
+        raise ValueError("names must contain a name that is not in use")
 
     def append(self, piece: bytes) -> None:
-        """Add `piece`.
+        """Append `piece`.
 
         Raises:
-            FileNotWritten: it has no room; the file is as it was before.
+            FileNotWritten: there is no room for it; the file is unchanged.
         """
         try:
             append_whole(self._file.fileno(), piece)
@@ -58,10 +59,10 @@ class AppendOnlyFile:
 
 
 def make_directory(directory: Path) -> None:
-    """Make a directory, and those above it, where they are not there.
+    """Create a directory and its parents, if they do not exist.
 
     Raises:
-        DirectoryNotWritable: it cannot be made.
+        DirectoryNotWritable: the directory cannot be created.
     """
     try:
         directory.mkdir(parents=True, exist_ok=True)

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""TensorBoard's event files, written by its own package.
+"""TensorBoard event files, written with TensorBoard's own package.
 
-Its `EventFileWriter` is not used: it has a thread that a fork would leave behind,
-writes from time to time only, and loads TensorFlow where that is installed. Import this
-module only where tensorboard is known to be there.
+Its `EventFileWriter` is not used: it has a thread that a forked process would lack,
+writes only from time to time, and loads TensorFlow if that is installed. Import this
+module only if tensorboard is known to be installed.
 """
 
 from __future__ import annotations
@@ -24,22 +24,22 @@ from tensorboard.summary.writer.record_writer import RecordWriter
 from ..errors import DirectoryNotWritable
 from .append_only_file import AppendOnlyFile, make_directory
 
-# Where a GIF has its width and height.
+# Format and offset of the width and height in a GIF.
 _GIF_SIZE = struct.Struct("<HH")
 _GIF_SIZE_AT = 6
 
 
 class EventFile:
-    """An event file in a new directory, in which each event is at once.
+    """An event file in a new directory, to which events are written immediately.
 
-    Several threads may write.
+    Several threads may write at the same time.
 
     Args:
-        directory: to be made. Where it is there, it gets a number behind its name:
-            TensorBoard stops reading the first of two files of one directory.
+        directory: the directory to create. If it exists, a number is added to its name,
+            because TensorBoard stops reading the first of two files in a directory.
 
     Raises:
-        DirectoryNotWritable: the directory cannot be made.
+        DirectoryNotWritable: the directory cannot be created.
         FileNotWritten: the disk is full.
     """
 
@@ -58,13 +58,13 @@ class EventFile:
     def write_scalars(
         self, values: Mapping[str, float], *, step: int, wall_time: float
     ) -> None:
-        """Write numbers by their tags."""
+        """Write scalars, by tag."""
         pairs = values.items()
         summaries = [summary_pb2.Summary.Value(tag=k, simple_value=v) for k, v in pairs]
         self._write_summary(*summaries, step=step, wall_time=wall_time)
 
     def write_gif(self, tag: str, gif: bytes, *, step: int, wall_time: float) -> None:
-        """Write an animation."""
+        """Write an animated GIF."""
         width, height = _GIF_SIZE.unpack_from(gif, _GIF_SIZE_AT)
         image = summary_pb2.Summary.Image(
             height=height, width=width, colorspace=3, encoded_image_string=gif
@@ -73,7 +73,7 @@ class EventFile:
         self._write_summary(value, step=step, wall_time=wall_time)
 
     def write_text(self, tag: str, text: str, *, step: int, wall_time: float) -> None:
-        """Write a text, which is shown as Markdown."""
+        """Write text, which TensorBoard shows as Markdown."""
         tensor = tensor_pb2.TensorProto(
             dtype=types_pb2.DT_STRING, string_val=[text.encode()]
         )
@@ -92,7 +92,7 @@ class EventFile:
         self._write(event_pb2.Event(wall_time=wall_time, step=step, summary=summary))
 
     def _write(self, event: event_pb2.Event) -> None:
-        # In memory: the check sum of a large one takes a while.
+        # In memory, outside the lock: the checksum of a large record takes a while.
         record = io.BytesIO()
         RecordWriter(record).write(event.SerializeToString())
         with self._lock:

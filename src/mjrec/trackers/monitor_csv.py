@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Stable-Baselines3's `monitor.csv`, for its readers and plots.
+"""Stable-Baselines3's `monitor.csv` format, for its readers and plots.
 
 ::
 
@@ -7,8 +7,8 @@
     r,l,t
     21.5,14,0.93
 
-`r` is the sum of the rewards, `l` the number of steps, and `t` the end of the episode
-in seconds since `t_start`, which is wall clock.
+`r` is the sum of the rewards, `l` the number of steps, and `t` the episode's end in
+seconds since `t_start`, which is wall-clock time.
 """
 
 from __future__ import annotations
@@ -24,23 +24,23 @@ from ..formats.monitor_directory import FILE_PREFIX
 from ..recorder.tracking import FinishedEpisode, Run, Tracker
 from .append_only_file import AppendOnlyFile
 
-# What Stable-Baselines3 looks for: every file of a directory whose name ends so.
+# Stable-Baselines3 reads every file in a directory whose name ends like this.
 _ENDING = "monitor.csv"
 
 
 class MonitorCsvTracker(Tracker):
-    """Writes files for `stable_baselines3.common.monitor.load_results`.
+    """A tracker that writes files for `stable_baselines3.common.monitor.load_results`.
 
     Each run has its own file: every sub-environment, and every run that adds to earlier
-    recordings. `load_results` reads all files of a directory and orders episodes by
-    their ends. An existing file is never changed. A row is on disk, whole, as soon as
-    its episode has ended.
+    recordings. `load_results` reads all files in a directory and orders episodes by
+    their ends. An existing file is never changed. An episode's complete row is on disk
+    as soon as the episode has ended.
 
     Args:
-        path: an existing directory, or a file name, to which `.monitor.csv` is added
-            unless it ends in `monitor.csv`, and a number if it exists:
-            `logs/a.monitor.csv`, `logs/a.1.monitor.csv` ... None is the monitor
-            directory. In a directory the name is
+        path: an existing directory or a file name. `.monitor.csv` is added to a file
+            name that does not end in `monitor.csv`, and a number if the file exists:
+            `logs/a.monitor.csv`, `logs/a.1.monitor.csv` ... None means the monitor
+            directory. In a directory, the file's name is
             `openaigym.results.<infix>.monitor.csv`.
         clock: returns the time, in seconds since the epoch.
     """
@@ -51,16 +51,16 @@ class MonitorCsvTracker(Tracker):
         *,
         clock: Callable[[], float] = time.time,
     ) -> None:
-        # Absolute, because the working directory may be another one by then.
+        # Absolute, because the working directory may change before the path is used.
         self._path = None if path is None else Path(path).absolute()
         self._clock = clock
         self._files: dict[Run, tuple[AppendOnlyFile, float]] = {}
 
     def begin(self, run: Run) -> None:
-        """Make the run's file.
+        """Create the run's file.
 
         Raises:
-            DirectoryNotWritable: the directory cannot be made or written to.
+            DirectoryNotWritable: the directory cannot be created or written to.
             FileNotWritten: the disk is full.
         """
         file, t_start = AppendOnlyFile(self._names(run)), self._clock()
@@ -72,11 +72,11 @@ class MonitorCsvTracker(Tracker):
         """Write the episode's row.
 
         Raises:
-            FileNotWritten: the disk is full; the file is as it was before.
+            FileNotWritten: the disk is full; the file is unchanged.
         """
         file, t_start = self._files[run]
         seconds = round(episode.end_time - t_start, 6)
-        # NumPy's numbers would be written with their types.
+        # `repr` of NumPy's numbers would include their types.
         row = float(episode.reward), int(episode.length), float(seconds)
         file.append((",".join(map(repr, row)) + "\n").encode())
 
@@ -86,12 +86,12 @@ class MonitorCsvTracker(Tracker):
         file.close()
 
     def _names(self, run: Run) -> Iterator[Path]:
-        """Yield the names that the run's file may have, best first."""
+        """Yield candidate paths for the run's file, preferred ones first."""
         path = run.directory if self._path is None else self._path
         if path == run.directory or path.is_dir():
             path /= f"{FILE_PREFIX}.results.{run.infix}.{_ENDING}"
         base = path.name.removesuffix(_ENDING).removesuffix(".")
         yield path.with_name(f"{base}.{_ENDING}" if base else _ENDING)
         for number in itertools.count(1):
-            # A name without a base is given by the number.
+            # Without a base, the name starts with the number.
             yield path.with_name(f"{base}.{number}.{_ENDING}".removeprefix("."))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the services get of an episode, and under which names."""
+"""The values that services log for an episode, and their names."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from ..recorder.tracking import FinishedEpisode, FinishedVideo
 
 
 def require(package: str, *, purpose: str) -> None:
-    """Import a service's package, which is also the name of our extra.
+    """Import a service's package, which has the same name as mjrec's extra for it.
 
     Raises:
-        MissingDependency: it is not installed.
+        MissingDependency: the package is not installed.
     """
     try:
         importlib.import_module(package)
     except ModuleNotFoundError as error:
-        # One that is installed and lacks something itself is another matter.
+        # The package itself is installed, but one of its dependencies is missing.
         if error.name != package:
             raise
         raise MissingDependency(
@@ -27,12 +27,12 @@ def require(package: str, *, purpose: str) -> None:
 
 
 def group_of(episode: FinishedEpisode | None) -> str:
-    """Return what comes before the slash; of no episode, that of training."""
+    """Return the tag's part before the slash; without an episode, it is `training`."""
     return "evaluation" if episode and episode.type == "e" else "training"
 
 
 def scalars_of(episode: FinishedEpisode) -> dict[str, float]:
-    """Return an episode's numbers by their names."""
+    """Return an episode's scalars by name."""
     scalars = {"return": float(episode.reward), "length": float(episode.length)}
     if episode.success is not None:
         scalars["success"] = float(episode.success)
@@ -40,5 +40,8 @@ def scalars_of(episode: FinishedEpisode) -> dict[str, float]:
 
 
 def name_of(video: FinishedVideo) -> str:
-    """Return what comes behind the slash: `video`, or `video_side` of a further one."""
+    """Return the tag's part after the slash.
+
+    It is `video`, or `video_<view>` for a further camera or a tiled video.
+    """
     return f"video_{video.view}" if video.view else "video"

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""TensorBoard: curves of the episodes, and the videos as animations."""
+"""TensorBoard tracker: curves of episode results, and videos as animations."""
 
 from __future__ import annotations
 
@@ -20,34 +20,35 @@ from .services import group_of, name_of, require, scalars_of
 if TYPE_CHECKING:
     from .event_file import EventFile
 
-# Videos that wait for their previews.
+# The maximum number of videos that wait for their previews.
 _MOST_WAITING = 100
 _MOST_BYTES = 2 << 20
-# Of the longer side, in pixels. The last is small enough for any hundred frames.
+# Lengths of a preview's longer side in pixels, tried in order until the GIF is small
+# enough. With the last one, any 100 frames fit.
 _SIDES = (320, 160, 80)
 _MOST_PICTURES = 100
-# In hundredths of a second, the format's unit.
+# The shortest time per frame, in the format's unit of 1/100 s.
 _SHORTEST_DELAY = 5
-# So many frames hold forty key frames and more, which are decoded in no time.
+# A video with this many frames has at least 40 key frames. Decoding only these is fast.
 _MANY_FRAMES = 10_000
 
 
 class TensorBoardTracker(Tracker):
-    """Writes event files for TensorBoard.
+    """A tracker that writes event files for TensorBoard.
 
-    Scalars over the steps of the run: `training/return`, `training/length` and, if the
-    environment reports it, `training/success`; evaluation episodes use `evaluation/`.
-    TensorBoard cannot play videos (its issue 39), so each mp4 is shown as a small
-    animated GIF, `training/video` under Images, with its name under Text. A thread
-    makes the GIF from the file.
+    Scalars are logged over the steps of the run: `training/return`, `training/length`
+    and, if the environment reports it, `training/success`. Evaluation episodes use
+    `evaluation/`. TensorBoard cannot play videos (its issue 39), so each mp4 is shown
+    as a small animated GIF, `training/video` under Images, with its file name under
+    Text. The GIFs are created on a separate thread.
 
-    Each monitor, so each sub-environment too, is a TensorBoard run in its own
+    Each monitor, and thus each sub-environment, is a TensorBoard run with its own
     directory, because TensorBoard reads only one of several growing files in a
-    directory. Events are on disk at once.
+    directory. Events are written to disk immediately.
 
     Args:
-        log_dir: parent of the runs' directories. None is `tensorboard` in the monitor
-            directory. A run is named `<infix>` there, and `<monitor directory's
+        log_dir: parent of the runs' directories. None means `tensorboard` in the
+            monitor directory. A run is named `<infix>` there, and `<monitor directory's
             name>.<infix>` in a `log_dir`, followed by `.env<i>` for a sub-environment.
 
     Raises:
@@ -56,15 +57,15 @@ class TensorBoardTracker(Tracker):
 
     def __init__(self, log_dir: str | os.PathLike[str] | None = None) -> None:
         require("tensorboard", purpose="TensorBoardTracker")
-        # Absolute, because the working directory may be another one by then.
+        # Absolute, because the working directory may change before the path is used.
         self._log_dir = None if log_dir is None else Path(log_dir).absolute()
         self._runs: dict[Run, _TensorBoardRun] = {}
 
     def begin(self, run: Run) -> None:
-        """Make the run's event file.
+        """Create the run's event file.
 
         Raises:
-            DirectoryNotWritable: its directory cannot be made.
+            DirectoryNotWritable: its directory cannot be created.
             FileNotWritten: the disk is full.
         """
         self._runs[run] = _TensorBoardRun(self._directory(run))
@@ -78,11 +79,11 @@ class TensorBoardTracker(Tracker):
         self._runs[run].write_episode(episode)
 
     def video(self, run: Run, video: FinishedVideo) -> None:
-        """Write the video's name, and start making its preview.
+        """Write the video's name, and start creating its preview.
 
         Raises:
             FileNotWritten: the disk is full.
-            EncoderError: ffmpeg failed at the preview of this or an earlier video.
+            EncoderError: ffmpeg failed to create this or an earlier video's preview.
             UnreadableFile: the video's metadata is damaged.
         """
         self._runs[run].write_video(video)
@@ -91,7 +92,7 @@ class TensorBoardTracker(Tracker):
         """Wait for the previews, and close the run's event file.
 
         Raises:
-            Error: as `video`, of the previews that were still to be made.
+            Error: one of the remaining previews failed, see `video`.
         """
         self._runs.pop(run).close()
 
@@ -99,20 +100,20 @@ class TensorBoardTracker(Tracker):
         name = run.infix if run.env_index is None else f"{run.infix}.env{run.env_index}"
         if self._log_dir is None:
             return run.directory / "tensorboard" / name
-        # Two monitors of one process have the same infix in their two directories.
+        # Monitors of one process may have the same infix in different directories.
         return self._log_dir / f"{run.directory.name}.{name}"
 
 
 class _TensorBoardRun:
-    """The event file of a run, and the thread that makes previews for it."""
+    """A run's event file, and the thread that creates its previews."""
 
     def __init__(self, directory: Path) -> None:
-        # Not at the top: it imports tensorboard.
+        # Imported late, because it imports tensorboard.
         from .event_file import EventFile
 
         self._file: EventFile = EventFile(directory)
         self._last_episode: FinishedEpisode | None = None
-        # Started by the first video; most runs of a vector environment have none.
+        # Started by the first video; most runs of a vector environment have no video.
         self._previews: WorkerThread[Callable[[], None]] | None = None
 
     def write_episode(self, episode: FinishedEpisode) -> None:
@@ -158,18 +159,18 @@ class _TensorBoardRun:
 
 
 def animated_gif(path: Path, *, frame_count: int, fps: Fraction) -> bytes:
-    """Return a video as a GIF of at most 100 frames and two megabytes.
+    """Convert a video to a looping GIF of at most 100 frames and two megabytes.
 
-    It lasts as long as the video, and is played again and again; a long one shows few
-    frames a second. The longer side has 320 pixels at most.
+    The GIF has the video's duration, so that of a long video shows few frames per
+    second. Its longer side has at most 320 pixels.
 
     Args:
         path: the video.
-        frame_count: how many frames it has.
-        fps: how many a second.
+        frame_count: its number of frames.
+        fps: its frames per second.
 
     Raises:
-        EncoderError: ffmpeg failed, or hangs.
+        EncoderError: ffmpeg failed or hangs.
     """
     delay = _delay(frame_count, fps)
     for side in _SIDES:
@@ -186,9 +187,9 @@ def _delay(frame_count: int, fps: Fraction) -> int:
 
 def _convert(path: Path, *, side: int, delay: int, frame_count: int) -> bytes:
     skipping = ["-skip_frame", "nokey"] if frame_count >= _MANY_FRAMES else []
-    # A palette of the video's own; only changes are stored.
+    # With a palette computed from the video; only changes are stored.
     filters = (
-        # Up, so that even the shortest video has a frame.
+        # Rounded up, so that even the shortest video has a frame.
         f"fps=100/{delay}:round=up,"
         f"scale=min(iw\\,{side}):min(ih\\,{side})"
         ":force_original_aspect_ratio=decrease:flags=area,"
@@ -202,5 +203,5 @@ def _convert(path: Path, *, side: int, delay: int, frame_count: int) -> bytes:
             *("-an", "-filter_complex", filters, "-frames:v", str(_MOST_PICTURES)),
             *("-loop", "0", "-f", "gif", "pipe:1"),
         ],
-        what=f"No preview could be made of {path}.",
+        what=f"Could not create a preview of {path}.",
     )

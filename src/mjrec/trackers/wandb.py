@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Weights & Biases: curves of the episodes, and the videos themselves."""
+"""Weights & Biases tracker: curves of episode results, and the videos themselves."""
 
 from __future__ import annotations
 
@@ -15,28 +15,29 @@ _VIDEO_STEPS = "video_total_steps"
 
 
 class WandbTracker(Tracker):
-    """Logs to a run of Weights & Biases.
+    """A tracker that logs to a Weights & Biases run.
 
-    Over the steps of the run, `training/total_steps`: `training/return`,
-    `training/length` and, if the environment reports it, `training/success`; evaluation
-    episodes use `evaluation/`, sub-environments `training/env<i>/`. Each mp4 is
-    uploaded as `training/video`, over `training/video_total_steps`, because a deferred
-    video comes later than the next episodes.
+    `training/return`, `training/length` and, if the environment reports it,
+    `training/success` are logged over the steps of the run, `training/total_steps`.
+    Evaluation episodes use `evaluation/`, sub-environments `training/env<i>/`. Each mp4
+    is uploaded as `training/video`, over `training/video_total_steps`, because a
+    deferred video is finished after later episodes.
 
-    Each call takes W&B's next step. W&B drops data with a lower step, so code that logs
+    Each call uses W&B's next step. W&B drops data with a lower step, so code that logs
     to the same run with `step=` should use `run.define_metric` instead.
 
     Args:
-        run: from `wandb.init`; it stays open. None is the run that is active when the
-            first monitor begins, if there are no other arguments; else a new one, which
-            is finished with the last monitor.
-        project: of the new run, as in `wandb.init`.
-        mode: of the new run, as in `wandb.init`, such as `"offline"`.
+        run: a run from `wandb.init`, which stays open. If None and no other arguments
+            are given, the run that is active when the first monitor starts is used, if
+            any. Otherwise a new run is created, and finished with the last monitor.
+        project: the new run's project, as in `wandb.init`.
+        mode: the new run's mode, as in `wandb.init`, such as `"offline"`.
         **init: other arguments of `wandb.init`.
 
     Raises:
         MissingDependency: wandb is not installed.
-        InvalidArgument: both a run and arguments for a new one are given.
+        InvalidArgument: `run` is not a W&B run, or is given together with arguments for
+            a new one.
     """
 
     def __init__(
@@ -52,16 +53,16 @@ class WandbTracker(Tracker):
         self._init = {k: v for k, v in named.items() if v is not None} | init
         if run is not None and self._init:
             raise InvalidArgument(
-                "WandbTracker takes a run, or how to make one, not both; got a run and "
-                f"{', '.join(self._init)}."
+                "WandbTracker takes either a run or the arguments for a new one, got a "
+                f"run and {', '.join(self._init)}."
             )
         if run is not None and not callable(getattr(run, "define_metric", None)):
             raise InvalidArgument(
-                "WandbTracker takes a run as wandb.init returns it, or project= and "
-                f"other arguments to make one, got {run!r}."
+                "WandbTracker takes a run from wandb.init, or project= and other "
+                f"arguments for a new one, got {run!r}."
             )
         self._given = run
-        # The run of W&B while there are monitors, and the process that is to finish it.
+        # W&B's run while monitors are open, and the process that must finish it.
         self._service: Any = None
         self._owner: int | None = None
         self._axes: set[str] = set()
@@ -81,8 +82,8 @@ class WandbTracker(Tracker):
         self._log(group, {_STEPS: episode.total_steps, **scalars_of(episode)})
 
     def video(self, run: Run, video: FinishedVideo) -> None:
-        """Log the file; W&B copies it."""
-        # Not at the top: importing this module imports no service.
+        """Log the file, which W&B copies."""
+        # Imported late, so that importing this module does not import wandb.
         import wandb
 
         episode = video.episode or self._last_episodes[run]
@@ -100,7 +101,7 @@ class WandbTracker(Tracker):
         if self._last_episodes:
             return
         service, self._service = self._service, None
-        # A forked child would end its parent's.
+        # A forked child must not finish its parent's run.
         if service is not None and self._owner == os.getpid():
             service.finish()
 
@@ -113,7 +114,8 @@ class WandbTracker(Tracker):
         if self._service is None and not self._init:
             self._service = wandb.run
         if self._service is None:
-            # Without it, `init` returns the active run, and `end` would finish that.
+            # Without `reinit`, `init` may return the active run, which `end` would
+            # then finish.
             self._service = wandb.init(**{"reinit": "create_new", **self._init})
             self._owner = os.getpid()
 
