@@ -123,8 +123,8 @@ class Provenance:
             self._found = {**found, "code": None}
             self._found = {**found, "code": _code(self._root)}
         except Exception:
-            # A recording must not fail because of this. A process that exits takes the child
-            # with it that lists the packages, and has no more use for them.
+            # A recording must not fail because of this. A process that exits ends the
+            # child that lists its packages, and no longer needs the list.
             if threading.main_thread().is_alive():
                 logger.warning("The provenance could not be collected.", exc_info=True)
 

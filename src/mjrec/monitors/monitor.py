@@ -132,13 +132,14 @@ def Monitor(  # noqa: N802  named like gym's class
             `video_callable`: "best:3" or "worst:3" (by return), "failures" or
             "failures:20" (the first 20), "median", several of these separated by
             commas, or a function from the finished episodes
-            (`mjrec.trackers.FinishedEpisode`) to the numbers to keep. An episode failed if `info["is_success"]` or `info["success"]` is false in its
-            last step or, without either, if it terminated. Other episodes are deleted
-            as soon as the rule allows; "median" and functions keep all states on disk
-            until `close`. Incomplete episodes are never chosen. Trajectories that are
-            kept for another reason remain, without their video. The manifest and
-            metadata name the rule. After a kill, all candidates are pending. If the
-            function raises or names unknown episodes, `close` reports it and keeps all.
+            (`mjrec.trackers.FinishedEpisode`) to the numbers to keep. An episode failed
+            if `info["is_success"]` or `info["success"]` is false in its last step or,
+            without either, if it terminated. Other episodes are deleted as soon as the
+            rule allows; "median" and functions keep all states on disk until `close`.
+            Incomplete episodes are never chosen. Trajectories that are kept for another
+            reason remain, without their video. The manifest and metadata name the rule.
+            After a kill, all candidates are pending. If the function raises or names
+            unknown episodes, `close` reports it and keeps all.
         step_trigger: maps the number of steps so far, before each step, to whether a
             clip starts. Replaces `video_callable`. A clip's first frame is the one
             before the step.
