@@ -261,7 +261,7 @@ if __name__ == "__main__":
     _main()
 
 
-_PACKAGES = (
+PACKAGES = (
     *("mjrec", "mujoco", "gymnasium", "gymnasium-robotics", "dm-control", "numpy"),
     "imageio-ffmpeg",
 )
@@ -275,7 +275,7 @@ def versions(*more: str) -> Mapping[str, str]:
         *more: the names of further packages.
     """
     found = {"python": platform.python_version()}
-    for package in (*_PACKAGES, *more):
+    for package in (*PACKAGES, *more):
         try:
             distribution = importlib.metadata.distribution(package)
             found[package] = str(_name_and_version(distribution)[1])
