@@ -199,6 +199,8 @@ def read_run(recordings: Path, *, options: PackingOptions) -> PackedRun:
                 tallies.get(monitor.infix, Tally()),
             )
             for monitor in monitors_of(recordings)
+            # What no manifest speaks of is not packed.
+            if monitor.manifest is not None
         ),
     )
 

@@ -35,6 +35,16 @@ _SOURCES = re.compile(r"openaigym\.model\.[0-9a-f]{16}\.zip", re.ASCII)
 _UNREADABLE = "Its inputs cannot be read"
 _LONGEST_HEADER = 10_000
 _MOST_EPISODES = 1_000_000
+# Of a provenance, the keys that a recorder writes; and those below them, where they
+# are always the same.
+_PROVENANCE: Mapping[str, tuple[str, ...]] = {
+    **dict.fromkeys(("command", "working_directory", "python", "packages"), ()),
+    **dict.fromkeys(("system", "variables"), ()),
+    "machine": ("architecture", "libc", "cpu_flags", "tunables"),
+    "cpu": ("model", "flags", "usable"),
+    "code": ("root", "commit", "dirty", "remote"),
+    "policy": ("file", "sha256"),
+}
 _DTYPES = frozenset(
     f"{kind}{bits}" for kind in ("float", "int", "uint") for bits in (8, 16, 32, 64)
 ) | {"bool"}
@@ -52,10 +62,13 @@ def read_inputs(data: Path) -> tuple[Inputs, dict[str, NDArray[Any]]]:
     """
     arrays: dict[str, NDArray[Any]] = {}
     try:
-        recordings = [
-            _recording(files, arrays) for files in monitors_of(data / RECORDINGS)
-        ]
         packing = _packing(data / ENVIRONMENT)
+        monitors = monitors_of(data / RECORDINGS)
+        strays = [files for files in monitors if packing and files.manifest is None]
+        if strays:
+            name = strays[0].paths[0].name
+            raise ValueError(f"{name} is of no recording: none has its manifest")
+        recordings = [_recording(files, arrays) for files in monitors]
     except UnreadableFile as error:
         raise Error(f"{_UNREADABLE}: {error.path.name}: {error.reason}") from error
     except (AttributeError, LookupError, TypeError, ValueError) as error:
@@ -94,9 +107,14 @@ def packing_options(said: Mapping[str, Any]) -> PackingOptions:
     try:
         chosen = None if episodes is None else tuple(map(_count, episodes))
         lists = {"authors": tuple(said.get("authors", ())), "episodes": chosen}
-        return PackingOptions(**{**said, **lists})
+        options = PackingOptions(**{**said, **lists})
     except TypeError as error:
         raise ValueError(f"its options of packing cannot be: {error}") from error
+    if type(options.anonymous) is not bool or not isinstance(
+        options.max_size, int | None
+    ):
+        raise ValueError(f"its options of packing cannot be {said!r:.200}")
+    return options
 
 
 def _recording(files: MonitorFiles, arrays: dict[str, NDArray[Any]]) -> RecordingInputs:
@@ -183,7 +201,7 @@ class _Journal:
             case "run", dict():
                 self.run = facts
             case "provenance", dict():
-                self.provenance = facts
+                self.provenance = _provenance(facts)
                 self.provenance_after = self._lines
             case "cut", {"episode_id": int(number)}:
                 self.cuts[number] = facts
@@ -330,6 +348,19 @@ def _selection(video: Any) -> Mapping[str, Any] | None:
     said = video.get("selection") if isinstance(video, Mapping) else None
     is_evaluation = isinstance(said, Mapping) and said.get("scope") == EVALUATION
     return said if is_evaluation else None
+
+
+def _provenance(said: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Return a provenance without keys that no recorder writes."""
+    known: dict[str, Any] = {}
+    for key, value in said.items():
+        if key not in _PROVENANCE:
+            continue
+        inner = _PROVENANCE[key]
+        if inner and isinstance(value, Mapping):
+            value = {name: each for name, each in value.items() if name in inner}
+        known[key] = value
+    return known
 
 
 def _sources(files: MonitorFiles, environment: Any) -> str | None:
