@@ -176,7 +176,7 @@ class Inputs:
     packing: Mapping[str, Any] = field(default_factory=dict)
 
     def unusual(self) -> dict[str, dict[str, Any]]:
-        """Return the inputs that are not the default, by what they are of."""
+        """Return environments and inputs that are not default, by what they are of."""
         found = {each.name: dict(_unusual(each)) for each in self.recordings}
         packing = {
             name: value
@@ -233,11 +233,15 @@ def given_actions(
 
 def _unusual(recording: RecordingInputs) -> Iterator[tuple[str, Any]]:
     environment = recording.environment or {}
+    of_author = ", a model (MJCF) of the author's"
+    is_mjcf = environment.get("framework") == "mjcf"
+    yield "environment", f"{environment.get('id')}{of_author if is_mjcf else ''}"
     for name, value in (environment.get("kwargs") or {}).items():
         yield f"environment: {name}", value
-    for key in ("max_episode_steps", "wrappers"):
-        if environment.get(key):
-            yield key, environment[key]
+    if environment.get("max_episode_steps"):
+        yield "max_episode_steps", environment["max_episode_steps"]
+    if environment.get("wrappers"):
+        yield "wrappers", list(_wrappers(environment))
     for name, value in recording.options.items():
         if value is not None:
             yield name, value
@@ -245,9 +249,21 @@ def _unusual(recording: RecordingInputs) -> Iterator[tuple[str, Any]]:
         yield "schedule", recording.schedule
     if recording.rule is not None:
         yield "keep", recording.rule
-    resets = [each for each in recording.episodes if each.options]
+    resets = [each.options for each in recording.episodes if each.options]
     if resets:
-        yield "options of resets", len(resets)
+        different = dict.fromkeys(map(json_text.dumps, resets))
+        yield "options of resets", list(map(json_text.loads, different))
+
+
+def _wrappers(environment: Mapping[str, Any]) -> Iterator[str]:
+    """Yield the wrappers with their arguments, outermost first."""
+    names = environment["wrappers"]
+    arguments = environment.get("wrapper_arguments") or [None] * len(names)
+    for name, given in zip(names, arguments, strict=False):
+        shown = ["..."]
+        if isinstance(given, Mapping):
+            shown = [f"{key}={value!r:.40}" for key, value in given.items()]
+        yield f"{name}({', '.join(shown)})"
 
 
 def _regular(episode: EpisodeInputs, recorded: NDArray[Any] | None) -> Iterator[Any]:
