@@ -11,6 +11,7 @@ import contextlib
 import dataclasses
 import functools
 import glob
+import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Final
@@ -28,6 +29,8 @@ from .layout import ENVIRONMENT, RECORDINGS
 
 _LONGEST_LINE: Final = 1 << 24
 _COMPILING: Final = ("mujoco", "machine")
+# What may be claimed as a version: no sentence.
+VERSION: Final = re.compile(r"[\w.+-]{1,40}", re.ASCII)
 # A key of another name is no claim of a version: some excuses have other names.
 _PACKAGES: Final = frozenset(("python", *PACKAGES, "bagit", "zlib"))
 _RECORDING: Final = "recording "
@@ -110,8 +113,9 @@ def _versions(given: Any, made: Any, *items: str) -> Iterator[Excuse]:
     one, other = _mapping(given), _mapping(made)
     for package in dict.fromkeys((*one, *other)):
         if package in _PACKAGES:
-            values = (str(each.get(package, "none")) for each in (one, other))
-            yield from _claim(package, *values, *items)
+            claimed, here = (str(each.get(package, "none")) for each in (one, other))
+            if VERSION.fullmatch(claimed):
+                yield from _claim(package, claimed, here, *items)
 
 
 def _machine(

@@ -27,12 +27,13 @@ from .frame_similarity import Planes
 
 _BEGINNING: Final = ("-hide_banner", "-loglevel", "error", "-nostdin", "-xerror")
 _INPUT: Final = ("-threads", "2", "-protocol_whitelist", "file", "-f", "mp4")
-# The tags of colours that mjrec writes; and what is no part of any frame.
+# The tags of colours that mjrec writes; and all but frames, among which are no
+# parameters of decoding: these stand in the file's head, for all players alike.
 _TAGS: Final = (
     "h264_metadata=video_full_range_flag=0:colour_primaries=1:"
     "transfer_characteristics=1:matrix_coefficients=1"
 )
-_BESIDE_FRAMES: Final = "filter_units=remove_types=1|5|7|8|9"
+_BESIDE_FRAMES: Final = "filter_units=remove_types=1|5|9"
 _MOST_BESIDE: Final = 1 << 20
 # A message by x264, which says how it encodes.
 _MESSAGE: Final = b"\0\0\0\1\x06\x05"
@@ -62,8 +63,7 @@ def has_messages(path: Path) -> bool:
     Raises:
         EncoderError: it cannot be read.
     """
-    filters = f"h264_mp4toannexb,{_BESIDE_FRAMES}"
-    beside = _stream(path, filters, "-f", "h264", "-fs", str(_MOST_BESIDE))
+    beside = _stream(path, _BESIDE_FRAMES, "-f", "data", "-fs", str(_MOST_BESIDE))
     return bool(beside) and not _is_by_x264(beside)
 
 

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .. import json_text
+from ..environments.scenes import shown_wrappers
 
 INPUTS_FILE: Final = "inputs.json"
 ARRAYS_FILE: Final = "arrays.npz"
@@ -241,7 +242,7 @@ def _unusual(recording: RecordingInputs) -> Iterator[tuple[str, Any]]:
     if environment.get("max_episode_steps"):
         yield "max_episode_steps", environment["max_episode_steps"]
     if environment.get("wrappers"):
-        yield "wrappers", list(_wrappers(environment))
+        yield "wrappers", shown_wrappers(environment)
     for name, value in recording.options.items():
         if value is not None:
             yield name, value
@@ -253,17 +254,6 @@ def _unusual(recording: RecordingInputs) -> Iterator[tuple[str, Any]]:
     if resets:
         different = dict.fromkeys(map(json_text.dumps, resets))
         yield "options of resets", list(map(json_text.loads, different))
-
-
-def _wrappers(environment: Mapping[str, Any]) -> Iterator[str]:
-    """Yield the wrappers with their arguments, outermost first."""
-    names = environment["wrappers"]
-    arguments = environment.get("wrapper_arguments") or [None] * len(names)
-    for name, given in zip(names, arguments, strict=False):
-        shown = ["..."]
-        if isinstance(given, Mapping):
-            shown = [f"{key}={value!r:.40}" for key, value in given.items()]
-        yield f"{name}({', '.join(shown)})"
 
 
 def _regular(episode: EpisodeInputs, recorded: NDArray[Any] | None) -> Iterator[Any]:

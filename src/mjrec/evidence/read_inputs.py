@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -45,6 +45,9 @@ _PROVENANCE: Mapping[str, tuple[str, ...]] = {
     "code": ("root", "commit", "dirty", "remote"),
     "policy": ("file", "sha256"),
 }
+# Of the choice among an evaluation's episodes: in a video's facts, and in a journal.
+_SELECTION = ("rule", "decided", "scope", "finished", "roles")
+_EVALUATION_KEEP = (*_SELECTION[:-1], "chosen", "recorded", "recording")
 _DTYPES = frozenset(
     f"{kind}{bits}" for kind in ("float", "int", "uint") for bits in (8, 16, 32, 64)
 ) | {"bool"}
@@ -210,7 +213,7 @@ class _Journal:
             case "clip", dict():
                 self.clips.append(facts)
             case "keep", {"scope": "evaluation"}:
-                self.evaluation_keep = facts
+                self.evaluation_keep = _known(facts, _EVALUATION_KEEP)
             case "keep", {"recorded": list(numbers)}:
                 self.kept = tuple(map(_count, numbers))
             case "recovered", _:
@@ -347,20 +350,22 @@ def _steps_taken(reader: TrajectoryReader) -> dict[str, NDArray[Any]]:
 def _selection(video: Any) -> Mapping[str, Any] | None:
     said = video.get("selection") if isinstance(video, Mapping) else None
     is_evaluation = isinstance(said, Mapping) and said.get("scope") == EVALUATION
-    return said if is_evaluation else None
+    return _known(said, _SELECTION) if is_evaluation else None
 
 
 def _provenance(said: Mapping[str, Any]) -> Mapping[str, Any]:
     """Return a provenance without keys that no recorder writes."""
     known: dict[str, Any] = {}
-    for key, value in said.items():
-        if key not in _PROVENANCE:
-            continue
+    for key, value in _known(said, _PROVENANCE).items():
         inner = _PROVENANCE[key]
-        if inner and isinstance(value, Mapping):
-            value = {name: each for name, each in value.items() if name in inner}
-        known[key] = value
+        is_nested = inner and isinstance(value, Mapping)
+        known[key] = _known(value, inner) if is_nested else value
     return known
+
+
+def _known(said: Mapping[str, Any], keys: Collection[str]) -> dict[str, Any]:
+    """Return what stands under known keys; nothing recreates the others."""
+    return {key: value for key, value in said.items() if key in keys}
 
 
 def _sources(files: MonitorFiles, environment: Any) -> str | None:
