@@ -11,7 +11,7 @@ import dataclasses
 import json
 import subprocess
 import zipfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -172,13 +172,19 @@ class ForgedRun:
     # Edits of a video.
 
     def film(
-        self, episode: int, frames: list[Any] | None = None, **metadata: Any
+        self,
+        episode: int,
+        frames: list[Any] | None = None,
+        *,
+        encoder_arguments: Sequence[str] = (),
+        **metadata: Any,
     ) -> None:
         """Put frames into the video of an episode, with hashes and metadata.
 
         Args:
             episode: its number.
             frames: those of its trajectory as it is now, if None.
+            encoder_arguments: as of `VideoWriter`.
             metadata: what else is said.
         """
         frames = self.frames(episode) if frames is None else frames
@@ -186,7 +192,8 @@ class ForgedRun:
         said = json.loads(path.with_suffix(".meta.json").read_text())
         said.update({"frame_count": len(frames), "frame_steps": [[0, len(frames) - 1]]})
         fps = Fraction(metadata.get("fps", said["fps"]))
-        with VideoWriter(path, fps=fps, frame_hashes=True) as writer:
+        more = {"encoder_arguments": encoder_arguments}
+        with VideoWriter(path, fps=fps, frame_hashes=True, **more) as writer:
             for frame in frames:
                 writer.write(frame)
         height, width = frames[0].shape[:2]

@@ -400,18 +400,27 @@ def test_what_was_fed_to_the_maker_is_believed(packed: Path, given: Path) -> Non
 
 
 def test_an_excuse_reaches_its_own_item_only(packed: Path, given: Path) -> None:
-    """A wrapper of one recording excuses rewards there, and no files."""
-    set_reward(the(given, "*episode000000.h5"), 2, 9.0)
+    """A wrapper of one recording excuses successes there, and no files."""
+
+    def succeed(episode: int) -> None:
+        path = the(given, "*.jsonl")
+        lines = path.read_text().splitlines(keepends=True)
+        begin = f'{{"episode_id": {episode}, '
+        [number] = [n for n, line in enumerate(lines) if line.startswith(begin)]
+        lines[number] = lines[number].replace('"success": null', '"success": true')
+        path.write_text("".join(lines))
+
+    succeed(0)
     notes = Notes()
-    notes.add("episode 0 of 0.u", "wrappers", "mine.DoubleReward is not here")
+    notes.add("episode 0 of 0.u", "wrappers", "mine.Success is not here")
     made = shutil.copytree(packed, given.with_name("made"))
     notes.write(made)
     verification = compared(given, made)
     assert verification.verdict is Verdict.PARTLY
     [excuse] = verification.excuses
     assert (excuse.name, excuse.items) == ("wrappers", ("episode 0 of 0.u",))
-    (given / "data" / "README.md").write_text("All is well.")
-    assert compared(given, made, is_described=True).verdict is Verdict.FAIL
+    succeed(1)
+    assert compared(given, made).verdict is Verdict.FAIL
 
 
 def claim(bag: Path, **facts: Any) -> None:

@@ -28,6 +28,7 @@ EXCUSES = {
     "ffmpeg": ("ffmpeg", "7.0", "9.0", RECORDING),
     "wrappers": ("wrappers", "mine.Wrapper", "", RECORDING),
     "beginning": ("unseeded beginning", "", "", EPISODE),
+    "environment": ("environment", "mine.Environment", "", RECORDING),
     "of another": ("mujoco", "3.16.0", "3.17.0", "recording 1.u"),
 }
 
@@ -81,10 +82,18 @@ WITHIN, BELIEVED, NOTED, DIFFERENT = (
         ("llvmpipe", frame(48.0, 26.5, shadow=0.001), WITHIN),
         ("llvmpipe", frame(48.0, 26.5, shadow=0.02), DIFFERENT),
         ("ffmpeg", frame(36.0, 12.0), WITHIN),
-        ("ffmpeg", difference(Aspect.HASH, topic=Topic.PICTURES), BELIEVED),
-        ("wrappers", difference(Aspect.EXACT, **REWARD), BELIEVED),
+        # Frames are hashed before they are encoded.
+        ("ffmpeg", difference(Aspect.HASH, topic=Topic.PICTURES), DIFFERENT),
+        # Its rewards were fed to the maker: nothing makes them differ.
+        ("wrappers", difference(Aspect.EXACT, **REWARD), DIFFERENT),
+        ("wrappers", difference(Aspect.OBSERVED, **REWARD), BELIEVED),
+        ("machine", difference(Aspect.OBSERVED, 1e-6, **REWARD), WITHIN),
+        ("machine", difference(Aspect.OBSERVED, 0.5, **REWARD), DIFFERENT),
         ("wrappers", frame(36.0, 12.0), DIFFERENT),
-        ("beginning", difference(Aspect.STATE, 1.0, topic=Topic.BEGINNING), BELIEVED),
+        ("beginning", difference(Aspect.STATE, 1.0, topic=Topic.BEGINNING), DIFFERENT),
+        ("environment", difference(Aspect.EXACT), BELIEVED),
+        # Descriptions follow from the recordings, whatever these are of.
+        ("environment", difference(Aspect.EXACT, file="README.md"), DIFFERENT),
         ("beginning", difference(Aspect.STATE, 1e-12), DIFFERENT),
         ("of another", difference(Aspect.STATE, 1e-12), DIFFERENT),
     ],

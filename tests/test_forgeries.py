@@ -10,11 +10,14 @@ from __future__ import annotations
 import json
 import re
 import shutil
+import warnings
+import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import gymnasium
 import h5py
 import numpy as np
 import pytest
@@ -28,6 +31,7 @@ from forged_runs import ForgedRun
 from mjrec.evaluation.chunk_results import recorded_results
 from mjrec.evidence.findings import Outcome, Verdict, Verification
 from mjrec.formats.monitor_directory import Infix
+from mjrec.formats.trajectory import added_up
 from mjrec.formats.trajectory_file import open_trajectory
 from mjrec.formats.trajectory_hdf5 import write_hdf5
 from mjrec.formats.video_writer import VideoWriter
@@ -37,6 +41,11 @@ from mjrec.rendering.jobs import RecordingKey
 FAIL, PARTLY, PASS = Verdict.FAIL, Verdict.PARTLY, Verdict.PASS
 
 Lie = Callable[[ForgedRun], object]
+
+FLIP = "display_orientation=insert:rotate=180"
+
+SMALL: dict[str, Any] = {"render_mode": "rgb_array", "width": 32, "height": 32}
+EVALUATION: dict[str, Any] = {"mode": "evaluation", "workers": 1}
 
 
 @dataclass(frozen=True)
@@ -211,15 +220,37 @@ def copy_the_recording(run: ForgedRun) -> None:
     """One recording shown as two, by two names."""
     for path in list(run.directory.iterdir()):
         if ".0.u." in path.name:
-            content = path.read_bytes()
-            if path.suffix in (".json", ".jsonl"):
-                content = content.replace(b".0.u.", b".0.v.")
-            path.with_name(path.name.replace(".0.u.", ".0.v.")).write_bytes(content)
-    for path in run.directory.glob("*.0.v.*.h5"):
-        with open_trajectory(path) as reader:
-            text = json.dumps(dict(reader.facts)).replace("0.u", "0.v")
-            reader.facts = json.loads(text)
-            write_hdf5(reader, path)
+            shutil.copy(path, path.with_name(path.name.replace(".0.u.", ".0.v.")))
+    replace_in_second(run, "0.u", "0.v")
+
+
+def replace_in_second(run: ForgedRun, old: str, new: str) -> None:
+    """Replace a text in all that the second recording says."""
+    for path in run.directory.glob("*.0.v.*"):
+        if path.suffix in (".json", ".jsonl"):
+            path.write_text(path.read_text().replace(old, new))
+        elif path.suffix == ".h5":
+            with open_trajectory(path) as reader:
+                text = json.dumps(dict(reader.facts)).replace(old, new)
+                reader.facts = json.loads(text)
+                write_hdf5(reader, path)
+
+
+def double_rewards_cut_off(run: ForgedRun) -> None:
+    """Of an episode that is in no statistics, and has a video."""
+    [cut_off] = {float(run.content(0).rewards.sum())}
+    run.edit_rows(0, rewards=lambda r: r.__imul__(2), facts={"reward": 2 * cut_off})
+    run.edit_json("*.video000000.meta.json", lambda m: m.update(reward=2 * cut_off))
+
+
+def double_the_return(run: ForgedRun) -> None:
+    """And leave the rewards of the steps as they are."""
+    run.say(1, reward=2 * added_up(run.content(1).rewards))
+
+
+def give_no_plain_option(run: ForgedRun) -> None:
+    """What is no plain value is given to no reset, so that nothing is recreated."""
+    run.say(3, options={"note": "version 1.0"})
 
 
 # Lies about videos.
@@ -229,6 +260,13 @@ def one_pixel(run: ForgedRun) -> None:
     frames = [frame.copy() for frame in run.frames(1)]
     frames[2][20, 10] ^= 64
     run.film(1, frames)
+
+
+def one_pixel_each(run: ForgedRun) -> None:
+    for episode in (0, 1):
+        frames = [frame.copy() for frame in run.frames(episode)]
+        frames[-1][20, 10] ^= 64
+        run.film(episode, frames)
 
 
 def negative(episode: int) -> Lie:
@@ -346,6 +384,16 @@ def cropped(run: ForgedRun) -> None:
     run.mux(1, "-c", "copy", "-bsf:v", "h264_metadata=crop_right=16")
 
 
+def refilm(arguments: str) -> Lie:
+    """Encode the same frames again, with what only players go by."""
+
+    def lie(run: ForgedRun) -> None:
+        for episode in (0, 1):
+            run.film(episode, encoder_arguments=("-bsf:v", arguments))
+
+    return lie
+
+
 def hidden_bytes(run: ForgedRun) -> None:
     path = run.video(1)
     path.write_bytes(path.read_bytes() + b"\0\0\0\x10free12345678")
@@ -447,6 +495,15 @@ def call_it_another_environment(run: ForgedRun) -> None:
     )
 
 
+def call_it_by_another_name(run: ForgedRun) -> None:
+    """In what people read; it is made by its own id."""
+
+    def edit(facts: dict[str, Any]) -> None:
+        _replace(facts, "InvertedPendulum-v5", "Humanoid-v5", key="env_id")
+
+    run.say_everywhere(edit)
+
+
 def call_it_ones_own(run: ForgedRun) -> None:
     run.say_everywhere(
         lambda facts: _replace(facts, "InvertedPendulum-v5", "MyPendulum-v0")
@@ -462,6 +519,19 @@ def pretend_to_be_gym(run: ForgedRun) -> None:
     for pattern in ("*.jsonl", "*.h5", "*.model.*"):
         for path in run.directory.glob(pattern):
             path.unlink()
+
+
+def put_another_model_before(run: ForgedRun) -> None:
+    """Two files of one name, of which a reader sees the first or the last."""
+    path = run.the("*.model.*.zip")
+    with zipfile.ZipFile(path) as archive:
+        members = {info: archive.read(info) for info in archive.infolist()}
+    with zipfile.ZipFile(path, "w") as archive, warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        for info, content in members.items():
+            if info.filename.endswith(".xml"):
+                archive.writestr(info.filename, content.replace(b"0.1", b"0.9"))
+            archive.writestr(info, content)
 
 
 def swap_the_model(run: ForgedRun) -> None:
@@ -519,6 +589,23 @@ def add_to(pattern: str) -> Lie:
 
 def add_to_manifest(run: ForgedRun) -> None:
     run.edit_json("*.manifest.json", lambda said: said["mjrec"].update(award="best"))
+
+
+def add_to_facts(key: str) -> Lie:
+    """Add to all objects that stand under a key."""
+
+    def edit(facts: dict[str, Any]) -> None:
+        if isinstance(facts.get(key), dict):
+            facts[key]["success_rate"] = 1
+
+    return lambda run: run.say_everywhere(edit)
+
+
+def add_a_video(bag: Path) -> None:
+    """Of a recording of which nothing else is there."""
+    path = the(bag, "*.video000001.mp4")
+    shutil.copy(path, path.with_name(path.name.replace(".0.u.", ".0.w.")))
+    describe_again(bag)
 
 
 def add_a_line(run: ForgedRun) -> None:
@@ -585,6 +672,13 @@ def edit_environment(**facts: Any) -> Callable[[Path], object]:
         edit_json(the(bag, "environment.json"), change)
 
     return edit
+
+
+def tell_in_options(bag: Path) -> None:
+    def edit(said: dict[str, Any]) -> None:
+        said["packed_with"]["options"]["anonymous"] = {"award": "best paper"}
+
+    edit_json(the(bag, "environment.json"), edit)
 
 
 def edit_the_table(bag: Path) -> None:
@@ -676,6 +770,18 @@ def best(directory: Path) -> None:
     honest.kept(directory, rule="best:1")
 
 
+def close_and_go_on(directory: Path) -> None:
+    """Close each time when an episode goes wrong."""
+    for first in (0, 2):
+        env = gymnasium.make("InvertedPendulum-v5", max_episode_steps=3, **SMALL)
+        monitor = mjrec.Monitor(env, directory, uid="u", resume=True, **EVALUATION)
+        for episode, steps in ((first, 3), (first + 1, 2)):
+            monitor.reset(seed=episode)
+            for _ in range(steps):
+                monitor.step(np.full(1, 0.1, np.float32))
+        monitor.close()
+
+
 def by_hand(directory: Path) -> None:
     honest.pendulum(directory, video_callable=lambda episode: episode in (0, 1))
 
@@ -744,6 +850,28 @@ FORGERIES = (
         both(double_rewards, call_actions_irregular),
         "reward",
     ),
+    # No package is called so, but an excuse is.
+    Forgery(
+        "rewards doubled, with a version of the environment claimed",
+        both(double_rewards, claim_version("environment", "1.0")),
+        "reward",
+        quick=True,
+    ),
+    Forgery(
+        "rewards doubled, with an option that no reset can be given",
+        both(double_rewards, give_no_plain_option),
+    ),
+    Forgery(
+        "rewards doubled of an episode that was cut off",
+        double_rewards_cut_off,
+        "reward",
+        of=honest.early,
+    ),
+    Forgery(
+        "a return doubled, with a wrapper claimed",
+        both(double_the_return, edit_an_action, claim_wrapper),
+        "reward",
+    ),
     Forgery(
         "rewards doubled by a wrapper that is not named",
         line="reward",
@@ -790,12 +918,23 @@ FORGERIES = (
     Forgery("the first left out", leave_the_first_out, "begins with episode 1"),
     Forgery("one recording shown as two", copy_the_recording, "same", verdict=PARTLY),
     Forgery("fall called a limit of time", swap_the_ending, "terminated|truncated"),
+    Forgery(
+        "closed whenever an episode goes wrong, and resumed",
+        of=close_and_go_on,
+        line="goes on after them",
+        verdict=PARTLY,
+    ),
     Forgery("actions called float64", call_it_double, of=honest.cheetah),
     # Videos.
     Forgery("one pixel changed", one_pixel, "frame 2", quick=True),
     *(
         Forgery(f"one pixel changed, with {name} claimed", both(one_pixel, claim))
         for name, claim in CLAIMS.items()
+    ),
+    Forgery(
+        "a pixel of each video changed, with another ffmpeg claimed",
+        both(one_pixel_each, claim_ffmpeg),
+        "hash",
     ),
     Forgery("the fall not shown", hide_the_fall, "frames"),
     Forgery("a frame doubled", double_a_frame, "frames"),
@@ -821,6 +960,14 @@ FORGERIES = (
             *(rotation, wide_pixels, cropped, hidden_bytes, double_a_frame),
         )
     ),
+    *(
+        Forgery(what, both(refilm(f"h264_metadata={metadata}"), claim_ffmpeg), line)
+        for what, metadata, line in (
+            ("false colours", "matrix_coefficients=0", "tags of colours"),
+            ("a message", f"sei_user_data={'ab' * 16}+Success", "frames and messages"),
+            ("videos turned in the stream", FLIP, "frame"),
+        )
+    ),
     Forgery(
         "negatives of all videos, with another GPU claimed",
         both(*(negative(episode) for episode in (0, 1)), claim_gpu),
@@ -841,9 +988,11 @@ FORGERIES = (
     # Identity.
     Forgery("arguments hidden", hide_arguments, of=noiseless, quick=True),
     Forgery("another environment named", call_it_another_environment),
+    Forgery("another name", call_it_by_another_name, "is called", quick=True),
     Forgery("called one's own environment", call_it_ones_own),
     Forgery("called gym's", pretend_to_be_gym),
     Forgery("another model's sources", swap_the_model, of=honest.mjcf),
+    Forgery("a second file in a model's sources", put_another_model_before, "zip"),
     Forgery("evaluation called training", call_it_trained),
     # Claims without a lie. Where nothing need differ, nothing was excused.
     *(
@@ -866,6 +1015,24 @@ FORGERIES = (
     Forgery("a key in the statistics", add_to("*.stats.json"), "success_rate"),
     Forgery("a key in metadata", add_to("*000001.meta.json"), "success_rate"),
     Forgery("a key in the manifest", add_to_manifest, "award"),
+    Forgery(
+        "a key in the manifest, with a schedule of one's own",
+        add_to_manifest,
+        "award",
+        of=by_hand,
+    ),
+    Forgery(
+        "a key about the device",
+        lambda run: run.edit_json(
+            "*.meta.json",
+            lambda said: said.update(gl_device={"index": 0, "note": "all succeeded"}),
+        ),
+        "gl_device",
+    ),
+    *(
+        Forgery(f"a key of the {key}", add_to_facts(key), "success_rate")
+        for key in ("provenance", "machine")
+    ),
     Forgery("a line in the journal", add_a_line, "remark"),
     Forgery("a line about rows", bag=add_a_line_about_rows, line="goals"),
     Forgery("a key in a line of the journal", add_to_a_line, "judged"),
@@ -876,6 +1043,7 @@ FORGERIES = (
         quick=True,
     ),
     Forgery("a note in the data", bag=add_a_file("data/notes.txt"), line="notes.txt"),
+    Forgery("a video of no recording", bag=add_a_video, line="of no recording"),
     Forgery(
         "a note in the recordings",
         bag=add_a_file("data/recordings/notes.txt"),
@@ -915,6 +1083,19 @@ FORGERIES = (
         line="crate",
     ),
     Forgery("a return in the table", bag=edit_the_table, line="statistics.csv"),
+    Forgery(
+        "a return in the table, beside an environment of one's own",
+        lambda run: replace_in_second(run, '"id": "InvertedP', '"id": "MyP'),
+        of=honest.several,
+        bag=edit_the_table,
+        line="statistics.csv",
+    ),
+    Forgery(
+        "an option of packing that tells more",
+        packing={"anonymous": True},
+        bag=tell_in_options,
+        line="options of packing",
+    ),
     Forgery(
         "another graphics card in environment.json",
         bag=edit_environment(frames=[{"gl_renderer": "RTX 4090"}]),

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from typing import Any
 
@@ -20,20 +21,22 @@ def seed_of(run: int, episode: int) -> int:
     return episode_seeds(run, episode).environment
 
 
+def recording(
+    number: int, episodes: Sequence[EpisodeInputs], **inputs: Any
+) -> RecordingInputs:
+    """Return a recording of these episodes."""
+    usual = {"infix": f"{number}.1", "env_id": "A-v0", "environment": None}
+    return RecordingInputs(**{**usual, **inputs}, episodes=episodes)
+
+
 def said(
     *recordings: Sequence[EpisodeInputs], first: int = 0, **options: Any
 ) -> list[Finding]:
     """Return what is said of recordings of these episodes."""
+    more = {"options": options, "first_episode_id": first}
     inputs = Inputs(
         recordings=[
-            RecordingInputs(
-                infix=f"{number}.1",
-                env_id="A-v0",
-                environment=None,
-                options=options,
-                first_episode_id=first,
-                episodes=episodes,
-            )
+            recording(number, episodes, **more)
             for number, episodes in enumerate(recordings)
         ]
     )
@@ -100,19 +103,12 @@ def test_a_missing_predecessor_is_in_the_first_line() -> None:
     [finding] = said([episode(2)], first=2)
     assert finding.is_headline
     assert "0, 1 are missing" in finding.reason
-    inputs = Inputs(
-        recordings=[
-            RecordingInputs(
-                infix=f"{first}.1",
-                env_id="A-v0",
-                environment=None,
-                first_episode_id=first,
-                episodes=[episode(first)],
-            )
-            for first in (0, 1)
-        ]
-    )
-    assert list(remarks(inputs, {})) == []
+    chain = [recording(n, [episode(n)], first_episode_id=n) for n in (0, 1)]
+    assert list(remarks(Inputs(recordings=chain), {})) == []
+    # Those of another environment stand in for nothing.
+    chain[0] = dataclasses.replace(chain[0], environment={"id": "Easier-v0"})
+    found = list(remarks(Inputs(recordings=chain), {}))
+    assert any("0 are missing" in each.reason for each in found)
 
 
 def test_equal_episodes_count_once_and_are_named() -> None:
@@ -126,8 +122,61 @@ def test_equal_episodes_count_once_and_are_named() -> None:
     assert finding.count == 1
 
 
-def test_cut_episodes_are_noted() -> None:
+def test_cut_episodes_are_in_the_first_line() -> None:
     """They are in no statistics."""
     [finding] = said([episode(0), episode(1, cut="reset")])
     assert finding.outcome is Outcome.NOTED
+    assert finding.is_headline
     assert "cut off: 1" in finding.reason
+
+
+def test_closing_and_going_on_leaves_episodes_out() -> None:
+    """A run is closed once; whoever resumes can drop each episode that goes wrong."""
+    first = recording(0, [episode(0), episode(1, cut="close")])
+    second = recording(1, [episode(2)], first_episode_id=2)
+    [finding] = remarks(Inputs(recordings=[first, second]), {})
+    assert finding.outcome is Outcome.BELIEVED
+    assert "goes on after them" in finding.reason
+
+
+@pytest.mark.parametrize(
+    ("name", "environment", "outcome"),
+    [
+        ("Humanoid-v5", {"id": "Hopper-v5"}, Outcome.DIFFERENT),
+        ("our hopper", {"id": "Hopper-v5"}, Outcome.BELIEVED),
+        ("Hopper-v5", {"id": "Hopper-v5", "framework": "mjcf"}, Outcome.NOTED),
+    ],
+)
+def test_an_environment_is_what_it_is_called(
+    name: str, environment: dict[str, Any], outcome: Outcome
+) -> None:
+    """All files bear the name, and another environment was run."""
+    run = recording(0, [episode(0)], env_id=name, environment=environment)
+    [finding] = remarks(Inputs(recordings=[run]), {})
+    assert finding.is_headline
+    assert finding.outcome is outcome
+
+
+def test_training_episodes_among_evaluations_are_named() -> None:
+    """An average over the others would leave them out."""
+    [finding] = said([episode(0, type="t"), episode(1, type="e")])
+    assert finding.is_headline
+    assert "1 of 2 episodes are called training" in finding.reason
+
+
+def test_episodes_of_an_evaluation_are_numbered_without_gaps() -> None:
+    """The best of many would be a choice; chunks of one evaluation count together."""
+    chunks = [
+        [episode(k, evaluation={"seed": 2, "episode": n}) for k, n in enumerate(each)]
+        for each in ((0, 1), (2, 5))
+    ]
+    [finding] = [each for each in said(*chunks) if each.is_headline]
+    assert finding.outcome is Outcome.BELIEVED
+    assert "3, 4" in finding.reason
+
+
+def test_huge_numbers_take_no_memory() -> None:
+    """A stranger's archive may have any."""
+    [gap, absent] = said([episode(10**15)], first=10**14)
+    assert "and 899999999999995 more" in gap.reason
+    assert absent.count == 10**14

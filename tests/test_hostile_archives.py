@@ -9,6 +9,7 @@ import struct
 import tempfile
 import warnings
 import zipfile
+import zlib
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -109,6 +110,20 @@ def rare_compression(path: Path) -> None:
         file.writestr(GOOD, b"1")
 
 
+def with_a_second_name(path: Path) -> None:
+    """Info-ZIP shows the name in this field, and Python the other one."""
+    info = zipfile.ZipInfo(GOOD)
+    called = b"\x01" + struct.pack("<L", zlib.crc32(GOOD.encode())) + b"run/data/evil"
+    info.extra = struct.pack("<2H", 0x7075, len(called)) + called
+    write(path, (info, b"1"))
+
+
+def with_a_comment_on_an_entry(path: Path) -> None:
+    info = zipfile.ZipInfo(GOOD)
+    info.comment = b"evil"
+    write(path, (info, b"1"))
+
+
 def linked_folder(path: Path) -> None:
     """An unpacked run whose recordings lie elsewhere."""
     elsewhere = path.with_name("elsewhere")
@@ -168,6 +183,12 @@ HARMS: list[tuple[Make, str]] = [
         ]
     ),
     (with_comment, "has a comment"),
+    (with_a_comment_on_an_entry, "has a comment"),
+    (with_a_second_name, "not all programs read"),
+    (
+        lambda path: write(path, (GOOD, b"1"), ("run/All succeeded/", b"")),
+        "is an empty",
+    ),
     (bomb, "made to fill a disk"),
     (many_files, "would be many"),
     (two_entries_over_the_same_bytes, "overlaps"),

@@ -15,7 +15,13 @@ import pytest
 
 import mjrec
 from mjrec.errors import Error
-from mjrec.evidence.inputs import ARRAYS_FILE, EpisodeInputs, Inputs, given_actions
+from mjrec.evidence.inputs import (
+    ARRAYS_FILE,
+    EpisodeInputs,
+    Inputs,
+    RecordingInputs,
+    given_actions,
+)
 from mjrec.evidence.read_inputs import read_inputs
 
 
@@ -102,7 +108,25 @@ def test_unusual_inputs_are_listed(data: Path) -> None:
     assert recording["max_episode_steps"] == 4
     assert recording["fps"] == "29.97"
     assert "lambda" in recording["schedule"]
-    assert recording["options of resets"] == 1
+    assert recording["options of resets"] == [{"a": 1}]
+    assert recording["environment"] == "InvertedPendulum-v5"
+
+
+def test_wrappers_are_listed_with_their_arguments() -> None:
+    """Gymnasium's own can give any reward."""
+    environment = {
+        "id": "A-v0",
+        "framework": "mjcf",
+        "wrappers": ["gymnasium.ClipReward", "mine.Wrapper"],
+        "wrapper_arguments": [{"min_reward": 100.0}, None],
+    }
+    recording = RecordingInputs(infix="0.u", env_id="A-v0", environment=environment)
+    [said] = Inputs(recordings=[recording]).unusual().values()
+    assert said["environment"] == "A-v0, a model (MJCF) of the author's"
+    assert said["wrappers"] == [
+        "gymnasium.ClipReward(min_reward=100.0)",
+        "mine.Wrapper(...)",
+    ]
 
 
 @pytest.mark.parametrize(

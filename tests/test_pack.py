@@ -308,12 +308,17 @@ def test_the_readme_leads_a_stranger(infix: str, bag: Path) -> None:
 def test_the_readme_says_what_environments_were_made_with(tmp_path: Path) -> None:
     """Which makes another environment of one with a name that everybody knows."""
     env = gymnasium.make("HalfCheetah-v5", forward_reward_weight=100.0)
+    env = gymnasium.wrappers.ClipReward(env, 1.0)
     directory = tmp_path / "run"
     kept: dict[str, Any] = {"video_callable": False, "trajectory_callable": True}
     honest_runs.play(mjrec.Monitor(env, directory, **kept), 1, most=2)
     folder = unpacked(mjrec.pack(directory, tmp_path / "a.zip"), tmp_path / "x")
-    said = "- Environment: HalfCheetah-v5, made with forward_reward_weight=100.0\n"
-    assert said in (folder / "data/README.md").read_text()
+    text = (folder / "data/README.md").read_text()
+    said = (
+        "- Environment: HalfCheetah-v5, made with forward_reward_weight=100.0, in the"
+    )
+    assert said in text
+    assert "ClipReward(min_reward=1.0" in text
 
 
 def test_nothing_need_be_stated(recorded: Path, tmp_path: Path) -> None:

@@ -81,7 +81,7 @@ def test_claims_that_nothing_needs_share_a_line() -> None:
     names = ("python", "zlib")
     idle = [excuse(name=n, claimed="1", here="2", is_needed=False) for n in names]
     assert summary.excuses(verification(excuses=tuple(idle))) == [
-        "not needed, as nothing differs: python 1 (here 2); zlib 1 (here 2)"
+        "claimed, and nothing rests on it: python 1 (here 2); zlib 1 (here 2)"
     ]
 
 

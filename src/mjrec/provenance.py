@@ -266,7 +266,7 @@ if __name__ == "__main__":
     _main()
 
 
-_PACKAGES = (
+PACKAGES = (
     *("mjrec", "mujoco", "gymnasium", "gymnasium-robotics", "dm-control", "numpy"),
     "imageio-ffmpeg",
 )
@@ -280,7 +280,7 @@ def versions(*more: str) -> Mapping[str, str]:
         *more: names of additional packages.
     """
     found = {"python": platform.python_version()}
-    for package in (*_PACKAGES, *more):
+    for package in (*PACKAGES, *more):
         try:
             distribution = importlib.metadata.distribution(package)
             found[package] = str(_name_and_version(distribution)[1])

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import sys
 import weakref
@@ -190,6 +191,25 @@ def shown_arguments(kwargs: Any) -> str:
     )
     if len(shown) > _MOST_CHARACTERS:
         return f"{shown[:_MOST_CHARACTERS]} ..."
+    return shown
+
+
+def shown_wrappers(environment: Mapping[str, Any]) -> list[str]:
+    """Return `Name(argument=value, ...)` of each wrapper, outermost first.
+
+    Args:
+        environment: as a recording has it; the values may be anything.
+    """
+    names, arguments = (
+        given if isinstance(given := environment.get(key), list) else []
+        for key in ("wrappers", "wrapper_arguments")
+    )
+    shown = []
+    for name, given in itertools.zip_longest(names, arguments[: len(names)]):
+        known = ["..."]
+        if isinstance(given, Mapping):
+            known = [f"{key}={value!r:.100}" for key, value in given.items()]
+        shown.append(f"{name}({', '.join(known)})")
     return shown
 
 

@@ -107,6 +107,7 @@ def _of_folder(path: Path, into: Path) -> Mapping[str, Any]:
     bag = _bag_in(path)
     if bag is not None:
         files = {each.relative_to(bag).as_posix(): each for each in _files_below(bag)}
+        _check_folders(bag)
         _copy_files(files, into, given=path)
         _check_recordings(into, path)
         return {"kind": Kind.BAG}
@@ -193,7 +194,15 @@ def _unpack(path: Path, into: Path) -> None:
         unpacked.mkdir()
         _check_room(contents.size, unpacked, path)
         _write_all(archive, contents, unpacked)
+    _check_folders(unpacked)
     (unpacked / contents.top).rename(into)
+
+
+def _check_folders(folder: Path) -> None:
+    """Check that no folder is empty: no list of a bag would name it."""
+    for path in folder.rglob("*"):
+        if path.is_dir() and not any(path.iterdir()):
+            raise ValueError(f"{path.name[:200]!r} is an empty folder")
 
 
 def _check_room(size: int, into: Path, path: Path) -> None:

@@ -11,6 +11,7 @@ import contextlib
 import dataclasses
 import functools
 import glob
+import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Final
@@ -20,6 +21,7 @@ from ..formats.json_fields import json_object, read_object
 from ..formats.monitor_directory import infix_of
 from ..formats.regular_files import open_regular
 from ..formats.trajectory_file import open_trajectory
+from ..provenance import PACKAGES
 from .descriptions import packed_with
 from .excuses import excuse_of
 from .findings import Excuse
@@ -27,6 +29,10 @@ from .layout import ENVIRONMENT, RECORDINGS
 
 _LONGEST_LINE: Final = 1 << 24
 _COMPILING: Final = ("mujoco", "machine")
+# What may be claimed as a version: no sentence.
+VERSION: Final = re.compile(r"[\w.+-]{1,40}", re.ASCII)
+# A key of another name is no claim of a version: some excuses have other names.
+_PACKAGES: Final = frozenset(("python", *PACKAGES, "bagit", "zlib"))
 _RECORDING: Final = "recording "
 _GL: Final = ("gl_vendor", "gl_renderer", "gl_version")
 
@@ -106,9 +112,10 @@ def _claims(given: Path, made: Path, recording: str) -> Iterator[Excuse]:
 def _versions(given: Any, made: Any, *items: str) -> Iterator[Excuse]:
     one, other = _mapping(given), _mapping(made)
     for package in dict.fromkeys((*one, *other)):
-        if package != "options":
-            values = (str(each.get(package, "none")) for each in (one, other))
-            yield from _claim(package, *values, *items)
+        if package in _PACKAGES:
+            claimed, here = (str(each.get(package, "none")) for each in (one, other))
+            if VERSION.fullmatch(claimed):
+                yield from _claim(package, claimed, here, *items)
 
 
 def _machine(

@@ -30,6 +30,7 @@ from .compare_json import (
     Rules,
     compare_journals,
     compare_objects,
+    is_gl_device,
     same_journal,
 )
 from .compare_models import (
@@ -300,6 +301,7 @@ class Comparison:
                 "decoded_sha256": lambda file, value: (
                     self._decoded.get(_video_of(file)) == value
                 ),
+                "gl_device": lambda _, value: is_gl_device(value),
             },
             left_out=left_out if kind == "manifest" else frozenset(),
             renamed=self._renamed,

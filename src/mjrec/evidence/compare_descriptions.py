@@ -7,7 +7,6 @@ them what their manifests, metadata and trajectories say, and not a word more.
 
 from __future__ import annotations
 
-import re
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
@@ -17,6 +16,7 @@ from ..errors import Error, UnreadableFile
 from ..formats.json_fields import read_object, unreadable
 from ..formats.regular_files import read_regular
 from .bag import bag_tags
+from .claims import VERSION
 from .descriptions import descriptions, packed_with
 from .differences import Difference, Same, only_in, unlike
 from .findings import Topic
@@ -25,7 +25,6 @@ from .packed_run import read_run
 from .read_inputs import packing_options
 
 _LONGEST_FILE: Final = 1 << 28
-_VERSION: Final = re.compile(r"[\w.+-]{1,40}", re.ASCII)
 
 
 def compare_descriptions(bag: Path) -> Iterator[Same | Difference]:
@@ -68,7 +67,7 @@ def written_again(bag: Path) -> dict[str, str]:
 def _claimed(said: dict[str, Any]) -> dict[str, str]:
     """Return the versions that packed it, as claimed."""
     claimed = {name: str(said.get(name)) for name in packed_with()}
-    return {n: v for n, v in claimed.items() if _VERSION.fullmatch(v)}
+    return {n: v for n, v in claimed.items() if VERSION.fullmatch(v)}
 
 
 def _compare(name: str, path: Path, text: str) -> Same | Difference:

@@ -24,7 +24,7 @@ from .findings import Topic
 _LONGEST_LINE: Final = 1 << 24
 _LONGEST_FILE: Final = 1 << 28
 _EPISODE: Final = re.compile(rb'\{"episode_id": (\d{1,15}),')
-_ABSENT: Final = object()
+ABSENT: Final = object()
 
 
 class Rule(NamedTuple):
@@ -37,7 +37,7 @@ class Rule(NamedTuple):
 
 _OF_FILES: Final = Rule(Topic.FILES)
 # Whether a value that is other than made again is right for the archive's own file:
-# its hash, its size. Called with the file's name and the value.
+# its hash, its size. Called with the file's name and the value, ABSENT for none.
 Own: TypeAlias = Callable[[str, Any], bool]
 
 
@@ -48,7 +48,8 @@ class Rules:
     Attributes:
         keys: by the outermost key that stands here; what is below it has the same.
         usual: of all other keys.
-        own: by key, of values that follow from a file of the archive itself.
+        own: by key, of values that follow from a file of the archive itself, or that
+            nothing can recreate.
         claims: keys whose values are versions by the names of packages.
         left_out: keys that are not looked at.
         renamed: names in the archive, and those of the same files made again: a
@@ -86,7 +87,8 @@ _MODEL: Final = Rule(Topic.IDENTITY, Aspect.MODEL)
 KEYS: Final[Mapping[str, Rule]] = {
     **dict.fromkeys(("reward", "episode_rewards", "reward_before"), _REWARD),
     **dict.fromkeys(("length", "episode_lengths", "terminated", "truncated"), _END),
-    **dict.fromkeys(("success", "type", "episode_types", "warnings"), _END),
+    **dict.fromkeys(("type", "episode_types", "warnings"), _END),
+    "success": Rule(Topic.REWARDS, Aspect.OBSERVED),
     **dict.fromkeys(("seed", "options", "random_state"), _BEGINNING),
     **dict.fromkeys(("schedule", "keep", "chosen", "selection", "dropped"), _SELECTION),
     **dict.fromkeys(("pending", "broken", "packed_episodes", "cut"), _SELECTION),
@@ -96,8 +98,6 @@ KEYS: Final[Mapping[str, Rule]] = {
     **dict.fromkeys(("timestep", "playback_speed", "stride", "rate"), _VIDEO),
     **dict.fromkeys(("frame_count", "frame_steps", "recording", "video"), _VIDEO),
     **dict.fromkeys(("gl_vendor", "gl_renderer", "gl_version"), _GL),
-    # Which of several alike; EGL numbers them, others do not.
-    "gl_device": _STATEMENT,
     **dict.fromkeys(("ffmpeg_sha256",), _FFMPEG),
     **dict.fromkeys(("start_time", "end_time", "timestamps"), _OF_FILES),
     **dict.fromkeys(("initial_reset_timestamp", "provenance"), _OF_FILES),
@@ -106,6 +106,24 @@ KEYS: Final[Mapping[str, Rule]] = {
 }
 # The program's name and version; what it was told is no claim.
 _ENCODER: Final = ("encoder_version.version", "encoder_version.cmdline[0]")
+# Of several devices alike, the one that drew. EGL numbers them, others do not.
+_DEVICE: Final = {
+    "file": re.compile(r"/dev/[\w/-]{1,80}", re.ASCII),
+    "uuid": re.compile(r"GPU-[0-9a-f-]{36}", re.ASCII),
+}
+
+
+def is_gl_device(value: Any) -> bool:
+    """Return whether a value is a `gl_device`, or none: a statement without words."""
+    if value is ABSENT:
+        return True
+    if not isinstance(value, dict) or type(value.get("index")) is not int:
+        return False
+    details = {key: text for key, text in value.items() if key != "index"}
+    return details.keys() <= _DEVICE.keys() and all(
+        isinstance(text, str) and _DEVICE[key].fullmatch(text)
+        for key, text in details.items()
+    )
 
 
 def compare_objects(
@@ -208,14 +226,14 @@ def json_differences(
                 continue
             inner = f"{where}.{key}" if where else key
             own = rules.own.get(key)
-            value = given.get(key, _ABSENT)
-            if own is not None and key in made and own(file, value):
-                if value != made[key]:
-                    yield _leaf(value, made[key], file, inner, episode, _STATEMENT)
+            value, other = given.get(key, ABSENT), made.get(key, ABSENT)
+            if own is not None and own(file, value):
+                if value != other:
+                    yield _leaf(value, other, file, inner, episode, _STATEMENT)
                 continue
             yield from json_differences(
                 value,
-                made.get(key, _ABSENT),
+                other,
                 file,
                 rules,
                 where=inner,
@@ -254,15 +272,16 @@ def _leaf(
         error = relative_error(given, made)
         size = error if math.isfinite(error) else None
     aspect = rule.aspect
-    is_gone = given is _ABSENT or made is _ABSENT
+    is_gone = given is ABSENT or made is ABSENT
     how = unlike(given, made)
     if is_gone:
-        how = only_in(made is _ABSENT, given if made is _ABSENT else made)
-    if (is_gone and aspect not in (Aspect.CLAIM, Aspect.STATEMENT)) or (
-        aspect is Aspect.DERIVED and size is None
-    ):
+        how = only_in(made is ABSENT, given if made is ABSENT else made)
+    may_be_gone = aspect is Aspect.STATEMENT or (
+        aspect is Aspect.CLAIM and rule.claim != "machine"
+    )
+    if (is_gone and not may_be_gone) or (aspect is Aspect.DERIVED and size is None):
         # No version makes a number of what is none, nor leaves a key out. But a
-        # package may be missing here.
+        # package may be missing here, or OpenGL's names.
         aspect = Aspect.EXACT
     return Difference(
         topic=rule.topic,

@@ -7,6 +7,7 @@ has its hash in its name, and is another one where another MuJoCo has compiled i
 
 from __future__ import annotations
 
+import contextlib
 import gzip
 import hashlib
 import re
@@ -21,6 +22,7 @@ from ..errors import UnreadableFile
 from ..formats.json_fields import json_object
 from .differences import Aspect, Difference, Same
 from .findings import Topic
+from .zip_contents import check_entries, check_table
 
 _MODEL: Final = re.compile(r"openaigym\.model\.[0-9a-f]{16}")
 # Four numbers; the last is the version. A model of 1 GiB is beyond any.
@@ -39,13 +41,14 @@ def model_name(file: str) -> str:
 
 def renamed_models(given: Path, made: Path) -> dict[str, str]:
     """Return the models that have another name made again, of the same sources."""
-    sources = [
-        {
-            _sources(path): model_name(path.name)
-            for path in folder.rglob("*.model.*.zip")
-        }
-        for folder in (given, made)
-    ]
+    sources: list[dict[str, str]] = []
+    for folder in (given, made):
+        names: dict[str, str] = {}
+        for path in folder.rglob(_SOURCES):
+            # What is damaged is found when it is compared.
+            with contextlib.suppress(UnreadableFile):
+                names[_sources(path)] = model_name(path.name)
+        sources.append(names)
     return {
         name: sources[1][digest]
         for digest, name in sources[0].items()
@@ -106,7 +109,9 @@ def _sources(path: Path) -> str:
     """
     digest = hashlib.sha256()
     try:
+        check_table(path)
         with zipfile.ZipFile(path) as sources:
+            check_entries(sources)
             if sum(each.file_size for each in sources.infolist()) > _LARGEST_MODEL:
                 raise ValueError("its sources are larger than any")
             contents = json_object(sources.read(_CONTENTS))

@@ -32,7 +32,7 @@ _DATASETS: Final = {
     "states": (Topic.PHYSICS, Aspect.STATE),
     "snapshots": (Topic.PICTURES, Aspect.STATE),
     "model_changes": (Topic.PHYSICS, Aspect.STATE),
-    "observations": (Topic.REWARDS, Aspect.DERIVED),
+    "observations": (Topic.REWARDS, Aspect.OBSERVED),
     "rewards": (Topic.REWARDS, Aspect.DERIVED),
     "terminated": (Topic.REWARDS, Aspect.EXACT),
     "truncated": (Topic.REWARDS, Aspect.EXACT),
@@ -111,6 +111,9 @@ def _compare_groups(
     one: h5py.File, other: h5py.File, file: str, rules: Rules
 ) -> Iterator[Same | Difference]:
     named = [_objects(each) for each in (one, other)]
+    before = [f"{each.userblock_size} bytes" for each in (one, other)]
+    if before[0] != before[1]:
+        yield _difference(Topic.FILES, file, "what is before it", *before)
     yield from _compare_attributes(one, other, file, rules)
     for name in sorted(named[0] | named[1]):
         dataset = name.partition("/")[0]
@@ -182,7 +185,9 @@ def _compare_datasets(
         raise ValueError(f"its {name} is stored outside it")
     kinds = [f"{each.dtype} of {each.shape}" for each in (a, b)]
     if kinds[0] != kinds[1]:
-        yield _difference(topic, file, name, *kinds)
+        other = _difference(topic, file, name, *kinds)
+        # A wrapper may observe in another shape.
+        yield replace(other, aspect=aspect) if aspect is Aspect.OBSERVED else other
         return
     found = _Rows(name, topic, aspect, file)
     rows = a.shape[0] if a.shape else 0
@@ -288,7 +293,7 @@ class _Rows:
             topic=topic,
             file=self._file,
             unit=unit,
-            aspect=aspect if is_finite else Aspect.EXACT,
+            aspect=aspect if is_finite or aspect is Aspect.OBSERVED else Aspect.EXACT,
             where=f"{self._name}[{first + row}]" + (f".{member}" if member else ""),
             how=unlike(left[row, column].item(), right[row, column].item()),
             size=size if is_finite else None,

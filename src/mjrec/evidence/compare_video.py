@@ -20,7 +20,7 @@ import numpy as np
 
 from ..formats.json_fields import unreadable
 from ..formats.regular_files import open_regular, read_regular
-from .decoded_video import DecodedVideo
+from .decoded_video import DecodedVideo, has_messages, has_usual_colours
 from .differences import Aspect, Difference, Same, short, unlike
 from .findings import Topic
 from .frame_similarity import (
@@ -81,7 +81,10 @@ def compare_videos(
         aspect=Aspect.ENCODED,
         how="it was encoded otherwise",
     )
-    frames = list(_compare_frames(given, made, file, on_decoded))
+    frames = [
+        *_compare_frames(given, made, file, on_decoded),
+        *_compare_streams(given, file),
+    ]
     yield from frames
     if not found and not any(each.topic is Topic.VIDEOS for each in frames):
         yield Same(topic=Topic.VIDEOS, file=file, unit="video")
@@ -120,6 +123,14 @@ def _compare_frames(
             worst.add(number, a, b)
     on_decoded(digest.hexdigest())
     yield from worst.differences()
+
+
+def _compare_streams(given: Path, file: str) -> Iterator[Difference]:
+    """Yield what players go by beside the frames: what colours mean, and captions."""
+    if not has_usual_colours(given):
+        yield _differs(file, "tags of colours", "others", "BT.709")
+    if has_messages(given):
+        yield _differs(file, "the stream", "frames and messages", "frames")
 
 
 def compare_sampled(

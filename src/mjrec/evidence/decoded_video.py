@@ -16,14 +16,82 @@ from typing import Final, Self
 import numpy as np
 
 from ..errors import UnreadableFile
-from ..formats.ffmpeg import FfmpegProcess, as_file, every_frame_arguments
+from ..formats.ffmpeg import (
+    FfmpegProcess,
+    as_file,
+    every_frame_arguments,
+    run_ffmpeg,
+)
 from ..formats.regular_files import regular_path
 from .frame_similarity import Planes
 
+_BEGINNING: Final = ("-hide_banner", "-loglevel", "error", "-nostdin", "-xerror")
+_INPUT: Final = ("-threads", "2", "-protocol_whitelist", "file", "-f", "mp4")
+# The tags of colours that mjrec writes; and all but frames, among which are no
+# parameters of decoding: these stand in the file's head, for all players alike.
+_TAGS: Final = (
+    "h264_metadata=video_full_range_flag=0:colour_primaries=1:"
+    "transfer_characteristics=1:matrix_coefficients=1"
+)
+_BESIDE_FRAMES: Final = "filter_units=remove_types=1|5|9"
+_MOST_BESIDE: Final = 1 << 20
+# A message by x264, which says how it encodes.
+_MESSAGE: Final = b"\0\0\0\1\x06\x05"
+_BY_X264: Final = bytes.fromhex("dc45e9bde6d948b7962cd820d923eeef")
 _READ_SIZE: Final = 1 << 20
 _LONGEST_HEADER: Final = 1024
 _HEADER: Final = re.compile(rb"YUV4MPEG2 W(\d{1,5}) H(\d{1,5}) [^\n]*")
 _FRAME: Final = b"FRAME\n"
+
+
+def has_usual_colours(path: Path) -> bool:
+    """Return whether the tags of a video let players show its colours as they are.
+
+    Raises:
+        EncoderError: it cannot be read.
+    """
+    hashes = [
+        _stream(path, filters, "-f", "hash", "-hash", "sha256")
+        for filters in ("h264_mp4toannexb", f"h264_mp4toannexb,{_TAGS}")
+    ]
+    return hashes[0] == hashes[1]
+
+
+def has_messages(path: Path) -> bool:
+    """Return whether anything but frames is in a video's stream, such as captions.
+
+    Raises:
+        EncoderError: it cannot be read.
+    """
+    beside = _stream(path, _BESIDE_FRAMES, "-f", "data", "-fs", str(_MOST_BESIDE))
+    return bool(beside) and not _is_by_x264(beside)
+
+
+def _is_by_x264(units: bytes) -> bool:
+    """Return whether units of a stream are one message of the encoder's, and no more.
+
+    Its size is a sum of bytes, of which the last is not 255.
+    """
+    sizes = units.removeprefix(_MESSAGE)
+    full = len(sizes) - len(sizes.lstrip(b"\xff"))
+    size = 255 * full + int.from_bytes(sizes[full : full + 1])
+    message = sizes[full + 1 :]
+    return (
+        units.startswith(_MESSAGE)
+        and message.startswith(_BY_X264)
+        and message[size:] == b"\x80"
+    )
+
+
+def _stream(path: Path, filters: str, *output: str) -> bytes:
+    """Return what filters of its bits make of a video's stream; nothing is decoded."""
+    arguments = [
+        *_BEGINNING,
+        *_INPUT,
+        *("-i", as_file(path), "-map", "0:v:0", "-c", "copy", "-bsf:v", filters),
+        *(*output, "pipe:1"),
+    ]
+    return run_ffmpeg(arguments, what=f"The video {path.name} cannot be read.")
 
 
 class DecodedVideo:
@@ -51,9 +119,9 @@ class DecodedVideo:
         self._rest = b""
         self._process = FfmpegProcess(
             [
-                *("-hide_banner", "-loglevel", "error", "-nostdin", "-xerror"),
-                *("-threads", "2", "-protocol_whitelist", "file"),
-                *("-f", "mp4", "-c:v", "h264", "-i", as_file(source)),
+                *_BEGINNING,
+                *_INPUT,
+                *("-c:v", "h264", "-i", as_file(source)),
                 *("-map", "0:v:0", *every_frame_arguments()),
                 *("-pix_fmt", "yuv420p", "-f", "yuv4mpegpipe", "pipe:1"),
             ],

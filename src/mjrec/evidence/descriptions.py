@@ -236,7 +236,9 @@ def _markdown(value: object) -> str:
     if isinstance(value, _Verbatim):
         return value
     line = " ".join(str(value).split())
-    return line.replace("<", "&lt;").replace("|", "\\|").replace("`", "'")
+    for sign, written in (("<", "&lt;"), ("|", "\\|"), ("`", "'"), ("[", "\\[")):
+        line = line.replace(sign, written)
+    return line
 
 
 def _json(value: object) -> str:

@@ -28,6 +28,8 @@ class Aspect(enum.Enum):
         EXACT: it must be equal; no version or machine changes it.
         STATE: numbers of the simulation.
         DERIVED: numbers that the environment computes of states.
+        OBSERVED: what the environment's or a wrapper's code gives besides rewards and
+            ends: observations, success.
         SOLVER: what only the solver uses to begin from: the warm start.
         MODEL: the compiled model.
         PICTURE: a frame's pixels, as the file shows them.
@@ -42,6 +44,7 @@ class Aspect(enum.Enum):
     EXACT = "exact"
     STATE = "state"
     DERIVED = "derived"
+    OBSERVED = "observed"
     SOLVER = "solver"
     MODEL = "model"
     PICTURE = "frame"

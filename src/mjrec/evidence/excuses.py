@@ -55,15 +55,15 @@ class _Rule:
         costs: what it takes away, a clause.
         allows: by aspect, up to which size.
         excludes: topics that are believed, whatever differs in them.
-        is_fed: what it excludes was fed to the maker, and is believed though it is
-            equal.
+        fed: topics that were fed to the maker: equal they prove nothing, and there is
+            no reason for a difference.
     """
 
     kind: ExcuseKind
     costs: str
     allows: _Allowed = field(default_factory=dict)
     excludes: Sequence[Topic] = ()
-    is_fed: bool = False
+    fed: Sequence[Topic] = ()
 
 
 _STEPS: Final = "steps and rewards are compared within a tolerance"
@@ -92,7 +92,8 @@ _BY_NAME: Final[Mapping[str, _Rule]] = {
     "ffmpeg": _Rule(
         kind=ExcuseKind.VERSION,
         costs="frames in the files are alike within a tolerance",
-        allows=_ALIKE,
+        # Frames are hashed before they are encoded.
+        allows={a: limit for a, limit in _ALIKE.items() if a is not Aspect.HASH},
     ),
     **dict.fromkeys(
         ("numpy", "gymnasium", "gymnasium-robotics", "dm-control"),
@@ -115,37 +116,33 @@ _BY_NAME: Final[Mapping[str, _Rule]] = {
     "wrappers": _Rule(
         kind=ExcuseKind.CODE,
         costs="what it made of actions, rewards and ends is believed",
-        excludes=(Topic.REWARDS,),
-        is_fed=True,
+        allows={Aspect.OBSERVED: math.inf},
+        fed=(Topic.REWARDS,),
     ),
     **dict.fromkeys(
         ("schedule", "rule", "step_trigger"),
         _Rule(
             kind=ExcuseKind.CODE,
             costs="which episodes it chose is believed",
-            excludes=(Topic.SELECTION,),
-            is_fed=True,
+            fed=(Topic.SELECTION,),
         ),
     ),
     "actions not kept": _Rule(
         kind=ExcuseKind.EVENT,
         costs="returns and ends are believed",
-        excludes=(Topic.REWARDS, Topic.BEGINNING, Topic.PHYSICS),
-        is_fed=True,
+        fed=(Topic.REWARDS, Topic.BEGINNING, Topic.PHYSICS),
     ),
     "unseeded beginning": _Rule(
         kind=ExcuseKind.EVENT,
         costs="the state that it begins from is believed",
-        excludes=(Topic.BEGINNING,),
-        is_fed=True,
+        fed=(Topic.BEGINNING,),
     ),
     **dict.fromkeys(
-        ("kill", "early reset", "exception", "fault", "close"),
+        ("kill", "early reset", "exception", "fault"),
         _Rule(
             kind=ExcuseKind.EVENT,
             costs="where it ends is believed",
-            excludes=(Topic.REWARDS,),
-            is_fed=True,
+            fed=(Topic.REWARDS,),
         ),
     ),
 }
@@ -280,8 +277,7 @@ class Trial:
         is_fed = False
         for index in self._reaching(place):
             self._equal[index, place.unit] += place.count
-            rule = _rule(self._excuses[index])
-            is_fed |= rule.is_fed and place.topic in rule.excludes
+            is_fed |= place.topic in _rule(self._excuses[index]).fed
         return is_fed
 
     def judge(self, found: Difference) -> Finding | None:
@@ -338,8 +334,7 @@ class Trial:
     def _reaching(self, place: Place) -> Iterator[int]:
         scopes = place.scopes
         for index, items in enumerate(self._scopes):
-            # Descriptions speak of all recordings.
-            if not items or "/" not in place.file or not items.isdisjoint(scopes):
+            if not items or not items.isdisjoint(scopes):
                 yield index
 
     def _refutation(self, index: int) -> str | None:
@@ -372,12 +367,12 @@ def believed(note: Note) -> tuple[Excuse, Finding | None]:
     # Of code the reason says whose.
     is_told = rule is not None and rule.kind is not ExcuseKind.EVENT
     excuse = excuse_of(name, reason if is_told else "", "", item)
-    if rule is not None and not rule.is_fed:
+    if rule is not None and not rule.fed:
         return excuse, None
     if rule is None:
         excuse = dataclasses.replace(excuse, kind=ExcuseKind.EVENT, costs=reason)
     finding = Finding(
-        topic=rule.excludes[0] if rule else Topic.FILES,
+        topic=rule.fed[0] if rule else Topic.FILES,
         item=item,
         outcome=Outcome.BELIEVED,
         reason=reason,
@@ -398,7 +393,11 @@ def _outcome(excuse: Excuse, found: Difference) -> Outcome | None:
     if found.aspect is Aspect.EXACT:
         is_described = excuse.name == "mjrec" and found.file in _DESCRIPTIONS
         return Outcome.BELIEVED if is_described else None
-    limit = _allows(excuse, rule).get(found.aspect)
+    allows = _allows(excuse, rule)
+    limit = allows.get(found.aspect)
+    aspect = found.aspect
+    if limit is None and aspect is Aspect.OBSERVED:
+        aspect, limit = Aspect.DERIVED, allows.get(Aspect.DERIVED)
     if limit is None:
         return None
     if isinstance(limit, Limits):
@@ -407,7 +406,7 @@ def _outcome(excuse: Excuse, found: Difference) -> Outcome | None:
         is_within = math.isinf(limit) or (
             found.size is not None and found.size <= limit
         )
-    return _OUTCOMES.get(found.aspect, Outcome.BELIEVED) if is_within else None
+    return _OUTCOMES.get(aspect, Outcome.BELIEVED) if is_within else None
 
 
 def _allows(excuse: Excuse, rule: _Rule) -> _Allowed:

@@ -168,7 +168,10 @@ class Verification:
             return Verdict.PARTLY
         if not any(map(_is_proof, self.findings)):
             return Verdict.FAIL
-        allowed = {excuse.name for excuse in self.excuses if excuse.allowed}
+        needed = [excuse for excuse in self.excuses if excuse.is_needed]
+        allowed = {excuse.name for excuse in needed if excuse.allowed}
+        # Of several claims of one kind, the reader may take one only.
+        allowed -= {excuse.name for excuse in needed if not excuse.allowed}
         # Less deep levels leave files and frames out.
         is_whole = self.level is Level.PIXELS and all(
             finding.outcome in (Outcome.MADE_AGAIN, Outcome.NOTED)

@@ -8,7 +8,9 @@ video may show a part of its episode, or be faster than real time.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator, Mapping, Sequence
+import itertools
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +25,8 @@ from .findings import Finding, Outcome, Topic
 from .inputs import EpisodeInputs, Inputs, RecordingInputs
 
 _MOST_SHOWN = 5
+# How the environments of Gymnasium's registry and of dm_control's suite are called.
+_REGISTERED = re.compile(r"dm_control/.+|.+-v\d+")
 
 
 def remarks(inputs: Inputs, arrays: Mapping[str, NDArray[Any]]) -> Iterator[Finding]:
@@ -33,8 +37,12 @@ def remarks(inputs: Inputs, arrays: Mapping[str, NDArray[Any]]) -> Iterator[Find
         arrays: the actions that they name.
     """
     for recording in inputs.recordings:
+        yield from _name(recording)
         yield from _gaps(recording, inputs.recordings)
+        yield from _cuts(recording, inputs.recordings)
+        yield from _types(recording)
         yield from _seeds(recording)
+    yield from _gaps_of_evaluations(inputs.recordings)
     yield from _repeated(inputs, arrays)
 
 
@@ -60,43 +68,122 @@ def remarks_on_video(metadata: Path, file: str) -> Iterator[Finding]:
         )
 
 
+def _name(recording: RecordingInputs) -> Iterator[Finding]:
+    """Yield that an environment is called by the name of another one."""
+    environment = recording.environment or {}
+    env_id, name = environment.get("id"), recording.env_id
+    if env_id is not None and name != env_id:
+        is_anothers = _REGISTERED.fullmatch(name) is not None
+        yield _headline(
+            Topic.IDENTITY,
+            recording.name,
+            f"it is called {name!r:.80}, and its environment is {env_id!r:.80}",
+            outcome=Outcome.DIFFERENT if is_anothers else Outcome.BELIEVED,
+            unit="recording",
+        )
+    elif environment.get("framework") == "mjcf" and _REGISTERED.fullmatch(name):
+        yield _headline(
+            Topic.IDENTITY,
+            recording.name,
+            f"{name!r:.80} is a model (MJCF) of the author's, not the environment of "
+            "that name",
+            outcome=Outcome.NOTED,
+            unit="recording",
+        )
+
+
 def _gaps(
     recording: RecordingInputs, all_of_them: Sequence[RecordingInputs]
 ) -> Iterator[Finding]:
     first = recording.first_episode_id
     numbers = {each.episode_id for each in recording.episodes}
-    missing = set(range(first, max(numbers, default=first - 1) + 1)) - numbers
-    if missing:
+    count, missing = _missing(numbers, first, max(numbers, default=first - 1) + 1)
+    if count:
         yield _headline(
             Topic.SELECTION,
             recording.name,
-            f"episodes are missing: {_listed(missing)}",
+            f"episodes are missing: {missing}",
             outcome=Outcome.DIFFERENT,
-            count=len(missing),
+            count=count,
         )
-    absent = set(range(first))
-    for other in all_of_them if first else ():
-        absent.difference_update(each.episode_id for each in other.episodes)
-    if absent:
+    before = {
+        each.episode_id
+        for other in all_of_them
+        if other.environment == recording.environment
+        for each in other.episodes
+    }
+    count, missing = _missing(before, 0, first)
+    if count:
         yield _headline(
             Topic.SELECTION,
             recording.name,
-            f"it begins with episode {first}, and the recordings that it went on from "
-            f"are not here: {_listed(absent)} are missing",
+            f"it begins with episode {first}, and the recordings of its environment "
+            f"that it went on from are not here: {missing} are missing",
             outcome=Outcome.BELIEVED,
-            count=len(absent),
+            count=count,
         )
-    cut = [each for each in recording.episodes if each.cut is not None]
-    if cut:
-        yield Finding(
-            topic=Topic.SELECTION,
-            item=recording.name,
+
+
+def _cuts(
+    recording: RecordingInputs, all_of_them: Sequence[RecordingInputs]
+) -> Iterator[Finding]:
+    """Yield which episodes are in no statistics, as they were cut off."""
+    cut = [each.episode_id for each in recording.episodes if each.cut is not None]
+    if not cut:
+        return
+    # A run is closed once. Whoever closes and goes on can leave out what goes wrong.
+    goes_on = any(
+        other.first_episode_id > max(cut) and other.env_id == recording.env_id
+        for other in all_of_them
+    )
+    then = ", and another recording goes on after them" if goes_on else ""
+    yield _headline(
+        Topic.SELECTION,
+        recording.name,
+        f"episodes that are not in the statistics, as they were cut off: "
+        f"{_listed(cut)}{then}",
+        outcome=Outcome.BELIEVED if goes_on else Outcome.NOTED,
+        count=len(cut),
+    )
+
+
+def _types(recording: RecordingInputs) -> Iterator[Finding]:
+    """Yield which episodes are called training among those called evaluation."""
+    complete = [each for each in recording.episodes if each.cut is None]
+    training = [each.episode_id for each in complete if each.type != "e"]
+    if training and len(training) < len(complete):
+        yield _headline(
+            Topic.SELECTION,
+            recording.name,
+            f"{len(training)} of {len(complete)} episodes are called training, the "
+            f"others evaluation: {_listed(training)}",
             outcome=Outcome.NOTED,
-            reason=f"episodes that are not in the statistics, as they were cut off: "
-            f"{_listed(each.episode_id for each in cut)}",
-            count=len(cut),
-            unit="episode",
+            count=len(training),
         )
+
+
+def _gaps_of_evaluations(recordings: Sequence[RecordingInputs]) -> Iterator[Finding]:
+    """Yield which episodes of an evaluation's seeds are not here.
+
+    They are numbered from 0, over all recordings of an environment.
+    """
+    numbers: dict[tuple[str, int], set[int]] = {}
+    for recording in recordings:
+        for each in recording.episodes:
+            said = each.evaluation or {}
+            seed, number = said.get("seed"), said.get("episode")
+            if type(seed) is int and type(number) is int:
+                numbers.setdefault((recording.env_id, seed), set()).add(number)
+    for (env_id, seed), known in numbers.items():
+        count, missing = _missing(known, 0, max(known) + 1)
+        if count:
+            yield _headline(
+                Topic.SELECTION,
+                f"{env_id:.80}, seed {seed}",
+                f"episodes of the evaluation that are not here, or failed: {missing}",
+                outcome=Outcome.BELIEVED,
+                count=count,
+            )
 
 
 def _seeds(recording: RecordingInputs) -> Iterator[Finding]:
@@ -177,7 +264,13 @@ def _digest(array: NDArray[Any] | None) -> str:
 
 
 def _headline(
-    topic: Topic, item: str, reason: str, *, outcome: Outcome, count: int
+    topic: Topic,
+    item: str,
+    reason: str,
+    *,
+    outcome: Outcome,
+    count: int = 1,
+    unit: str = "episode",
 ) -> Finding:
     return Finding(
         topic=topic,
@@ -185,16 +278,26 @@ def _headline(
         outcome=outcome,
         reason=reason,
         count=count,
-        unit="episode",
+        unit=unit,
         is_headline=True,
     )
 
 
-def _listed(items: Any) -> str:
+def _missing(known: set[int], start: int, stop: int) -> tuple[int, str]:
+    """Return how many numbers of a range are not known, and the first of them."""
+    count = max(0, stop - start) - sum(start <= number < stop for number in known)
+    missing = (number for number in range(start, stop) if number not in known)
+    return count, _shown(itertools.islice(missing, min(count, _MOST_SHOWN)), count)
+
+
+def _listed(items: Iterable[Any]) -> str:
     ordered = sorted(items)
-    shown = ", ".join(map(str, ordered[:_MOST_SHOWN]))
-    left = len(ordered) - _MOST_SHOWN
-    return f"{shown} and {left} more" if left > 0 else shown
+    return _shown(ordered[:_MOST_SHOWN], len(ordered))
+
+
+def _shown(first: Iterable[Any], count: int) -> str:
+    text, more = ", ".join(map(str, first)), count - _MOST_SHOWN
+    return f"{text} and {more} more" if more > 0 else text
 
 
 def _of_video(said: Mapping[str, Any]) -> Iterator[str]:

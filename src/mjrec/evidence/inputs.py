@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .. import json_text
+from ..environments.scenes import shown_wrappers
 
 INPUTS_FILE: Final = "inputs.json"
 ARRAYS_FILE: Final = "arrays.npz"
@@ -190,7 +191,7 @@ class Inputs:
     packing: Mapping[str, Any] = field(default_factory=dict)
 
     def unusual(self) -> dict[str, dict[str, Any]]:
-        """Return the inputs that are not the default, by what they are of."""
+        """Return environments and inputs that are not default, by what they are of."""
         found = {each.name: dict(_unusual(each)) for each in self.recordings}
         packing = {
             name: value
@@ -247,11 +248,15 @@ def given_actions(
 
 def _unusual(recording: RecordingInputs) -> Iterator[tuple[str, Any]]:
     environment = recording.environment or {}
+    of_author = ", a model (MJCF) of the author's"
+    is_mjcf = environment.get("framework") == "mjcf"
+    yield "environment", f"{environment.get('id')}{of_author if is_mjcf else ''}"
     for name, value in (environment.get("kwargs") or {}).items():
         yield f"environment: {name}", value
-    for key in ("max_episode_steps", "wrappers"):
-        if environment.get(key):
-            yield key, environment[key]
+    if environment.get("max_episode_steps"):
+        yield "max_episode_steps", environment["max_episode_steps"]
+    if environment.get("wrappers"):
+        yield "wrappers", shown_wrappers(environment)
     for name, value in recording.options.items():
         if value is not None:
             yield name, value
@@ -261,9 +266,10 @@ def _unusual(recording: RecordingInputs) -> Iterator[tuple[str, Any]]:
         yield "keep", recording.rule
     for keep in recording.evaluation_keeps[-1:]:
         yield "keep", str(keep.get("rule"))
-    resets = [each for each in recording.episodes if each.options]
+    resets = [each.options for each in recording.episodes if each.options]
     if resets:
-        yield "options of resets", len(resets)
+        different = dict.fromkeys(map(json_text.dumps, resets))
+        yield "options of resets", list(map(json_text.loads, different))
 
 
 def _regular(episode: EpisodeInputs, recorded: NDArray[Any] | None) -> Iterator[Any]:

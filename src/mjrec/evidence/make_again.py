@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from ..environments.recreate import NotRecreated, Recreated, checked_options, recreate
 from ..environments.scenes import new_warnings
 from ..environments.stand_ins import RecordedSteps
-from ..errors import UnreadableFile
+from ..errors import Error, UnreadableFile
 from ..formats.journal import KILLED
 from ..recorder.ending_reasons import EXCEPTION, INTERRUPT, RESET
 from ..simulation.model_sources import read_authored
@@ -111,7 +111,11 @@ def play_recording(
             notes=notes,
             on_steps=on_steps,
         )
-        playing.run()
+        try:
+            playing.run()
+        except NotRecreated:
+            playing.abandon()
+            raise
         return playing.rewards
 
     if not recording.was_killed:
@@ -229,6 +233,11 @@ class _Playing:
                 f"seed {facts['seed']}, episode {facts['episode']} failed, as its "
                 f"author says: {facts.get('failure')!s:.200}",
             )
+
+    def abandon(self) -> None:
+        """Let go of a recording that cannot go on; what is there is of no use."""
+        with contextlib.suppress(Error):
+            self._monitor.close()
 
     def _evaluation_facts(self, said: Mapping[str, Any]) -> Mapping[str, Any]:
         warnings = new_warnings(self._warned, self._recreated.warnings())

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ..environments.scenes import shown_arguments
+from ..environments.scenes import shown_arguments, shown_wrappers
 from ..formats.json_fields import read_object, unreadable
 from ..formats.monitor_directory import infix_of, iter_monitor_files
 from ..formats.trajectory_hdf5 import open_hdf5
@@ -199,6 +199,8 @@ def read_run(recordings: Path, *, options: PackingOptions) -> PackedRun:
                 tallies.get(monitor.infix, Tally()),
             )
             for monitor in monitors_of(recordings)
+            # What no manifest speaks of is not packed.
+            if monitor.manifest is not None
         ),
     )
 
@@ -248,7 +250,11 @@ def _arguments(facts: Mapping[str, Any]) -> str:
     environment = facts_in(facts.get("environment"))
     if environment and environment.get("kwargs") is None:
         return "arguments that are not recorded"
-    return shown_arguments(environment.get("kwargs"))
+    shown = shown_arguments(environment.get("kwargs"))
+    wrappers = shown_wrappers(environment)
+    if not wrappers:
+        return shown
+    return f"{shown or 'its defaults'}, in the wrappers {', '.join(wrappers)}"
 
 
 def _read(path: Path) -> Mapping[str, Any]:

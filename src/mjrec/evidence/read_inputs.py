@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -38,6 +38,19 @@ _MOST_EPISODES = 1_000_000
 # What the journal says of an evaluation's episodes.
 _UNIT = ("seed", "episode")
 _FAILED = (*_UNIT, "episode_id", "failure", "length", "start_time", "seconds")
+# Of a provenance, the keys that a recorder writes; and those below them, where they
+# are always the same.
+_PROVENANCE: Mapping[str, tuple[str, ...]] = {
+    **dict.fromkeys(("command", "working_directory", "python", "packages"), ()),
+    **dict.fromkeys(("system", "variables"), ()),
+    "machine": ("architecture", "libc", "cpu_flags", "tunables"),
+    "cpu": ("model", "flags", "usable"),
+    "code": ("root", "commit", "dirty", "remote"),
+    "policy": ("file", "sha256"),
+}
+# Of the choice among an evaluation's episodes: in a video's facts, and in a journal.
+_SELECTION = ("rule", "decided", "scope", "finished", "roles")
+_EVALUATION_KEEP = (*_SELECTION[:-1], "chosen", "recorded", "recording")
 _DTYPES = frozenset(
     f"{kind}{bits}" for kind in ("float", "int", "uint") for bits in (8, 16, 32, 64)
 ) | {"bool"}
@@ -55,10 +68,13 @@ def read_inputs(data: Path) -> tuple[Inputs, dict[str, NDArray[Any]]]:
     """
     arrays: dict[str, NDArray[Any]] = {}
     try:
-        recordings = [
-            _recording(files, arrays) for files in monitors_of(data / RECORDINGS)
-        ]
         packing = _packing(data / ENVIRONMENT)
+        monitors = monitors_of(data / RECORDINGS)
+        strays = [files for files in monitors if packing and files.manifest is None]
+        if strays:
+            name = strays[0].paths[0].name
+            raise ValueError(f"{name} is of no recording: none has its manifest")
+        recordings = [_recording(files, arrays) for files in monitors]
     except UnreadableFile as error:
         raise Error(f"{_UNREADABLE}: {error.path.name}: {error.reason}") from error
     except (AttributeError, LookupError, TypeError, ValueError) as error:
@@ -97,9 +113,14 @@ def packing_options(said: Mapping[str, Any]) -> PackingOptions:
     try:
         chosen = None if episodes is None else tuple(map(_count, episodes))
         lists = {"authors": tuple(said.get("authors", ())), "episodes": chosen}
-        return PackingOptions(**{**said, **lists})
+        options = PackingOptions(**{**said, **lists})
     except TypeError as error:
         raise ValueError(f"its options of packing cannot be: {error}") from error
+    if type(options.anonymous) is not bool or not isinstance(
+        options.max_size, int | None
+    ):
+        raise ValueError(f"its options of packing cannot be {said!r:.200}")
+    return options
 
 
 def _recording(files: MonitorFiles, arrays: dict[str, NDArray[Any]]) -> RecordingInputs:
@@ -195,7 +216,7 @@ class _Journal:
             case "run", dict():
                 self.run = facts
             case "provenance", dict():
-                self.provenance = facts
+                self.provenance = _provenance(facts)
                 self.provenance_after = self._lines
             case "cut", {"episode_id": int(number)}:
                 self.cuts[number] = facts
@@ -208,8 +229,8 @@ class _Journal:
             case "begun" | "failed", dict():
                 self.evaluation_events.append((kind, _of_evaluation(kind, facts)))
             case "keep", {"scope": "evaluation", "chosen": list(numbers)}:
-                chosen = [*map(_count, numbers)]
-                self.evaluation_keeps.append({**facts, "chosen": chosen})
+                known = {**facts, "chosen": [*map(_count, numbers)]}
+                self.evaluation_keeps.append(_known(known, _EVALUATION_KEEP))
             case "keep", {"recorded": list(numbers)}:
                 self.kept = tuple(map(_count, numbers))
             case "recovered", _:
@@ -345,19 +366,32 @@ def _steps_taken(reader: TrajectoryReader) -> dict[str, NDArray[Any]]:
 
 
 def _of_evaluation(kind: str, facts: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Return facts of an event of an evaluation, if it has these and no others."""
-    known = {"begun": _UNIT, "failed": _FAILED}[kind]
-    if not facts.keys() <= {*known} or not all(
-        type(facts.get(k)) is int for k in _UNIT
-    ):
-        raise ValueError(f"{facts!r:.200} are no facts of an event {kind!r}")
-    return facts
+    """Return the known facts of an event of an evaluation."""
+    if not all(type(facts.get(name)) is int for name in _UNIT):
+        raise ValueError(f"{facts!r:.200} names no episode of an evaluation")
+    return _known(facts, _UNIT if kind == "begun" else _FAILED)
 
 
 def _selection(video: Any) -> Mapping[str, Any] | None:
     said = video.get("selection") if isinstance(video, Mapping) else None
-    is_evaluation = isinstance(said, Mapping) and said.get("scope") == EVALUATION
-    return said if is_evaluation else None
+    if not isinstance(said, Mapping) or said.get("scope") != EVALUATION:
+        return None
+    return _known(said, _SELECTION)
+
+
+def _provenance(said: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Return a provenance without keys that no recorder writes."""
+    known: dict[str, Any] = {}
+    for key, value in _known(said, _PROVENANCE).items():
+        inner = _PROVENANCE[key]
+        is_nested = inner and isinstance(value, Mapping)
+        known[key] = _known(value, inner) if is_nested else value
+    return known
+
+
+def _known(said: Mapping[str, Any], keys: Collection[str]) -> dict[str, Any]:
+    """Return what stands under known keys; nothing recreates the others."""
+    return {key: value for key, value in said.items() if key in keys}
 
 
 def _sources(files: MonitorFiles, environment: Any) -> str | None:

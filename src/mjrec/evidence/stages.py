@@ -110,6 +110,7 @@ def _make(request: Mapping[str, Any], say: _Say) -> None:
     import numpy as np
 
     from ..environments.recreate import NotRecreated
+    from ..formats.monitor_directory import infix_of, iter_monitor_files
     from ..rendering.recovery import recover
     from .draw_again import draw_all, draw_sample
     from .evaluation_choice import choose_for_evaluations
@@ -147,6 +148,10 @@ def _make(request: Mapping[str, Any], say: _Say) -> None:
                     on_steps=count_steps,
                 )
             except NotRecreated as error:
+                # What was recorded before that proves nothing.
+                for path in iter_monitor_files(played, hidden=True):
+                    if infix_of(path.name) == recording.infix:
+                        path.unlink()
                 episodes = max(1, len(recording.episodes))
                 notes.add(recording.name, error.excuse, str(error), count=episodes)
     if any(recording.was_killed for recording in inputs.recordings):

@@ -14,7 +14,16 @@ from typing import Any, Final
 from .. import json_text
 from ..formats.monitor_directory import FILE_PREFIX
 from ..plain_text import counted
-from .findings import Excuse, Finding, Level, Outcome, Topic, Verdict, Verification
+from .findings import (
+    Excuse,
+    ExcuseKind,
+    Finding,
+    Level,
+    Outcome,
+    Topic,
+    Verdict,
+    Verification,
+)
 
 _MOST_ITEMS: Final = 3
 _LONGEST_INPUT: Final = 100
@@ -65,7 +74,8 @@ def headline(verification: Verification) -> str:
             return f"{name}: nothing contradicts it, but not everything is proved."
     count = sum(finding.count for finding in verification.failures)
     if count or any(excuse.refuted for excuse in verification.excuses):
-        return f"{name}: it is not what its inputs give; {_places(count)} differ."
+        differ = f"{counted(count, 'place')} differ{'s' if count == 1 else ''}"
+        return f"{name}: it is not what its inputs give; {differ}."
     return f"{name}: nothing could be made again, so nothing is proved."
 
 
@@ -84,7 +94,7 @@ def excuses(verification: Verification) -> list[str]:
     known = verification.excuses
     needed = [each for each in known if each.is_needed or each.refuted]
     others = dict.fromkeys(_claim(each) for each in known if each not in needed)
-    idle = [f"not needed, as nothing differs: {'; '.join(others)}"] if others else []
+    idle = [f"claimed, and nothing rests on it: {'; '.join(others)}"] if others else []
     return [*(_excuse(each, verification) for each in needed), *idle]
 
 
@@ -190,6 +200,9 @@ def _excuse(excuse: Excuse, verification: Verification) -> str:
 
 def _claim(excuse: Excuse) -> str:
     here = f" (here {excuse.here})" if excuse.here else ""
+    if excuse.kind is ExcuseKind.CODE and excuse.claimed:
+        # It is a sentence.
+        return f"{excuse.name} ({excuse.claimed})"
     return f"{excuse.name} {excuse.claimed}{here}".strip()
 
 
@@ -204,10 +217,6 @@ def _some(items: tuple[str, ...]) -> str:
     more = len(items) - _MOST_ITEMS
     shown = ", ".join(items[:_MOST_ITEMS])
     return f"{shown} and {more} more" if more > 0 else shown
-
-
-def _places(count: int) -> str:
-    return counted(count, "place")
 
 
 def _short(value: Any) -> str:

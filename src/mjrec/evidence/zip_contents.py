@@ -36,6 +36,10 @@ _DESCRIPTOR_SIZES = (12, 16, 20, 24)
 # Encrypted, patched, strongly encrypted, with a masked table.
 _UNREADABLE = 0x0001 | 0x0020 | 0x0040 | 0x2000
 
+# Of what may follow a name: sizes beyond 4 GiB, times and owners. Other fields give an
+# entry another name, which some programs read and others do not.
+_KNOWN_EXTRAS = (0x0001, 0x000A, 0x5455, 0x5855, 0x7855, 0x7875)
+
 # Text packs tenfold, deflate at most a thousandfold.
 _ALWAYS_FINE = 1 << 26
 _MOST_EXPANSION = 100
@@ -87,13 +91,8 @@ def zip_contents(archive: zipfile.ZipFile) -> ZipContents:
         ValueError: it is no plain archive, or a bomb.
         OSError: it cannot be read.
     """
-    infos = archive.infolist()
-    for info in infos:
-        _check_entry(info)
-    _check_places(archive, infos)
+    infos = check_entries(archive)
     files = tuple(info for info in infos if not info.is_dir())
-    # On some systems two of them may be one; folders may be said twice.
-    check_distinct(info.filename for info in files)
     tops = {portable_parts(info.filename.rstrip("/"))[0] for info in infos}
     if len(tops) != 1 or any("/" not in info.filename for info in files):
         raise ValueError(
@@ -106,6 +105,22 @@ def zip_contents(archive: zipfile.ZipFile) -> ZipContents:
         folders=tuple(info.filename for info in infos if info.is_dir()),
         size=_checked_size(files),
     )
+
+
+def check_entries(archive: zipfile.ZipFile) -> Sequence[zipfile.ZipInfo]:
+    """Return the entries of an archive, in which all programs see the same.
+
+    Raises:
+        ValueError: it is no plain archive.
+        OSError: it cannot be read.
+    """
+    infos = archive.infolist()
+    for info in infos:
+        _check_entry(info)
+    _check_places(archive, infos)
+    # On some systems two of them may be one; folders may be said twice.
+    check_distinct(info.filename for info in infos if not info.is_dir())
+    return infos
 
 
 def _table_of(file: BinaryIO, size: int) -> tuple[int, int, int, int]:
@@ -165,6 +180,19 @@ def _check_entry(info: zipfile.ZipInfo) -> None:
         info.compress_size != info.file_size
     ):
         raise ValueError(f"{name!r} has two sizes")
+    if info.comment:
+        raise ValueError(f"{name!r} has a comment")
+    _check_extra(name, info.extra)
+
+
+def _check_extra(name: str, extra: bytes) -> None:
+    while extra:
+        kind, size = struct.unpack("<2H", extra[:4].ljust(4, b"\0"))
+        if kind not in _KNOWN_EXTRAS or len(extra) < 4 + size:
+            raise ValueError(
+                f"{name!r} has a field {kind:#06x} that not all programs read"
+            )
+        extra = extra[4 + size :]
 
 
 def _check_places(archive: zipfile.ZipFile, infos: Sequence[zipfile.ZipInfo]) -> None:
@@ -199,6 +227,7 @@ def _end_of(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> int:
     ):
         raise ValueError(f"{info.filename!r} is called so in one of two places only")
     name_size, extra_size = int(fields[-2]), int(fields[-1])
+    _check_extra(info.filename, archive.fp.read(extra_size))
     begin = info.header_offset + _LOCAL.size + name_size + extra_size
     return begin + info.compress_size
 
