@@ -510,9 +510,8 @@ def test_time_is_linear_in_episodes(tmp_path: Path) -> None:
         start = time.process_time()
         found = list(Comparison(*bags))
         seconds.append(time.process_time() - start)
-        assert (
-            sum(f.count for f in found if f.outcome is Outcome.DIFFERENT) == count // 2
-        )
+        # What was fed to the run has no excuse.
+        assert sum(f.count for f in found if f.outcome is Outcome.DIFFERENT) == count
     assert seconds[1] < 8 * seconds[0] + 0.1
 
 
