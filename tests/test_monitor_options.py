@@ -66,8 +66,8 @@ IMPOSSIBLE = {
     "cheetah": [
         *(({"render": v}, "InvalidArgument", "deferred") for v in ("later", 3, "")),
         *(({"workers": v}, "InvalidArgument", "workers") for v in (-1, 1.5, True, "2")),
-        ({"keep": "wurst:3"}, "UnknownName", "'wurst:3'. Available: best:N"),
-        ({"keep": "median:2"}, "UnknownName", "Available: best:N"),
+        ({"keep": "wurst:3"}, "UnknownName", "'wurst:3'. Available: best, best:N"),
+        ({"keep": "median:2"}, "UnknownName", "Available: best, best:N"),
         *(
             ({"keep": rule}, "InvalidArgument", "1 or more")
             for rule in ("worst:0", "best:x", "failures:1.5", "worst")
