@@ -224,7 +224,7 @@ def namespaces():
     [
         ("egl", "libEGL.so*", "", "", ["EGL's library, libEGL.so.1, is not"]),
         ("egl", "libEGL_mesa.so*", "", "", ["libEGL_mesa.so.0, named in"]),
-        ("egl", "", "", _VENDORS, ["no driver for it"]),
+        ("egl", "", "", _VENDORS, ["without a driver"]),
         # Mesa's drivers; since 24.2 they are one library that EGL's needs.
         (
             *("egl", "dri libgallium-*", "", ""),

@@ -118,7 +118,7 @@ class Child:
         _children.add(self)
 
     def fileno(self) -> int:
-        """Return the descriptor that is readable when the child has sent or ended."""
+        """Return a descriptor that is readable once the child sends data or ends."""
         return self._answers.fileno()
 
     def send(self, **message: Any) -> None:

@@ -4,7 +4,7 @@
 ::
 
     Error (Exception)
-    ├── InvalidArgument (also ValueError)   a wrong value
+    ├── InvalidArgument (also ValueError)   an invalid value
     │   ├── UnknownName                     no such environment, camera, policy ...
     │   └── InvalidFrame                    not a (height, width, 3) uint8 array
     ├── ExistingRecordings                  neither force nor resume was given
@@ -144,7 +144,7 @@ class DirectoryNotWritable(Error, OSError):
 
 
 class FileNotWritten(Error, OSError):
-    """A file could not be written: the disk is full, or the directory is gone.
+    """A file could not be written: the disk is full, or the directory is missing.
 
     Attributes:
         path: the file.

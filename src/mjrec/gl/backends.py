@@ -8,7 +8,7 @@ from collections.abc import Mapping
 
 from ..errors import GLError, UnknownName
 
-# In the order in which they are tried: EGL needs no display and can use a GPU, OSMesa
+# In the order in which they are tested: EGL needs no display and can use a GPU, OSMesa
 # needs no display, GLFW needs one.
 BACKENDS = ("egl", "osmesa", "glfw")
 

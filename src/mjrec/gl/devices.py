@@ -210,8 +210,8 @@ def _device(gpu: str, environ: Mapping[str, str]) -> tuple[EglDevice | None, Pro
         return device, alone
     if gpu.startswith("GPU-") and hardware[0].uuid:
         return None, alone
-    # The only one there is may be the GPU in spite of that: of another maker, or of a
-    # driver without its CUDA part, so that no device has a number.
+    # A single GPU may be the right one even without a CUDA number: it may be from
+    # another vendor, or its driver may lack the CUDA part.
     everything = {k: v for k, v in environ.items() if k != CUDA_VISIBLE_DEVICES}
     seen = probe("egl", environ={**everything, _CHOSEN: "0"})
     is_known_to_cuda = any(device.cuda_id is not None for device in seen.devices)
@@ -221,10 +221,10 @@ def _device(gpu: str, environ: Mapping[str, str]) -> tuple[EglDevice | None, Pro
 def _tries(
     device: EglDevice, gpu: str, alone: Probe, environ: Mapping[str, str]
 ) -> Iterator[tuple[int, Probe]]:
-    """Yield numbers that may mean a device to mujoco, the likely first, and try them.
+    """Yield numbers that may select a device in mujoco, likely ones first, with probes.
 
-    It is the place in EGL's list for mujoco 3. For mujoco 4 it is a place in
-    `CUDA_VISIBLE_DEVICES`, or CUDA's number, or the place in a list of its own.
+    For mujoco 3, the number is the index in EGL's list. For mujoco 4, it is an index in
+    `CUDA_VISIBLE_DEVICES`, CUDA's number, or the index in mujoco's own list.
     """
     if environ.get(CUDA_VISIBLE_DEVICES) == gpu:
         yield 0, alone

@@ -135,7 +135,7 @@ def probe_environment(
     devices = tuple(EglDevice(**device) for device in facts.get("devices", ()))
     if known.get("renders"):
         return Probe(backend=backend, devices=devices, **known)
-    # A failure that the table does not know is its own cause.
+    # For a failure that is not in the table, the output itself is given as the cause.
     words = "\n".join(list(filter(str.strip, output.splitlines()))[-3:])
     found = diagnose(output, backend=backend, environ=environ) or Diagnosis(
         words or "The child process printed nothing.", ""

@@ -205,9 +205,9 @@ class EnvironmentMonitor(MonitorBase):
     def model_changed(self) -> None:
         """Report that a texture, height field or mesh changed during an episode.
 
-        All other visible changes are detected automatically, and at a reset these are
-        too. The next recorded frame shows the change. Changed physical constants
-        (masses, damping) are then also stored in the trajectory, for replays.
+        Other visible changes, and all changes at a reset, are detected automatically.
+        The next recorded frame shows the change. Changed physical constants (masses,
+        damping) are then also stored in the trajectory, for replays.
         """
         self._recorder.model_changed()
 

@@ -29,8 +29,8 @@ def camera_frames(
 
     Returns:
         The only or first camera, which scenes are recorded with; and arguments for
-        `RecordedEnvironment`: `frames`, and with several cameras `further_frames` or
-        `cameras`.
+        `RecordedEnvironment`. These are `frames` and, with several cameras, `cameras`
+        and `further_frames` (only if the frames exist and are not tiled).
 
     Raises:
         InvalidArgument: the list is empty, contains a camera twice, or contains None

@@ -118,19 +118,19 @@ class DmEnvMonitor(EnvironmentMonitor, dm_env.Environment):  # type: ignore[misc
         return timestep
 
     def observation_spec(self) -> Any:
-        """Return the environment's."""
+        """Return the environment's observation spec."""
         return self._env.observation_spec()
 
     def action_spec(self) -> Any:
-        """Return the environment's."""
+        """Return the environment's action spec."""
         return self._env.action_spec()
 
     def reward_spec(self) -> Any:
-        """Return the environment's."""
+        """Return the environment's reward spec."""
         return self._env.reward_spec()
 
     def discount_spec(self) -> Any:
-        """Return the environment's."""
+        """Return the environment's discount spec."""
         return self._env.discount_spec()
 
     def __getattr__(self, name: str) -> Any:

@@ -159,7 +159,7 @@ class VectorMonitor(MonitorBase, gymnasium.vector.VectorWrapper):
         self._guard_by(closings)
 
     def get_episode_rewards(self) -> list[list[float]]:
-        """Return the rewards sum of each complete episode, by sub-environment."""
+        """Return the sum of rewards of each complete episode, by sub-environment."""
         return [monitor.get_episode_rewards() for monitor in self.monitors]
 
     def get_episode_lengths(self) -> list[list[int]]:
