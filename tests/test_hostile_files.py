@@ -413,7 +413,7 @@ HARMS: list[tuple[str, Harm, str]] = [
         ("spans", functools.partial(beginning_with, head(rows)), said)
         for said, rows in ROWS.items()
     ),
-    ("spans", functools.partial(beginning_with, b"[" * 10**7 + b"\n"), "does not name"),
+    ("spans", functools.partial(beginning_with, b"[" * 10**7 + b"\n"), "does not say"),
     *(
         (".looks", functools.partial(with_change, header), "change of the model")
         for header in CHANGES
