@@ -92,8 +92,7 @@ def remembered(program: str, question: str, answer: Callable[[], str]) -> str:
     rendering a hundred small frames. So the answers are cached in
     `$XDG_CACHE_HOME/mjrec/programs.json` (`~/.cache/mjrec/programs.json` by default),
     which can be deleted at any time. They are valid only for exactly the same file: the
-    same path, device, inode, size, mtime and ctime. The kernel sets ctime, so it cannot
-    be forged.
+    same path, device, inode, size, mtime and ctime. Only the kernel sets ctime.
 
     Args:
         program: the program's path.

@@ -16,23 +16,23 @@
     ├── openaigym.video.<infix>.video000027.side.mp4    video of a further camera
     ├── openaigym.video.<infix>.video000027.camera2.mp4 ... of a camera without a name
     ├── openaigym.video.<infix>.video000027.tiled.mp4   all sub-environments in one
-    video ├── openaigym.video.<infix>.video000027.side.640x480.mp4 a rerendered video
-    ├── openaigym.video.<infix>.video000027.step000137.mp4 video of a clip ├──
-    rl-video-episode-27.mp4                         second name of the first video ...
-    ├── rl-video-episode-27.side.mp4                    ... and of a further one ├──
-    openaigym.states.<infix>.000000.log             rows of recordings in flight ├──
-    openaigym.states.<infix>.000000.tail            ... the last of these rows ├──
-    openaigym.states.<infix>.000000.looks           ... changes of the model ├──
-    openaigym.trajectory.<infix>.episode000027.h5   a recorded episode, finished ├──
-    openaigym.trajectories.<infix>.h5               ... or many in one file ├──
-    openaigym.model.<16 hex digits>.mjb.gz          its compiled model ... ├──
-    openaigym.model.<16 hex digits>.zip             ... and the model's sources ├──
-    openaigym.results.<infix>.monitor.csv           for Stable-Baselines3, if wanted ├──
-    .openaigym.<infix>.lock                         held while its monitor is open ├──
-    .openaigym.video.<infix>.video000027.lock       held while a video is rendered ├──
-    .openaigym.clip.<infix>.step000000137.lock      held while a clip is rendered ├──
-    .openaigym.manifest.<infix>.lock                held while it is rewritten └──
-    .openaigym.render.<number>.lock                 held while that CPU is in use
+    ├── openaigym.video.<infix>.video000027.side.640x480.mp4 a rerendered video
+    ├── openaigym.video.<infix>.video000027.step000137.mp4 video of a clip
+    ├── rl-video-episode-27.mp4                         second name of the first ...
+    ├── rl-video-episode-27.side.mp4                    ... and of a further one
+    ├── openaigym.states.<infix>.000000.log             rows of recordings in flight
+    ├── openaigym.states.<infix>.000000.tail            ... the last of these rows
+    ├── openaigym.states.<infix>.000000.looks           ... changes of the model
+    ├── openaigym.trajectory.<infix>.episode000027.h5   a recorded episode, finished
+    ├── openaigym.trajectories.<infix>.h5               ... or many in one file
+    ├── openaigym.model.<16 hex digits>.mjb.gz          its compiled model ...
+    ├── openaigym.model.<16 hex digits>.zip             ... and the model's sources
+    ├── openaigym.results.<infix>.monitor.csv           for Stable-Baselines3, if wanted
+    ├── .openaigym.<infix>.lock                         held while its monitor is open
+    ├── .openaigym.video.<infix>.video000027.lock       held while a video is rendered
+    ├── .openaigym.clip.<infix>.step000000137.lock      held while a clip is rendered
+    ├── .openaigym.manifest.<infix>.lock                held while it is rewritten
+    └── .openaigym.render.<number>.lock                 held while that CPU is in use
 
 The videos of one episode differ in a part of the name before the suffix. A camera can
 have any name, so its part is an encoded form of the name that cannot be mistaken for
@@ -588,7 +588,7 @@ def second_name_of(name: str, second: str, *, first: str) -> str | None:
     Args:
         name: the file's name.
         second: the second name of the episode's first video.
-        first: the own name of the episode's first video.
+        first: the name of the episode's first video.
 
     Returns:
         The second name, or None if the file does not belong to this episode.

@@ -52,8 +52,8 @@ class RowLog:
         path: as given.
         count: number of rows so far.
         slots: the tail, `(capacity, row_words) uint64`. After `make_room`, fill row
-            `count` in `slots[count % capacity]`, and count it with `counter[0] =
-            log.count = count + 1`.
+            `count` in `slots[count % capacity]`, then increase `counter[0]` and `count`
+            by 1.
         memory: the bytes of the tail file: `TAIL_HEAD` bytes, then the slots.
         counter: the words of the tail's head; `counter[0]` is the number of rows so
             far, for readers.
@@ -139,8 +139,8 @@ class RowLog:
         if self.is_open:
             os.close(self._log)
             self._log = -1
-            # A reference to this object must not keep the mapping alive, which holds a
-            # file.
+            # A reference to this object must not keep the mapping, and with it a file,
+            # alive.
             del self.slots, self.counter, self.memory
 
     def write(self) -> None:

@@ -206,8 +206,8 @@ class OpenLog:
         self.path, self.number, self.journal = path, number, journal
         self.is_alone = False
         self.look_size = 0
-        # There are few: they are all looked up here, which is faster than in the
-        # journal.
+        # There are few, so they are kept here: reading them from the journal would take
+        # time and memory.
         self.recordings: list[Recording] = []
         self._dtype = dtype
         self._looks: int | None = None

@@ -109,7 +109,7 @@ def check_dtype(dtype: np.dtype[Any]) -> None:
     """Check that a dtype has only plain little-endian numbers and valid names.
 
     Raises:
-        ValueError: it does not.
+        ValueError: the dtype is invalid.
     """
     for name in dtype.names or ():
         if not _NAME.fullmatch(name):

@@ -262,8 +262,9 @@ def open_hdf5(path: Path) -> TrajectoryReader:
             version.
     """
     with _reading(path), contextlib.ExitStack() as opened:
-        # Do not request locking: HDF5 refuses if this process, such as the user's own
-        # code, has the file open with different locking.
+        # Do not request locking: HDF5 refuses to open a file that is already open in
+        # this process, for example in the user's code, with a different locking
+        # setting.
         holder = file_of(path)
         file = opened.enter_context(h5py.File(regular_path(holder), "r"))
         group = file if holder == path else _group(file, group_of(path))
