@@ -92,21 +92,21 @@ def test_a_hundred_videos_fit_and_no_more(tmp_path: Path) -> None:
 
 # The names of videos and their metadata, of which the last is refused.
 NAMES = [
-    *((["a.mp4\n"], "'a.mp4\\n' is no name for a video"), (["a.mkv"], "'a.mkv' is no")),
-    (["ð.mp4"], "'ð.mp4' is no name for a video"),
-    (["a.mp4 a.json"], "'a.json' is no name for metadata"),
-    (["a.mp4 manifest.json"], "'manifest.json' is no name for metadata"),
-    (["b.meta.json a.meta.json"], "'b.meta.json' is the name of metadata"),
-    (["manifest.json"], "the archive's own list"),
-    (["Manifest.json"], "the archive's own list"),
+    *((["a.mp4\n"], "'a.mp4\\n' is not a video's name"), (["a.mkv"], "'a.mkv' is no")),
+    (["ð.mp4"], "'ð.mp4' is not a video's name"),
+    (["a.mp4 a.json"], "'a.json' is not a metadata name"),
+    (["a.mp4 manifest.json"], "'manifest.json' is not a metadata name"),
+    (["b.meta.json a.meta.json"], "'b.meta.json' is a metadata file's name"),
+    (["manifest.json"], "the archive's manifest"),
+    (["Manifest.json"], "the archive's manifest"),
     # In gym's order: pair by pair, and in each presence, doubles, names.
-    (["-"], "There is no video"),
-    (["a.mp4 -"], "There is no metadata"),
-    (["b+c.mp4", "-"], "no name for a video"),
-    (["-", "b+c.mp4"], "There is no video"),
-    (["a.mp4", "other/a.mp4"], "'a.mp4' is there twice (the second time as "),
-    (["a.mp4", "b.mp4 other/a.meta.json"], "'a.meta.json' is there twice"),
-    (["b.meta.json b.meta.json"], "'b.meta.json' is there twice"),
+    (["-"], "The video "),
+    (["a.mp4 -"], "the metadata of the video"),
+    (["b+c.mp4", "-"], "not a video's name"),
+    (["-", "b+c.mp4"], "The video "),
+    (["a.mp4", "other/a.mp4"], "'a.mp4' occurs twice (the second time as "),
+    (["a.mp4", "b.mp4 other/a.meta.json"], "'a.meta.json' occurs twice"),
+    (["b.meta.json b.meta.json"], "'b.meta.json' occurs twice"),
 ]
 
 

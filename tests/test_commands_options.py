@@ -46,7 +46,7 @@ WRONG = [
     ({"engine_option": ("a=1", "a=2"), "engine": "slurm"}, "given twice"),
     ({"gpus": -1.0}, "gpus"),
     ({"engine": "slrum"}, "(?s)slrum.*slurm.*dask:ADDRESS"),
-    ({"engine": "dask:tcp://127.0.0.1:8786", "gpus": 1.0}, "those that the Dask"),
+    ({"engine": "dask:tcp://127.0.0.1:8786", "gpus": 1.0}, "belong to the Dask"),
 ]
 
 

@@ -168,13 +168,13 @@ def test_a_job_whose_child_dies_is_done_again(begin, tmp_path, caplog):
         key="poison",
         value=None,
         failure=(
-            "Its worker died, which was try 3 of 3: it was killed by SIGKILL. "
+            "Its worker died, on try 3 of 3: it was killed by SIGKILL. "
             "Its last output: SIGKILL is near"
         ),
         tries=3,
     )
     assert [found[key].failure for key in "abcdef"] == [None] * 6
-    assert "job once, which is begun again. It was killed by SIGSEGV" in caplog.text
+    assert "job once, which will be retried. It was killed by SIGSEGV" in caplog.text
 
 
 @on_each
@@ -208,7 +208,7 @@ def test_children_that_die_as_they_begin(begin):
         submit(run, "a", do="echo")
         with pytest.raises(
             Error,
-            match=r"No worker can begin. The last one ended with status 3. "
+            match=r"No worker can start. The last one ended with status 3. "
             r"Its last output: a library is missing",
         ):
             outcomes(run)

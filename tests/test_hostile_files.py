@@ -182,11 +182,11 @@ JSON = {
     "nested too deeply": b"[" * 10_000_000,
     "nested too deep": b'{"a": %s}' % (b"[" * 900 + b"]" * 900),
     "Exceeds the limit": b'{"a": %s}' % (b"9" * 1_000_000),
-    "belongs there": b'{"stats": 0.%s}' % (b"9" * 10_000_000),
+    "it must be a string": b'{"stats": 0.%s}' % (b"9" * 10_000_000),
     "more than 16777216 values": b'{"a": [%s0]}' % (b"0," * 20_000_000),
     "the key 'a' twice": b'{"a": 1, "\\u0061": 2}',
     "not UTF-8": b'{"a": "\xff"}',
-    "an object belongs there": b"[]",
+    "it must be an object": b"[]",
 }
 
 
@@ -265,15 +265,15 @@ def object_field(file: h5py.File) -> None:
 # Of one the process is ended when it has had its CPU time, which takes a while.
 HDF5: list[tuple[Callable[[h5py.File], object], str]] = [
     (virtual, "in a way that mjrec does not write"),
-    (overflowing_frames, "not of its steps"),
+    (overflowing_frames, "out of order"),
     (replaced("states", shape=(5, 2**35), dtype="f8"), "C int"),
     (replaced("rewards", shape=(2**40,), dtype="f8"), "more memory"),
     (replaced("rewards", shape=(2**40,), dtype="f8", chunks=(9,)), "more memory"),
     (gigabytes_of_observations, "more memory"),
     (one_change_by_many_names, "SIGXCPU|SIGKILL"),
     (linked_field, "no 'geom_rgba' of its own"),
-    (object_field, "no dtype"),
-    (lambda file: file.attrs.create("format_version", True), "another type"),
+    (object_field, "not a valid dtype"),
+    (lambda file: file.attrs.create("format_version", True), "wrong type"),
 ]
 
 
@@ -292,14 +292,14 @@ def beginning_with(line: bytes, path: Path) -> None:
 
 HEAD = DTYPE.descr[:4]
 ROWS = {
-    "what its rows are cannot be read": 5,
+    "its rows' layout cannot be read": 5,
     "the state of a row": [*HEAD, ["state", "<f8"]],
     "not all float64": [*HEAD, ["state", [["a", "<f4"], ["", "|V4"]]]],
-    "cannot name an array": [*HEAD, ["snapshot", [["a/b", "<f8"]]]],
-    "no dtype of a trajectory": [*HEAD, ["action", "|O"]],
+    "is not a valid array name": [*HEAD, ["snapshot", [["a/b", "<f8"]]]],
+    "not a valid dtype for a trajectory": [*HEAD, ["action", "|O"]],
     "cannot be read": [*HEAD, ["action", "<f8", [1 << 62]]],
-    "do not lie": [*HEAD, ["action", "|u1"]],
-    "do not lie one": [*HEAD, ["other", "<f8"]],
+    "unknown parts": [*HEAD, ["action", "|u1"]],
+    "parts or gaps": [*HEAD, ["other", "<f8"]],
 }
 RECORD = "{{'descr': [('a', {})], 'fortran_order': False, 'shape': {}}}"
 CHANGES = (
@@ -413,7 +413,7 @@ HARMS: list[tuple[str, Harm, str]] = [
         ("spans", functools.partial(beginning_with, head(rows)), said)
         for said, rows in ROWS.items()
     ),
-    ("spans", functools.partial(beginning_with, b"[" * 10**7 + b"\n"), "does not say"),
+    ("spans", functools.partial(beginning_with, b"[" * 10**7 + b"\n"), "does not give"),
     *(
         (".looks", functools.partial(with_change, header), "change of the model")
         for header in CHANGES

@@ -139,9 +139,9 @@ def test_a_last_line_cut_anywhere_is_left_out(path, caplog):
 @pytest.mark.parametrize(
     ("damage", "reason"),
     [
-        (b"\0\0\0\n", "not whole JSON"),
-        (b'{"episode_id": "1"}\n', "a whole number belongs there, not a text"),
-        (b'{"episode_id": 1e99}\n', "larger than any count"),
+        (b"\0\0\0\n", "not valid JSON"),
+        (b'{"episode_id": "1"}\n', "it must be a whole number, not a string"),
+        (b'{"episode_id": 1e99}\n', "too large for a count"),
     ],
 )
 def test_damage_in_the_middle_costs_one_line(path, damage, reason, caplog):

@@ -126,7 +126,7 @@ def test_more_than_one_is_whole():
 
 def test_who_requires_a_gpu_asks_for_one():
     """Else nobody could say which."""
-    with pytest.raises(InvalidArgument, match="say how much of one"):
+    with pytest.raises(InvalidArgument, match="give each worker a share"):
         GpuShare(required=True)
 
 

@@ -21,10 +21,10 @@ def path(tmp_path):
 @pytest.mark.parametrize(
     ("content", "reason"),
     [
-        ('{"stats": "s", "videos": []', "not whole JSON"),
+        ('{"stats": "s", "videos": []', "not valid JSON"),
         ('{"videos": [], "env_info": {}}', "it has no 'stats'"),
-        ('{"stats": 1, "videos": [], "env_info": {}}', "a text belongs there"),
-        ('{"stats": "s", "videos": [["a"]], "env_info": {}}', "not 1 names"),
+        ('{"stats": 1, "videos": [], "env_info": {}}', "it must be a string"),
+        ('{"stats": "s", "videos": [["a"]], "env_info": {}}', "it has 1 names"),
         ('{"stats": "..", "videos": [], "env_info": {}}', "not the name of a file"),
         ('{"stats": "s", "videos": [["a/b", "c"]], "env_info": {}}', "'a/b' is not"),
         ('{"stats": "s", "videos": [], "env_info": {}, "mjrec": 1}', "'mjrec'"),
@@ -41,12 +41,12 @@ def test_damage_of_a_manifest_is_named(path, content, reason):
 @pytest.mark.parametrize(
     ("right", "wrong", "reason"),
     [
-        ("[3, 4]", '"34"', "a list belongs there"),
+        ("[3, 4]", '"34"', "it must be a list"),
         ("[3, 4]", "[3, true]", "not true or false"),
         ("[3, 4]", "[3, 4.5]", "'episode_lengths' is wrong"),
         ("[3, 4]", "[3]", "1 episode_lengths"),
         ('["t", "e"]', '["t"]', "1 episode_types for 2"),
-        ("1.5", "9" * 400, "larger than a float"),
+        ("1.5", "9" * 400, "too large for a float"),
     ],
 )
 def test_damage_of_statistics_is_named(path, right, wrong, reason):

@@ -105,7 +105,7 @@ def test_a_node_that_dies_takes_no_job_with_it(cluster, work, tmp_path, caplog):
     assert len(found) == 8
     assert {outcome.failure for outcome in found.values()} == {None}
     assert sum(len(lines(tmp_path / key)) for key in "abcd") == 5
-    assert caplog.text.count("is begun again") == 1
+    assert caplog.text.count("will be retried") == 1
 
 
 def test_workers_without_mjrec(cluster, work, tmp_path):

@@ -61,7 +61,7 @@ def test_a_killed_worker_of_ray_counts_as_a_death(tmp_path, caplog):
             os.kill(parent_of(pid), signal.SIGKILL)
             assert wait_for(tmp_path / "begun", run) != pid
             wait_until(lambda: str(pid) in lines(tmp_path / "left"))
-    assert "job a, which is begun again" in caplog.text
+    assert "job a, which will be retried" in caplog.text
 
 
 def parent_of(pid):
@@ -120,8 +120,10 @@ except GLError as error:
     print("refused:", error)
 """
     said = run_python("-c", script, str(tmp_path), **{MARK: str(tmp_path)})
-    assert said.count("Ray finds none on this machine. They draw in software.") == 1
-    assert "refused: Workers should get GPUs" in said
+    assert (
+        said.count("Ray finds none on this machine. Workers render in software.") == 1
+    )
+    assert "refused: GPUs were requested" in said
     wait_until(lambda: not marked(tmp_path), seconds=10)
 
 

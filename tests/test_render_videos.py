@@ -40,7 +40,7 @@ from mjrec.rendering.views import Variant, View
 from mjrec.simulation.model_trust import note_models
 
 VIDEO = "openaigym.video.0.7.video000000"
-DIED = "Its worker died, which was try 3 of 3: it was killed by SIGKILL."
+DIED = "Its worker died, on try 3 of 3: it was killed by SIGKILL."
 
 
 class Here(Executor):

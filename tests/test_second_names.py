@@ -72,7 +72,7 @@ def test_somebody_elses_file_stays(video, caplog):
     mine = video.with_name(f"{SECOND}.mp4")
     mine.write_text("mine")
     give_second_names(video)
-    assert f"{SECOND}.mp4 is there already" in caplog.text
+    assert f"{SECOND}.mp4 already exists" in caplog.text
     assert seconds(video.parent) == ALL
     take_second_names(video)
     clear_monitor_files(video.parent)

@@ -105,7 +105,7 @@ def test_slurm_jobs_that_end_as_soon_as_they_begin(tmp_path):
     made = engine(setup=["echo no such module >&2; exit 1"])
     with Run(made, odd_work(shared=tmp_path / "shared")) as run:
         submit(run, "a", do="echo")
-        with pytest.raises(Error, match=r"No worker can begin.* was in the Slurm job"):
+        with pytest.raises(Error, match=r"No worker can start.* was in the Slurm job"):
             outcomes(run)
 
 
@@ -177,13 +177,13 @@ def test_how_many_workers():
     ("options", "said"),
     [
         ({"workers": 0}, "workers must be"),
-        ({"cluster": "pbs"}, "cluster is"),
+        ({"cluster": "pbs"}, "cluster must be"),
         ({"cpus_per_worker": 0}, "cpus_per_worker must be"),
         ({"workers_per_job": 1.5}, "workers_per_job must be"),
         ({"time_min": 0}, "time_min must be"),
-        ({"time_min": 1, "notice_s": 60}, "notice_s is less than"),
-        ({"mem_gb": 0}, "mem_gb is more than 0"),
-        ({"gpus": -1}, "gpus is the number"),
+        ({"time_min": 1, "notice_s": 60}, "notice_s must be less than"),
+        ({"mem_gb": 0}, "mem_gb must be more than 0"),
+        ({"gpus": -1}, "gpus must be the number"),
     ],
 )
 def test_what_cannot_be(options, said):
@@ -252,7 +252,7 @@ def test_texts_that_cannot_be():
     """A slip is told with what there is."""
     with pytest.raises(mjrec.UnknownName, match=r"'partitoin'.*partition.*sbatch.NAME"):
         slurm_options({"partitoin": "gpu"})
-    with pytest.raises(InvalidArgument, match="time_min of Slurm's is a number"):
+    with pytest.raises(InvalidArgument, match="time_min must be a number"):
         slurm_options({"time_min": "an hour"})
 
 
@@ -274,5 +274,5 @@ assert "SUBMITIT_LOG_LEVEL" not in os.environ
 
 def test_it_does_jobs_only():
     """Their outcomes are files, which other functions would not write."""
-    with pytest.raises(InvalidArgument, match="executor of submitit's"):
+    with pytest.raises(InvalidArgument, match="submitit executor"):
         engine().submit(len, "abc")

@@ -202,13 +202,13 @@ def test_what_is_finished_meanwhile_is_read(
 
 def test_nothing_to_finish_is_one_clear_error(path: Path) -> None:
     """Neither log nor file; or a log that cannot be read, which stays."""
-    with pytest.raises(UnreadableFile, match=r"\.h5: there is no such file, and no l"):
+    with pytest.raises(UnreadableFile, match=r"\.h5: neither the file nor a log"):
         finish_trajectory(path)
     record(path)
     [log], [journal] = log_paths(path.parent), path.parent.glob("*.jsonl")
     journal.write_bytes(b"something else\n")
     for _ in range(2):
-        with pytest.raises(UnreadableFile, match="no log of it"):
+        with pytest.raises(UnreadableFile, match="nor a log of it"):
             finish_trajectory(path)
     assert log.exists()
 
@@ -283,16 +283,16 @@ def link(name: str, target: Any) -> Callable[[h5py.File], None]:
 
 
 HARM: dict[str, Callable[[h5py.File], None]] = {
-    "no trajectory": attribute("format", np.bytes_(b"robomimic")),
-    "of another type": attribute("format", "mjrec trajectory"),
+    "not a trajectory": attribute("format", np.bytes_(b"robomimic")),
+    "has the wrong type": attribute("format", "mjrec trajectory"),
     "update mjrec": attribute("format_version", np.int64(2)),
     "its facts are damaged": attribute("facts", np.bytes_(b"{}")),
-    "not of the same steps": dataset("actions", data=np.zeros((3, 3), "f4")),
+    "the same number of steps": dataset("actions", data=np.zeros((3, 3), "f4")),
     "not all float64": dataset("states", data=np.zeros(41, "f4,f4")),
-    "no dtype": dataset("rewards", data=["a"] * 40),
-    "rewards are": dataset("rewards", data=np.zeros((40, 2))),
+    "not a valid dtype": dataset("rewards", data=["a"] * 40),
+    "rewards have": dataset("rewards", data=np.zeros((40, 2))),
     "the snapshot of a row": dataset("snapshots", data=np.zeros(41)),
-    "frames are not of its steps": dataset("frame_steps", data=np.arange(41)[::-1]),
+    "frame steps are out of order": dataset("frame_steps", data=np.arange(41)[::-1]),
     "a way that mjrec does not write": dataset(
         "rewards", (40,), "<f8", external=[("/etc/passwd", 0, 320)]
     ),
@@ -300,7 +300,7 @@ HARM: dict[str, Callable[[h5py.File], None]] = {
         "rewards", data=np.ones(40), chunks=(40,), compression="lzf"
     ),
     "no 'rewards' of its": link("rewards", h5py.ExternalLink("other.h5", "/x")),
-    "is no group": link("model_changes", np.zeros(3)),
+    "is not a group": link("model_changes", np.zeros(3)),
     "no 'truncated' of its own": lambda file: file.__delitem__("truncated"),
     "no '0' of its": lambda file: file.move("model_changes/0", "model_changes/9"),
 }

@@ -1,22 +1,22 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A process that does jobs: `python -m mjrec.engines.child`.
+"""A child process that does jobs: `python -m mjrec.engines.child`.
 
-The first that its parent sends says what the work is, see `jobs.Run`. Then comes one
-job after the other::
+The first message from its parent describes the work, see `jobs.Run`. Jobs follow, one
+at a time::
 
     {"key": "a", "arguments": {...}}
 
-and this process sends::
+The child sends::
 
-    {"ready": true}                       there is a handler; before anything else
-    {"error": {...}}                      instead of it: none could be made
+    {"ready": true}                       the handler was created; sent first
+    {"error": {...}}                      sent instead if it could not be created
     {"key": "a", "value": {...}}          a job is done
-    {"key": "b", "failure": "..."}        or failed, with what the handler raised
-    {"log": ["mjrec.x", 30, "..."]}       for the parent's log
+    {"key": "b", "failure": "..."}        a job failed: the handler's error
+    {"log": ["mjrec.x", 30, "..."]}       a record for the parent's log
     {"limit": [2.0, "FILE", "..."]}       see `worker.time_limit`
 
-It ends at once, in mid-job too, when the pipe from its parent ends, or by SIGTERM
-or SIGUSR2.
+It exits at once, even in the middle of a job, when the pipe from its parent closes, or
+on SIGTERM or SIGUSR2.
 """
 
 from __future__ import annotations
@@ -47,22 +47,24 @@ _SECONDS_TO_LEAVE = 2.0
 
 
 def main() -> None:
-    """Do jobs until the run is over."""
+    """Do jobs until the run ends."""
     parent = worker.parent = Parent()
-    # As in a terminal: what is printed is there when the process dies.
+    # Line buffering, as in a terminal, so that printed lines survive the process's
+    # death.
     cast("io.TextIOWrapper", sys.stdout).reconfigure(line_buffering=True)
     parent.send_warnings()
     handler: Any = None
     is_leaving = threading.Lock()
 
     def leave(*_: object) -> None:
-        # Once: both a signal and the pipe's end may come. The second waits for the end.
+        # Leave once: both a signal and the end of the pipe may come. The second one
+        # waits for the first.
         if is_leaving.acquire(timeout=_SECONDS_TO_LEAVE) and hasattr(handler, "leave"):
             handler.leave()
         # Not `sys.exit`, which would wait for a driver.
         os._exit(0)
 
-    # Slurm sends them to all processes of a job, and not to the first one only.
+    # Slurm sends these signals to all processes of a job, not only to the first.
     for signum in (signal.SIGTERM, signal.SIGUSR2):
         signal.signal(signum, leave)
         signal.pthread_sigmask(signal.SIG_UNBLOCK, [signum])
@@ -76,7 +78,7 @@ def main() -> None:
 
 
 def _next_job(parent: Parent, work: Path) -> dict[str, Any] | None:
-    """Return the next job, waiting for it; None where the run is over."""
+    """Wait for the next job and return it; return None if the run is over."""
     while True:
         try:
             return parent.receive(_SECONDS_BETWEEN_LOOKS)
@@ -86,14 +88,14 @@ def _next_job(parent: Parent, work: Path) -> dict[str, Any] | None:
 
 
 def _handler(work: Mapping[str, Any], parent: Parent) -> Any:
-    """Make the handler; tell the parent why there is none."""
+    """Create the handler; report any error to the parent and exit."""
     try:
-        # What this machine has of its own comes first.
+        # This machine's own entries of sys.path come first.
         known = {*sys.path}
         more = (entry for entry in work["path"] if entry not in known)
         sys.path += [entry for entry in more if Path(entry).exists()]
         if work["require_gpu"] is not None:
-            # Before the handler's module, which may import mujoco.
+            # Before importing the handler's module, which may import mujoco.
             render_on_given_gpu(required=work["require_gpu"])
         module, _, name = work["entry"].partition(":")
         make = operator.attrgetter(name)(importlib.import_module(module))
@@ -106,7 +108,7 @@ def _handler(work: Mapping[str, Any], parent: Parent) -> Any:
 def _do(handler: Any, job: Mapping[str, Any], parent: Parent) -> None:
     try:
         parent.send(key=job["key"], value=dict(handler(job["arguments"])))
-    # A policy that calls sys.exit() ends its job, and not the worker.
+    # A policy that calls sys.exit() must end its job, not the worker.
     except (Exception, SystemExit) as error:
         logger.warning("The job %s failed.", job["key"], exc_info=True)
         text = " ".join(str(error).split())

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""An engine from its name and what was said of it."""
+"""Creating an engine from its name and options."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ ENGINES = ("local", "ray", "slurm", f"{_DASK}ADDRESS")
 
 
 def given_engine(engine: Executor | str | None, workers: int | None) -> Executor | None:
-    """Return the engine that a caller names or gives; None where there is none.
+    """Return the engine that a caller names or passes; None if there is none.
 
     Args:
-        engine: an executor, or the name of one of ours.
-        workers: how many it is to have, where it is a name.
+        engine: an executor, or the name of an engine.
+        workers: number of workers, if `engine` is a name.
 
     Raises:
-        UnknownName: there is no engine of that name.
-        InvalidArgument: `engine` is none, or `workers` is no number of workers, or
-            contradicts an executor, which has its own.
-        MissingDependency: what the engine needs is not installed.
+        UnknownName: no engine has that name.
+        InvalidArgument: `engine` is not an executor or a name, `workers` is not a valid
+            number, or `workers` is given with an executor, which has its own.
+        MissingDependency: a package that the engine needs is not installed.
     """
     if engine is None:
         return None
@@ -59,26 +59,27 @@ def engine_from(
     """Return an engine.
 
     Args:
-        name: `"local"`, `"ray"`, `"slurm"`, or `"dask:ADDRESS"`, where a Dask scheduler
-            listens.
-        workers: how many at most; None is what the engine takes by itself.
-        address: of a Ray cluster, `"auto"` for the one that runs on this machine; None
-            is the one that `RAY_ADDRESS` names, else one that is started for the run.
-        gpus: how much of a GPU each worker gets.
-        require_gpu: a worker that renders in software is an error.
-        options: what belongs to one engine only, as texts: parameters of `SlurmEngine`.
+        name: `"local"`, `"ray"`, `"slurm"`, or `"dask:ADDRESS"` with the address of a
+            Dask scheduler.
+        workers: maximum number of workers; None is the engine's default.
+        address: address of a Ray cluster, `"auto"` for the one that runs on this
+            machine; None is the one that `RAY_ADDRESS` names, otherwise one that is
+            started for the run.
+        gpus: number of GPUs for each worker, which may be a fraction.
+        require_gpu: whether a worker that renders in software is an error.
+        options: options of a single engine, as strings: parameters of `SlurmEngine`.
 
     Raises:
-        UnknownName: there is no such engine, or no such option.
-        InvalidArgument: one of them cannot be, or belongs to another engine.
-        MissingDependency: what the engine needs is not installed.
-        Error: there is no Dask scheduler.
+        UnknownName: the engine or an option does not exist.
+        InvalidArgument: an argument is invalid, or belongs to a different engine.
+        MissingDependency: a package that the engine needs is not installed.
+        Error: the Dask scheduler does not answer.
     """
     if name.startswith(_DASK):
         if workers is not None or address is not None or gpus or options:
             raise InvalidArgument(
-                f"The workers of {name} are those that the Dask cluster has. Choose "
-                "their number and resources when you start them."
+                f"The workers of {name} belong to the Dask cluster. Choose their "
+                "number and resources when you start them."
             )
         return _dask(name.removeprefix(_DASK))
     if name not in ENGINES[:-1]:
@@ -90,7 +91,7 @@ def engine_from(
     if options and name != "slurm":
         raise InvalidArgument(
             f"The engine {name} has no options of its own, got "
-            f"{', '.join(sorted(options))}. Those of Slurm need --engine slurm."
+            f"{', '.join(sorted(options))}. Options of Slurm need --engine slurm."
         )
     if name == "ray":
         return RayEngine(workers, address=address, gpus=gpus, require_gpu=require_gpu)
@@ -119,7 +120,7 @@ def _dask(address: str) -> Executor:
             f"No Dask scheduler answers at {address}. `dask scheduler` starts one and "
             f"prints its address. Dask's error: {error}"
         ) from error
-    # Each job is done, though another one looks the same.
+    # Do not merge jobs that look alike: each one must run.
     executor: Executor = client.get_executor(pure=False)
     weakref.finalize(executor, client.close)
     return executor

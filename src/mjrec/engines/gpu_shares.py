@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How many workers there are, and what each gets of GPUs."""
+"""The number of workers, and the GPUs that each one gets."""
 
 from __future__ import annotations
 
@@ -12,16 +12,17 @@ from ..errors import InvalidArgument
 
 @dataclass(frozen=True, kw_only=True)
 class GpuShare:
-    """What each worker of an engine gets of a GPU.
+    """Each worker's share of the GPUs.
 
     Attributes:
-        each: how many GPUs, in parts: with 0.25 four workers share one; 0 is none.
-        required: a worker that renders in software all the same is an error, and not
-            only a warning.
+        each: number of GPUs per worker, which may be a fraction: with 0.25, four
+            workers share one. 0 means none.
+        required: whether a worker that renders in software anyway is an error, not only
+            a warning.
 
     Raises:
-        InvalidArgument: `each` is negative, no number, or more than 1 and not whole; or
-            a GPU is required and none asked for.
+        InvalidArgument: `each` is not a number, is negative, or is more than 1 and not
+            whole; or a GPU is required but `each` is 0.
     """
 
     each: float = 0.0
@@ -31,41 +32,42 @@ class GpuShare:
         number = isinstance(self.each, int | float) and not isinstance(self.each, bool)
         if not (number and math.isfinite(self.each) and self.each >= 0):
             raise InvalidArgument(
-                "gpus is the number of GPUs per worker, such as 1, or 0.25 if four "
-                f"share one, got {self.each!r}."
+                "gpus must be the number of GPUs per worker, such as 1, or 0.25 if "
+                f"four share one, got {self.each!r}."
             )
         if self.each > 1 and self.each != int(self.each):
             raise InvalidArgument(
-                "A worker gets part of one GPU or several whole ones: gpus cannot be "
-                f"{self.each:g}."
+                "A worker gets part of one GPU or several whole ones, so gpus cannot "
+                f"be {self.each:g}."
             )
         if self.required and not self.each:
             raise InvalidArgument(
-                "A GPU is required (require_gpu, --require-gpu): say how much of one "
-                "each worker gets, such as gpus=0.25 (--gpus 0.25)."
+                "A GPU is required (require_gpu, --require-gpu): give each worker a "
+                "share of one, such as gpus=0.25 (--gpus 0.25)."
             )
 
     @property
     def asked_for(self) -> bool:
-        """Whether workers get any."""
+        """Whether workers get GPUs."""
         return self.each > 0
 
     @property
     def sharing(self) -> int:
-        """How many workers share a GPU; 1 where none was asked for."""
+        """Number of workers that share a GPU; 1 if no GPUs were requested."""
         return max(1, math.floor(1 / self.each + 1e-9)) if self.asked_for else 1
 
     def of(self, seat: int, gpus: Sequence[str]) -> str | None:
-        """Return which GPUs a worker gets, as `CUDA_VISIBLE_DEVICES` names them.
+        """Return the GPUs for a worker, in the format of `CUDA_VISIBLE_DEVICES`.
 
-        Where the workers are more than the GPUs have parts, they go round again.
+        If there are more workers than shares, the assignment starts over with the first
+        GPU.
 
         Args:
-            seat: the worker's number, from 0 on.
-            gpus: those that there are, as in `CUDA_VISIBLE_DEVICES`.
+            seat: the worker's number, from 0.
+            gpus: the available GPUs, as in `CUDA_VISIBLE_DEVICES`.
 
         Returns:
-            None where there are none, or none were asked for.
+            None if there are no GPUs, or none were requested.
         """
         if not (gpus and self.asked_for):
             return None
@@ -77,10 +79,17 @@ class GpuShare:
 
 
 def check_worker_count(count: int | None, name: str = "workers") -> int | None:
-    """Return a number of at least 1, or None.
+    """Check a number of workers: a whole number of at least 1, or None.
+
+    Args:
+        count: the number.
+        name: the argument's name, for the error message.
+
+    Returns:
+        The number as given.
 
     Raises:
-        InvalidArgument: it is something else.
+        InvalidArgument: `count` is neither.
     """
     whole = isinstance(count, int) and not isinstance(count, bool)
     if count is not None and not (whole and count >= 1):

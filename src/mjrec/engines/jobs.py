@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Handing jobs to an executor, and following them until all are over.
+"""Submitting jobs to an executor, and following them until all are done.
 
 An engine is a `concurrent.futures.Executor`: ours (`LocalEngine`, `RayEngine`,
-`SlurmEngine`) or any other whose workers see the same directory. What it is given is
+`SlurmEngine`) or any other whose workers see the same directory. It is given
 `worker.do_job` with plain data, which does the job in a child process of the worker. So
-a crash costs one job, and the executor never notices it.
+a crash costs only one job, and the executor never notices it.
 
-Doing a job twice is harmless: a job whose child died is handed out again.
+Doing a job twice is harmless: if the child dies, the job is submitted again.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from .worker import BEGUN, WORK, do_job, end_idle_children
 
 logger = logging.getLogger(__name__)
 
-# In `Work.shared_directory`: what children need while a run lasts.
+# The folder in `Work.shared_directory` with the files that children need during a run.
 WORK_FOLDER = ".mjrec.work"
 
 TRIES = 3
@@ -41,24 +41,26 @@ TRIES = 3
 _OF_MUJOCO = "simulation.warnings"
 _NUMBERS = re.compile(r"[\d.]+")
 
-# Not by `tempfile`, which loads `random`: a script's neighbour may be called so.
+# Not from `tempfile`, which imports `random`: a user's script may be named like that.
 _TEMPORARY = Path(os.environ.get("TMPDIR") or "/tmp")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Work:
-    """What the children of a run do.
+    """The work of a run's children.
 
     Attributes:
-        entry: `module:name` of what makes a handler. It is called once in each child,
-            with the settings. The handler is called with the arguments of one job
-            after the other and returns a small JSON object. If it has `leave()`, that
-            is called on another thread when the child is ended by no fault of its own.
-        settings: for all jobs; JSON.
-        environ: environment variables of the children, besides their worker's.
-        shared_directory: one that all workers see under this name; a folder in it is
-            used while the run lasts. None is enough for processes of this machine.
-        payload: bytes for all children; the settings get their file as `payload`.
+        entry: `module:name` of a function that creates a handler. It is called once in
+            each child, with the settings. The handler is called with the arguments of
+            one job after another, and returns a small JSON object. If it has `leave()`,
+            that is called on another thread when the child has to exit for reasons
+            other than its own failure.
+        settings: settings for all jobs, as JSON.
+        environ: environment variables of the children, in addition to their worker's.
+        shared_directory: a directory that all workers see under this path; a folder in
+            it is used during the run. None is enough for processes on this machine.
+        payload: bytes for all children; the settings get the path of their file as
+            `payload`.
     """
 
     entry: str
@@ -70,13 +72,13 @@ class Work:
 
 @dataclass(frozen=True, kw_only=True)
 class JobOutcome:
-    """The end of a job.
+    """The outcome of a job.
 
     Attributes:
-        key: of the job.
-        value: what the handler returned; None where it failed.
-        failure: what the handler raised, or how the child died; None where it did not.
-        tries: how often it was begun.
+        key: the job's key.
+        value: the handler's return value; None if the job failed.
+        failure: the handler's error, or how the child died; None if the job succeeded.
+        tries: number of times the job was started.
     """
 
     key: str
@@ -93,16 +95,16 @@ class _Task:
 
 
 class Run:
-    """Jobs of one work on one executor. Leaving `with` cancels what is not done.
+    """The jobs of a `Work` on an executor. Leaving `with` cancels unfinished jobs.
 
     Args:
-        engine: where the jobs run. It is not shut down.
-        work: what is done.
+        engine: the executor. It is not shut down.
+        work: the work to do.
 
     Raises:
-        InvalidArgument: the executor's workers may be on other machines and there is no
-            shared directory.
-        DirectoryNotWritable: that directory.
+        InvalidArgument: the executor's workers may be on other machines, but the work
+            has no shared directory.
+        DirectoryNotWritable: the shared directory is not writable.
     """
 
     def __init__(self, engine: Executor, work: Work) -> None:
@@ -110,8 +112,8 @@ class Run:
         is_here = isinstance(engine, LocalEngine)
         if not is_here and work.shared_directory is None:
             raise InvalidArgument(
-                "Workers elsewhere need a directory that all workers see, and this "
-                "work names none (shared_directory)."
+                "Workers on other machines need a directory that all workers see. Set "
+                "the shared_directory of this work."
             )
         self._place = _new_place(None if is_here else work.shared_directory)
         settings = dict(work.settings)
@@ -119,7 +121,7 @@ class Run:
             settings["payload"] = str(self._place / "payload")
             (self._place / "payload").write_bytes(work.payload)
         share = getattr(engine, "share", None)
-        # Locked while this process lives.
+        # The file stays locked while this process lives.
         self._file = (self._place / WORK).open("w")
         fcntl.flock(self._file, fcntl.LOCK_EX)
         json.dump(
@@ -128,7 +130,7 @@ class Run:
                 "settings": settings,
                 "environ": dict(work.environ),
                 "require_gpu": share.required if share and share.asked_for else None,
-                # Modules of a policy are found where the driver finds them.
+                # So that a policy's modules are found as in the driver.
                 "directory": str(Path.cwd()),
                 "path": [str(Path(entry).absolute()) for entry in sys.path],
             },
@@ -142,29 +144,30 @@ class Run:
 
     @property
     def unfinished(self) -> int:
-        """How many jobs have no outcome yet."""
+        """Number of jobs without an outcome."""
         return len(self._tasks) + len(self._parked)
 
     def submit(self, key: str, **arguments: Any) -> None:
-        """Add a job, also while results come.
+        """Add a job, which is possible even while results arrive.
 
         Args:
-            key: tells it from all others of the run.
-            **arguments: JSON.
+            key: a key that is unique in the run.
+            **arguments: the handler's arguments, as JSON.
         """
         self._hand_out(_Task(key, arguments))
 
     def results(self, *, timeout_s: float | None = None) -> Iterator[JobOutcome | None]:
-        """Yield outcomes as they come, until there is no job left.
+        """Yield outcomes as they arrive, until no jobs are left.
 
-        A job whose child dies is done again behind the others, `TRIES` times in all.
+        If a job's child dies, the job is retried after the others, up to `TRIES` times
+        in all.
 
         Args:
-            timeout_s: None is yielded whenever nothing has come for so long; never,
-                if it is None.
+            timeout_s: yield None whenever no outcome has arrived for this many seconds;
+                never if `timeout_s` is None.
 
         Raises:
-            Error: no child can begin; or what the handler's maker raised.
+            Error: no child can start; or the error that creating the handler raised.
         """
         while self._tasks or self._parked:
             outcome = None
@@ -178,24 +181,24 @@ class Run:
             if future in self._tasks:
                 outcome = self._take(future)
             if outcome is not None:
-                # There is a worker that can do jobs.
+                # At least one worker can do jobs.
                 self._hand_out_parked()
                 yield outcome
 
     def cancel(self) -> None:
         """End all jobs. Idempotent."""
-        # Children, and those who wait for them, see it.
+        # Children, and the threads that wait for them, watch this file.
         (self._place / WORK).unlink(missing_ok=True)
         running = {future for future in self._tasks if not future.cancel()}
         self._tasks.clear()
         self._parked.clear()
         try:
-            # Slurm's, whose jobs outlive their futures.
+            # For Slurm, whose jobs outlive their futures.
             if end_run := getattr(self._engine, "end_run", None):
                 end_run(str(self._place))
             wait(running)
         finally:
-            # Also where Ctrl-C has cut the waiting short.
+            # Even if Ctrl-C interrupted the wait.
             end_idle_children(str(self._place))
             _remove(self._place)
             self._file.close()
@@ -217,7 +220,7 @@ class Run:
             self._hand_out(self._parked.pop(0))
 
     def _take(self, future: Future[Any]) -> JobOutcome | None:
-        """Return the outcome of a job; None where it is to be done again."""
+        """Return the outcome of a job, or None if it will be retried."""
         task = self._tasks.pop(future)
         try:
             answer = future.result()
@@ -226,7 +229,7 @@ class Run:
         except Error:
             raise
         except Exception as error:
-            # The executor's own: a worker of it is gone.
+            # An error of the executor itself: one of its workers was lost.
             why = f"{type(error).__name__}: {error}".splitlines()
             how = f"is gone: {why[0]} {why[-1] if why[1:] else ''}"
             answer = {"died": how, "begun": True}
@@ -245,28 +248,30 @@ class Run:
     def _bury(self, task: _Task, how: str, *, has_begun: bool) -> JobOutcome | None:
         can_any_begin = (self._place / BEGUN).exists()
         if not has_begun and can_any_begin and self._tasks:
-            # It never came to the job, which waits for a worker that can do jobs.
-            logger.warning("A worker could not begin. It %s", how)
+            # The child never reached the job, so the job waits for a worker that can do
+            # jobs.
+            logger.warning("A worker could not start. It %s", how)
             self._parked.append(task)
             return None
         task.deaths += 1
         if task.deaths < TRIES:
             logger.warning(
-                "A worker died at the job %s, which is begun again. It %s",
+                "A worker died at the job %s, which will be retried. It %s",
                 task.key,
                 how,
             )
             self._hand_out(task)
             return None
         if not can_any_begin:
-            raise Error(f"No worker can begin. The last one {how}")
-        failure = f"Its worker died, which was try {task.deaths} of {TRIES}: it {how}"
+            raise Error(f"No worker can start. The last one {how}")
+        failure = f"Its worker died, on try {task.deaths} of {TRIES}: it {how}"
         return JobOutcome(key=task.key, value=None, failure=failure, tries=task.deaths)
 
     def _log(self, lines: Any) -> None:
-        """Log here what children logged, each text once in a run."""
+        """Log the children's log records here, each text once per run."""
         for name, level, text in lines:
-            # What MuJoCo says of a moment or a joint is no other warning at the next.
+            # MuJoCo's warnings differ in times and joint numbers; log each kind only
+            # once.
             kind = _NUMBERS.sub("", text) if name.endswith(_OF_MUJOCO) else text
             if (name, level, kind) not in self._told:
                 self._told.add((name, level, kind))
@@ -274,7 +279,7 @@ class Run:
 
 
 def _new_place(shared: Path | None) -> Path:
-    """Return a new folder that children see."""
+    """Return a new folder that the children can see."""
     name = os.urandom(8).hex()
     try:
         if shared is None:
@@ -282,7 +287,7 @@ def _new_place(shared: Path | None) -> Path:
         else:
             place = shared.absolute() / WORK_FOLDER / name
             _end_earlier_runs(place.parent)
-        # Only its owner says what is run.
+        # The folder decides what code runs, so only its owner may write to it.
         place.mkdir(mode=0o700, parents=True)
     except OSError as error:
         raise DirectoryNotWritable(shared or _TEMPORARY, error.strerror) from error
@@ -290,12 +295,12 @@ def _new_place(shared: Path | None) -> Path:
 
 
 def _end_earlier_runs(folder: Path) -> None:
-    """Remove the folders of killed drivers, which ends what still works for them."""
+    """Remove the folders of killed drivers, which ends the children of their runs."""
     for path in folder.glob(f"*/{WORK}"):
         with contextlib.suppress(OSError), path.open("rb") as file:
-            # Raises where the driver lives.
+            # Raises an error if the driver is alive.
             fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
-            logger.info("The run in %s has no driver, and is ended.", path.parent)
+            logger.info("The run in %s has no driver, so it was ended.", path.parent)
             path.unlink()
             _remove(path.parent)
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Jobs in processes of this machine."""
+"""An engine that runs jobs in processes on this machine."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from .gpu_shares import GpuShare, check_worker_count
 
 
 class LocalEngine(Executor):
-    """Runs jobs in processes of this machine: a thread per worker, each with a child.
+    """An engine that runs jobs on this machine, with a thread and a child per worker.
 
     Args:
-        workers: how many at most. None is one per usable CPU.
-        gpus: part of a GPU for each worker; with 0.25 four share one. Workers get the
-            GPUs in `CUDA_VISIBLE_DEVICES`, else all of the machine.
-        require_gpu: a worker that was given a GPU but renders in software is an error,
-            not only a warning.
+        workers: maximum number of workers. None is one per usable CPU.
+        gpus: part of a GPU for each worker; with 0.25, four share one. Workers get the
+            GPUs in `CUDA_VISIBLE_DEVICES`, otherwise all of the machine's.
+        require_gpu: whether a worker that was given a GPU but renders in software is an
+            error, not only a warning.
 
     Raises:
         InvalidArgument: `workers` is not a whole number of at least 1, or `gpus` is not
@@ -44,7 +44,7 @@ class LocalEngine(Executor):
         self.share = GpuShare(each=gpus, required=require_gpu)
         self._calls: queue.SimpleQueue[_Call | None] = queue.SimpleQueue()
         self._threads = 0
-        # So that an engine that is forgotten leaves no threads.
+        # So that an engine that is garbage-collected leaves no threads.
         self._end = weakref.finalize(self, self._calls.put, None)
 
     def __repr__(self) -> str:
@@ -57,15 +57,15 @@ class LocalEngine(Executor):
         """Call `fn` on one of the threads; see `concurrent.futures.Executor`.
 
         Raises:
-            ClosedError: it was shut down.
+            ClosedError: the engine was shut down.
         """
         if not self._end.alive:
             raise ClosedError("The engine was shut down.")
         future: Future[Any] = Future()
         self._calls.put((future, functools.partial(fn, *args, **kwargs)))
         if self._threads < self.workers:
-            # Daemons: they must not hold up the interpreter's end. They know their
-            # queue only, which does not keep the engine.
+            # Daemons, so that they do not delay interpreter exit. They refer only to
+            # the queue, so they do not keep the engine alive.
             threading.Thread(
                 target=_work,
                 args=[self._calls, self.share, self._threads],
@@ -76,7 +76,7 @@ class LocalEngine(Executor):
         return future
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        """Take no more calls and let the threads end. Idempotent."""
+        """Accept no more calls and let the threads end. Idempotent."""
         del wait, cancel_futures
         self._end()
 
@@ -94,7 +94,7 @@ def _work(calls: queue.SimpleQueue[_Call | None], share: GpuShare, number: int) 
                 future.set_result(do())
             except BaseException as error:
                 future.set_exception(error)
-        # So that nothing of it lives on until the next one.
+        # Do not keep references to the call until the next one.
         del call, future, do
-    # For the other threads.
+    # Pass the end on to the other threads.
     calls.put(None)

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Jobs on a Ray cluster: each is a task, done in a child process of Ray's worker.
+"""An engine for Ray: each job is a Ray task, done in a child of Ray's worker.
 
-Where this process is connected to Ray, that is used and left as it is. Else a
-connection is made: to a cluster, or to a Ray that is started on this machine.
+If this process is already connected to Ray, that connection is used and left open.
+Otherwise a connection is made, to a cluster or to a Ray that is started on this
+machine.
 """
 
 from __future__ import annotations
@@ -30,23 +31,24 @@ from .gpu_shares import GpuShare, check_worker_count
 
 logger = logging.getLogger(__name__)
 
-# Ray starts with no less than 75 MiB; jobs and their outcomes need next to nothing.
+# Ray's minimum is 75 MiB; jobs and their outcomes need next to nothing.
 _SMALLEST_STORE = 80 << 20
 _SECONDS_TO_REACH = 10.0
 
 
 class RayEngine(Executor):
-    """Runs jobs on a Ray cluster.
+    """An engine that runs jobs on a Ray cluster.
 
     Args:
-        workers: how many at once. None is as many as the cluster has room for, also
-            while it grows.
-        address: of the cluster. None is `RAY_ADDRESS`, else a Ray is started on this
-            machine, without usage statistics and dashboard, and ends with the engine.
-            An existing connection of this process is used and left open.
-        gpus: part of a GPU for each worker; with 0.25 four share one.
-        require_gpu: a worker that was given a GPU but renders in software is an error,
-            not only a warning.
+        workers: maximum number of workers at once. None is as many as the cluster has
+            room for, even as it grows.
+        address: address of the cluster. None is `RAY_ADDRESS`; if that is not set, a
+            Ray is started on this machine, without usage statistics or a dashboard,
+            and stopped with the engine. An existing connection of this process is used
+            and left open.
+        gpus: part of a GPU for each worker; with 0.25, four share one.
+        require_gpu: whether a worker that was given a GPU but renders in software is an
+            error, not only a warning.
 
     Raises:
         InvalidArgument: `workers` is not a whole number of at least 1, or `gpus` is not
@@ -81,12 +83,12 @@ class RayEngine(Executor):
     def submit(
         self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any
     ) -> Future[Any]:
-        """Call `fn` in a task of Ray's; see `concurrent.futures.Executor`.
+        """Call `fn` in a Ray task; see `concurrent.futures.Executor`.
 
         Raises:
-            ClosedError: it was shut down.
-            GLError: a GPU is required, and the Ray that was started has none.
-            Error: there is no such cluster, or no Ray can be started.
+            ClosedError: the engine was shut down.
+            GLError: a GPU is required, but the Ray that was started has none.
+            Error: the cluster does not answer, or Ray cannot be started.
         """
         if self._is_shut_down:
             raise ClosedError("The engine was shut down.")
@@ -98,7 +100,7 @@ class RayEngine(Executor):
         return future
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        """Take no more calls; end the connection if it was made here. Idempotent."""
+        """Accept no more calls; close a connection that was made here. Idempotent."""
         del wait, cancel_futures
         self._is_shut_down = True
         if self._disconnect is not None:
@@ -108,16 +110,16 @@ class RayEngine(Executor):
         if not self._ray.is_initialized():
             is_started = _connect(self._ray, self.address, self.workers)
             self._disconnect = weakref.finalize(self, _disconnect, self._ray)
-            # No worker shall wait for ever for a GPU that there is not.
+            # A worker must not wait forever for a GPU that does not exist.
             has_gpus = self._ray.cluster_resources().get("GPU")
             if is_started and self.share.asked_for and not has_gpus:
-                lack = "Workers should get GPUs, but Ray finds none on this machine."
+                lack = "GPUs were requested, but Ray finds none on this machine."
                 if self.share.required:
                     raise GLError(f"{lack} `nvidia-smi -L` lists GPUs.")
-                logger.warning("%s They draw in software.", lack)
+                logger.warning("%s Workers render in software.", lack)
                 self.share = GpuShare()
         self._task = self._ray.remote(
-            # A task that is lost is handed out again by its run, which says so.
+            # A lost task is resubmitted by its run, which reports it.
             num_cpus=1,
             num_gpus=self.share.each,
             max_retries=0,
@@ -141,7 +143,8 @@ class RayEngine(Executor):
         if error is None:
             future.set_result(done.result())
         else:
-            # What a task raised comes as an error of Ray's, with its own as the cause.
+            # A task's exception arrives as one of Ray's errors, with the original as
+            # its cause.
             cause = getattr(error, "cause", None)
             future.set_exception(cause if isinstance(cause, Error) else error)
         self._begin()
@@ -150,18 +153,18 @@ class RayEngine(Executor):
 def _call(
     version: str, fn: Callable[..., Any], args: tuple[Any, ...], kwargs: dict[str, Any]
 ) -> Any:
-    """Call a function in Ray's worker."""
+    """Call a function in a Ray worker, if it has the same version of mjrec."""
     if version != mjrec.__version__:
         raise Error(
-            f"mjrec is {version} at the driver and {mjrec.__version__} where Ray has "
-            "started a worker: install the same on all machines of the cluster."
+            f"The driver has mjrec {version}, but a Ray worker has "
+            f"{mjrec.__version__}: install the same version on all machines."
         )
     return fn(*args, **kwargs)
 
 
 def _import_ray() -> Any:
     try:
-        # Heavy, and optional.
+        # A heavy and optional import.
         return importlib.import_module("ray")
     except ModuleNotFoundError as error:
         if error.name != "ray":
@@ -174,8 +177,8 @@ def _import_ray() -> Any:
 def _disconnect(ray: Any) -> None:
     with contextlib.suppress(Exception):
         ray.shutdown()
-    # Let a later Ray of this process have another token than ours. Its place is
-    # private, and older ones have none.
+    # A later Ray of this process must get a different token than ours. The cache is a
+    # private API, which older versions lack.
     with contextlib.suppress(ImportError, AttributeError):
         raylet = importlib.import_module("ray._raylet")
         raylet.AuthenticationTokenLoader.instance().reset_cache()
@@ -186,8 +189,8 @@ def _connect(ray: Any, address: str | None, cpus: int | None) -> bool:
     address = address or os.environ.get("RAY_ADDRESS") or "local"
     if address.startswith("ray://"):
         raise InvalidArgument(
-            f"{address} is an address for Ray's client, which cannot watch workers. "
-            "Start mjrec on a machine of the cluster, with --address auto."
+            f"{address} is an address for Ray's client, which cannot monitor "
+            "workers. Start mjrec on a machine in the cluster, with --address auto."
         )
     try:
         with _signals_as_they_are():
@@ -197,7 +200,7 @@ def _connect(ray: Any, address: str | None, cpus: int | None) -> bool:
             _check_reachable(address)
             ray.init(address=address, logging_level=logging.WARNING)
             return False
-    # Ray has no class of its own for what goes wrong here.
+    # Ray has no error class of its own for these failures.
     except Exception as error:
         with contextlib.suppress(Exception):
             ray.shutdown()
@@ -214,9 +217,9 @@ def _connect(ray: Any, address: str | None, cpus: int | None) -> bool:
 
 
 def _check_reachable(address: str) -> None:
-    """Raise OSError where no cluster listens; Ray would try for minutes."""
+    """Raise OSError if no cluster is listening; Ray itself would try for minutes."""
     if address == "auto":
-        # What Ray has noted of a cluster that need not run any more; a private name.
+        # Ray's record of a cluster, which may no longer be running; a private API.
         with contextlib.suppress(ImportError, AttributeError):
             services = importlib.import_module("ray._private.services")
             address = services.canonicalize_bootstrap_address(address) or ""
@@ -228,9 +231,9 @@ def _check_reachable(address: str) -> None:
 def _start(ray: Any, cpus: int) -> None:
     environ = {
         "RAY_USAGE_STATS_ENABLED": "0",
-        # Workers that were given no GPU see what they would without Ray.
+        # Workers without a GPU see the same GPUs as without Ray.
         "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",
-        # Processes of jobs end by themselves, when they have said so.
+        # Children of jobs exit on their own, after sending their last message.
         "RAY_kill_child_processes_on_worker_exit": "0",
     }
     is_token_known = (
@@ -238,7 +241,7 @@ def _start(ray: Any, cpus: int) -> None:
         & {*filter(os.environ.get, os.environ)}
     ) or (Path.home() / ".ray" / "auth_token").exists()
     if not is_token_known:
-        # Else it would write one into the home, and leave it there.
+        # Otherwise Ray would write a token into the home directory, and leave it there.
         environ["RAY_AUTH_TOKEN"] = secrets.token_hex(32)
     with _environment(environ):
         ray.init(
@@ -252,7 +255,7 @@ def _start(ray: Any, cpus: int) -> None:
 
 @contextlib.contextmanager
 def _environment(more: Mapping[str, str]) -> Iterator[None]:
-    """Have environment variables for a while, and undo whatever else is set."""
+    """Set environment variables for the block, then restore the environment."""
     before = dict(os.environ)
     os.environ.update(more)
     try:
@@ -265,7 +268,7 @@ def _environment(more: Mapping[str, str]) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _signals_as_they_are() -> Iterator[None]:
-    """Undo what is done to handlers of signals, which Python does in one thread."""
+    """Restore signal handlers after the block, which only the main thread can do."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return

@@ -1,16 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Jobs on a Slurm cluster: arrays of Slurm jobs, and each does some of ours.
+"""An engine for Slurm: arrays of Slurm jobs, each doing some of a run's jobs.
 
-The outcomes are files in the run's folder, which all machines see, so that nothing
-depends on one Slurm job's life: a job that Slurm begins again does what it has not
-done, and what an array has left undone is submitted once more. In that folder::
+Outcomes are files in the run's folder, which all machines see, so that nothing depends
+on the life of a single Slurm job. A Slurm job that is requeued does the jobs that it
+has not done, and jobs that an array did not finish are submitted again. The files in
+that folder are::
 
-    slurm/outcomes/17.json   what `worker.do_job` returned of job 17
-    slurm/logs/              what the Slurm jobs print, and submitit's own files
+    slurm/outcomes/17.json   the return value of `worker.do_job` for job 17
+    slurm/logs/              output of the Slurm jobs, and submitit's own files
 
-`submitit` writes the scripts and submits them. The state of a Slurm job is asked of
-`squeue`, which every cluster has; submitit asks `sacct`, which needs a database that
-not every cluster keeps, and only every ten minutes.
+`submitit` writes the scripts and submits them. The states of Slurm jobs come from
+`squeue`, which every cluster has. submitit itself uses `sacct`, which needs a database
+that not every cluster has, and queries it only every ten minutes.
 """
 
 from __future__ import annotations
@@ -44,13 +45,14 @@ from .worker import do_job, end_idle_children
 
 logger = logging.getLogger(__name__)
 
-# What a cluster would grant is not known before; four are always granted.
+# The number of jobs that a cluster would run at once is unknown; four is always
+# acceptable.
 DEFAULT_WORKERS = 4
 
 _CLUSTERS = ("slurm", "local")
 _COMMANDS = ("sbatch", "squeue", "scancel", "srun")
 _SBATCH = "sbatch."
-# So that the last jobs of an array end at about the same time.
+# Several per worker, so that the last jobs of an array end at about the same time.
 _ELEMENTS_PER_WORKER = 4
 _SECONDS_BETWEEN_LOOKS = 0.2
 _SECONDS_BETWEEN_QUESTIONS = 10.0
@@ -67,7 +69,7 @@ _NOT_OVER = frozenset(
 
 @dataclass(frozen=True, eq=False)
 class _Task:
-    """A job of a run, and its future."""
+    """A job of a run, with its future."""
 
     number: int
     place: Path
@@ -76,35 +78,36 @@ class _Task:
 
 
 class SlurmEngine(Executor):
-    """Runs jobs in Slurm jobs.
+    """An engine that runs jobs in Slurm jobs.
 
     Args:
-        workers: how many at most, in all Slurm jobs together. None is 4, or one per CPU
-            with `cluster="local"`.
-        cluster: None is this machine's Slurm cluster; `"local"` uses processes of this
-            machine instead of Slurm jobs, to try it out.
-        gpus: part of a GPU for each worker; with 0.25 four share one.
-        require_gpu: a worker that was given a GPU but renders in software is an error,
-            not only a warning.
-        cpus_per_worker: CPUs for each worker.
-        workers_per_job: workers in one Slurm job, on one machine. None is as many as
-            share a GPU, else one.
-        partition: for the Slurm jobs. None is the cluster's default, here and below.
-        account: charged for the jobs.
+        workers: maximum number of workers, in all Slurm jobs together. None is 4, or
+            one per CPU with `cluster="local"`.
+        cluster: None is this machine's Slurm cluster; `"local"` uses processes on this
+            machine instead of Slurm jobs, for trying it out.
+        gpus: part of a GPU for each worker; with 0.25, four share one.
+        require_gpu: whether a worker that was given a GPU but renders in software is an
+            error, not only a warning.
+        cpus_per_worker: number of CPUs per worker.
+        workers_per_job: number of workers in one Slurm job, on one machine. None is as
+            many as share a GPU, otherwise one.
+        partition: partition for the Slurm jobs. None is the cluster's default, here and
+            below.
+        account: account to charge for the jobs.
         qos: quality of service.
         constraint: features that nodes must have.
-        time_min: time limit in minutes. A job that reaches it goes back into the queue
-            and continues. The longest single job must fit.
-        notice_s: a Slurm job stops this many seconds before its limit. None is 120, or
-            a quarter of a short limit.
-        mem_gb: memory of each worker, in gigabytes.
+        time_min: time limit in minutes. A Slurm job that reaches it is requeued and
+            continues. The longest single job must fit.
+        notice_s: how many seconds before its limit a Slurm job stops. None is 120, or a
+            quarter of a short limit.
+        mem_gb: memory per worker, in gigabytes.
         setup: shell lines that run first in a Slurm job.
         sbatch: other options of `sbatch`, by name, without dashes.
 
     Raises:
-        InvalidArgument: an argument has a wrong value.
+        InvalidArgument: an argument is invalid.
         MissingDependency: submitit is not installed.
-        Error: this machine has no Slurm commands.
+        Error: this machine does not have the Slurm commands.
     """
 
     def __init__(
@@ -131,12 +134,12 @@ class SlurmEngine(Executor):
         check_worker_count(workers_per_job, "workers_per_job")
         self.share = GpuShare(each=gpus, required=require_gpu)
         if mem_gb is not None and not mem_gb > 0:
-            raise InvalidArgument(f"mem_gb is more than 0, got {mem_gb!r}.")
+            raise InvalidArgument(f"mem_gb must be more than 0, got {mem_gb!r}.")
         notice = min(120.0, 60 * time_min / 4) if notice_s is None else notice_s
         if not 0 <= notice < 60 * time_min:
             raise InvalidArgument(
-                f"notice_s is less than the time limit of {time_min} minutes (time_min)"
-                f", in seconds, got {notice_s!r}."
+                f"notice_s must be less than the time limit of {time_min} minutes "
+                f"(time_min), in seconds, got {notice_s!r}."
             )
         self._cluster = cluster or "slurm"
         self._submitit = _submitit(self._cluster)
@@ -164,15 +167,15 @@ class SlurmEngine(Executor):
             "slurm_array_parallelism": self._most_jobs,
             "slurm_setup": list(setup) or None,
             "local_setup": list(setup),
-            # Since Slurm 22.05 a step does not get the job's CPUs by itself.
+            # Since Slurm 22.05, a step does not inherit the job's CPUs automatically.
             "slurm_srun_args": [f"--cpus-per-task={cpus}"],
             "slurm_additional_parameters": others,
         }
         self._numbers = itertools.count()
         self._waiting: list[_Task] = []
-        # By the Slurm job that does them.
+        # By the id of the Slurm job that does them.
         self._elements: dict[str, list[_Task]] = {}
-        # Those of `cluster="local"`.
+        # The processes of `cluster="local"`.
         self._processes: dict[str, Any] = {}
         self._last_added = self._last_asked = -math.inf
         self._last_progress = 0.0
@@ -188,18 +191,18 @@ class SlurmEngine(Executor):
     def submit(
         self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any
     ) -> Future[Any]:
-        """Run a job of a `jobs.Run` in some Slurm job.
+        """Run a job of a `jobs.Run` in one of the Slurm jobs.
 
         Raises:
             ClosedError: the engine was shut down.
-            InvalidArgument: it is another function.
+            InvalidArgument: `fn` is not `worker.do_job`.
         """
         if self._is_shut_down:
             raise ClosedError("The engine was shut down.")
         if fn is not do_job:
             raise InvalidArgument(
-                "SlurmEngine does only jobs of mjrec, whose outcomes are files. For "
-                "other functions use an executor of submitit's."
+                "SlurmEngine runs only mjrec's own jobs, whose outcomes are files. "
+                "Use a submitit executor for other functions."
             )
         place, job = args
         task = _Task(next(self._numbers), Path(place, "slurm"), job, Future())
@@ -215,7 +218,7 @@ class SlurmEngine(Executor):
         return task.future
 
     def end_run(self, place: str) -> None:
-        """End the Slurm jobs of a run, and wait until they have ended. Idempotent."""
+        """Cancel the Slurm jobs of a run, and wait until they end. Idempotent."""
         with self._one_at_a_time:
             self._waiting = [t for t in self._waiting if t.place.parent != Path(place)]
             ending = {
@@ -226,8 +229,8 @@ class SlurmEngine(Executor):
             if ending and self._cluster == "slurm":
                 _command("scancel", "--quiet", *sorted(ending))
             deadline = time.monotonic() + _SECONDS_TO_END
-            # Where Slurm does not answer, the deadline ends this. What stands in for
-            # Slurm jobs ends by itself.
+            # If Slurm does not answer, the deadline ends the wait. Local processes exit
+            # on their own.
             while ending and time.monotonic() < deadline:
                 states = self._states(ending)
                 ending -= {job for job in states if states[job][0] not in _NOT_OVER}
@@ -239,12 +242,12 @@ class SlurmEngine(Executor):
             }
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        """Take no more jobs. Idempotent."""
+        """Accept no more jobs. Idempotent."""
         del wait, cancel_futures
         self._is_shut_down = True
 
     def _follow(self) -> None:
-        """Submit jobs and look for their outcomes, as long as there are any."""
+        """Submit jobs and collect their outcomes while there are any."""
         while True:
             time.sleep(_SECONDS_BETWEEN_LOOKS)
             with self._one_at_a_time:
@@ -266,11 +269,12 @@ class SlurmEngine(Executor):
     def _submit_waiting(self) -> None:
         now = time.monotonic()
         free = self._most_jobs - len(self._elements)
-        # Those that come at once share an array.
+        # Wait a moment, so that jobs submitted at the same time share an array.
         is_whole = now - self._last_added > _SECONDS_BETWEEN_LOOKS
         if not self._waiting or not is_whole or free <= 0:
             return
-        # With nothing running the cluster keeps the limit itself, array by array.
+        # If nothing is running, the cluster itself enforces the limit within the new
+        # array.
         most = free if self._elements else self._most_jobs * _ELEMENTS_PER_WORKER
         place = self._waiting[0].place
         tasks = [task for task in self._waiting if task.place == place]
@@ -302,7 +306,7 @@ class SlurmEngine(Executor):
                         _resolve(task, json.loads(done[str(task.number)].read_bytes()))
 
     def _ask(self) -> None:
-        """Ask for the states of Slurm jobs."""
+        """Query the states of Slurm jobs, and handle those that have ended."""
         now = time.monotonic()
         is_local = self._cluster == "local"
         if not is_local and now - self._last_asked < _SECONDS_BETWEEN_QUESTIONS:
@@ -311,13 +315,13 @@ class SlurmEngine(Executor):
         states = self._states(self._elements)
         over = {job for job, (state, _) in states.items() if state not in _NOT_OVER}
         if over:
-            # What they have done before their end.
+            # Take the outcomes that they wrote before they ended.
             self._take_outcomes()
         for job in over:
             for task in self._elements.pop(job):
                 how = (
                     f"was in the Slurm job {job}, which ended ({states[job][0]}). The "
-                    f"end of what that said: {_end_of_log(task.place, job)}"
+                    f"end of that job's log: {_end_of_log(task.place, job)}"
                 )
                 _resolve(task, {"died": how, "begun": True})
         if states and now - self._last_progress > _SECONDS_WITHOUT_START:
@@ -331,7 +335,7 @@ class SlurmEngine(Executor):
                 )
 
     def _states(self, jobs: Collection[str]) -> dict[str, tuple[str, str]]:
-        """Return states and reasons of Slurm jobs; nothing where there is no answer."""
+        """Return states and reasons of Slurm jobs; empty if Slurm does not answer."""
         if self._cluster == "local":
             return {job: (self._processes[job].state, "") for job in jobs}
         if not jobs:
@@ -351,18 +355,18 @@ class SlurmEngine(Executor):
         return states
 
 
-# In a Slurm job: it goes back into the queue.
+# Set in a Slurm job that is about to be requeued.
 _is_ending = threading.Event()
 
 
 @dataclass
 class ArrayElement:
-    """What submitit runs in a Slurm job, and puts back into Slurm's queue.
+    """The callable that submitit runs in a Slurm job, and requeues.
 
     Attributes:
-        place: `slurm` in the run's folder.
-        workers: how many do the jobs at once.
-        share: what each gets of the Slurm job's GPUs.
+        place: the folder `slurm` in the run's folder.
+        workers: number of workers that do jobs at once.
+        share: each worker's share of the Slurm job's GPUs.
     """
 
     place: Path
@@ -370,8 +374,8 @@ class ArrayElement:
     share: GpuShare
 
     def __call__(self, jobs: Mapping[int, Mapping[str, Any]]) -> None:
-        """Do jobs, by their numbers, as far as they are not done."""
-        # submitit takes no notice of it. Children end with this process.
+        """Do the jobs, keyed by number, that have no outcome yet."""
+        # submitit does not handle SIGTERM. Children end with this process.
         signal.signal(signal.SIGTERM, lambda *_: os._exit(1))
         run = str(self.place.parent)
 
@@ -380,7 +384,8 @@ class ArrayElement:
             if path.exists() or _is_ending.is_set():
                 return
             answer = do_job(run, jobs[number])
-            # A child that was told to end with this process is no job's fault.
+            # If the child died because this Slurm job is ending, the job is not to
+            # blame.
             if "died" not in answer or not _is_ending.wait(_SECONDS_BETWEEN_LOOKS):
                 with contextlib.suppress(Error):
                     write_text(path, json.dumps(answer))
@@ -391,21 +396,21 @@ class ArrayElement:
         end_idle_children(run)
 
     def checkpoint(self, jobs: Mapping[int, Mapping[str, Any]]) -> Any:
-        """Return what goes on after the job's time limit, or its preemption."""
+        """Return the submission that continues after the time limit or a preemption."""
         _is_ending.set()
         return _submitit("local").helpers.DelayedSubmission(self, jobs)
 
 
 def slurm_options(texts: Mapping[str, str]) -> dict[str, Any]:
-    """Return parameters of `SlurmEngine` from options as the command line has them.
+    """Return parameters of `SlurmEngine` from command-line options.
 
     Args:
-        texts: parameters by name; `sbatch.NAME` is an option of `sbatch`, and `setup`
-            one line.
+        texts: values by parameter name; `sbatch.NAME` is an option of `sbatch`, and
+            `setup` is a single line.
 
     Raises:
-        UnknownName: there is no such option.
-        InvalidArgument: one is no number.
+        UnknownName: an option does not exist.
+        InvalidArgument: a value is not a number.
     """
     options: dict[str, Any] = {}
     sbatch: dict[str, str | bool] = {}
@@ -416,7 +421,7 @@ def slurm_options(texts: Mapping[str, str]) -> dict[str, Any]:
             sbatch[name.removeprefix(_SBATCH)] = text or True
         elif name not in known:
             raise UnknownName(
-                "option of Slurm's",
+                "Slurm option",
                 name,
                 [*known, f"{_SBATCH}NAME"],
                 hint=f"Any other option of sbatch is {_SBATCH}NAME=VALUE.",
@@ -429,12 +434,12 @@ def slurm_options(texts: Mapping[str, str]) -> dict[str, Any]:
                 options[name] = {"int": int, "float": float, "str": str}[kind](text)
             except ValueError as error:
                 raise InvalidArgument(
-                    f"The option {name} of Slurm's is a number, got {text!r}."
+                    f"The Slurm option {name} must be a number, got {text!r}."
                 ) from error
     return {**options, "sbatch": sbatch}
 
 
-# What the command line has options of its own for.
+# Parameters that the command line has separate options for.
 _ELSEWHERE = ("workers", "gpus", "require_gpu", "sbatch")
 
 
@@ -454,15 +459,15 @@ def _end_of_log(place: Path, job: str) -> str:
 def _submitit(cluster: str) -> ModuleType:
     if cluster not in _CLUSTERS:
         raise InvalidArgument(
-            f"cluster is {' or '.join(map(repr, _CLUSTERS))}, got {cluster!r}."
+            f"cluster must be {' or '.join(map(repr, _CLUSTERS))}, got {cluster!r}."
         )
-    # Else it would configure the process's logging, and close handlers on the way.
-    # Slurm jobs do not inherit it, and have submitit's words in their logs.
+    # Otherwise submitit would configure the process's logging, closing handlers on the
+    # way. Slurm jobs do not inherit this, so their logs have submitit's messages.
     before = os.environ.get("SUBMITIT_LOG_LEVEL")
     if "submitit" not in sys.modules and before is None:
         os.environ["SUBMITIT_LOG_LEVEL"] = "NOCONFIG"
     try:
-        # Optional, and not quick to import.
+        # An optional import, and slow.
         import submitit
     except ImportError as error:
         raise MissingDependency(
@@ -474,26 +479,26 @@ def _submitit(cluster: str) -> ModuleType:
     missing = [command for command in _COMMANDS if shutil.which(command) is None]
     if cluster == "slurm" and missing:
         raise Error(
-            f"This machine has no {', '.join(missing)} on its PATH, with which "
-            "jobs of a Slurm cluster are submitted and looked after. Run mjrec "
-            "where Slurm's commands are: on the cluster's login node, or in a "
-            'Slurm job. cluster="local" (--engine-option cluster=local) tries it '
-            "out with processes of this machine."
+            f"This machine has no {', '.join(missing)} on its PATH. Run mjrec where "
+            "Slurm's commands are installed: on the cluster's login node, or in a "
+            'Slurm job. To try it with local processes, use cluster="local" '
+            "(--engine-option cluster=local)."
         )
     return submitit
 
 
 @contextlib.contextmanager
 def _as_from_outside() -> Iterator[None]:
-    """Submit from inside a Slurm job as from outside.
+    """Submit from inside a Slurm job as if from outside.
 
-    What that job was given (its CPUs, its memory) would be taken for what is asked for.
+    Otherwise the resources of that job (its CPUs, its memory) would be taken for
+    requested ones.
     """
     inside = "SLURM_JOB_ID" in os.environ
     hidden = {
         name: os.environ.pop(name)
         for name in [*os.environ]
-        # Where the cluster is stays as it is.
+        # Keep the location of the cluster.
         if inside and name != "SLURM_CONF"
         if name.startswith(("SLURM_", "SLURMD_", "SRUN_"))
     }
@@ -504,7 +509,7 @@ def _as_from_outside() -> Iterator[None]:
 
 
 def _command(*words: str) -> subprocess.CompletedProcess[str] | None:
-    """Run a command of Slurm's; return nothing if it does not answer."""
+    """Run a Slurm command; return None if it does not answer."""
     try:
         return subprocess.run(
             words,

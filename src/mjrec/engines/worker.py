@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Doing a job in a child process: what executors are given.
+"""Doing a job in a child process: the function that executors call.
 
-A child stays for later jobs of its run, so that a policy is read once for each child.
-It is ended when its run is over, which shows wherever it is: the file `work.json` in
-the run's folder is gone. It also ends with the process that started it.
+A child stays for later jobs of its run, so that a policy is loaded once per child. It
+is ended when its run is over, which every machine can see: the file `work.json` in the
+run's folder is gone. It also ends with the process that started it.
 """
 
 from __future__ import annotations
@@ -22,31 +22,31 @@ from ..child_python import Child, wait_for_news
 from ..gl.devices import CUDA_VISIBLE_DEVICES
 from ..parent import Parent
 
-# In a run's folder: what its children do; it is there as long as the run.
+# In a run's folder: describes the work of its children; exists as long as the run.
 WORK = "work.json"
-# In a run's folder: a child has begun.
+# In a run's folder: exists once a child has started.
 BEGUN = "begun"
 
 _SECONDS_BETWEEN_LOOKS = 0.2
 _END_OF_WORDS = 2000
 
-# `seat.gpus`: of the thread that does a job, where an engine shares GPUs out.
+# `seat.gpus`: the GPUs of the thread that does a job, if the engine shares out GPUs.
 seat = threading.local()
 # In a child: the process that started it.
 parent: Parent | None = None
 
 
 def do_job(place: str, job: Mapping[str, Any]) -> dict[str, Any]:
-    """Do a job in a child process, and return its end as plain data.
+    """Do a job in a child process, and return its outcome as plain data.
 
     Args:
         place: the run's folder.
         job: `key` and `arguments`.
 
     Returns:
-        `value` or `failure` where the job is over; `died`, and whether its child had
-        `begun`, where that has died; `error` where no handler can be made. With `log`,
-        what the child logged as a warning or worse.
+        `value` or `failure` if the job is over; `died`, and whether the child had
+        `begun`, if the child died; `error` if the handler could not be created. `log`
+        has the child's log records at warning level and above.
     """
     kind = place, getattr(seat, "gpus", None)
     with _one_at_a_time:
@@ -57,7 +57,7 @@ def do_job(place: str, job: Mapping[str, Any]) -> dict[str, Any]:
     except OSError as error:
         how = f"cannot be started: {sys.executable!r}: {error}"
         if not Path(place, WORK).exists():
-            how = f"sees no {place}: all machines must see it under the same name"
+            how = f"cannot see {place}: all machines must see it under the same path"
         return {"died": how, "begun": False}
     answer = child.do(job)
     if "died" in answer or "error" in answer:
@@ -69,7 +69,7 @@ def do_job(place: str, job: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def end_idle_children(place: str) -> None:
-    """End the children of a run that have nothing to do. Idempotent."""
+    """End the idle children of a run. Idempotent."""
     with _one_at_a_time:
         kinds = [kind for kind in _idle if kind[0] == place]
         children = [child for kind in kinds for child in _idle.pop(kind)]
@@ -79,14 +79,15 @@ def end_idle_children(place: str) -> None:
 
 @contextlib.contextmanager
 def time_limit(seconds: float | None, file: Path, text: str) -> Iterator[None]:
-    """End this child if what is done inside takes longer.
+    """Kill this child if the block takes longer than a limit.
 
-    By the process that started it, because what hangs may hold the interpreter.
+    The process that started it does that, because code that hangs may block the
+    interpreter.
 
     Args:
-        seconds: so long; None is for ever.
-        file: to which that process appends something then.
-        text: what it appends.
+        seconds: the limit; None means no limit.
+        file: the file to which the parent process then appends `text`.
+        text: the string to append.
     """
     if seconds is None or parent is None:
         yield
@@ -99,17 +100,17 @@ def time_limit(seconds: float | None, file: Path, text: str) -> Iterator[None]:
 
 
 class _JobChild(Child):
-    """A process that does jobs of one run; the module `child` says what is sent.
+    """A process that does the jobs of one run; see the module `child` for the messages.
 
-    What it prints goes to the standard error, line by line.
+    Its output is copied to standard error, line by line.
 
     Args:
         place: the run's folder.
-        gpus: that it draws on, as `CUDA_VISIBLE_DEVICES` names them; None is what this
-            process has.
+        gpus: the GPUs that it renders on, in the format of `CUDA_VISIBLE_DEVICES`; None
+            is this process's own setting.
 
     Raises:
-        OSError: it cannot be started, or there is no such run.
+        OSError: the process cannot be started, or the run does not exist.
     """
 
     def __init__(self, place: str, gpus: str | None) -> None:
@@ -172,17 +173,17 @@ class _JobChild(Child):
         return {"died": died, "begun": self._is_ready, "log": log}
 
     def end(self) -> None:
-        """End it and what it has started. Idempotent."""
+        """End the child and the processes that it started. Idempotent."""
         super().end()
-        # What it has left may keep the pipe open.
+        # Processes that it left may keep the pipe open.
         self._listener.join(_SECONDS_BETWEEN_LOOKS)
 
     def _pass_on(self, words: int) -> None:
-        # Progress bars go back to the beginning of their line, which ends it here.
+        # Universal newlines: a progress bar's carriage return ends a line here.
         with open(words, errors="replace", newline=None) as lines:
             for line in lines:
                 self._said = (self._said + line)[-_END_OF_WORDS:]
-                # Python's own, which a progress bar may have taken over.
+                # Python's own stream, which a progress bar may have replaced.
                 with contextlib.suppress(OSError, ValueError, AttributeError):
                     sys.stderr.write(line)
                     sys.stderr.flush()
@@ -191,5 +192,5 @@ class _JobChild(Child):
 _idle: dict[tuple[str, str | None], list[_JobChild]] = {}
 _one_at_a_time = threading.Lock()
 
-# A forked child's copies were closed by `Child`.
+# After a fork, `Child` has already closed the child process's copies.
 os.register_at_fork(after_in_child=_idle.clear)

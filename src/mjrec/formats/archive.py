@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Videos packed for upload: gym's archive.
+"""Gym's archive: videos packed for upload.
 
 A gzipped tar file, flat::
 
     <video>, <its metadata>      for each pair, in the order given
     manifest.json                {"version": 0, "videos": [[video, metadata], ...]}
 
-It depends on the names and contents of the files alone: their times, owners and
-permissions are left out, so the same videos give the same bytes.
+The archive depends only on the names and contents of the files, not on their times,
+owners and permissions: the same videos give the same bytes.
 """
 
 from __future__ import annotations
@@ -51,10 +51,10 @@ def write_archive(
         videos: pairs of video path and metadata path, as in
             `load_results(...)["videos"]`; at most 100, with different names.
         archive_file: a binary file open for writing. It is not closed.
-        env_id: the environment, for error messages.
+        env_id: the environment's id, for error messages.
 
     Raises:
-        ArchiveError: a file is missing, unreadable, no regular file, or has a name that
+        ArchiveError: a file is missing, unreadable or not a regular file, or its name
             is not allowed. Nothing was written.
     """
     pairs = [(Path(video), Path(metadata)) for video, metadata in videos]
@@ -71,7 +71,7 @@ def write_archive(
 
 
 def _objections(pairs: Sequence[_Pair]) -> Iterator[str]:
-    """Yield why there will be no archive, in the order in which gym looked."""
+    """Yield the reasons why these pairs cannot be archived, in gym's order."""
     if len(pairs) > MAX_VIDEOS:
         yield (
             f"{len(pairs)} videos were given, and an archive holds at most "
@@ -81,36 +81,36 @@ def _objections(pairs: Sequence[_Pair]) -> Iterator[str]:
     for video, metadata in pairs:
         if not os.path.lexists(video):
             yield (
-                f"There is no video {video}. Its recording may have failed: see the "
-                "recorder's `functional`."
+                f"The video {video} does not exist. Its recording may have failed: see "
+                "the recorder's `functional`."
             )
         if not os.path.lexists(metadata):
-            yield f"There is no metadata {metadata} for the video {video}."
+            yield f"{metadata}, the metadata of the video {video}, does not exist."
         for path in (video, metadata):
             if not stat.S_ISREG(path.lstat().st_mode):
-                yield f"{path} is a link, a directory or a device. Give the file."
+                yield f"{path} is a link, a directory or a device. Give a regular file."
         for path in (video, metadata):
             if path.name in taken:
                 yield (
-                    f"The name {path.name!r} is there twice (the second time as "
-                    f"{path}), and an archive has no directories."
+                    f"The name {path.name!r} occurs twice (the second time as {path}), "
+                    "and an archive has no directories. Rename one of the files."
                 )
             taken.add(path.name)
         plain = "it must be letters, digits, '_', '-' and '.', ending in"
         if not _VIDEO_NAME.fullmatch(video.name):
-            yield f"{video.name!r} is no name for a video: {plain} .mp4, .avi or .json."
+            yield f"{video.name!r} is not a video's name: {plain} .mp4, .avi or .json."
         if video.name.endswith(".meta.json"):
-            yield f"{video.name!r} is the name of metadata, not of a video."
+            yield f"{video.name!r} is a metadata file's name, not a video's."
         if video.name.lower() == _MANIFEST:
-            yield f"{video.name!r} is the archive's own list, and no name for a video."
+            yield f"{video.name!r} is the name of the archive's manifest. Rename it."
         if not _METADATA_NAME.fullmatch(metadata.name):
-            yield f"{metadata.name!r} is no name for metadata: {plain} .meta.json."
+            yield f"{metadata.name!r} is not a metadata name: {plain} .meta.json."
 
 
 def _pack(pairs: Sequence[_Pair], whole: IO[bytes]) -> None:
     names = [[video.name, metadata.name] for video, metadata in pairs]
     manifest = dumps({"version": 0, "videos": names}).encode()
-    # Through a stream of our own, because tarfile puts time and name into gzip's
+    # Use our own gzip stream, because tarfile writes the time and the name into gzip's
     # header.
     with (
         gzip.GzipFile(filename="", mode="wb", fileobj=whole, mtime=0) as stream,

@@ -3,7 +3,7 @@
 
 The format is asciinema's (https://docs.asciinema.org/manual/asciicast/v1/): one JSON
 object with `version`, `width`, `height`, `duration`, `command`, `title`, `env` and
-`stdout`, a list of pairs of a delay in seconds and the text that is then printed.
+`stdout`, a list of pairs: a delay in seconds and the text printed after it.
 """
 
 from __future__ import annotations
@@ -24,18 +24,18 @@ from ..json_text import loads
 from ..rates import rate_from_timestep
 from .json_fields import unreadable
 
-# Frames come first in the file, a line each, and then what all of them decide.
+# The frames come first, one per line; the fields that depend on all of them follow.
 _BEGIN = '{"stdout": [\n'
 _CLEAR_AND_HOME = "\x1b[2J\x1b[1;1H"
-# Control sequences (colours, cursor) take no room on the screen. ECMA-48, 5.4.
+# Control sequences (colours, cursor) take no space on the screen. ECMA-48, 5.4.
 _CONTROL_SEQUENCE = re.compile(r"\x1b\[[0-?]*[ -/]*[@-~]")
 
 
 def text_of_frame(frame: object) -> str:
-    r"""Return the text of what `render()` gave in the mode `ansi`.
+    r"""Return the text that `render()` returned in `ansi` mode.
 
     Raises:
-        InvalidFrame: it is neither text nor a `StringIO`.
+        InvalidFrame: the frame is neither a `str` nor a `StringIO`.
     """
     if isinstance(frame, io.StringIO):
         frame = frame.getvalue()
@@ -47,10 +47,10 @@ def text_of_frame(frame: object) -> str:
 
 
 class AsciicastWriter:
-    """Writes text frames, each shown for the same time, into one file.
+    """A writer of text frames, each shown for the same time, into one file.
 
-    Frames go to the disk as they come, into the hidden file that gets the recording's
-    name in `close`.
+    Frames go to the disk as they come, into a hidden file that `close` renames to the
+    recording's name.
 
     Args:
         path: the finished file.
@@ -69,7 +69,7 @@ class AsciicastWriter:
         """Append a frame.
 
         Raises:
-            FileNotWritten: the disk is full, or the directory is gone.
+            FileNotWritten: the disk is full, or the directory was removed.
         """
         lines = text.replace("\r\n", "\n").split("\n")
         self._width = max(self._width, *(_columns(line) for line in lines))
@@ -80,15 +80,15 @@ class AsciicastWriter:
                 self._file = self._part.open("w", encoding="utf-8")
             begin = ",\n" if self.frame_count else _BEGIN
             self._file.write(begin + json.dumps(event))
-            # A killed process leaves what is with the operating system.
+            # If the process is killed, only what the operating system has survives.
             self._file.flush()
         self.frame_count += 1
 
     def close(self) -> None:
-        """Finish the file; without a frame there is none. Idempotent.
+        """Finish the file. Without any frames, no file is created. Idempotent.
 
         Raises:
-            FileNotWritten: as `write`.
+            FileNotWritten: the disk is full, or the directory was removed.
         """
         if self._file is None:
             return
@@ -109,14 +109,14 @@ class AsciicastWriter:
                 self._part.replace(self.path)
 
     def abort(self) -> None:
-        """End without a file."""
+        """Stop without producing a file."""
         if self._file is not None:
             with contextlib.suppress(OSError):
                 self._file.close()
             self._part.unlink(missing_ok=True)
 
     def leave(self) -> None:
-        """Let go of the unfinished file, which others finish."""
+        """Close the unfinished file and leave it to be finished elsewhere."""
         if self._file is not None:
             self._file.close()
 
@@ -129,14 +129,14 @@ class AsciicastWriter:
 
 
 def unfinished_recording(path: Path) -> tuple[Fraction, list[str]]:
-    """Return the rate and the text frames of a recording that was cut off.
+    """Return the rate and the text frames of an unfinished recording.
 
     Args:
-        path: the hidden file that a killed process has left. What was torn at its end
-            is left out.
+        path: the hidden file that a killed process left. An incomplete frame at its end
+            is ignored.
 
     Raises:
-        UnreadableFile: it is no such file, or holds no frame.
+        UnreadableFile: the file is not such a recording, or holds no frame.
     """
     with unreadable(path):
         if not path.is_file() or path.is_symlink():

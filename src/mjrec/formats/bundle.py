@@ -1,17 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where a finished trajectory lies: in a file of its own, or in a bundle.
+"""Bundles: many finished trajectories of one monitor in one HDF5 file.
 
-A bundle, `openaigym.trajectories.<infix>.h5`, holds trajectories of one monitor in one
-HDF5 file: a group `episode000027` has what the file
-`openaigym.trajectory.<infix>.episode000027.h5` would have at its root. A trajectory is
-called by the path of that file wherever it lies; `is_finished` and `file_of` say where.
+A finished trajectory is in a file of its own or in a bundle,
+`openaigym.trajectories.<infix>.h5`. In a bundle, the group `episode000027` holds what
+the file `openaigym.trajectory.<infix>.episode000027.h5` would hold at its root. A
+trajectory is always identified by the path of its own file, even if it is in a bundle;
+`is_finished` and `file_of` locate it.
 
-Which episodes a bundle holds stands before its HDF5 part, in what HDF5 calls the user
-block, as ranges of their numbers::
+A bundle's episodes are listed before its HDF5 part, in what HDF5 calls the user block,
+as ranges of episode numbers::
 
     {"format": "mjrec trajectories", "version": 1, "episodes": [[0, 23], [25, 25]]}
 
-So a directory is listed without the HDF5 library.
+So listing a directory does not need the HDF5 library.
 """
 
 from __future__ import annotations
@@ -40,26 +41,26 @@ FINISHED = ".h5"
 _FORMAT = "mjrec trajectories"
 _VERSION = 1
 _MOST_EPISODES = 1_000_000
-# HDF5 looks for its own beginning at 0, 512, 1024, 2048 ...
+# HDF5 looks for its signature at bytes 0, 512, 1024, 2048 ...
 _SMALLEST_INDEX = 512
 _LONGEST_INDEX = 1 << 26
 _LONGEST_RANGE = 44
 
 
 def is_finished(path: Path) -> bool:
-    """Return whether a trajectory is there, by the path of its own file."""
+    """Return whether a finished trajectory exists, given the path of its own file."""
     return path.is_file() or _is_bundled(path)
 
 
 def file_of(path: Path) -> Path:
-    """Return the file that holds a trajectory; its own one where none does."""
+    """Return the file that holds a trajectory, or `path` if no file does."""
     if not path.is_file() and _is_bundled(path):
         return bundle_of(path)
     return path
 
 
 def bundle_of(path: Path) -> Path:
-    """Return the path of the bundle that a trajectory may lie in."""
+    """Return the path of the bundle that would hold a trajectory."""
     return path.with_name(bundle_name(infix_of(path.name) or ""))
 
 
@@ -69,7 +70,7 @@ def group_of(path: Path) -> str:
 
 
 def finished_trajectories(directory: Path) -> Iterator[Path]:
-    """Yield the paths of the own files of all finished trajectories, sorted."""
+    """Yield the paths that identify all finished trajectories, sorted."""
     found: set[Path] = set()
     for path in iter_monitor_files(directory):
         if is_bundle(path.name):
@@ -80,9 +81,9 @@ def finished_trajectories(directory: Path) -> Iterator[Path]:
 
 
 def trajectories_in(bundle: Path) -> list[Path]:
-    """Return the paths of the own files of the trajectories in a bundle.
+    """Return the paths that identify the trajectories in a bundle, sorted.
 
-    One that cannot be read has none: opening it says why.
+    The list is empty if the bundle cannot be read; opening it reports the reason.
     """
     infix = Infix.parse(infix_of(bundle.name) or "")
     if infix is None:
@@ -94,7 +95,7 @@ def trajectories_in(bundle: Path) -> list[Path]:
 
 
 def index_size(count: int) -> int:
-    """Return how many bytes before the HDF5 part the index of `count` episodes gets."""
+    """Return the number of bytes reserved for the index of `count` episodes."""
     size = _SMALLEST_INDEX
     while size < _SMALLEST_INDEX // 4 + _LONGEST_RANGE * count:
         size *= 2
@@ -102,7 +103,7 @@ def index_size(count: int) -> int:
 
 
 def index_of(episodes: Iterable[int]) -> bytes:
-    """Return what a bundle's file begins with."""
+    """Return the index that a bundle's file begins with."""
     ranges: list[list[int]] = []
     for number in sorted(episodes):
         if ranges and ranges[-1][1] == number - 1:
@@ -123,7 +124,7 @@ def _is_bundled(path: Path) -> bool:
 
 
 def _episodes_in(bundle: Path) -> frozenset[int]:
-    # Most directories have none.
+    # Most directories have no bundle.
     if not bundle.is_file():
         return frozenset()
     try:
@@ -135,14 +136,14 @@ def _episodes_in(bundle: Path) -> frozenset[int]:
         return frozenset()
 
 
-# Each trajectory is looked for by itself.
+# Each trajectory is looked up separately.
 @functools.lru_cache(maxsize=64)
 def _read_index(bundle: Path, version: tuple[int, ...]) -> frozenset[int]:
     del version
     with open_regular(bundle) as file:
         index = json_object(file.readline(_LONGEST_INDEX))
     if index.get("format") != _FORMAT:
-        raise ValueError("it is no bundle of trajectories")
+        raise ValueError("it is not a bundle of trajectories")
     check_version(field(index, "version", integer))
     numbers: set[int] = set()
     following = 0

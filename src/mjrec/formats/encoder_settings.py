@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How ffmpeg encodes: the codec, its quality, the colours, the kind of file.
+"""ffmpeg's encoding settings: codec, quality, colours and container.
 
 The same frames give the same file on any CPU and with any number of cores: the number
-of threads is fixed, x264 keeps to what every CPU does alike (`cpu-independent=1`), and
-the conversion of colours rounds as its definition says.
+of threads is fixed, x264 uses only what works alike on every CPU (`cpu-independent=1`),
+and colours are converted with exact rounding.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ from .ffmpeg import (
 
 _DEFAULT_CODEC = "libx264"
 _WORST_CRF = 51.0
-# x264's output depends on the number of its threads, so that the number is a constant
-# and not the machine's.
+# x264's output depends on its number of threads, so this is a constant and does not
+# follow the machine.
 _ENCODER_THREADS = 4
 
-# The kinds of file, by the ending of the name.
+# Containers, by file name suffix.
 MUXERS = {
     ".mp4": "mp4",
     ".mov": "mov",
@@ -45,18 +45,18 @@ _RGB_FORMATS = ("rgb24", "bgr24", "gbrp", "bgr0", "rgb0")
 _LOSSLESS_CODECS = frozenset(
     {"ffv1", "libx264rgb", "utvideo", "png", "apng", "qtrle", "ffvhuff", "huffyuv"}
 )
-# Where ffmpeg's own default is poor, or not what the codec is taken for.
+# For codecs whose default quality in ffmpeg is poor or unexpected.
 _QUALITY = {
     _DEFAULT_CODEC: ("-crf", "18"),
     "libx264rgb": ("-crf", "0"),
     "mpeg4": ("-q:v", "2"),
 }
 
-# Rounding and chroma averaging as the definition says rather than as the CPU likes
-# best: without `bitexact` and `accurate_rnd`, swscale's result depends on the CPU.
+# Exact rounding and chroma averaging: without `bitexact` and `accurate_rnd`, swscale's
+# result depends on the CPU.
 _SCALE_FLAGS = "area+accurate_rnd+full_chroma_int+full_chroma_inp+bitexact"
-# The tags are set on the frames: ffmpeg 8 and later take those of the frames over
-# `-color_primaries` and `-color_trc` given for the encoder, and write "unknown".
+# Tag the frames: ffmpeg 8 and later prefer the frames' tags to `-color_primaries` and
+# `-color_trc` given for the encoder, and write "unknown".
 _TO_BT709 = (
     f"scale=out_color_matrix=bt709:out_range=limited:flags={_SCALE_FLAGS},"
     "format=yuv420p,setparams=range=limited:color_primaries=bt709:color_trc=bt709:"
@@ -72,13 +72,14 @@ _BT709_TAGS = (
 
 @dataclass(frozen=True)
 class EncoderSettings:
-    """How to encode, whatever the size and the rate.
+    """Encoder settings that apply to any frame size and rate.
 
     Attributes:
         codec: ffmpeg's name of the encoder.
-        pixel_format: of the encoded pixels: yuv420p, or one that holds all of rgb24.
-        muxer: ffmpeg's name of the kind of file.
-        encoding: the arguments between the input and the kind of file.
+        pixel_format: pixel format of the encoded video: yuv420p, or one that holds
+            rgb24 without loss.
+        muxer: ffmpeg's name of the container.
+        encoding: the arguments between the input and the container.
     """
 
     codec: str
@@ -98,8 +99,8 @@ class EncoderSettings:
             *("-hide_banner", "-loglevel", "error", "-nostdin", "-y"),
             *("-f", "rawvideo", "-pixel_format", "rgb24"),
             *("-video_size", f"{width}x{height}"),
-            # Not `-framerate`: in the file it would be replaced by a usual rate near
-            # it, for some rates always, for 125 where there are 3 to 9 frames.
+            # Not `-framerate`: ffmpeg would replace it in the file with a common rate
+            # near it, for some rates always, for 125 if there are 3 to 9 frames.
             *("-r", f"{fps.numerator}/{fps.denominator}"),
             *("-i", "pipe:0"),
             *self.encoding,
@@ -115,10 +116,10 @@ def encoder_settings(
     muxer: str,
     encoder_arguments: Sequence[str] = (),
 ) -> EncoderSettings:
-    """Return the settings that `VideoWriter`'s arguments mean.
+    """Return the settings for `VideoWriter`'s arguments.
 
     Raises:
-        InvalidArgument: one of them cannot be.
+        InvalidArgument: an argument is invalid.
         UnknownName: ffmpeg has no such encoder.
     """
     codec = _DEFAULT_CODEC if codec is None else codec
@@ -153,22 +154,22 @@ def encoder_settings(
 
 
 def check_encoding(settings: EncoderSettings, fps: Fraction) -> None:
-    """Try an encoding, so that what cannot work fails before any work.
+    """Try an encoding, so that an impossible one fails before any work is done.
 
-    Once for each ffmpeg.
+    Each encoding is tried once per ffmpeg.
 
     Raises:
-        EncoderError: it cannot work.
+        EncoderError: ffmpeg cannot encode with these settings.
     """
     question = " ".join(_trial_arguments(settings, fps))
     remembered(ffmpeg_executable(), question, lambda: try_encoding(settings, fps))
 
 
 def try_encoding(settings: EncoderSettings, fps: Fraction) -> str:
-    """Encode one small grey frame; return that it works.
+    """Encode one small grey frame, and return a note that it works.
 
     Raises:
-        EncoderError: it cannot work.
+        EncoderError: ffmpeg cannot encode with these settings.
     """
     run_ffmpeg(
         _trial_arguments(settings, fps),
@@ -188,7 +189,8 @@ def _trial_arguments(settings: EncoderSettings, fps: Fraction) -> list[str]:
 def _x264_arguments(codec: str, crf: float | None) -> tuple[str, ...]:
     if codec not in ("libx264", "libx264rgb"):
         return ()
-    # x264 calls lossless what truncates to 0, and no profile High has it.
+    # x264 treats any crf that truncates to 0 as lossless, which profile High does not
+    # support.
     high = codec == "libx264" and (crf is None or crf >= 1)
     return (
         *("-preset", "veryfast"),
@@ -210,8 +212,8 @@ def _quality_arguments(
         )
     if " -crf " not in help_text:
         raise InvalidArgument(
-            f"The encoder {codec} knows no crf, got crf={crf:g}: leave it out, or use "
-            "codec='libx264'."
+            f"The encoder {codec} does not support crf, got crf={crf:g}: leave it out, "
+            "or use codec='libx264'."
         )
     return ("-crf", f"{crf:g}")
 
@@ -224,14 +226,14 @@ def _pixel_format(codec: str, help_text: str) -> str:
         if pixel_format in supported:
             return pixel_format
     raise InvalidArgument(
-        f"The encoder {codec} takes none of {', '.join(wanted)}, only "
+        f"The encoder {codec} supports none of {', '.join(wanted)}, only "
         f"{', '.join(supported) or 'unknown formats'}: use codec='libx264', or "
         "codec='ffv1' for a lossless video."
     )
 
 
 def _encoder_help(codec: str) -> str:
-    """Return what ffmpeg says about an encoder."""
+    """Return ffmpeg's help text for an encoder."""
     executable = ffmpeg_executable()
     arguments = ["-hide_banner", "-h", f"encoder={codec}"]
     text = remembered(
@@ -239,12 +241,12 @@ def _encoder_help(codec: str) -> str:
         " ".join(arguments),
         lambda: run_ffmpeg(arguments).decode("utf-8", errors="replace"),
     )
-    # Of a codec's name it shows all encoders that there are for it.
+    # For a codec's name, ffmpeg shows all encoders of that codec.
     if f"Encoder {codec} [" not in text:
         raise UnknownName(
             "video encoder",
             codec,
             video_encoders(),
-            hint=f"They are those of {executable}, {ffmpeg_version()}.",
+            hint=f"These are the encoders of {executable}, {ffmpeg_version()}.",
         )
     return text

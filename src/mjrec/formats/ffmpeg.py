@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""ffmpeg: which one, and running it so that a failure is never missed.
+"""Finding ffmpeg, and running it such that no failure goes unnoticed.
 
-`imageio-ffmpeg` brings the binary (or finds one); driving it is done here. Every
-failure of an ffmpeg that ran is one `EncoderError` with the command, the exit status
-and the end of what it said. One that cannot be started is another error, with the
-reason.
+`imageio-ffmpeg` brings the binary (or finds one); this module runs it. If an ffmpeg
+that ran fails, that is always an `EncoderError` with the command, the exit status and
+the end of its error output. If it cannot be started, that is a different error, with
+the reason.
 """
 
 from __future__ import annotations
@@ -40,35 +40,35 @@ _ENVIRONMENT_VARIABLE = "IMAGEIO_FFMPEG_EXE"
 _END_OF_STDERR = 2000
 _PIPE_SIZE = 1 << 20
 _SECONDS_TO_DIE = 10.0
-# The libavutil of ffmpeg 5.1, which renamed an option; 9 took the old name away.
+# The libavutil of ffmpeg 5.1, which renamed an option; ffmpeg 9 removed the old name.
 _LIBAVUTIL_OF_FPS_MODE = (57, 28)
 _MOST_BYTES = 1 << 20
 _MOST_PROGRAMS = 8
 
-# Of each program what it answered.
+# The answers of each program, by question.
 _answers: dict[str, dict[str, str]] = {}
 
 
 def ffmpeg_executable() -> str:
     """Return the path of ffmpeg.
 
-    It is the one that `IMAGEIO_FFMPEG_EXE` names, else the one that comes with
-    `imageio-ffmpeg`, else conda's or the system's.
+    This is the ffmpeg that `IMAGEIO_FFMPEG_EXE` names, otherwise the one that comes
+    with `imageio-ffmpeg`, otherwise conda's or the system's.
 
     Raises:
-        MissingDependency: there is none.
-        InvalidArgument: `IMAGEIO_FFMPEG_EXE` names none.
+        MissingDependency: no ffmpeg was found.
+        InvalidArgument: `IMAGEIO_FFMPEG_EXE` does not name a program.
     """
-    # Not at the top: importing mjrec imports no ffmpeg.
+    # Not at the top: importing mjrec must not import imageio-ffmpeg.
     import imageio_ffmpeg
 
     try:
         name: str = imageio_ffmpeg.get_ffmpeg_exe()
     except RuntimeError as error:
-        raise _unusable("ffmpeg", "there is none") from error
+        raise _unusable("ffmpeg", "no ffmpeg was found") from error
     path = shutil.which(name)
     if path is None:
-        raise _unusable(f"ffmpeg ({name})", "there is no program of that name")
+        raise _unusable(f"ffmpeg ({name})", "no such program exists")
     return path
 
 
@@ -78,7 +78,7 @@ def ffmpeg_version() -> str:
 
 
 def ffmpeg_sha256() -> str:
-    """Return the sha256 of the ffmpeg binary, in hexadecimal."""
+    """Return the SHA-256 of the ffmpeg binary, in hexadecimal."""
     executable = ffmpeg_executable()
     return remembered(
         executable, "sha256", lambda: file_sha256(Path(executable).resolve())
@@ -88,16 +88,16 @@ def ffmpeg_sha256() -> str:
 def remembered(program: str, question: str, answer: Callable[[], str]) -> str:
     """Return the answer to a question about a program, asking only once.
 
-    Asking ffmpeg three questions and hashing its 80 megabytes takes as long as drawing
-    a hundred small frames. So the answers lie in `$XDG_CACHE_HOME/mjrec/programs.json`
-    (`~/.cache/mjrec/programs.json` by default), which can be deleted at any time. They
-    count only for the very file that was asked: the same path, device, inode, size and
-    times; the kernel sets the last.
+    Asking ffmpeg three questions and hashing its 80 megabytes takes as long as
+    rendering a hundred small frames. So the answers are cached in
+    `$XDG_CACHE_HOME/mjrec/programs.json` (`~/.cache/mjrec/programs.json` by default),
+    which can be deleted at any time. They are valid only for exactly the same file: the
+    same path, device, inode, size, mtime and ctime. Only the kernel sets ctime.
 
     Args:
-        program: its path.
-        question: what tells it from other questions.
-        answer: asks the program; what it raises is not remembered.
+        program: the program's path.
+        question: a key that identifies the question.
+        answer: asks the program. If it raises, nothing is cached.
     """
     status = Path(program).stat()
     times = (status.st_mtime_ns, status.st_ctime_ns)
@@ -119,7 +119,7 @@ def remembered(program: str, question: str, answer: Callable[[], str]) -> str:
 
 
 def _read(path: Path) -> dict[str, dict[str, str]]:
-    # Whatever stands there, it can be found out again.
+    # An unreadable cache does not matter: the answers can be found again.
     with contextlib.suppress(OSError, ValueError, TypeError, AttributeError):
         stored = json.loads(read_regular(path, limit=_MOST_BYTES))
         return {key: dict(value) for key, value in stored.items()}
@@ -134,10 +134,10 @@ def video_encoders() -> list[str]:
 
 
 def every_frame_arguments() -> tuple[str, ...]:
-    """Return the output arguments for each frame once, none dropped or repeated.
+    """Return the output arguments that keep each frame once, none dropped or repeated.
 
-    Left alone, ffmpeg fills gaps with copies and drops what comes too early, to make
-    the rate even; in decoding, that hides what a file lacks or doubles.
+    By default, ffmpeg fills gaps with copies and drops early frames to make the rate
+    even. When decoding, that hides missing and duplicate frames.
     """
     version = re.search(r"^libavutil +(\d+)\. *(\d+)", _version(), re.M)
     is_old = version and tuple(map(int, version.groups())) < _LIBAVUTIL_OF_FPS_MODE
@@ -145,8 +145,8 @@ def every_frame_arguments() -> tuple[str, ...]:
 
 
 def as_file(path: Path) -> str:
-    """Return a path as ffmpeg takes it for one, whatever is in it."""
-    # Without the prefix a colon in the name would make ffmpeg look for a protocol.
+    """Return the argument for a path that ffmpeg always takes as a file."""
+    # Without the prefix, ffmpeg would take a name with a colon for a protocol.
     return f"file:{path}"
 
 
@@ -156,16 +156,18 @@ def run_ffmpeg(
     standard_input: bytes = b"",
     what: str = "ffmpeg failed.",
 ) -> bytes:
-    """Run ffmpeg to its end and return what it wrote to its standard output.
+    """Run ffmpeg to its end and return its standard output.
 
     Args:
         arguments: those after the program's name.
-        standard_input: what it reads.
-        what: what fails when it fails: the first sentence of the error.
+        standard_input: bytes to feed to ffmpeg.
+        what: the first sentence of the error message if ffmpeg fails.
 
     Raises:
-        EncoderError: its exit status is not 0, or it took longer than `timeout_s`.
-        Error: it could not be started, as `ffmpeg_executable` where that is its fault.
+        EncoderError: the exit status is not 0, or ffmpeg made no progress for
+            `timeout_s`.
+        Error: ffmpeg could not be started. See `ffmpeg_executable` for errors about the
+            program itself.
     """
     with FfmpegProcess(arguments, what=what, reads=True, writes=True) as process:
         process.write(standard_input)
@@ -176,27 +178,28 @@ def run_ffmpeg(
 
 
 class FfmpegProcess:
-    """An ffmpeg that is fed through, or read from, a pipe.
+    """An ffmpeg process that is fed through a pipe, or read from one.
 
     It runs in a session of its own: Ctrl-C in the terminal reaches only the parent,
     which decides. When the parent dies, ffmpeg sees the end of its input and finishes
-    its file by itself. Leaving `with` ends it.
+    its file on its own. Leaving `with` kills the process.
 
-    Each method that waits for it ends it when it has hung for `timeout_s`: when it
-    takes no byte, gives none, or has all and does not write on in its file.
+    Each method that waits for ffmpeg kills it if it hangs for `timeout_s`: if it
+    accepts no input, returns no output, or has all its input and its file does not
+    change.
 
     Args:
         arguments: those after the program's name.
-        what: what fails when it fails: the first sentence of the error.
-        reads: whether it is fed through `write`.
-        writes: whether it is read through `read`.
-        keeps: the descriptor of a file that it holds open.
+        what: the first sentence of the error message if ffmpeg fails.
+        reads: whether ffmpeg is fed through `write`.
+        writes: whether its output is read through `read`.
+        keeps: the descriptor of a file that ffmpeg holds open.
 
     Attributes:
         command: the program and its arguments.
 
     Raises:
-        Error: as `run_ffmpeg`, if it could not be started.
+        Error: ffmpeg could not be started, see `run_ffmpeg`.
     """
 
     def __init__(
@@ -213,7 +216,7 @@ class FfmpegProcess:
         self._timeout = Timeout()
         try:
             with contextlib.ExitStack() as on_failure:
-                # A file, not a pipe: it need not be emptied while the process runs.
+                # A file, not a pipe: it need not be emptied while ffmpeg runs.
                 stderr = on_failure.enter_context(tempfile.TemporaryFile())
                 self._process = subprocess.Popen(
                     self.command,
@@ -222,9 +225,8 @@ class FfmpegProcess:
                     stderr=stderr,
                     bufsize=0,
                     start_new_session=True,
-                    # A file that would grow beyond a limit is an error that ffmpeg
-                    # reports, not the end of it: Python ignores SIGXFSZ, and so does
-                    # ffmpeg then.
+                    # With SIGXFSZ ignored, as Python ignores it, ffmpeg reports a file
+                    # size limit as an error instead of being killed.
                     restore_signals=False,
                     pass_fds=() if keeps is None else (keeps,),
                 )
@@ -235,8 +237,8 @@ class FfmpegProcess:
         pipes = (self._process.stdin, self._process.stdout)
         self._pipes = [pipe for pipe in pipes if pipe is not None]
         for pipe in self._pipes:
-            # Linux's default is 64 KiB, eleven switches for a 480x480 frame. More is
-            # a favour that the kernel may refuse.
+            # Linux's default is 64 KiB: eleven context switches for a 480x480 frame.
+            # The kernel may refuse a larger pipe.
             with contextlib.suppress(OSError):
                 fcntl.fcntl(pipe, fcntl.F_SETPIPE_SZ, _PIPE_SIZE)
         if self._process.stdin is not None:
@@ -245,11 +247,11 @@ class FfmpegProcess:
 
     @property
     def pid(self) -> int:
-        """The process's number."""
+        """The process id."""
         return self._process.pid
 
     def write(self, data: bytes | Frame) -> None:
-        """Feed `data`, waiting until the pipe has taken all of it.
+        """Feed `data` to ffmpeg, waiting until the pipe has taken all of it.
 
         Raises:
             EncoderError: ffmpeg has ended, or hangs.
@@ -259,21 +261,21 @@ class FfmpegProcess:
         rest = memoryview(data if isinstance(data, bytes) else data.data).cast("B")
         try:
             while rest:
-                # None: it is full.
+                # None: the pipe is full.
                 taken = pipe.write(rest)
                 if taken:
                     rest = rest[taken:]
                 else:
                     self._wait_for(pipe, select.POLLOUT)
         except (OSError, ValueError) as error:
-            # ValueError: the pipe was closed before. One that has closed its input ends
-            # by itself; a wrapper script may not.
+            # ValueError: the pipe was closed before. An ffmpeg that has closed its
+            # input ends on its own; a wrapper script may not.
             self._has_ended(_SECONDS_TO_DIE)
             self.kill()
             raise self._error() from error
 
     def read(self, size: int) -> bytes:
-        """Return at most `size` bytes of output; none at its end.
+        """Return at most `size` bytes of output, empty at its end.
 
         Raises:
             EncoderError: ffmpeg hangs.
@@ -284,31 +286,31 @@ class FfmpegProcess:
         return pipe.read(size)
 
     def end_input(self) -> None:
-        """Say that nothing follows."""
+        """Close ffmpeg's input."""
         if self._process.stdin is not None:
             self._process.stdin.close()
 
     def wait(self) -> None:
-        """Wait for the end. May be called again.
+        """Wait for ffmpeg to end. Can be called more than once.
 
         Raises:
-            EncoderError: the exit status is not 0, or it hangs.
+            EncoderError: the exit status is not 0, or ffmpeg hangs.
         """
         self._wait_until(self._has_ended, self._state_of_output)
         if self._process.returncode != 0:
             raise self._error()
 
     def kill(self) -> None:
-        """End the process at once, with those that a wrapper script has started.
+        """Kill the process at once, with any processes that a wrapper script started.
 
-        The pipes stay open: a thread may be about to write, and the number of a closed
-        one may be another file's by then.
+        The pipes stay open: a thread may be about to write, and a closed descriptor's
+        number may already belong to another file.
         """
         if self._process.poll() is None:
-            # It leads a group of its own. Not more than the process may have ended.
+            # It leads its own process group. The process may already have ended.
             with contextlib.suppress(ProcessLookupError, PermissionError):
                 os.killpg(self.pid, signal.SIGKILL)
-        # One whose disk does not answer cannot die.
+        # A process whose disk does not answer cannot die, so do not wait forever.
         self._has_ended(_SECONDS_TO_DIE)
 
     def release(self) -> None:
@@ -344,11 +346,12 @@ class FfmpegProcess:
         is_ready: Callable[[float], bool],
         state: Callable[[], object] = lambda: None,
     ) -> None:
-        """Wait, and end the process if there is no progress for too long.
+        """Wait, and kill the process if there is no progress for too long.
 
         Args:
-            is_ready: waits at most this many seconds.
-            state: returns what changes as long as there is progress.
+            is_ready: waits for at most the given number of seconds, and returns whether
+                the wait is over.
+            state: returns a value that changes as long as there is progress.
         """
         last = state()
         self._timeout.renew()
@@ -366,7 +369,7 @@ class FfmpegProcess:
         return self._process.returncode is not None
 
     def _state_of_output(self) -> tuple[int, int]:
-        """Return what changes while it writes its file; as one, where it has none."""
+        """Return a value that changes while ffmpeg writes its file, if it has one."""
         protocol, _, path = self.command[-1].partition(":")
         if protocol == "file":
             with contextlib.suppress(OSError):
@@ -378,8 +381,8 @@ class FfmpegProcess:
         what = self._what
         if self._timeout.is_over:
             what += (
-                f" It made no progress for {self._timeout.seconds:g} seconds, and was "
-                "ended."
+                f" It made no progress for {self._timeout.seconds:g} seconds and was "
+                "killed."
             )
         size = self._stderr.seek(0, os.SEEK_END)
         self._stderr.seek(max(0, size - _END_OF_STDERR))
@@ -411,12 +414,12 @@ def _version() -> str:
 
 
 def _not_started(executable: str, error: OSError) -> Error:
-    # Its name is there only where the program itself is to blame, and not a lack of
+    # The error has a file name only if the program itself is the problem, not a lack of
     # memory, processes or open files.
     if error.filename != executable:
         return Error(f"ffmpeg ({executable}) could not be started: {error}.")
     reason = str(error.strerror)
-    return _unusable(f"an ffmpeg other than {executable} ({reason})", reason)
+    return _unusable(f"a working ffmpeg ({executable}: {reason})", reason)
 
 
 def _unusable(package: str, reason: str) -> Error:

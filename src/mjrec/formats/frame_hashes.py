@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The `.framehash` file: the sha256 of each frame as it was rendered.
+"""The `.framehash` file: the SHA-256 of each rendered frame.
 
-The text is what ffmpeg's `framehash` muxer writes, byte for byte, for the same frames
-as raw video (`-fflags +bitexact -f rawvideo -pix_fmt rgb24 ... -f framehash`), so that
-its users' tools read it::
+The content is byte for byte what ffmpeg's `framehash` muxer writes for the same frames
+as raw video (`-fflags +bitexact -f rawvideo -pix_fmt rgb24 ... -f framehash`), so tools
+that read ffmpeg's files read it too::
 
     #format: frame checksums
     #version: 2
@@ -49,21 +49,21 @@ def frame_hash_header(*, height: int, width: int, fps: Fraction) -> str:
 
 
 def frame_hash_line(number: int, frame: Frame) -> str:
-    """Return the line of the frame with this number, counted from 0."""
+    """Return the line for the frame with this number, counted from 0."""
     digest = hashlib.sha256(np.ascontiguousarray(frame).data).hexdigest()
     return f"0, {number:10d}, {number:10d}, {1:8d}, {frame.nbytes:8d}, {digest}\n"
 
 
 def cut_frame_hashes(path: Path, count: int) -> None:
-    """Leave only the first `count` frames' hashes in a file, whole or not at all.
+    """Keep only the hashes of the first `count` frames in a file, whole or not at all.
 
     Raises:
-        OSError: it cannot be read or written.
-        ValueError: it holds fewer, or is no such file.
+        OSError: the file cannot be read or written.
+        ValueError: the file holds fewer hashes, or is not a `.framehash` file.
     """
     header = frame_hash_header(height=1, width=1, fps=Fraction(1)).count("\n")
     lines = path.read_text(encoding="ascii").splitlines(keepends=True)
-    # The last one may be torn.
+    # The last line may be torn.
     kept = [line for line in lines[: header + count] if line.endswith("\n")]
     if len(kept) < header + count:
         raise ValueError(f"it has hashes of fewer than {count} frames")
@@ -73,5 +73,5 @@ def cut_frame_hashes(path: Path, count: int) -> None:
 
 
 def frame_hash_path(video: Path) -> Path:
-    """Return the name of the `.framehash` file of a video."""
+    """Return the path of the `.framehash` file of a video."""
     return video.with_suffix(".framehash")

@@ -1,24 +1,25 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The journal: what happened in a run, one line of JSON for each event.
+"""The journal: the events of a run, one line of JSON each.
 
 `openaigym.episodes.<infix>.jsonl` grows while the monitor runs, so that a killed
-process loses nothing that was over. Statistics and manifest follow from it, and which
-rows of the logs are which recording (`spans`). A completed episode is a line::
+process loses nothing that had ended. Statistics and manifest are derived from it. It
+also records which rows of the logs belong to which recording (`spans`). A completed
+episode is a line::
 
     {"episode_id": 27, "length": 200, "reward": 12.5, "type": "t",
      "start_time": 1790000000.0, "end_time": 1790000004.0,
      "seed": 7, "options": null, "terminated": false, "truncated": true,
      "success": null, "chosen": true, "recording": "deferred"}
 
-`chosen` is there where the schedule chose the episode, `recording` (`"live"` or
-`"deferred"`) where it has a video of its own, `evaluation` (seed, number and MuJoCo's
-warnings) where the episode is one of an evaluation. Every other line is an event, an
-object of one key: its kind, one of `EVENTS`. The first line is the `run`'s.
+`chosen` is present if the schedule chose the episode, `recording` (`"live"` or
+`"deferred"`) if it has a video of its own, `evaluation` (seed, number and MuJoCo's
+warnings) if it is part of an evaluation. Every other line is an event, an object with a
+single key: its kind, one of `EVENTS`. The first line is the `run` event.
 
 Times are seconds since the epoch. Keys that this version does not know are ignored.
 
-A killed machine can leave half a line at the end, and a failing disk anything
-anywhere. A reader leaves out what is no event, keeps the rest, and says so.
+A machine that dies can leave half a line at the end, and a failing disk can corrupt any
+line. A reader skips invalid lines, keeps the rest, and reports what it skipped.
 """
 
 from __future__ import annotations
@@ -50,32 +51,32 @@ from .regular_files import open_regular
 
 logger = logging.getLogger(__name__)
 
-# Bounds, so that no file can fill the memory or keep a reader busy for ever. They are
+# Limits, so that no file can fill the memory or keep a reader busy forever. They are
 # far beyond what any run writes.
 _LONGEST_LINE = 1 << 24
 _MOST_DAMAGED_LINES = 1000
 _BLOCK = 4096
 MOST_EPISODES = 10**15
 
-# In their order: what the run is; its machine, packages and code; an episode that is
-# no part of the statistics; a clip that is over; an action that does not fit into rows;
-# an episode whose video falls out while its trajectory stays; what could not be
-# recorded; which videos were kept; the end; that another process has put the directory
-# in order; and of an evaluation's episodes, that one begins, or has failed.
+# In order: the run's facts; its machine, packages and code; an episode that is not part
+# of the statistics; a finished clip; an action that does not fit into rows; an episode
+# whose video is dropped while its trajectory stays; something that could not be
+# recorded; the videos that were kept; the end; the recovery of the directory by another
+# process; an evaluation's episode that begins, and one that failed.
 EVENTS = (
     *("run", "provenance", "cut", "clip", "action", "dropped"),
     *("fault", "keep", "closed", "recovered", "begun", "failed"),
 )
 
-# Of recordings: what rows are, that one begins, more about it, that it ended, that its
-# rows were given up; and that a log gets no more rows.
+# About recordings: the layout of rows, a recording begins, more facts about it, it
+# ended, its rows were given up; and a log gets no more rows.
 SPAN_EVENTS = ("rows", "begin", "note", "end", "drop", "full")
 _OF_SPANS = tuple(f'{{"{kind}": '.encode() for kind in SPAN_EVENTS)
 
-# The reason of an episode that ended with its process.
+# Why an episode ended, if its process was killed.
 KILLED = "killed"
 
-# The seed and the options are for people to read; more of them is cut off.
+# Seed and options are for people to read; longer ones are truncated.
 _LONGEST_REPR = 1000
 
 _BEGIN = re.compile(rb'\{"episode_id": (\d{1,15}),')
@@ -86,19 +87,20 @@ class JournalEntry:
     """One completed episode.
 
     Attributes:
-        episode_id: counts the begun episodes of the run.
+        episode_id: number of the episode in the run, from 0; counts all that began.
         length: number of steps.
         reward: sum of the rewards.
         type: `"t"` for training, `"e"` for evaluation.
-        start_time: wall clock just before the reset.
-        end_time: wall clock after the last step.
-        seed: as given to `reset`.
-        options: as given to `reset`.
+        start_time: wall clock time just before the reset.
+        end_time: wall clock time after the last step.
+        seed: the seed given to `reset`.
+        options: the options given to `reset`.
         terminated: the task ended the episode.
-        truncated: a limit from outside the task ended it.
-        success: what the environment said of it; None where it said nothing.
+        truncated: a limit outside the task ended it.
+        success: the success that the environment reported; None if it reported none.
         chosen: the schedule chose it.
-        recording: `"live"` or `"deferred"`; None where it has no video of its own.
+        recording: `"live"` or `"deferred"`; None if the episode has no video of its
+            own.
         evaluation: `seed`, `episode` and `warnings` of an evaluation's episode.
     """
 
@@ -119,20 +121,20 @@ class JournalEntry:
 
 
 class JournalWriter:
-    """Appends episodes and other events to a journal.
+    """A writer that appends episodes and other events to a journal.
 
-    The file is made by the first of them. Each is one `write` of whole lines, so that
-    a reader at any moment, and a process killed at any moment, has whole lines. What
-    could not be written, because the disk was full, is written before the next one.
+    The first event creates the file. Each event is one `write` of whole lines, so that
+    readers see only whole lines at any moment, even after the process is killed. Lines
+    that could not be written because the disk was full are written before the next one.
 
     Args:
         path: the file.
-        run: what the first line of a new file says.
+        run: the facts of the `run` event, the first line of a new file.
 
     Attributes:
         path: as given.
-        lost: how many files were removed: the next one says nothing of what was said
-            before.
+        lost: number of times that the file was removed. A new file does not repeat the
+            lines of the removed one.
     """
 
     def __init__(self, path: Path, *, run: Mapping[str, Any] | None = None) -> None:
@@ -144,17 +146,17 @@ class JournalWriter:
         self._is_empty = self._closed = False
 
     def append(self, entry: JournalEntry) -> None:
-        """Write down a completed episode.
+        """Record a completed episode.
 
-        A seed or options that would make a line of more than 16 MiB are written as
-        `{"repr": ...}` and cut off.
+        If its seed or options would make a line of 16 MiB or more, they are written as
+        `{"repr": ...}` and truncated.
 
         Raises:
-            ClosedError: after `close`.
-            FileNotWritten: it cannot be written now (a full disk); the journal is then
-                as it was before. Or it was removed.
+            ClosedError: the journal is closed.
+            FileNotWritten: the journal cannot be written now (a full disk), and is
+                unchanged; or it was removed.
         """
-        # Not `asdict`, which would copy the options deeply; they may not allow it.
+        # Not `asdict`, which would deep-copy the options; they may not support that.
         optional_keys = ("chosen", "recording", "evaluation")
         left_out = [key for key in optional_keys if not vars(entry)[key]]
         values = {k: v for k, v in vars(entry).items() if k not in left_out}
@@ -164,15 +166,17 @@ class JournalWriter:
         self._append(f"{line}\n".encode())
 
     def note(self, kind: str, facts: Any, *, later: bool = True) -> None:
-        """Write down another event.
+        """Record another event.
 
         Args:
-            kind: one of `EVENTS`, or of `SPAN_EVENTS`.
-            facts: what JSON can hold.
-            later: False forgets it where it cannot be written now.
+            kind: one of `EVENTS` or `SPAN_EVENTS`.
+            facts: anything that JSON can hold.
+            later: whether to retry with the next line if the event cannot be written
+                now.
 
         Raises:
-            ClosedError, FileNotWritten: as `append`.
+            ClosedError: the journal is closed.
+            FileNotWritten: see `append`.
         """
         line = dumps({kind: facts})
         if len(line) >= _LONGEST_LINE and kind in ("rows", "begin"):
@@ -181,11 +185,11 @@ class JournalWriter:
 
     @property
     def is_behind(self) -> bool:
-        """Whether something could not be written yet."""
+        """Whether some lines could not be written yet."""
         return bool(self._unwritten)
 
     def close(self) -> None:
-        """Close the file; further calls do nothing."""
+        """Close the file. Idempotent."""
         self._closed = True
         descriptor, self._descriptor = self._descriptor, None
         if descriptor is not None:
@@ -213,7 +217,7 @@ class JournalWriter:
             append_whole(self._descriptor, lines, torn=b"\n")
             self._is_empty = False
         except FileNotFoundError:
-            # The next event begins another file.
+            # The next event creates a new file.
             os.close(self._descriptor)
             self._descriptor = None
             self.lost += 1
@@ -230,25 +234,25 @@ def _shortened(values: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def is_of_spans(line: bytes) -> bool:
-    """Return whether a line of a journal is about rows: `formats.spans` reads these."""
+    """Return whether a line of a journal is about rows, which `formats.spans` reads."""
     return line.startswith(_OF_SPANS)
 
 
 class JournalReader:
-    """Reads the entries of a journal, one at a time, in the order written.
+    """A reader of a journal's entries, one at a time, in the order written.
 
-    Iterate over it, once. Lines that are no episode are left out and counted, and so
-    is an episode whose number was there before. After a line of 16 MiB or more, or
-    when too much is damaged for a journal, everything that follows is left out.
+    Iterate over it once. Invalid lines are skipped and counted, and so are episodes
+    whose number occurred before. After a line of 16 MiB or more, or after too many
+    damaged lines, everything that follows is skipped.
 
     Args:
         path: the file.
         on_event: called with the kind and the facts of every other event.
 
     Attributes:
-        last_episode_id: the highest number so far, also of damaged lines that still
-            show theirs; -1 before.
-        dropped: how many lines were left out so far.
+        last_episode_id: the highest episode number so far, including damaged lines
+            whose number is readable; -1 before the first.
+        dropped: number of lines skipped so far.
     """
 
     def __init__(
@@ -256,7 +260,7 @@ class JournalReader:
     ) -> None:
         self._path = path
         self._on_event = on_event
-        # The numbers so far, a bit each: they are dense.
+        # The numbers so far, one bit each: they are dense.
         self._seen: dict[int, int] = {}
         self._damaged = 0
         self._first_reason = ""
@@ -268,13 +272,13 @@ class JournalReader:
         """Yield the entries.
 
         Raises:
-            UnreadableFile: there is no such file, or it cannot be read.
+            UnreadableFile: the file is missing or cannot be read.
         """
         with unreadable(self._path):
             file = open_regular(self._path)
         with file:
             for index in itertools.count(1):
-                # Disks fail while they are read, too.
+                # Disks can fail during reading, too.
                 with unreadable(self._path):
                     line = file.readline(_LONGEST_LINE)
                 if not line:
@@ -286,7 +290,7 @@ class JournalReader:
                     return
 
     def report(self) -> None:
-        """Say in the log what was left out, if anything was."""
+        """Log a warning about the lines that were skipped, if there were any."""
         if not self.dropped:
             return
         rest = " and all that follows" if self._gave_up else ""
@@ -306,7 +310,7 @@ class JournalReader:
         try:
             if len(line) >= _LONGEST_LINE:
                 self._gave_up = True
-                raise ValueError("it is too long to be an episode's")
+                raise ValueError("it is too long for an episode")
             values = json_object(line)
             kind = next(iter(values)) if len(values) == 1 else None
             if kind in EVENTS:
@@ -315,14 +319,14 @@ class JournalReader:
             entry = entry_of(values)
         except ValueError as error:
             torn = not line.endswith(b"\n") and not self._gave_up
-            # Its writer was killed in the middle of it, or is at it now.
+            # Its writer was killed in the middle of the line, or is still writing it.
             self._leave_out(index, line, "it was cut off" if torn else str(error))
             self._damaged += 1
             self._gave_up |= self._damaged >= _MOST_DAMAGED_LINES
             return None
         block, bit = divmod(entry.episode_id, _BLOCK)
         if self._seen.get(block, 0) >> bit & 1:
-            self._leave_out(index, line, "its episode was there before")
+            self._leave_out(index, line, "its episode occurred before")
             return None
         self._seen[block] = self._seen.get(block, 0) | 1 << bit
         self.last_episode_id = max(self.last_episode_id, entry.episode_id)
@@ -341,10 +345,11 @@ class JournalReader:
 def read_journal(path: Path) -> Iterator[JournalEntry]:
     """Yield the entries of a journal, one at a time, in the order written.
 
-    What is no episode is left out, as by `JournalReader`, with one warning at the end.
+    Lines that are not valid are skipped, as by `JournalReader`, with one warning at the
+    end.
 
     Raises:
-        UnreadableFile: there is no such file, or it cannot be read.
+        UnreadableFile: the file is missing or cannot be read.
     """
     reader = JournalReader(path)
     try:
@@ -354,10 +359,10 @@ def read_journal(path: Path) -> Iterator[JournalEntry]:
 
 
 def entry_of(values: Mapping[str, Any]) -> JournalEntry:
-    """Return the entry whose members a line of a journal, or a trajectory, has.
+    """Return the entry in a line of a journal, or in the facts of a trajectory.
 
     Raises:
-        ValueError: one is missing, or is not what it should be.
+        ValueError: a member is missing or has the wrong type.
     """
     return JournalEntry(
         episode_id=field(values, "episode_id", _count),
@@ -380,6 +385,6 @@ def entry_of(values: Mapping[str, Any]) -> JournalEntry:
 def _count(value: Any) -> int:
     count = integer(value)
     if not 0 <= count < MOST_EPISODES:
-        # Not its digits: there may be thousands.
-        raise ValueError("it is negative, or larger than any count can be")
+        # Do not show its digits: there may be thousands.
+        raise ValueError("it is negative or too large for a count")
     return count

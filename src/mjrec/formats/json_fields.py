@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Values taken out of JSON that a stranger may have written.
+"""Checked access to values in untrusted JSON.
 
 Every function here raises `ValueError` with a reason that can follow "Cannot read
 FILE:"; the readers of the file formats turn it into `UnreadableFile`.
@@ -23,7 +23,7 @@ T = TypeVar("T")
 # The statistics of several million episodes.
 _LONGEST_FILE = 1 << 28
 
-# Counts and numbers of things, as every other language can hold them.
+# The largest integer that every language's JSON reader can hold.
 _LARGEST_INTEGER = 2**63 - 1
 
 _LONGEST_NAME = 255
@@ -36,50 +36,50 @@ _KINDS = {
     float: "a number",
     int: "a whole number",
     list: "a list",
-    str: "a text",
+    str: "a string",
     type(None): "null",
 }
 
 
 @contextlib.contextmanager
 def unreadable(path: Path) -> Iterator[None]:
-    """Turn an error of the block about the content of a file into `UnreadableFile`."""
+    """Turn the block's errors about the content of a file into `UnreadableFile`."""
     try:
         yield
     except OSError as error:
         raise UnreadableFile(path, error.strerror or error) from error
     except MemoryError as error:
-        raise UnreadableFile(path, "it needs more memory than there is") from error
+        raise UnreadableFile(path, "it needs more memory than is available") from error
     except ValueError as error:
         raise UnreadableFile(path, error) from error
 
 
 def read_object(path: Path) -> Mapping[str, Any]:
-    """Return the object that the whole file holds.
+    """Return the JSON object that a file holds.
 
     Raises:
-        OSError: there is no such file.
-        ValueError: it is no regular file of its directory, or does not hold a JSON
-            object.
+        OSError: the file does not exist or cannot be read.
+        ValueError: the file is not a regular file of its directory, is too large, or
+            does not hold a JSON object.
     """
     return json_object(read_regular(path, limit=_LONGEST_FILE))
 
 
 def json_object(data: bytes) -> Mapping[str, Any]:
-    """Return the JSON object that `data` is the text of."""
+    """Return the JSON object encoded in `data`."""
     try:
         value = loads(data)
     except UnicodeDecodeError as error:
         raise ValueError("it is not UTF-8 text") from error
     except ValueError as error:
-        raise ValueError(f"it is not whole JSON ({error})") from error
+        raise ValueError(f"it is not valid JSON ({error})") from error
     return mapping(value)
 
 
 def field(
     values: Mapping[str, Any], key: str, convert: Callable[[Any], T], **default: T
 ) -> T:
-    """Return `values[key]`, converted; `default=` stands in for a missing key."""
+    """Return `values[key]`, converted, or `default` if the key is missing."""
     if key not in values:
         if default:
             return default["default"]
@@ -91,12 +91,12 @@ def field(
 
 
 def optional(convert: Callable[[Any], T]) -> Callable[[Any], T | None]:
-    """Return a conversion that leaves null alone."""
+    """Return a conversion that leaves null unchanged."""
     return lambda value: None if value is None else convert(value)
 
 
 def list_of(convert: Callable[[Any], T]) -> Callable[[Any], tuple[T, ...]]:
-    """Return a conversion of each item of a list."""
+    """Return a conversion that converts each item of a list."""
 
     def convert_items(value: Any) -> tuple[T, ...]:
         return tuple(convert(item) for item in _checked(value, list))
@@ -105,7 +105,7 @@ def list_of(convert: Callable[[Any], T]) -> Callable[[Any], tuple[T, ...]]:
 
 
 def one_of(*known: str) -> Callable[[Any], str]:
-    """Return a conversion that takes nothing but these texts."""
+    """Return a conversion that accepts only these strings."""
 
     def convert(value: Any) -> str:
         if value not in known:
@@ -116,16 +116,16 @@ def one_of(*known: str) -> Callable[[Any], str]:
 
 
 def mapping(value: Any) -> Mapping[str, Any]:
-    """Return an object as it is."""
+    """Return an object unchanged."""
     return _checked(value, dict)
 
 
 def text(value: Any) -> str:
-    """Return a text as it is."""
+    """Return a string unchanged."""
     try:
         _checked(value, str).encode()
     except UnicodeEncodeError as error:
-        raise ValueError("it is a text that no file can hold") from error
+        raise ValueError("it is not a valid Unicode string") from error
     return str(value)
 
 
@@ -145,50 +145,50 @@ def base_name(value: Any) -> str:
 
 
 def boolean(value: Any) -> bool:
-    """Return true or false as it is."""
+    """Return a boolean unchanged."""
     return _checked(value, bool)
 
 
 def integer(value: Any) -> int:
-    """Return a whole number, also one written with a fraction of zero."""
+    """Return an integer, which may be written as a float such as 3.0."""
     if isinstance(value, float) and value.is_integer():
         value = int(value)
     if abs(_checked(value, int)) > _LARGEST_INTEGER:
-        raise ValueError("it is larger than any count")
+        raise ValueError("it is too large for a count")
     return int(value)
 
 
 def positive(value: Any) -> int:
-    """Return a whole number that is 1 or more."""
+    """Return an integer that is at least 1."""
     count = integer(value)
     if count < 1:
-        raise ValueError(f"{count} is not 1 or more")
+        raise ValueError(f"{count} is less than 1")
     return count
 
 
 def number(value: Any) -> float:
-    """Return a number; null is NaN, as `json_text` writes it."""
+    """Return a number; null means NaN, as `json_text` writes it."""
     if not isinstance(value, float | None):
         _checked(value, int)
     try:
         return float_from_json(value)
     except OverflowError as error:
-        raise ValueError("a number is larger than a float can be") from error
+        raise ValueError("it is too large for a float") from error
 
 
 def rate(value: Any) -> Fraction:
-    """Check that `value` is a positive number as text, such as "60000/1001"."""
+    """Return a positive rate, given as a string such as "60000/1001"."""
     if not _RATE.fullmatch(text(value)):
-        raise ValueError(f"{value!r:.80} is no rate")
+        raise ValueError(f"{value!r:.80} is not a valid rate")
     above, _, below = value.partition("/")
     if not int(above) or not int(below or 1):
-        raise ValueError(f"{value!r:.80} is no rate")
+        raise ValueError(f"{value!r:.80} is not a valid rate")
     return Fraction(value)
 
 
 def _checked(value: Any, kind: type[T]) -> T:
-    # bool is a subclass of int, but true is no number in JSON.
+    # bool is a subclass of int, but true is not a number in JSON.
     if type(value) is not kind:
         found = _KINDS.get(type(value), type(value).__name__)
-        raise ValueError(f"{_KINDS[kind]} belongs there, not {found}")
+        raise ValueError(f"it must be {_KINDS[kind]}, not {found}")
     return value

@@ -1,17 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Lock files: who is alive is asked of the kernel, never of a process number.
+"""Lock files: the kernel, not a process id, shows whether their holder is alive.
 
-An open monitor holds `.openaigym.<infix>.lock` locked (`flock`). The kernel drops
-that when the process ends, however it ends, so a lock file that no process holds is
-what a dead monitor left. Process numbers come round again, in containers all the time.
+An open monitor holds `.openaigym.<infix>.lock` locked (`flock`). The kernel drops the
+lock when the process ends, in whatever way, so a lock file that no process holds was
+left by a dead monitor. Process ids are reused, in containers all the time.
 
-A monitor's lock is a name that is given once. The others (who renders a video, who
-uses a CPU, who rewrites a manifest) go from hand to hand, and what a dead process left
-is taken over.
+A monitor's lock is never reused, because its name belongs to that monitor alone. The
+other locks (rendering a video, using a CPU, rewriting a manifest) are reused, and one
+that a dead process left is taken over.
 
-A directory may come from anybody. A link, a pipe or a file with a second name that
-stands where a lock belongs is no lock: it is never followed, written or waited
-for. Asking for that lock raises an error that says so.
+A directory may be untrusted. A link, a pipe or a file with a second hard link in the
+place of a lock is never followed, written or waited for. Acquiring that lock raises an
+error that says so.
 """
 
 from __future__ import annotations
@@ -28,16 +28,16 @@ from typing import Self
 
 from ..errors import DirectoryNotWritable
 
-# `is_locked` holds a lock for a moment, which is no reason to give up.
+# `is_locked` holds a lock for a moment, which is not a reason to give up.
 _MOMENTS = 5
 _MOMENT = 0.002
 
-# Not blocking, should a pipe lie there.
+# Do not block if there is a pipe.
 _CAREFULLY = os.O_NOFOLLOW | os.O_NONBLOCK | os.O_NOCTTY
-# Of a link, a directory, and a socket or a device without a driver.
+# The errors for a link, a directory, and a socket or a device without a driver.
 _OF_OTHER_THINGS = (errno.ELOOP, errno.EISDIR, errno.ENXIO)
 
-# A forked child shares the lock, which would outlive a killed parent in it.
+# A forked child shares the lock and could keep it held after its parent is killed.
 _held: weakref.WeakSet[Lock] = weakref.WeakSet()
 
 
@@ -45,13 +45,14 @@ class Lock:
     """A new file at `path`, locked until `release` or the end of the process.
 
     Args:
-        path: the file to make; it must not exist.
-        content: what others may read about its holder; it stays when the holder dies.
-        mode: of the file.
+        path: the file to create; it must not exist.
+        content: what others may read about the lock's holder; it stays when the holder
+            dies.
+        mode: the file's permission bits.
 
     Raises:
-        FileExistsError: the file is there, held or left behind.
-        OSError: it cannot be made there.
+        FileExistsError: the file exists, held or left behind.
+        OSError: the file cannot be created.
     """
 
     def __init__(self, path: Path, content: str, *, mode: int = 0o644) -> None:
@@ -62,7 +63,7 @@ class Lock:
         self._take(path, descriptor)
         try:
             if not self._lock(fcntl.LOCK_EX):
-                # Before it was locked it looked like a dead monitor's.
+                # Before it was locked, it looked like a dead monitor's lock.
                 raise FileExistsError(f"{path} was removed while it was being locked")
             os.write(descriptor, content.encode())
         except BaseException:
@@ -75,29 +76,29 @@ class Lock:
         _held.add(self)
 
     def _lock(self, operation: int) -> bool:
-        """Lock the file; False where another one is in its place by now."""
+        """Lock the file; return False if it has been replaced or removed since."""
         fcntl.flock(self.fileno(), operation)
         return _is_at(self.fileno(), self._path)
 
     def fileno(self) -> int:
-        """Return the descriptor. A process that inherits it holds the lock too."""
+        """Return the file descriptor. A process that inherits it holds the lock too."""
         if self._descriptor is None:
-            raise ValueError(f"{self._path.name} is not locked any more")
+            raise ValueError(f"{self._path.name} is no longer locked")
         return self._descriptor
 
     def let_go(self) -> None:
-        """Hold it no longer, and leave the file; further calls do nothing."""
+        """Release the lock but leave the file. Idempotent."""
         descriptor, self._descriptor = self._descriptor, None
         if descriptor is not None:
             os.close(descriptor)
 
     def release(self) -> None:
-        """Remove the file and let it go; further calls do nothing.
+        """Remove the file and release the lock. Idempotent.
 
-        A file that another program has put in its place stays.
+        A file that another program has put in its place is kept.
         """
         try:
-            # Removed while it is still held: it is never seen unlocked.
+            # Removed while still held, so that it is never seen unlocked.
             if self._descriptor is not None and _is_at(self._descriptor, self._path):
                 self._path.unlink(missing_ok=True)
         finally:
@@ -111,14 +112,13 @@ class Lock:
 
 
 def try_lock(path: Path) -> Lock | None:
-    """Return a lock at `path`, or None where another process holds it.
+    """Return a lock at `path`, or None if another process holds it.
 
-    A file that no process holds is taken over with its content, and made where it is
-    missing.
+    A file that no process holds is taken over with its content, and created if missing.
 
     Raises:
-        DirectoryNotWritable: it cannot be made or opened, or something else stands
-            there.
+        DirectoryNotWritable: the file cannot be created or opened, or is a link or not
+            a regular file.
     """
     for _ in range(_MOMENTS):
         with contextlib.suppress(BlockingIOError):
@@ -128,10 +128,10 @@ def try_lock(path: Path) -> Lock | None:
 
 
 def wait_for_lock(path: Path) -> Lock:
-    """Return a lock at `path`, as soon as no other process holds it.
+    """Wait until no other process holds the lock at `path`, and return it.
 
     Raises:
-        DirectoryNotWritable: as `try_lock`.
+        DirectoryNotWritable: see `try_lock`.
     """
     return _taken(path, fcntl.LOCK_EX)
 
@@ -142,8 +142,8 @@ def _taken(path: Path, operation: int) -> Lock:
             lock = Lock.__new__(Lock)
             lock._take(path, _opened(path))
             try:
-                # Its holder may have removed it after it was opened, and another
-                # process have made a new one: then this one guards nothing.
+                # Its holder may have removed the file after we opened it, and another
+                # process may have created a new one. Then our lock guards nothing.
                 if lock._lock(operation):
                     return lock
             except BaseException:
@@ -157,7 +157,7 @@ def _taken(path: Path, operation: int) -> Lock:
 
 
 def _opened(path: Path) -> int:
-    """Return a descriptor of the lock file at `path`, made where it is missing."""
+    """Return a descriptor of the lock file at `path`, creating it if missing."""
     try:
         descriptor = os.open(path, os.O_CREAT | os.O_RDWR | _CAREFULLY, 0o644)
     except OSError as error:
@@ -165,21 +165,21 @@ def _opened(path: Path) -> int:
             raise
     else:
         facts = os.fstat(descriptor)
-        # One that has just been removed has no name at all.
+        # A file that has just been removed has no links at all.
         if stat.S_ISREG(facts.st_mode) and facts.st_nlink <= 1:
             return descriptor
         os.close(descriptor)
-    what = f"{path.name} is a link or no regular file, which no lock is. Remove it"
+    what = f"{path.name} is a link or not a regular file, so not a lock. Remove it"
     raise OSError(errno.EINVAL, what)
 
 
 def is_locked(path: Path) -> bool:
     """Return whether a living process holds the lock file at `path`.
 
-    A link or no regular file counts as not held.
+    A link, or anything else that is not a regular file, counts as not held.
 
     Raises:
-        OSError: the file is there and cannot be opened.
+        OSError: the file exists but cannot be opened.
     """
     try:
         descriptor = os.open(path, os.O_RDONLY | _CAREFULLY)

@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """Gym's two files of a monitor: the manifest and the statistics.
 
-The manifest, `openaigym.manifest.<infix>.manifest.json`, says which files belong to one
-monitor. It is written last, so that whatever it lists is there and whole. Names in it
-are base names: the directory can be moved, and a manifest from elsewhere cannot point
+The manifest, `openaigym.manifest.<infix>.manifest.json`, lists the files that belong to
+one monitor. It is written last, so that every file it lists is complete. Names in it
+are base names: the directory can be moved, and an untrusted manifest cannot point
 outside its own directory.
 
 The statistics, `openaigym.episode_batch.<infix>.stats.json`, have the keys of
-`StatsFile`, in its order. The lists have one item for each completed episode. Gym
-itself wrote one type for each *reset*, so that its `episode_types` can be longer than
-the other lists; they are read as they stand.
+`StatsFile`, in this order. The lists have one item for each completed episode. Gym
+itself wrote one type for each *reset*, so its `episode_types` can be longer than the
+other lists; they are read unchanged.
 """
 
 from __future__ import annotations
@@ -36,20 +36,20 @@ from .json_fields import (
 )
 from .regular_files import read_regular
 
-# What stands for gym's version in what this package writes.
+# What this package writes as gym's version.
 GYM_VERSION = "mjrec-1"
 
 
 @dataclass(frozen=True)
 class Manifest:
-    """What one manifest says.
+    """The content of a manifest.
 
     Attributes:
         stats: base name of the statistics file.
         videos: base names of each finished video and its metadata, in the order of
             recording.
-        env_info: `gym_version` and `env_id`; some gyms left one or both out.
-        mjrec: what gym did not write; None in gym's own manifests.
+        env_info: `gym_version` and `env_id`; some versions of gym omitted one or both.
+        mjrec: facts that gym did not write; None in gym's own manifests.
     """
 
     stats: str
@@ -59,10 +59,11 @@ class Manifest:
 
 
 def read_manifest(path: Path) -> Manifest:
-    """Return what the manifest says. Unknown keys are ignored.
+    """Read a manifest. Unknown keys are ignored.
 
     Raises:
-        UnreadableFile: it is missing or damaged, or names a file elsewhere.
+        UnreadableFile: the file is missing or damaged, or names a file in another
+            directory.
     """
     with unreadable(path):
         values = read_object(path)
@@ -75,7 +76,7 @@ def read_manifest(path: Path) -> Manifest:
 
 
 def write_manifest(path: Path, manifest: Manifest) -> bool:
-    """Write the manifest, whole or not at all, unless it is there; tell whether."""
+    """Write the manifest atomically; return whether its content changed."""
     content = {key: value for key, value in vars(manifest).items() if value is not None}
     return _write_new(path, dumps(content))
 
@@ -92,13 +93,13 @@ def _pair(value: Any) -> tuple[str, str]:
     names = list_of(base_name)(value)
     if len(names) != 2:
         raise ValueError(
-            f"a video and its metadata belong together, not {len(names)} names"
+            f"it must name a video and its metadata, but it has {len(names)} names"
         )
     return names[0], names[1]
 
 
 def _details(value: Any) -> Mapping[str, Any]:
-    """Return what gym did not write, with what others rely on as it should be."""
+    """Return the facts that gym did not write, after checking those that are used."""
     details = mapping(value)
     next_id = field(details, "next_episode_id", optional(integer), default=None)
     if next_id is not None and next_id < 0:
@@ -114,15 +115,16 @@ def _details(value: Any) -> Mapping[str, Any]:
 
 @dataclass(frozen=True)
 class StatsFile:
-    """What one monitor counted.
+    """The content of a statistics file.
 
     Attributes:
-        initial_reset_timestamp: when the first reset began; None before it.
+        initial_reset_timestamp: when the first reset began; None before the first
+            reset.
         timestamps: when each episode ended.
-        episode_lengths: steps of each episode.
+        episode_lengths: number of steps of each episode.
         episode_rewards: sum of the rewards of each episode.
-        episode_types: `"t"` for training, `"e"` for evaluation; None in files of
-            before there were types.
+        episode_types: `"t"` for training, `"e"` for evaluation; None in files of gym
+            versions without types.
     """
 
     initial_reset_timestamp: float | None
@@ -133,15 +135,15 @@ class StatsFile:
 
 
 def read_stats_file(path: Path) -> StatsFile:
-    """Return what the file holds; `null` among the rewards is NaN.
+    """Read a statistics file. Null among the rewards is NaN.
 
     Raises:
-        UnreadableFile: it is missing or damaged, or its lists differ in length.
+        UnreadableFile: the file is missing or damaged, or its lists differ in length.
     """
     with unreadable(path):
         values = read_object(path)
         stats = StatsFile(
-            # Absent in the first of all gyms.
+            # The first versions of gym did not write it.
             initial_reset_timestamp=field(
                 values, "initial_reset_timestamp", optional(number), default=None
             ),
@@ -157,7 +159,7 @@ def read_stats_file(path: Path) -> StatsFile:
 
 
 def write_stats_file(path: Path, stats: StatsFile) -> bool:
-    """Write the file, whole or not at all, unless it is there; tell whether."""
+    """Write the statistics atomically; return whether the content changed."""
     values = vars(stats)
     if stats.episode_types is None:
         values = {k: v for k, v in values.items() if k != "episode_types"}
@@ -169,7 +171,7 @@ def _check_lengths(stats: StatsFile) -> None:
     counts = {name: len(vars(stats)[name]) for name in names}
     if len(set(counts.values())) > 1:
         each = ", ".join(f"{count} {name}" for name, count in counts.items())
-        raise ValueError(f"its lists belong together but differ in length: {each}")
+        raise ValueError(f"its lists must have the same length, but have {each}")
     types, count = stats.episode_types, counts["timestamps"]
     if types is not None and len(types) < count:
         raise ValueError(f"it has {len(types)} episode_types for {count} episodes")

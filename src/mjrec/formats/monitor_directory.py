@@ -6,47 +6,47 @@
     directory/
     ├── openaigym.manifest.<infix>.manifest.json        the index, written last
     ├── openaigym.episode_batch.<infix>.stats.json      gym's statistics
-    ├── openaigym.episodes.<infix>.jsonl                journal, a line an episode
+    ├── openaigym.episodes.<infix>.jsonl                journal, one line per episode
     ├── openaigym.video.<infix>.video000027.mp4         a video ...
-    ├── openaigym.video.<infix>.video000027.meta.json   ... and all about it
-    ├── openaigym.video.<infix>.video000027.framehash   ... and its frames' hashes
-    ├── openaigym.video.<infix>.video000027.failed.json why it is still pending
-    ├── openaigym.clip.<infix>.step000000137.failed.json    likewise, of a clip
+    ├── openaigym.video.<infix>.video000027.meta.json   ... its metadata
+    ├── openaigym.video.<infix>.video000027.framehash   ... the hashes of its frames
+    ├── openaigym.video.<infix>.video000027.failed.json ... why it is still pending
+    ├── openaigym.clip.<infix>.step000000137.failed.json    why a clip is still pending
     ├── openaigym.video.<infix>.video000027.json        a text recording (asciicast)
-    ├── openaigym.video.<infix>.video000027.side.mp4    a further camera's
-    ├── openaigym.video.<infix>.video000027.camera2.mp4 of one that has no name
-    ├── openaigym.video.<infix>.video000027.tiled.mp4   all sub-environments' in one
-    ├── openaigym.video.<infix>.video000027.side.640x480.mp4 rendered again
-    ├── openaigym.video.<infix>.video000027.step000137.mp4 of a clip
-    ├── rl-video-episode-27.mp4                         another name of the first ...
+    ├── openaigym.video.<infix>.video000027.side.mp4    video of a further camera
+    ├── openaigym.video.<infix>.video000027.camera2.mp4 ... of a camera without a name
+    ├── openaigym.video.<infix>.video000027.tiled.mp4   all sub-environments in one
+    ├── openaigym.video.<infix>.video000027.side.640x480.mp4 a rerendered video
+    ├── openaigym.video.<infix>.video000027.step000137.mp4 video of a clip
+    ├── rl-video-episode-27.mp4                         second name of the first ...
     ├── rl-video-episode-27.side.mp4                    ... and of a further one
     ├── openaigym.states.<infix>.000000.log             rows of recordings in flight
-    ├── openaigym.states.<infix>.000000.tail            ... the last of these
+    ├── openaigym.states.<infix>.000000.tail            ... the last of these rows
     ├── openaigym.states.<infix>.000000.looks           ... changes of the model
     ├── openaigym.trajectory.<infix>.episode000027.h5   a recorded episode, finished
     ├── openaigym.trajectories.<infix>.h5               ... or many in one file
     ├── openaigym.model.<16 hex digits>.mjb.gz          its compiled model ...
-    ├── openaigym.model.<16 hex digits>.zip             ... and what that was made from
-    ├── openaigym.results.<infix>.monitor.csv           Stable-Baselines3's, if wanted
-    ├── .openaigym.<infix>.lock                         while its monitor is open
-    ├── .openaigym.video.<infix>.video000027.lock       while it is rendered
-    ├── .openaigym.clip.<infix>.step000000137.lock      likewise
-    ├── .openaigym.manifest.<infix>.lock                while it is rewritten
-    └── .openaigym.render.<number>.lock                 while that CPU is in use
+    ├── openaigym.model.<16 hex digits>.zip             ... and the model's sources
+    ├── openaigym.results.<infix>.monitor.csv           for Stable-Baselines3, if wanted
+    ├── .openaigym.<infix>.lock                         held while its monitor is open
+    ├── .openaigym.video.<infix>.video000027.lock       held while a video is rendered
+    ├── .openaigym.clip.<infix>.step000000137.lock      held while a clip is rendered
+    ├── .openaigym.manifest.<infix>.lock                held while it is rewritten
+    └── .openaigym.render.<number>.lock                 held while that CPU is in use
 
-What tells videos of one episode apart is a part of the name before its ending. A camera
-may be called anything, so its part is made of its name such that it is no other part
-and never leads out of the directory.
+The videos of one episode differ in a part of the name before the suffix. A camera can
+have any name, so its part is an encoded form of the name that cannot be mistaken for
+another part and never leads out of the directory.
 
-A recording in flight is a span of rows, which the journal names (`spans`): an episode
-as its trajectory will be, a clip's part, which is of one episode, as
-`openaigym.clip.<infix>.step000000137.part000000` after the number of steps that the
-monitor had recorded when the clip began. A clip's video is called as the episode's in
-which it began, or `video000027.step000137.mp4` where a step began it.
+A recording in flight is a span of rows, which the journal names (`spans`). An episode
+has the name of its future trajectory. A clip has a part for each episode,
+`openaigym.clip.<infix>.step000000137.part000000`, named after the number of steps that
+the monitor had recorded when the clip began. A clip's video is named after the episode
+in which it began, with a step (`video000027.step000137.mp4`) if a step triggered it.
 
-`<infix>` is `<monitor id>.<uid or process id>`. It stands for one monitor: no two
-monitors ever share one in a directory. Names that start with a dot and end in
-`.part` are files that are being written.
+`<infix>` is `<monitor id>.<uid or process id>`. It identifies one monitor: no two
+monitors ever share one in a directory. Names that start with a dot and end in `.part`
+are files that are still being written.
 """
 
 from __future__ import annotations
@@ -69,21 +69,21 @@ MANIFEST_PREFIX = f"{FILE_PREFIX}.manifest"
 
 _SHOWN = 5
 
-# Gym took any text for a uid.
+# Gym accepted any string as a uid.
 _INFIX = re.compile(r"(?P<number>[0-9]{1,18})\.(?P<uid>[^/\n\0]+)")
 _UID = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9_.-]{0,99}", re.ASCII)
 
-# What this package and every gym wrote; nothing else in a directory is ours. A `~`
-# is gym's temporary name.
+# The names that this package and every version of gym wrote; nothing else in a
+# directory is ours. A `~` is gym's temporary name.
 #
-# Names also stand in files, which may be anybody's: a name that has a slash in it would
-# lead out of the directory, and a number of a million digits takes minutes to read.
+# Names also occur in files, which may be untrusted: a name with a slash would lead out
+# of the directory, and a number of a million digits takes minutes to parse.
 _INFIX_PART = r"(?P<infix>[^/\n\0]+)"
 _VIDEO = rf"openaigym\.video\.{_INFIX_PART}\.video(?P<episode>[0-9]{{6,18}})"
 _TRAJECTORY = (
     rf"openaigym\.trajectory\.{_INFIX_PART}\.episode(?P<episode>[0-9]{{6,18}})"
 )
-# Not the number of an episode: no part of a clip is taken for an episode's file.
+# Not an episode's number, so that no part of a clip is taken for an episode's file.
 _CLIP = rf"openaigym\.clip\.{_INFIX_PART}\.step(?P<step>[0-9]{{9,18}})"
 _CLIP_PART = re.compile(rf"{_CLIP}\.part(?P<part>[0-9]{{6,18}})")
 _VIDEO_FILE = re.compile(
@@ -93,8 +93,8 @@ _VIDEO_FILE = re.compile(
 _STATES = rf"openaigym\.states\.{_INFIX_PART}\.(?P<log>[0-9]{{6,9}})"
 
 _MANIFEST = re.compile(rf"openaigym\.manifest\.{_INFIX_PART}\.manifest\.json")
-# By what stands behind `openaigym.`: a directory may hold a million names, and each
-# is compared with one pattern and not with all.
+# Keyed by the word after `openaigym.`: a directory may hold a million names, and each
+# is matched against one pattern, not all of them.
 _VISIBLE = {
     "manifest": re.compile(rf"openaigym\.manifest\.{_INFIX_PART}\.manifest\.json~*"),
     "episode_batch": re.compile(
@@ -117,7 +117,7 @@ _HIDDEN = (
     re.compile(rf"\.openaigym\.{_INFIX_PART}\.lock"),
     re.compile(r"\.openaigym\.[^/\n\0]+\.part"),
 )
-# A note is rewritten as every file is: an unfinished one has both endings.
+# A note is rewritten like any file, so an unfinished note has both suffixes.
 _PART = re.compile(
     r"\.(?P<final>openaigym\..+?)(?P<note>\.note(\.part)?)?(?P<hex>\.[0-9a-f]{8})?\.part"
 )
@@ -125,16 +125,16 @@ _PART = re.compile(
 _MP4 = ".mp4"
 _TILED = "tiled"
 
-# Names of cameras that would be taken for another part of a file's name, or for none.
+# Camera names that would be mistaken for another part of a file's name, or for none.
 _AMBIGUOUS = re.compile(
     r"|full|draft|annotated|plain|tiled|meta|\d*x\d*|.*fps|(video|step)\d+"
     r"|camera(-.*|\d+)"
 )
-# Directories have names of 255 bytes, and there are other parts.
+# File names have at most 255 bytes, and there are other parts.
 _LONGEST_PART = 80
 _DIGEST = 8
 
-# What Gymnasium's RecordVideo calls its files, for any `name_prefix` that is portable.
+# The file names of Gymnasium's RecordVideo, for any portable `name_prefix`.
 _SECOND_NAME = re.compile(
     r"(?!openaigym)[A-Za-z0-9_][A-Za-z0-9_.-]{0,99}-(episode|step)-[0-9]{1,18}\.mp4",
     re.ASCII,
@@ -143,10 +143,10 @@ _SECOND_NAME = re.compile(
 
 @dataclass(frozen=True)
 class Infix:
-    """What tells the files of one monitor from those of another.
+    """The part of file names that identifies one monitor.
 
     Attributes:
-        monitor_id: counts the monitors, from 0.
+        monitor_id: the monitor's number, from 0.
         uid: the user's name for the run, or the process id.
     """
 
@@ -158,19 +158,19 @@ class Infix:
 
     @classmethod
     def parse(cls, text: str) -> Infix | None:
-        """Return the infix written as `text`; None for one of another making."""
+        """Return the infix written as `text`, or None if it is not a valid infix."""
         match = _INFIX.fullmatch(text)
         return None if match is None else cls(int(match["number"]), match["uid"])
 
 
 @dataclass(frozen=True)
 class ClipPart:
-    """What the name of a part of a video that is counted in steps says.
+    """The parsed name of a part of a clip.
 
     Attributes:
-        infix: of its monitor.
-        first_step: how many steps the monitor had recorded when the video began.
-        number: which part it is, from 0.
+        infix: the monitor's infix.
+        first_step: number of steps that the monitor had recorded when the clip began.
+        number: the part's number, from 0.
     """
 
     infix: Infix
@@ -179,7 +179,7 @@ class ClipPart:
 
     @classmethod
     def parse(cls, name: str) -> ClipPart | None:
-        """Return what a file's name says; None for other files."""
+        """Return the parsed name, or None for other names."""
         match = _CLIP_PART.fullmatch(name)
         infix = None if match is None else Infix.parse(match["infix"])
         if match is None or infix is None:
@@ -189,15 +189,17 @@ class ClipPart:
 
 @dataclass(frozen=True)
 class VideoName:
-    """What the name of a video, or of a file that belongs to one, says.
+    """The parsed name of a video, or of a file that belongs to one.
 
     Attributes:
-        name: the name of the file.
-        infix: of its monitor.
-        episode_id: the episode that it shows, or in which a clip began.
-        first_step: as of `ClipPart`; None where no step began it.
-        view: which of several videos; empty for the first camera's as recorded.
-        ending: what kind of file it is, such as `mp4` or `meta.json`.
+        name: the file's name.
+        infix: the monitor's infix.
+        episode_id: the episode that the video shows, or in which a clip began.
+        first_step: number of recorded steps at which a clip began; None if no step
+            triggered it.
+        view: which of several videos this is; empty for the first camera's, as
+            recorded.
+        ending: the kind of file, such as `mp4` or `meta.json`.
     """
 
     name: str
@@ -209,7 +211,7 @@ class VideoName:
 
     @classmethod
     def parse(cls, name: str) -> VideoName | None:
-        """Return what a file's name says; None for other files."""
+        """Return the parsed name, or None for other files."""
         match = _VIDEO_FILE.fullmatch(name)
         if match is None:
             return None
@@ -221,12 +223,12 @@ class VideoName:
 
     @property
     def video(self) -> str:
-        """The name of the mp4."""
+        """The name of the mp4 file."""
         return f"{self.name.removesuffix(self.ending)}mp4"
 
     @property
     def is_episodes(self) -> bool:
-        """Whether it is of an episode's first video, and of no clip that a step began.
+        """Whether it belongs to an episode's first video, not to a step-triggered clip.
 
         A clip that began with an episode has such a name, too.
         """
@@ -234,10 +236,10 @@ class VideoName:
 
 
 def check_uid(uid: object) -> str:
-    """Return `uid` as the text that goes into file names.
+    """Return `uid` as the string that goes into file names.
 
     Raises:
-        InvalidArgument: it would not make a portable file name.
+        InvalidArgument: `uid` would not make a portable file name.
     """
     text = str(uid)
     if not _UID.fullmatch(text):
@@ -274,52 +276,52 @@ def trajectory_prefix(infix: Infix, episode_id: int) -> str:
 
 
 def bundle_name(infix: Infix | str) -> str:
-    """Return the name of the file that many trajectories of a monitor lie in."""
+    """Return the name of a monitor's bundle, the file that holds many trajectories."""
     return f"{FILE_PREFIX}.trajectories.{infix}.h5"
 
 
 def is_bundle(name: str) -> bool:
-    """Return whether `name` is that of a file with many trajectories."""
+    """Return whether `name` is the name of a bundle."""
     return _VISIBLE["trajectories"].fullmatch(name) is not None
 
 
 def video_lock_name(infix: Infix, episode_id: int) -> str:
-    """Return the name of the lock file of an episode's rendering."""
+    """Return the name of the lock file held while an episode is rendered."""
     return f".{video_prefix(infix, episode_id)}.lock"
 
 
 def clip_prefix(infix: Infix, first_step: int) -> str:
-    """Return how the names of the parts of a video begin that is counted in steps.
+    """Return the start of the names of a clip's parts.
 
     Args:
-        infix: the monitor's.
-        first_step: how many steps the monitor had recorded when it began.
+        infix: the monitor's infix.
+        first_step: number of steps that the monitor had recorded when the clip began.
     """
     return f"{FILE_PREFIX}.clip.{infix}.step{first_step:09d}"
 
 
 def clip_part_name(infix: Infix, first_step: int, number: int) -> str:
-    """Return the name of one part, which is of one episode; they count from 0."""
+    """Return the name of a clip's part; there is one per episode, counted from 0."""
     return f"{clip_prefix(infix, first_step)}.part{number:06d}"
 
 
 def log_name(infix: Infix | str, number: int) -> str:
-    """Return the name of a row log; the files beside it have other suffixes."""
+    """Return the name of a row log; its companion files have other suffixes."""
     return f"{FILE_PREFIX}.states.{infix}.{number:06d}.log"
 
 
 def clip_lock_name(infix: Infix, first_step: int) -> str:
-    """Return the name of the lock file of such a video's rendering."""
+    """Return the name of the lock file held while a clip is rendered."""
     return f".{clip_prefix(infix, first_step)}.lock"
 
 
 def clip_video_prefix(infix: Infix, episode_id: int, step: int | None) -> str:
-    """Return the name of a video that is counted in steps, without its extensions.
+    """Return the name of a clip's video without its extensions.
 
     Args:
-        infix: the monitor's.
-        episode_id: the episode in which it began.
-        step: how many steps were recorded when a step began it; None where it began
+        infix: the monitor's infix.
+        episode_id: the episode in which the clip began.
+        step: number of steps recorded when a step triggered the clip; None if it began
             with the episode.
     """
     prefix = video_prefix(infix, episode_id)
@@ -327,62 +329,62 @@ def clip_video_prefix(infix: Infix, episode_id: int, step: int | None) -> str:
 
 
 def render_lock_name(number: int) -> str:
-    """Return the name of the file that stands for one of the machine's CPUs."""
+    """Return the name of the lock file that represents one of the machine's CPUs."""
     return f".{FILE_PREFIX}.render.{number}.lock"
 
 
 def lock_name(infix: Infix) -> str:
-    """Return the name of the file that an open monitor holds locked."""
+    """Return the name of the lock file that an open monitor holds."""
     return f".{FILE_PREFIX}.{infix}.lock"
 
 
 def manifest_lock_name(infix: Infix) -> str:
-    """Return the name of the lock file of a manifest's rewriting.
+    """Return the name of the lock file held while a manifest is rewritten.
 
-    It is another one than the monitor's: a monitor that is closed stays closed.
+    This is not the monitor's lock: a closed monitor stays closed.
     """
     return f".{MANIFEST_PREFIX}.{infix}.lock"
 
 
 def is_manifest(name: str) -> bool:
-    """Return whether `name` is a manifest's, finished."""
+    """Return whether `name` is the name of a finished manifest."""
     return _MANIFEST.fullmatch(name) is not None
 
 
 def infix_of(name: str) -> str | None:
-    """Return the infix in the name of a file or recording; None where there is none."""
+    """Return the infix in the name of a file or recording, or None if it has none."""
     match = _match(name) or _CLIP_PART.fullmatch(name)
     return None if match is None else match.groupdict().get("infix")
 
 
 def episode_of(name: str) -> int | None:
-    """Return the episode's number in a file's name; None where there is none."""
+    """Return the episode number in a file's name, or None if it has none."""
     match = _match(name)
     number = None if match is None else match.groupdict().get("episode")
     return None if number is None else int(number)
 
 
 def log_number(name: str) -> int | None:
-    """Return the number of the row log that a file is of; None for other files."""
+    """Return the number of the row log that a file belongs to; None for other files."""
     match = _match(name)
     number = None if match is None else match.groupdict().get("log")
     return None if number is None else int(number)
 
 
 def final_name(name: str) -> str | None:
-    """Return the name that an unfinished file, or the file of a note, will get."""
+    """Return the final name of an unfinished file or note; None for other names."""
     part = _PART.fullmatch(name)
     return None if part is None else part["final"]
 
 
 def is_note(name: str) -> bool:
-    """Return whether `name` is that of a note beside an unfinished video."""
+    """Return whether `name` is the name of a note about an unfinished video."""
     part = _PART.fullmatch(name)
     return part is not None and bool(part["note"]) and not part["hex"]
 
 
 def unfinished_files(path: Path) -> list[Path]:
-    """Return the hidden files under which `path` is written, or was."""
+    """Return the existing hidden files under which `path` is or was being written."""
     pattern = f".{glob.escape(path.name)}.{8 * '[0-9a-f]'}.part"
     found = sorted(path.parent.glob(pattern))
     # A link may lead anywhere.
@@ -392,13 +394,13 @@ def unfinished_files(path: Path) -> list[Path]:
 def iter_monitor_files(directory: Path, *, hidden: bool = False) -> Iterator[Path]:
     """Yield the monitor files of `directory`, sorted by name.
 
-    Only regular files (and links to them) with a name that a monitor gives; other
-    files that start with `openaigym.`, and directories, are not ours.
+    Only regular files (and links to them) whose name a monitor gives are included.
+    Other files that start with `openaigym.`, and directories, are ignored.
 
     Args:
-        directory: where to look; not below it. A directory that is not there holds
-            nothing.
-        hidden: also locks and unfinished files.
+        directory: the directory, without its subdirectories. A missing directory counts
+            as empty.
+        hidden: whether to include locks and unfinished files.
     """
     if not directory.is_dir():
         return
@@ -407,9 +409,10 @@ def iter_monitor_files(directory: Path, *, hidden: bool = False) -> Iterator[Pat
 
 
 def monitor_directories_in(directory: Path) -> list[Path]:
-    """Return the directories below one that hold monitor files, sorted by name.
+    """Return the subdirectories that hold monitor files, sorted by name.
 
-    Two levels are looked at: an evaluation has a folder for each task, and in it some.
+    Two levels are searched: an evaluation has a folder for each task, with folders in
+    it.
     """
     found: list[Path] = []
     for path in sorted(directory.iterdir()):
@@ -421,31 +424,31 @@ def monitor_directories_in(directory: Path) -> list[Path]:
 
 
 def recording_directories(directory: Path) -> list[Path]:
-    """Return where the recordings of a directory are: in it, or else in those below."""
+    """Return the directory if it has recordings, otherwise those below it that do."""
     if not directory.is_dir() or any(iter_monitor_files(directory)):
         return [directory]
     return monitor_directories_in(directory) or [directory]
 
 
 def where_recordings_are(directory: Path) -> str:
-    """Return the message for a directory without recordings.
+    """Return advice for the error about a directory without recordings.
 
-    What is below it is looked at, because an evaluation has its recordings there.
+    Its subdirectories are searched, because an evaluation has its recordings there.
     """
     below = monitor_directories_in(directory)
     folders = [str(path.relative_to(directory)) for path in below]
     if not folders:
-        return f"`mjrec record ENV --out {shlex.quote(str(directory))}` makes some."
+        return f"To record, run `mjrec record ENV --out {shlex.quote(str(directory))}`."
     rest = len(folders) - _SHOWN
     more = f" and {rest} more" if rest > 0 else ""
     return f"Its folders do ({', '.join(folders[:_SHOWN])}{more}): name one of them."
 
 
 def names_in(directory: Path) -> Iterator[str]:
-    """Yield the names of all that is in a directory, in no order.
+    """Yield the names of all entries in a directory, in no particular order.
 
-    For a search of a few among a million names, where a `Path` of each is not worth
-    making.
+    For finding a few names among a million, when creating a `Path` for each is too
+    slow.
     """
     with os.scandir(directory) as entries:
         for entry in entries:
@@ -453,8 +456,8 @@ def names_in(directory: Path) -> Iterator[str]:
 
 
 def _names(directory: Path, *, hidden: bool) -> Iterator[str]:
-    # What kind of file an entry is comes with its name: a network file system is asked
-    # once for many entries, and not once for each.
+    # scandir returns the file type with the name, so a network file system is queried
+    # once for many entries, not once for each.
     with os.scandir(directory) as entries:
         for entry in entries:
             is_wanted = hidden or not entry.name.startswith(".")
@@ -463,12 +466,12 @@ def _names(directory: Path, *, hidden: bool) -> Iterator[str]:
 
 
 def _is_file(entry: os.DirEntry[str]) -> bool:
-    # What a link leads to is asked of the path: a link to itself is no error there.
+    # Follow links with `Path.is_file`, which does not raise for a link to itself.
     return Path(entry).is_file() if entry.is_symlink() else entry.is_file()
 
 
 def _match(name: str) -> re.Match[str] | None:
-    """Return what tells a name to be a monitor file's; None for other files."""
+    """Return the match of a monitor file's name; None for other files."""
     if name.startswith("."):
         final = final_name(name)
         if final is not None and (match := _match(final)) is not None:
@@ -482,29 +485,30 @@ def _match(name: str) -> re.Match[str] | None:
 
 
 def name_part(text: str) -> str:
-    """Return a text as a part of a file's name.
+    """Encode a string as a part of a file's name.
 
-    Every character but letters, digits, `_` and `-` of ASCII is percent-encoded, as
-    UTF-8. One that is too long for a name ends in a digest instead.
+    Every character except ASCII letters, digits, `_` and `-` is percent-encoded as
+    UTF-8. If the result is too long for a name, it ends in a digest instead.
     """
     quoted = urllib.parse.quote(text, safe="", errors="surrogatepass")
-    # What `quote` leaves alone and is no letter, digit, `_` or `-`.
+    # The characters that `quote` leaves alone and that are not letters, digits, `_` or
+    # `-`.
     part = quoted.replace(".", "%2E").replace("~", "%7E")
     if len(part) <= _LONGEST_PART:
         return part
     digest = hashlib.sha256(part.encode()).hexdigest()[:_DIGEST]
-    # No half of an encoded character.
+    # Do not end in half of an encoded character.
     begin = re.sub("%.?$", "", part[: _LONGEST_PART - _DIGEST - 1])
     return f"{begin}-{digest}"
 
 
 def camera_part(camera: Any) -> str:
-    """Return the part of a file's name that stands for one camera.
+    """Return the part of a file's name that represents one camera.
 
-    One whose name could be another part of a name is there as `camera-draft`.
+    A name that could be mistaken for another part is prefixed, as in `camera-draft`.
 
     Args:
-        camera: a name, a number, or the members of an `MjvCamera`.
+        camera: a name, a number, or the fields of an `MjvCamera`.
     """
     if isinstance(camera, int):
         return str(camera)
@@ -513,14 +517,14 @@ def camera_part(camera: Any) -> str:
 
 
 def further_parts(cameras: Sequence[Any]) -> list[str]:
-    """Return the parts that stand for all cameras of an episode but the first.
+    """Return the name parts of all cameras of an episode except the first.
 
-    A camera that has no name is called by its place, `camera2` for the second of all.
-    Where two would be the same, as of camera 1 and the camera "1", the later one gets
-    `-2`, `-3` and so on.
+    A camera without a name is named after its position, such as `camera2` for the
+    second. If two parts would be the same, as for camera 1 and the camera "1", the
+    later one gets `-2`, `-3` and so on.
 
     Args:
-        cameras: all of them, in their order.
+        cameras: all cameras, in order.
     """
     parts: list[str] = []
     for place, camera in enumerate(cameras[1:], 2):
@@ -554,24 +558,24 @@ def tiled_name(video: str) -> str:
     """Return the name of the video that shows all sub-environments at once.
 
     Args:
-        video: the name that it would have otherwise.
+        video: the name that the video would have otherwise.
     """
     return with_part(video, _TILED)
 
 
 def view_of(video: str) -> str:
-    """Return which of an episode's videos one is; empty for the first camera's.
+    """Return which of an episode's videos this is; empty for the first camera's.
 
     >>> view_of("openaigym.video.0.7.video000027.step000137.side.mp4")
     'side'
     """
     name = VideoName.parse(video)
-    # One that was rendered again has more than a camera's part.
+    # The view of a rerendered video has more than a camera's part.
     return "" if name is None or "." in name.view else name.view
 
 
 def is_second_name(name: str) -> bool:
-    """Return whether a video of ours may be called `name` besides its own name."""
+    """Return whether `name` could be the second name of one of our videos."""
     return _SECOND_NAME.fullmatch(name) is not None
 
 
@@ -582,12 +586,12 @@ def second_name_of(name: str, second: str, *, first: str) -> str | None:
     'rl-video-episode-2.side.meta.json'
 
     Args:
-        name: of the file.
+        name: the file's name.
         second: the second name of the episode's first video.
-        first: the first name of that.
+        first: the name of the episode's first video.
 
     Returns:
-        None where the file is none of this episode.
+        The second name, or None if the file does not belong to this episode.
     """
     stem = first.removesuffix(_MP4)
     if not name.startswith(f"{stem}."):

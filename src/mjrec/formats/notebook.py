@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How recordings show themselves in a notebook: a player and a table, as HTML.
+"""HTML that shows recordings in a notebook: video players and a table.
 
-The videos are in the HTML itself, as mediapy's are: a notebook that is sent away keeps
-them. All text comes from files and is escaped.
+The videos are embedded in the HTML, as mediapy does, so a notebook keeps them when it
+is shared. All text comes from files and is escaped.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from pathlib import Path
 
 from .regular_files import read_regular
 
-# A notebook's file holds each output; beyond this, videos are only named.
+# A notebook stores every output; beyond this limit, videos are only named.
 MOST_BYTES = 20_000_000
 _MOST_PLAYERS = 6
 
@@ -30,10 +30,11 @@ def shown(
     """Return the HTML of a recording.
 
     Args:
-        title: its first line.
-        facts: what is known of it, by name; None as a value is left out.
-        videos: its videos. The first ones that fit are players, the others names.
-        columns: names of a table's columns.
+        title: the first line.
+        facts: facts about the recording, by name; None values are omitted.
+        videos: the recording's videos. The first ones that fit are embedded as players,
+            the others are only named.
+        columns: the names of a table's columns.
         rows: the table's rows.
     """
     parts = [f"<strong>{html.escape(title)}</strong>"]

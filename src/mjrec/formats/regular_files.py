@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Opening files that a stranger may have put into a directory.
+"""Opening files in an untrusted directory.
 
-What bears a monitor file's name may be a pipe, whose opening waits for ever, a device,
-which may do anything when it is opened, or a link to a file of the user who reads the
-directory. Only regular files are opened, and links are followed only inside their
-directory: what is read, packed or rendered never comes from elsewhere.
+A file with a monitor file's name may be a pipe, which blocks when it is opened, a
+device, which may do anything, or a link to a file of the user who reads the directory.
+Only regular files are opened, and links are followed only inside their directory, so
+that nothing from elsewhere is read, packed or rendered.
 """
 
 from __future__ import annotations
@@ -14,16 +14,18 @@ import stat
 from pathlib import Path
 from typing import BinaryIO
 
-# Whatever is put there between the look and the opening is not followed or waited for.
+# If the file is replaced between the check and the opening, do not follow or wait for
+# it.
 _CAREFULLY = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_NOCTTY
 
 
 def regular_path(path: Path) -> Path:
-    """Return the path of the regular file that `path` is, or is a link to.
+    """Return the path of a regular file, after following a link.
 
     Raises:
-        OSError: there is no such file.
-        ValueError: it is no regular file, or a link that leads out of its directory.
+        OSError: the file does not exist.
+        ValueError: the path is not a regular file, or is a link that leads out of its
+            directory.
     """
     if path.is_symlink():
         path = _followed(path)
@@ -36,8 +38,8 @@ def open_regular(path: Path) -> BinaryIO:
     """Open a regular file for reading bytes.
 
     Raises:
-        OSError: it cannot be opened.
-        ValueError: as `regular_path`.
+        OSError: the file cannot be opened.
+        ValueError: see `regular_path`.
     """
     descriptor = os.open(regular_path(path), _CAREFULLY)
     try:
@@ -50,21 +52,21 @@ def open_regular(path: Path) -> BinaryIO:
 
 
 def read_regular(path: Path, *, limit: int) -> bytes:
-    """Return all of a regular file of at most `limit` bytes.
+    """Return the content of a regular file of at most `limit` bytes.
 
     Raises:
-        OSError: it cannot be read.
-        ValueError: as `regular_path`, or it is larger.
+        OSError: the file cannot be read.
+        ValueError: the file is larger; or see `regular_path`.
     """
     with open_regular(path) as file:
         size = os.fstat(file.fileno()).st_size
         if size > limit:
-            raise ValueError(f"it has {size} bytes, and {limit} would be much")
+            raise ValueError(f"it has {size} bytes, more than the limit of {limit}")
         return file.read(size)
 
 
 def _followed(link: Path) -> Path:
-    # Not `Path.resolve`: what that raises for a link to itself is no OSError.
+    # Not `Path.resolve`, which does not raise an OSError for a link to itself.
     target = Path(os.path.realpath(link, strict=True))
     if not target.is_relative_to(os.path.realpath(link.parent)):
         raise ValueError(

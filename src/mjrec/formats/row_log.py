@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """An append-only log of fixed-size rows that survives SIGKILL without being flushed.
 
-Row i stands at byte `i * row_size` of the log, and before that in slot `i % capacity`
-of the tail, a small file beside it that is mapped into the writer's memory. Rows are
-filled in place there, in pages that stay hot; one aligned 64-bit counter, raised when a
-row is whole, is all that a reader needs. A full tail is written to the log before a
-slot is used again, so that every row is in one of the two at any instant.
+Row i is at byte `i * row_size` of the log, and before that in slot `i % capacity` of
+the tail, a small file next to the log that is mapped into the writer's memory. Rows are
+filled in place there, in pages that stay hot. One aligned 64-bit counter, incremented
+when a row is complete, is all that a reader needs. A full tail is written to the log
+before a slot is reused, so every row is in one of the two files at any instant.
 
-The tail file begins with a page of 64-bit words: the counter, the words in a row, and
-how many rows it has room for. When the log is closed its last rows are written and the
-tail is removed.
+The tail file begins with a page of 64-bit words: the counter, the number of words per
+row, and the number of rows that fit. Closing the log writes its last rows and removes
+the tail.
 """
 
 from __future__ import annotations
@@ -34,31 +34,33 @@ _LEAST_ROWS = 4
 TAIL_HEAD = 4096
 _TAIL = ".tail"
 
-# statfs(2) of ext4, XFS, tmpfs and overlayfs: what a mapped page holds outlives the
-# process there. Of others (networks, FUSE, copy-on-write) some lose pages, or answer a
-# full disk with SIGBUS, so each row is written as it comes.
+# The statfs(2) types of ext4, XFS, tmpfs and overlayfs, where the content of a mapped
+# page outlives the process. Some other file systems (network, FUSE, copy-on-write) lose
+# pages, or raise SIGBUS on a full disk, so each row is written as it comes.
 _MAPPABLE = frozenset((0xEF53, 0x58465342, 0x01021994, 0x794C7630))
 
 
 class RowLog:
-    """Writes a row log.
+    """A writer of a row log.
 
     Args:
-        path: of the log; neither it nor its tail is there.
-        row_words: 64-bit words in a row.
-        tail_bytes: how much of the log the tail holds, at least four rows.
+        path: the log; neither it nor its tail may exist.
+        row_words: number of 64-bit words in a row.
+        tail_bytes: size of the tail in bytes; it holds at least four rows.
 
     Attributes:
         path: as given.
-        count: rows so far.
-        slots: the tail, `(capacity, row_words) uint64`. Row `count` is filled in
-            `slots[count % capacity]` once `make_room` was called, and counted by
-            `counter[0] = log.count = count + 1`.
-        memory: the tail as its file has it: `TAIL_HEAD` bytes, then the slots.
-        counter: of the rows so far, for readers.
-        limit: `make_room` is to be called before row `limit` is filled.
+        count: number of rows so far.
+        slots: the tail, `(capacity, row_words) uint64`. After `make_room`, fill row
+            `count` in `slots[count % capacity]`, then increase `counter[0]` and `count`
+            by 1.
+        memory: the bytes of the tail file: `TAIL_HEAD` bytes, then the slots.
+        counter: the words of the tail's head; `counter[0]` is the number of rows so
+            far, for readers.
+        limit: call `make_room` before filling row `limit`.
 
     Raises:
+        FileNotWritten: the disk has no room for the tail, or the directory was removed.
         FileNotWritten: the disk has no room for the tail, or the directory is gone.
     """
 
@@ -87,11 +89,11 @@ class RowLog:
 
     @property
     def size(self) -> int:
-        """The bytes of all rows so far."""
+        """The size of all rows so far, in bytes."""
         return self.count * self.row_size
 
     def make_room(self) -> None:
-        """Write what the log lacks, so that the next slot can be filled.
+        """Write the rows that the log lacks, so that the next slot can be filled.
 
         Raises:
             FileNotWritten: the disk is full; all rows so far are kept.
@@ -100,10 +102,10 @@ class RowLog:
         self.limit = self.count + (self.capacity if self._is_mapped else 0)
 
     def settle(self) -> None:
-        """Write the counted rows where no tail keeps them.
+        """Write the counted rows if no tail file keeps them.
 
         Raises:
-            FileNotWritten: the disk is full; they stay in memory.
+            FileNotWritten: the disk is full; the rows stay in memory.
         """
         if not self._is_mapped:
             self.write()
@@ -115,7 +117,7 @@ class RowLog:
 
     @property
     def is_there(self) -> bool:
-        """Whether it is open, and was not removed."""
+        """Whether the log is open and its file was not removed."""
         return self.is_open and os.fstat(self._log).st_nlink > 0
 
     def close(self) -> None:
@@ -129,22 +131,23 @@ class RowLog:
         self.write()
         self.release()
         with contextlib.suppress(OSError):
-            # Where it stays it does no harm: it says nothing that the log does not.
+            # A leftover tail does no harm: it has nothing that the log does not have.
             tail_path(self.path).unlink()
 
     def release(self) -> None:
-        """Let go of the files as they are. Idempotent."""
+        """Close the files as they are. Idempotent."""
         if self.is_open:
             os.close(self._log)
             self._log = -1
-            # A reference to this object must not keep the mapping, which is a file.
+            # A reference to this object must not keep the mapping, and with it a file,
+            # alive.
             del self.slots, self.counter, self.memory
 
     def write(self) -> None:
         """Write the rows that the log lacks.
 
         Raises:
-            FileNotWritten: the disk is full; they stay in memory.
+            FileNotWritten: the disk is full; the rows stay in memory.
         """
         with self._naming_errors():
             while self._written < self.count:
@@ -163,7 +166,8 @@ class RowLog:
         path = tail_path(self.path)
         tail = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o666)
         try:
-            # A full disk is an error here, and not a SIGBUS when a page is touched.
+            # Turn a full disk into an error here instead of a SIGBUS when a page is
+            # touched.
             os.posix_fallocate(tail, 0, length)
             return mmap.mmap(tail, length)
         except BaseException:
@@ -181,7 +185,7 @@ class RowLog:
 
 
 def tail_path(log: Path) -> Path:
-    """Return where the tail of a log is."""
+    """Return the path of a log's tail."""
     return log.with_suffix(_TAIL)
 
 
@@ -195,20 +199,20 @@ def has_rows(log: Path) -> bool:
 
 
 class RowLogReader:
-    """Reads a row log, also while it is written and after its writer was killed.
+    """A reader of a row log, which may still be written or whose writer was killed.
 
     Args:
-        path: of the log.
-        row_size: bytes in a row.
+        path: the log.
+        row_size: number of bytes in a row.
 
     Raises:
-        OSError: there is no such log, or it cannot be read.
+        OSError: the log does not exist or cannot be read.
     """
 
     def __init__(self, path: Path, row_size: int) -> None:
         self._row_size = row_size
         with contextlib.ExitStack() as opened:
-            # The tail first: a writer that closes now has all rows in the log.
+            # Open the tail first: if the writer closes now, the log has all rows.
             self._tail = self._capacity = 0
             with contextlib.suppress(FileNotFoundError):
                 tail = opened.enter_context(open_regular(tail_path(path)))
@@ -218,38 +222,38 @@ class RowLogReader:
 
     @property
     def count(self) -> int:
-        """Rows so far."""
+        """Number of rows so far."""
         counted, in_log = self._counted(), self._in_log()
-        # More than the tail has room for were never counted before they were written.
+        # A counter beyond the tail's capacity is wrong: a full tail is written first.
         return max(in_log, min(counted, in_log + self._capacity))
 
     def read(self, start: int, stop: int) -> NDArray[np.uint8]:
-        """Return `(stop - start, row_size) uint8`, rows of `count`.
+        """Return rows `start` to `stop`, `(stop - start, row_size) uint8`.
 
         Raises:
-            ValueError: they are not all there: the log was cut short.
+            ValueError: some of the rows are missing: the log was truncated.
         """
         rows = np.empty((stop - start, self._row_size), np.uint8)
         done = self._read_log(start, rows)
         while done < len(rows):
             first = start + done
             found = self._read_tail(first, rows[done:])
-            # Slots that were used again meanwhile: their rows are in the log now.
+            # Slots that were reused in the meantime: their rows are in the log now.
             lost = max(0, self._counted() + 1 - self._capacity - first)
             if lost and self._in_log() > first:
                 done += self._read_log(first, rows[done:])
             elif found:
                 done += found
             else:
-                raise ValueError("its last rows are not there")
+                raise ValueError("its last rows are missing")
         return rows
 
     def close(self) -> None:
-        """Close the files; idempotent."""
+        """Close the files. Idempotent."""
         self._opened.close()
 
     def _room_in(self, tail: int) -> int:
-        """Return how many rows a tail holds; 0 where it is none of this log."""
+        """Return how many rows a tail can hold; 0 if it does not belong to this log."""
         page = os.pread(tail, 24, 0)
         words, capacity = (
             struct.unpack_from("=QQ", page, 8) if len(page) == 24 else (0, 0)
@@ -270,7 +274,7 @@ class RowLogReader:
         return os.fstat(self._log).st_size // self._row_size
 
     def _read_log(self, start: int, out: NDArray[np.uint8]) -> int:
-        """Fill rows from the log, and return how many are there whole."""
+        """Fill rows from the log, and return the number of complete rows read."""
         left = out.reshape(-1).data
         offset = start * self._row_size
         while left and (count := os.preadv(self._log, [left], offset)):
@@ -278,7 +282,7 @@ class RowLogReader:
         return (offset - start * self._row_size) // self._row_size
 
     def _read_tail(self, start: int, out: NDArray[np.uint8]) -> int:
-        """Fill rows from the tail up to its end, and return how many they are."""
+        """Fill rows from the tail up to its end, and return the number of rows read."""
         if not self._capacity:
             return 0
         slot = start % self._capacity
@@ -290,7 +294,7 @@ class RowLogReader:
 
 
 def _may_be_mapped(descriptor: int) -> bool:
-    # `os.statvfs` has no type; the first member of the C struct is it.
+    # `os.statvfs` does not have the type; it is the first member of the C struct.
     found = (ctypes.c_long * 64)()
     failed = ctypes.CDLL(None).fstatfs(descriptor, found)
     return not failed and found[0] in _MAPPABLE

@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Videos under a second name, such as `rl-video-episode-27.mp4`.
+"""Second names of videos, such as `rl-video-episode-27.mp4`.
 
-The metadata of an episode's first video says which name that is (`also_named`). It is
-a link in the same directory, given last of all, so that no video is under it that is
-not whole. The further videos of the episode, and the metadata of each, are called
-alike.
+The second name is in the metadata of an episode's first video (`also_named`). It is a
+link in the same directory, created last, so that it never refers to an incomplete
+video. The episode's further videos, and the metadata of each video, get second names
+too.
 
-A different file under such a name belongs to another program, and
-is neither replaced nor removed.
+A different file with such a name belongs to another program, and is neither replaced
+nor removed.
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ logger = logging.getLogger(__name__)
 
 
 def give_all_second_names(directory: Path) -> None:
-    """Give the videos of a directory their second names, where these are missing.
+    """Create any missing second names of the videos in a directory.
 
-    Where that cannot be done, the log has a warning.
+    Failures are logged as warnings.
     """
     for path in iter_monitor_files(directory):
         if path.name.endswith(".mp4") and metadata_path(path).exists():
@@ -42,30 +42,31 @@ def give_all_second_names(directory: Path) -> None:
 
 
 def give_second_names(video: Path) -> None:
-    """Give a finished video, and what belongs to it, its second name, if it has one.
+    """Create the second names of a finished video and its related files, if it has any.
 
-    Where another file is in the way, or there can be no link, the log has a warning.
+    If another file has that name, or links cannot be created, a warning is logged.
 
     Args:
-        video: the first video of an episode. Others have none of their own.
+        video: the first video of an episode. Further videos have no second name of
+            their own.
     """
     for file, link in _second_names(video):
         try:
             _link(file, link)
         except OSError as error:
-            logger.warning("%s could not be called %s: %s.", file.name, link, error)
+            logger.warning("%s could not be linked as %s: %s.", file.name, link, error)
 
 
 def take_second_names(video: Path) -> None:
-    """Remove the second names of a video and of what belongs to it.
+    """Remove the second names of a video and its related files.
 
-    To be called before any of these files is replaced or removed.
+    Call this before replacing or removing any of these files.
 
     Args:
         video: the first video of an episode.
 
     Raises:
-        OSError: one cannot be removed.
+        OSError: a link cannot be removed.
     """
     for file, link in _second_names(video):
         if _is_same(file, link):
@@ -73,7 +74,7 @@ def take_second_names(video: Path) -> None:
 
 
 def is_called_like_second(name: str) -> bool:
-    """Return whether `name` could be a second name, also of a further camera."""
+    """Return whether `name` could be a second name, including a further camera's."""
     for ending in (".mp4", ".meta.json"):
         if name.endswith(ending):
             video = f"{name.removesuffix(ending)}.mp4"
@@ -82,20 +83,20 @@ def is_called_like_second(name: str) -> bool:
 
 
 def _second_names(video: Path) -> Iterator[tuple[Path, Path]]:
-    """Yield the files of an episode that have a second name, each with that."""
+    """Yield each file of an episode that has a second name, with that name's path."""
     second = _said_of(video)
     if second is None:
         return
     for name in itertools.chain.from_iterable(finished_videos(video)):
         link = second_name_of(name, second, first=video.name)
         file = video.with_name(name)
-        # What is a link itself may lead anywhere.
+        # A file that is itself a link may lead anywhere.
         if link is not None and file.is_file() and not file.is_symlink():
             yield file, video.with_name(link)
 
 
 def _said_of(video: Path) -> str | None:
-    """Return the second name in a video's metadata, which may be anybody's."""
+    """Return the second name in a video's metadata, which is untrusted."""
     if video.suffix != ".mp4" or episode_of(video.name) is None:
         return None
     name = metadata_of(video).get("also_named")
@@ -106,14 +107,14 @@ def _link(file: Path, link: Path) -> None:
     if os.path.lexists(link):
         if not _is_same(file, link):
             logger.warning(
-                "%s is there already and is another file than %s, which was to have "
-                "that name too. It is left alone; give each monitor of a directory a "
-                "name_prefix of its own.",
+                "%s already exists and is a different file than %s, which was meant to "
+                "have that name too. It is left alone; give each monitor of a "
+                "directory a name_prefix of its own.",
                 link,
                 file.name,
             )
         return
-    # Another process may be quicker.
+    # Another process may have created it first.
     with contextlib.suppress(FileExistsError):
         try:
             link.hardlink_to(file)

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Writing recordings into a monitor's row logs, one behind the other.
+"""Writing recordings into a monitor's row logs, one after another.
 
-A log goes on from recording to recording for as long as their rows look alike and it is
-not long. Each line of the journal and each row is with the operating system when the
-call that wrote it returns, so that a killed process loses nothing and nothing needs to
-be flushed.
+A log is used for further recordings while their rows have the same layout and the log
+is not too long. The operating system has each line of the journal and each row when the
+call that wrote it returns, so a killed process loses nothing and nothing needs to be
+flushed.
 """
 
 from __future__ import annotations
@@ -37,27 +37,27 @@ from .trajectory import (
 )
 from .trajectory_log import pack_change
 
-# A new log begins with the next recording then.
+# Above this size, the next recording begins a new log.
 _LONG = 64 << 20
-# Finding one of them means reading them all.
+# To find one recording, all recordings of its log are read, so limit their number.
 _MANY = 256
 
-# The tail of a log of one recording is that much shorter: making it takes longer than
-# all else at the start of an episode.
+# The tail of a log with a single recording is smaller by this factor: creating it takes
+# longer than everything else at the start of an episode.
 _TAILS_OF_ONE = 8
 
 ROW_HEAD = struct.Struct("=qqdQ")
 
 
 class SpanLogs:
-    """The logs of one monitor; one is written at a time.
+    """The row logs of one monitor, of which one is written at a time.
 
     Args:
         directory: the monitor directory.
-        infix: the monitor's.
-        journal: says which rows are which recording.
-        numbers: gives each log its number; of one monitor all share it.
-        tail_bytes: of each log.
+        infix: the monitor's infix.
+        journal: records which rows belong to which recording.
+        numbers: yields the number of each log; shared by all logs of a monitor.
+        tail_bytes: size of each log's tail in bytes.
     """
 
     def __init__(
@@ -78,7 +78,7 @@ class SpanLogs:
         self._said: _Rows | None = None
 
     def path_of(self, name: str) -> Path:
-        """Return the file that an episode's recording of this name becomes."""
+        """Return the file that an episode's recording with this name becomes."""
         return self.directory / f"{name}{FINISHED}"
 
     def begin(
@@ -92,13 +92,14 @@ class SpanLogs:
         """Begin a recording.
 
         Args:
-            name: of its file, without suffix.
-            facts: what is known of it.
-            dtype: of its rows, from `row_dtype`.
-            alone: it gets a log of its own, to be removed with it.
+            name: the recording's file name, without suffix.
+            facts: the facts known so far.
+            dtype: the dtype of its rows, from `row_dtype`.
+            alone: whether the recording gets a log of its own, which is removed with
+                it.
 
         Raises:
-            FileNotWritten: the disk is full, or the directory is gone.
+            FileNotWritten: the disk is full, or the directory was removed.
         """
         if self._log is not None and (alone or not self._log.suits(dtype)):
             self.close()
@@ -109,7 +110,8 @@ class SpanLogs:
             self._log = OpenLog(path, number, dtype, self._journal, tail_bytes=tail)
         log = self._log
         try:
-            # The log is there before the journal has it: what has none is gone.
+            # Create the log before the journal names it: a recording without a log
+            # counts as gone.
             said = self._say_rows(log.number, dtype, facts)
             line = _begin(log, name, facts, said)
             self._journal.note("begin", line, later=False)
@@ -122,7 +124,7 @@ class SpanLogs:
         return SpanWriter(log, name, facts)
 
     def close(self) -> None:
-        """Write what the log lacks, and close it. Idempotent.
+        """Write the rows that the log lacks, and close it. Idempotent.
 
         Raises:
             FileNotWritten: the disk is full; the next call tries again.
@@ -132,7 +134,7 @@ class SpanLogs:
             self._log = None
 
     def release(self) -> None:
-        """Let go of the log as it is: in a forked process it is its parent's."""
+        """Close the log's files as they are: a forked child does not own them."""
         if self._log is not None:
             self._log.release()
             self._log = None
@@ -140,7 +142,7 @@ class SpanLogs:
     def _say_rows(
         self, number: int, dtype: np.dtype[Any], facts: Mapping[str, Any]
     ) -> _Rows:
-        """Say what rows are, unless the journal has it."""
+        """Record the layout of rows, unless the journal already has it."""
         said, lost = self._said, self._journal.lost
         if said is not None and said.lost == lost and said.dtype == dtype:
             return said
@@ -151,7 +153,7 @@ class SpanLogs:
 
 
 class _Rows(NamedTuple):
-    """What the journal says of rows, and how many journals were lost before."""
+    """The rows event in the journal, and the number of journals lost before it."""
 
     number: int
     lost: int
@@ -162,7 +164,7 @@ class _Rows(NamedTuple):
 def _begin(
     log: OpenLog, name: str, facts: Mapping[str, Any], rows: _Rows
 ) -> dict[str, Any]:
-    """Return what the journal says of a beginning: what it has not said of the rows."""
+    """Return the facts of a begin event, without those that the rows event has."""
     known = rows.facts
     own = {
         key: value
@@ -177,19 +179,19 @@ def _begin(
 
 
 class OpenLog:
-    """A row log that is written.
+    """A row log that is being written.
 
     Attributes:
-        path: of the log.
-        number: its number.
-        journal: says what is in it.
-        rows: the log itself.
-        columns: what the slots of its tail hold: `state` as float64, `snapshot` in
-            words, `action` and `observation`; what rows do not have is not there.
-        bodies: for each slot all words behind its head.
-        is_alone: it is one recording's only, and ends with it.
-        look_size: the bytes of all changes of the model so far.
-        recordings: all that were begun.
+        path: the log.
+        number: the log's number.
+        journal: records the content of the log.
+        rows: the underlying `RowLog`.
+        columns: views of the tail's slots by part: `state` as float64, `snapshot` as
+            words, `action` and `observation`. Parts that rows do not have are missing.
+        bodies: for each slot, all words after its head.
+        is_alone: whether the log holds a single recording and ends with it.
+        look_size: size in bytes of all changes of the model so far.
+        recordings: all recordings that were begun.
     """
 
     def __init__(
@@ -204,7 +206,8 @@ class OpenLog:
         self.path, self.number, self.journal = path, number, journal
         self.is_alone = False
         self.look_size = 0
-        # Few: to read them all in the journal would take time and memory.
+        # There are few, so they are kept here: reading them from the journal would take
+        # time and memory.
         self.recordings: list[Recording] = []
         self._dtype = dtype
         self._looks: int | None = None
@@ -218,17 +221,17 @@ class OpenLog:
             self.columns[name] = whole.get(name, slots.view(dtype)[:, 0][name])
 
     def suits(self, dtype: np.dtype[Any]) -> bool:
-        """Return whether a recording with such rows can go on in this log."""
+        """Return whether a recording with this row layout can continue in this log."""
         size = self.rows.size + self.look_size
         is_short = size < _LONG and len(self.recordings) < _MANY
         is_free = self.rows.is_there and not self.is_alone
         return is_short and is_free and self._dtype == dtype
 
     def add_change(self, change: ModelChange) -> None:
-        """Add a change of the model that holds from the next row on.
+        """Add a change of the model that takes effect at the next row.
 
         Raises:
-            InvalidArgument: it cannot be written down.
+            InvalidArgument: the change cannot be recorded.
             FileNotWritten: the disk is full; nothing was added.
         """
         record = pack_change(self.rows.count, change)
@@ -256,23 +259,23 @@ class OpenLog:
             self.journal.note("full", self.number, later=False)
         except FileNotWritten:
             if not self.path.exists():
-                # The directory was removed; there is nothing to try again.
+                # The directory was removed, so there is nothing to retry.
                 self.release()
             raise
         self.rows.close()
         self.release()
         if not any(recording.is_in_flight for recording in self.recordings):
-            # Else the finisher does it.
+            # Otherwise the finisher removes them.
             self.remove()
 
     def remove(self) -> None:
-        """Let go of the files, and remove them."""
+        """Close the files and remove them."""
         self.release()
         with contextlib.suppress(DirectoryNotWritable):
             remove_log(self.path)
 
     def release(self) -> None:
-        """Let go of the files as they are. Idempotent."""
+        """Close the files as they are. Idempotent."""
         self.rows.release()
         self.bodies, self.columns = [], {}
         if self._looks is not None:
@@ -281,18 +284,18 @@ class OpenLog:
 
 
 class SpanWriter:
-    """Writes one recording.
+    """A writer of one recording.
 
     Args:
-        log: where its rows go.
-        name: of its file, without suffix.
-        facts: what is known of it.
+        log: the log for its rows.
+        name: the recording's file name, without suffix.
+        facts: the facts known so far.
 
     Attributes:
         log: as given.
-        steps: the number of the last step; 0 before.
-        frame_count: how many frames there are.
-        last_frame: the step of the last one; -1 before.
+        steps: the number of the last step; 0 before the first.
+        frame_count: number of frames so far.
+        last_frame: the step of the last frame; -1 before the first.
     """
 
     def __init__(self, log: OpenLog, name: str, facts: Mapping[str, Any]) -> None:
@@ -306,7 +309,7 @@ class SpanWriter:
         self.last_frame = -1
 
     def make_room(self) -> int:
-        """Return the slot that the next row is to be filled in.
+        """Return the slot for the next row.
 
         Raises:
             FileNotWritten: the disk is full; all rows so far are kept.
@@ -330,23 +333,23 @@ class SpanWriter:
 
         Args:
             step: 0 for the reset, which has no reward and no action, then 1, 2, 3 ...
-            reward: of the step.
-            is_step: the row has the step's state, action and observation.
-            is_frame: the row has the snapshot of this moment.
+            reward: the step's reward.
+            is_step: whether the row has the step's state, action and observation.
+            is_frame: whether the row has a snapshot for a frame.
             terminated: the task ended the episode.
-            truncated: a limit from outside the task ended it.
+            truncated: a limit outside the task ended it.
 
         Raises:
-            FileNotWritten: the disk is full, where rows are written one by one; the
-                row stays, and all that follows tries again.
+            FileNotWritten: the disk is full, and rows are written one by one. The row
+                is kept, and later calls retry.
         """
         rows = self.log.rows
         flags = (STEP if is_step else 0) | (FRAME if is_frame else 0)
         flags |= (TERMINATED if terminated else 0) | (TRUNCATED if truncated else 0)
         head = rows.slots[rows.count % rows.capacity, :HEAD_WORDS]
         ROW_HEAD.pack_into(head.data.cast("B"), 0, rows.count, step, reward, flags)
-        # No call in here: a signal's handler that raises does so after one, and what is
-        # counted has to be what is there.
+        # No calls between these statements: a signal handler that raises runs after a
+        # call, and the count must match the rows.
         rows.counter[0] = rows.count = rows.count + 1
         if is_step:
             self.steps = step
@@ -356,18 +359,19 @@ class SpanWriter:
         rows.settle()
 
     def note(self, facts: Mapping[str, Any]) -> None:
-        """Add to the facts, also after the end; of a key, the newest counts.
+        """Add facts, even after the end; newer facts replace older ones.
 
         Raises:
-            FileNotWritten: the disk is full; it is said before the next line.
+            FileNotWritten: the disk is full; the facts are written before the next
+                line.
         """
         self.log.journal.note("note", {"name": self._name, "facts": dict(facts)})
 
     def end(self, facts: Mapping[str, Any]) -> None:
-        """Say how it ended. A log that is its own is closed.
+        """Record how the recording ended. A log of its own is closed.
 
         Raises:
-            FileNotWritten: the disk is full; it is said before the next line.
+            FileNotWritten: the disk is full; the end is written before the next line.
         """
         said = {
             "name": self._name,
@@ -379,13 +383,13 @@ class SpanWriter:
             self.log.close()
 
     def drop(self) -> None:
-        """Give up its rows. A log that is its own is removed.
+        """Give up the recording's rows. A log of its own is removed.
 
         Raises:
-            FileNotWritten: the disk is full; it is said before the next line.
+            FileNotWritten: the disk is full; the event is written before the next line.
         """
         if self.log.is_alone:
-            # First of all: the disk may be full.
+            # Remove it first: the disk may be full.
             self.log.remove()
         self._recording.is_dropped = True
         self.log.journal.note("drop", self._name)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which rows of a monitor's logs are which recording, as its journal tells it.
+"""The mapping from rows of a monitor's logs to recordings, read from its journal.
 
-A recording in flight is a span of rows: an episode, or a clip's part that is of one
-episode. The journal has a line each time something happens::
+A recording in flight is a span of rows: an episode, or the part of a clip in one
+episode. The journal has a line for each event::
 
     {"rows": {"number": 0, "version": 1, "dtype": [["row", "<i8"], ...], "facts": {}}}
     {"begin": {"name": "openaigym.trajectory.0.7.episode000027", "log": 3, "rows": 0,
@@ -13,13 +13,14 @@ episode. The journal has a line each time something happens::
     {"drop": "openaigym.trajectory.0.7.episode000027"}
     {"full": 3}
 
-`rows` says what rows are, and the facts of every recording with such rows, as far as
-`begin` does not say otherwise. A span without an end goes on to the last row. Log 3 is
-`openaigym.states.<infix>.000003.log`, and the `.looks` beside it has the changes of the
-model. These are removed when all that is in them was dropped, or is there in its final
-form: an episode as a trajectory, what has a video only as that.
+`rows` gives the layout of rows, and the facts that all recordings with this layout
+share unless `begin` overrides them or lists them in `without`. A span without an end
+extends to the last row. Log 3 is `openaigym.states.<infix>.000003.log`; the `.looks`
+file next to it has the changes of the model. These files are removed when every
+recording in them was dropped or exists in its final form: an episode as a trajectory,
+or only as a video if its trajectory is not kept.
 
-A recording is called by the path of the file that it will become.
+A recording is identified by the path of the file that it will become.
 """
 
 from __future__ import annotations
@@ -60,24 +61,24 @@ from .video_metadata import is_done
 LOG, LOOKS = ".log", ".looks"
 
 _LONGEST_LINE = 1 << 24
-# So much of what was read last must still be there for the next reading to go on.
+# The last bytes read; they must be unchanged for the next reading to continue there.
 _SEAM = 128
 
 
 @dataclass
 class Recording:
-    """A recording whose rows are in a log, as far as the journal was read.
+    """A recording whose rows are in a log, according to the journal so far.
 
     Attributes:
-        name: of its file without suffix.
+        name: the recording's file name without suffix.
         log: its row log.
-        rows: what the journal says of its rows.
-        facts: all that is known of it.
-        row: its first.
-        look: where to look for its changes of the model.
-        stop: the row behind its last; None where it has not ended.
-        following: the first row of the next recording; None where it is the last.
-        is_dropped: its rows were given up.
+        rows: the journal's `rows` event for its rows.
+        facts: all known facts.
+        row: its first row.
+        look: offset of its changes of the model in the `.looks` file.
+        stop: one past its last row; None if it has not ended.
+        following: the first row of the next recording; None if it is the last one.
+        is_dropped: whether its rows were given up.
     """
 
     name: str
@@ -92,28 +93,29 @@ class Recording:
 
     @property
     def path(self) -> Path:
-        """What it is called: the file that an episode becomes."""
+        """The path that identifies it: for an episode, the file that it becomes."""
         is_episode = episode_of(f"{self.name}{FINISHED}") is not None
         return self.log.with_name(f"{self.name}{FINISHED * is_episode}")
 
     @functools.cached_property
     def dtype(self) -> np.dtype[Any]:
-        """Of its rows.
+        """The dtype of its rows.
 
         Raises:
-            UnreadableFile: the journal does not say it, or is of a newer version.
+            UnreadableFile: the journal does not give it, or has a newer version.
         """
         with unreadable(_journal_of(self.log)):
             if not self.rows:
-                raise ValueError("it does not say what the rows of its logs are")
+                raise ValueError("it does not give the layout of the rows in its logs")
             check_version(integer(self.rows.get("version")))
             return dtype_from_json(self.rows.get("dtype"))
 
     @property
     def is_gone(self) -> bool:
-        """Whether its rows are of no use: dropped, or its video was all they were for.
+        """Whether its rows are no longer needed.
 
-        Where its trajectory is kept, they are of use until that is there.
+        True if it was dropped, or if its trajectory is not kept and its video is
+        finished or given up.
         """
         if self.is_dropped or self.facts.get("kept") is not False:
             return self.is_dropped
@@ -125,7 +127,7 @@ class Recording:
 
     @property
     def is_in_flight(self) -> bool:
-        """Whether only the log has it."""
+        """Whether it exists only in the log."""
         path = self.path
         return not (path.suffix == FINISHED and is_finished(path)) and not self.is_gone
 
@@ -138,12 +140,12 @@ class Recording:
 
 @dataclass
 class _Spans:
-    """What a journal says of rows, as far as it was read.
+    """The events about rows in a journal, as far as it was read.
 
     Attributes:
         journal: the file.
-        logs: the recordings of each log that is there, in the order of their rows.
-        recordings: all of these by their names, the newest of each.
+        logs: the recordings of each existing log, in the order of their rows.
+        recordings: the newest of these recordings of each name.
         full: the logs that get no more rows.
     """
 
@@ -167,16 +169,16 @@ class _Spans:
         return is_same or (is_longer and file.read(len(self._seam)) == self._seam)
 
     def read_on(self, file: BinaryIO) -> None:
-        """Take in what a file has behind what was read."""
+        """Read the rest of a file, from the end of the last reading."""
         self._status = os.fstat(file.fileno())
         file.seek(self._offset)
         began = self._offset
-        # Without its end a line is being written, or its writer was killed.
+        # A line without an end is still being written, or its writer was killed.
         while (line := file.readline(_LONGEST_LINE)).endswith(b"\n"):
             self._offset += len(line)
             self._seam = line[-_SEAM:]
             if is_of_spans(line):
-                # Nothing follows from a line that makes no sense.
+                # An invalid line is ignored.
                 with contextlib.suppress(ValueError, LookupError, TypeError):
                     self._take(json_object(line))
         if self._offset > began:
@@ -208,7 +210,7 @@ class _Spans:
     def _begin(self, said: Mapping[str, Any]) -> None:
         name, log = base_name(said["name"]), self._log(said["log"])
         if infix_of_recording(name) != infix_of(self.journal.name):
-            raise ValueError(f"{name!r:.100} is no recording of its monitor")
+            raise ValueError(f"{name!r:.100} is not a recording of its monitor")
         rows, without = self._rows.get(said["rows"], {}), said.get("without", ())
         common = mapping(rows.get("facts", {})).items()
         facts = {k: v for k, v in common if k not in without}
@@ -220,7 +222,7 @@ class _Spans:
             others[-1].following = recording.row
         others.append(recording)
         if name in self.recordings:
-            # It is begun anew.
+            # It is begun again.
             self.recordings[name].is_dropped = True
         self.recordings[name] = recording
 
@@ -230,25 +232,25 @@ class _Spans:
 
 
 class _Known(threading.local):
-    """What this thread has read: a lock could be held when the process is forked."""
+    """This thread's cache. A shared one would need a lock, which a fork could hold."""
 
     def __init__(self) -> None:
         self.spans: dict[Path, _Spans] = {}
 
 
-# A journal only grows, and each recording is looked for by itself.
+# A journal only grows, and recordings are looked up one at a time.
 _known = _Known()
 _MOST_KNOWN = 64
 
 
 def _read(journal: Path) -> _Spans:
-    """Return what a journal says of rows now; nothing where there is none.
+    """Return the current events about rows in a journal; empty if it does not exist.
 
     Raises:
-        UnreadableFile: it cannot be read.
+        UnreadableFile: the journal cannot be read.
     """
     known = _known.spans
-    # What is interrupted is read anew.
+    # Removed from the cache first: an interrupted reading starts anew.
     spans = known.pop(journal, None) or _Spans(journal)
     with unreadable(journal):
         try:
@@ -266,12 +268,12 @@ def _read(journal: Path) -> _Spans:
 
 
 def _journal_of(path: Path) -> Path:
-    """Return the journal of the monitor that a file is of."""
+    """Return the journal of the monitor that a file belongs to."""
     return path.with_name(journal_name(infix_of(path.name) or ""))
 
 
 def infix_of_recording(name: str) -> str | None:
-    """Return the infix in a recording's name; None where it is none."""
+    """Return the infix in a recording's name; None if the name is not a recording's."""
     if ClipPart.parse(name) is not None:
         return infix_of(name)
     path = f"{name}{FINISHED}"
@@ -279,9 +281,9 @@ def infix_of_recording(name: str) -> str | None:
 
 
 def log_paths(directory: Path, infix: Infix | str | None = None) -> Iterator[Path]:
-    """Return the paths of the logs of a directory, or of one monitor in it.
+    """Yield the paths of the logs of a directory, or of one monitor in it.
 
-    A log counts as long as a file beside it is left.
+    A log is included if any of its files is left.
     """
     logs = {
         directory / log_name(own, number)
@@ -297,20 +299,21 @@ def recordings_in(log: Path) -> list[Recording]:
     """Return the recordings of a log, in the order of their rows.
 
     Raises:
-        UnreadableFile: the journal cannot be read, or does not say what its rows are.
+        UnreadableFile: the journal cannot be read, or does not give the layout of the
+            log's rows.
     """
     found = _read(_journal_of(log)).logs.get(log, [])
     with unreadable(log):
         if not found and log.exists() and has_rows(log):
-            raise ValueError("no journal says what its rows are")
+            raise ValueError("no journal gives the layout of its rows")
     for recording in found:
-        # What is damaged has no dtype.
+        # Raises if the layout is damaged.
         _ = recording.dtype
     return [*found]
 
 
 def find_recording(path: Path) -> Recording | None:
-    """Return a recording whose rows are of use, by the path of its file.
+    """Return a recording whose rows are still needed, by the path of its file.
 
     Raises:
         UnreadableFile: the journal of its monitor cannot be read.
@@ -328,7 +331,7 @@ def find_recording(path: Path) -> Recording | None:
 def find_trajectory(
     directory: Path, infix: Infix | str, episode_id: int
 ) -> Path | None:
-    """Return the path of an episode's own file; None where none is recorded."""
+    """Return the path of an episode's own file, or None if it was not recorded."""
     known = infix if isinstance(infix, Infix) else Infix.parse(infix)
     if known is None:
         return None
@@ -337,7 +340,7 @@ def find_trajectory(
 
 
 def is_recorded(path: Path) -> bool:
-    """Return whether a trajectory is there in any form, by the path of its own file.
+    """Return whether a trajectory exists in any form, given the path of its own file.
 
     Raises:
         UnreadableFile: the journal of its monitor cannot be read.
@@ -346,10 +349,10 @@ def is_recorded(path: Path) -> bool:
 
 
 def is_in_flight(path: Path) -> bool:
-    """Return whether a recording is in a log only, by the path of its file.
+    """Return whether a recording exists only in a log, given the path of its file.
 
     Raises:
-        UnreadableFile: as `find_recording`.
+        UnreadableFile: the journal of its monitor cannot be read.
     """
     if path.suffix == FINISHED and is_finished(path):
         return False
@@ -359,9 +362,9 @@ def is_in_flight(path: Path) -> bool:
 def recordings_in_flight(
     directory: Path, infix: Infix | str | None = None
 ) -> list[Recording]:
-    """Return the recordings that only logs have, of all monitors or one.
+    """Return the recordings that exist only in logs, of all monitors or one.
 
-    Where that cannot be read they are left out: `recordings_in` says why.
+    Unreadable ones are omitted: `recordings_in` reports the reason.
     """
     found: list[Recording] = []
     for log in log_paths(directory, infix):
@@ -374,9 +377,9 @@ def remove_if_done(log: Path) -> None:
     """Remove a log once it gets no more rows and nothing in it is in flight.
 
     Raises:
-        DirectoryNotWritable: it cannot be removed.
+        DirectoryNotWritable: the log cannot be removed.
     """
-    # Asked first: a monitor that is closed begins nothing any more.
+    # Checked first: a monitor that is closed begins no more recordings.
     is_open = _is_open(log)
     try:
         recordings = recordings_in(log)
@@ -394,10 +397,10 @@ def files_beside(log: Path) -> tuple[Path, ...]:
 
 
 def remove_log(log: Path) -> None:
-    """Remove a log, and the files beside it.
+    """Remove a log and its companion files.
 
     Raises:
-        DirectoryNotWritable: they cannot be removed.
+        DirectoryNotWritable: the files cannot be removed.
     """
     try:
         for each in files_beside(log):
@@ -418,5 +421,5 @@ def _is_open(log: Path) -> bool:
 def _count(value: Any) -> int:
     number = integer(value)
     if number < 0:
-        raise ValueError(f"{number} is no number of things")
+        raise ValueError(f"{number} is not a valid count")
     return number

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a trajectory holds, whichever of its two forms it has.
+"""The content of a trajectory, independent of its form.
 
 A recorded episode is first a span of the monitor's row log (`trajectory_log`), then an
-HDF5 file (`trajectory_hdf5`). Both hold facts, rows and changes of the model. One NumPy
-structured dtype says what a row is. `docs/reference/trajectories.md` has the file.
+HDF5 file (`trajectory_hdf5`). Both hold facts, rows and changes of the model. A NumPy
+structured dtype describes a row. `docs/reference/trajectories.md` has the file.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ from ..errors import ClosedError, InvalidArgument
 
 FORMAT_VERSION = 1
 
-# In the flags of a row.
+# The bits of a row's flags.
 TERMINATED, TRUNCATED, STEP, FRAME = 1, 2, 4, 8
-# Words before the state: the row's number, the step, the reward, the flags.
+# Words before the state: the row's number, the step, the reward and the flags.
 HEAD_WORDS = 4
 _HEAD = (("row", "<i8"), ("step", "<i8"), ("reward", "<f8"), ("flags", "<u8"))
 PARTS = ("state", "snapshot", "action", "observation")
 
-# They become names inside the HDF5 file, where a slash would be a path.
+# Names of arrays inside the HDF5 file, where a slash would be a path separator.
 _NAME = re.compile(r"(?!\.{1,2}$)[^/\x00-\x1f\x7f\ud800-\udfff]{1,200}")
 
 
@@ -38,7 +38,7 @@ def packed(members: Iterable[tuple[str, Any]]) -> np.dtype[Any]:
     """Return a structured dtype whose members begin at multiples of 8 bytes.
 
     Args:
-        members: names, and dtypes as NumPy takes them.
+        members: names and dtypes, in any form that NumPy accepts.
     """
     names, formats, offsets, size = [], [], [], 0
     for name, kind in members:
@@ -58,66 +58,70 @@ def row_dtype(
     action: np.dtype[Any] | None = None,
     observation: np.dtype[Any] | None = None,
 ) -> np.dtype[Any]:
-    """Return what a row consists of; of what is None or empty it has no member.
+    """Return the dtype of a row; parts that are None or empty are left out.
 
     Args:
         state: float64 members, MuJoCo's state components by name.
-        snapshot: the arrays that frames are drawn from, by MuJoCo's names.
+        snapshot: the arrays needed to render a frame, by MuJoCo's names.
         action: dtype and shape of an action.
-        observation: of an observation.
+        observation: dtype and shape of an observation.
 
     Raises:
-        ValueError: no file could hold such rows.
+        ValueError: the parts cannot be stored in a file.
     """
     parts = zip(PARTS, (state, snapshot, action, observation), strict=True)
     members = [(name, kind) for name, kind in parts if kind is not None and kind != []]
     for name, kind in members:
         if (kind.names is None) != (name in ("action", "observation")):
-            raise ValueError(f"the {name} of a row is {kind!s:.80}")
+            raise ValueError(f"the {name} of a row has the wrong type {kind!s:.80}")
         check_dtype(kind.base)
     kinds = [] if state is None else [(n, state[n].shape) for n in state.names or ()]
     if kinds and state != packed((name, ("<f8", shape)) for name, shape in kinds):
-        raise ValueError("a state is not all float64")
+        raise ValueError("the state is not all float64")
     return packed((*_HEAD, *members))
 
 
 def dtype_from_json(value: Any) -> np.dtype[Any]:
-    """Return a row's dtype, given in NumPy's own words, `numpy.dtype.descr`.
+    """Return a row's dtype from its JSON form, `numpy.dtype.descr`.
 
     Raises:
-        ValueError: it is no row of a recording.
+        ValueError: the value is not the dtype of a recording's rows.
     """
     return _dtype_from_text(json.dumps(value))
 
 
-# The same for all recordings of a log, and it takes Python long.
+# All recordings of a log have the same dtype, and parsing it is slow in Python.
 @functools.lru_cache(maxsize=16)
 def _dtype_from_text(text: str) -> np.dtype[Any]:
     try:
         dtype = np.lib.format.descr_to_dtype(json.loads(text))
         names = dtype.names or ()
         own = row_dtype(**{name: dtype[name] for name in PARTS if name in names})
-    # NumPy raises many things at what is no dtype.
+    # NumPy raises many kinds of errors for an invalid dtype.
     except Exception as error:
-        raise ValueError(f"what its rows are cannot be read: {error}") from error
+        raise ValueError(f"its rows' layout cannot be read: {error}") from error
     if dtype != own:
-        raise ValueError("the parts of its rows do not lie one behind the other")
+        raise ValueError("its rows have unknown parts or gaps")
     return own
 
 
 def check_dtype(dtype: np.dtype[Any]) -> None:
-    """Raise `ValueError` unless all is plain little-endian numbers, and well named."""
+    """Check that a dtype has only plain little-endian numbers and valid names.
+
+    Raises:
+        ValueError: the dtype is invalid.
+    """
     for name in dtype.names or ():
         if not _NAME.fullmatch(name):
-            raise ValueError(f"{name[:200]!r} cannot name an array")
+            raise ValueError(f"{name[:200]!r} is not a valid array name")
         check_dtype(dtype[name].base)
     is_plain = dtype.kind in "biuf" and dtype.itemsize <= 8 and dtype.str[0] in "<|"
     if dtype.names is None and not is_plain:
-        raise ValueError(f"{dtype.str!r:.80} is no dtype of a trajectory")
+        raise ValueError(f"{dtype.str!r:.80} is not a valid dtype for a trajectory")
 
 
 def columns_of(state: np.dtype[Any]) -> dict[str, slice]:
-    """Return where the components of a state are among its numbers."""
+    """Return the slice of each state component in the state vector."""
     return {
         name: slice(offset // 8, (offset + kind.itemsize) // 8)
         for name, (kind, offset, *_) in (state.fields or {}).items()
@@ -126,14 +130,14 @@ def columns_of(state: np.dtype[Any]) -> dict[str, slice]:
 
 @dataclass(frozen=True, kw_only=True)
 class ModelChange:
-    """Model fields that are other than before, from some step on.
+    """Model fields that changed, effective from a step on.
 
     Attributes:
-        step: the first step that they hold for; 0 is what differs from the stored
-            model since the reset.
-        fields: their new values: arrays of `MjModel` by their names (`geom_rgba`),
-            members of its structs as `opt.gravity`, `vis.headlight.ambient`,
-            `stat.extent`; and, of the view, `camera.lookat`, `option.flags` ...
+        step: the first step that the values apply to; 0 for differences from the stored
+            model at the reset.
+        fields: the new values: arrays of `MjModel` by name (`geom_rgba`), members of
+            its structs such as `opt.gravity`, `vis.headlight.ambient`, `stat.extent`;
+            and of the view, such as `camera.lookat`, `option.flags`.
     """
 
     step: int
@@ -141,50 +145,52 @@ class ModelChange:
 
 
 def check_version(version: int) -> None:
-    """Raise `ValueError` for a format version that this code does not read."""
+    """Raise `ValueError` if this code cannot read a format version."""
     if version != FORMAT_VERSION:
         raise ValueError(
             f"it was written by a newer mjrec, in format version {version}, and this "
             f"one reads versions up to {FORMAT_VERSION}: update mjrec"
             if version > FORMAT_VERSION
-            else f"there is no format version {version}"
+            else f"format version {version} does not exist"
         )
 
 
 def added_up(rewards: ArrayLike) -> float:
-    """Return the sum of rewards, one added after the other, as a monitor does.
+    """Return the sum of rewards, added one after another as a monitor adds them.
 
-    `sum` makes up for roundings from Python 3.12 on, and NumPy's adds in pairs.
+    From Python 3.12 on, `sum` compensates for rounding errors, and NumPy's sum adds in
+    pairs.
     """
     values = np.asarray(rewards, np.float64)
-    # Zero comes first: it makes the sum of negative zeros a positive one.
+    # Add to 0.0, as a monitor does: it turns a sum of negative zeros into a positive
+    # zero.
     with np.errstate(all="ignore"):
         return 0.0 + float(np.add.accumulate(values)[-1]) if len(values) else 0.0
 
 
 @dataclass(kw_only=True, repr=False)
 class TrajectoryReader:
-    """An open trajectory. T is the number of steps, F of video frames.
+    """An open trajectory with T steps and F video frames.
 
-    Rows are read when they are asked for, in ranges `start, stop` as Python counts
-    them. A reader is used by one thread, in the process that opened it.
+    Rows are read on demand, in ranges `start, stop` as in Python slices. Use a reader
+    on one thread, in the process that opened it.
 
     Attributes:
-        path: of the file.
-        facts: what JSON can hold; `docs/reference/trajectories.md` lists the keys.
-        dtype: of a row, as `row_dtype` makes it.
-        row_count: how many states there are: T + 1, the first after the reset; 0 in
-            the log of an episode that was killed before that was written.
+        path: the file.
+        facts: a JSON object; `docs/reference/trajectories.md` lists the keys.
+        dtype: the dtype of a row, from `row_dtype`.
+        row_count: number of states: T + 1, the first one after the reset; 0 in the log
+            of an episode that was killed before its first row was written.
         rewards: `(T,) float64`.
         terminated: `(T,) bool`.
         truncated: `(T,) bool`.
-        frame_steps: `(F,) int64`, the step that each snapshot was taken after.
-        change_count: how often the model changed.
-        dropped: how many rows at the end of the log were torn or damaged.
-        read: returns some of the `PARTS` of rows, by name and range.
+        frame_steps: `(F,) int64`, the step after which each snapshot was taken.
+        change_count: number of changes of the model.
+        dropped: number of rows at the end of the log that were torn or damaged.
+        read: returns one of the `PARTS` for a range of rows.
         read_change: returns a change of the model by its number.
         release: closes the files.
-        is_closed: nothing can be read any more.
+        is_closed: whether the reader was closed.
     """
 
     path: Path
@@ -204,29 +210,29 @@ class TrajectoryReader:
 
     @property
     def step_count(self) -> int:
-        """T."""
+        """Number of steps, T."""
         return len(self.rewards)
 
     @property
     def frame_count(self) -> int:
-        """F."""
+        """Number of video frames, F."""
         return len(self.frame_steps)
 
     def kind(self, part: str) -> np.dtype[Any] | None:
-        """Return the dtype of one of the `PARTS`; None where rows do not have it."""
+        """Return the dtype of one of the `PARTS`, or None if rows do not have it."""
         return self.dtype[part] if part in (self.dtype.names or ()) else None
 
     @property
     def columns(self) -> dict[str, slice]:
-        """Where the components of a state are in a row of `states`."""
+        """The slice of each state component in a row of `states`."""
         state = self.kind("state")
         return {} if state is None else columns_of(state)
 
     def states(self, start: int, stop: int) -> NDArray[np.float64]:
-        """Return `(stop - start, n) float64`, of `row_count` rows.
+        """Return a range of the `row_count` states, `(stop - start, n) float64`.
 
         Raises:
-            UnreadableFile: the file was damaged since it was opened.
+            UnreadableFile: the file was damaged after it was opened.
         """
         rows = self._rows("state", start, stop, self.row_count)
         if rows is None:
@@ -234,15 +240,24 @@ class TrajectoryReader:
         return rows.view(np.float64).reshape(len(rows), rows.itemsize // 8)
 
     def actions(self, start: int, stop: int) -> NDArray[Any] | None:
-        """Return `(stop - start, *shape)`, of T; None where they are not recorded."""
+        """Return a range of the T actions; None if they were not recorded.
+
+        The shape is `(stop - start, *shape)`.
+        """
         return self._rows("action", start, stop, self.step_count)
 
     def observations(self, start: int, stop: int) -> NDArray[Any] | None:
-        """Return `(stop - start, *shape)`, of `row_count`; None as of `actions`."""
+        """Return a range of `row_count` observations; None if they were not recorded.
+
+        The shape is `(stop - start, *shape)`.
+        """
         return self._rows("observation", start, stop, self.row_count)
 
     def snapshots(self, start: int, stop: int) -> NDArray[Any]:
-        """Return `(stop - start,)` of F: MuJoCo's arrays are members of each."""
+        """Return a range of the F snapshots, `(stop - start,)`.
+
+        MuJoCo's arrays are the members of each.
+        """
         rows = self._rows("snapshot", start, stop, self.frame_count)
         return np.empty(stop - start, []) if rows is None else rows
 
@@ -254,11 +269,11 @@ class TrajectoryReader:
 
     @functools.cached_property
     def model_changes(self) -> tuple[ModelChange, ...]:
-        """The changes of the model in the order of their steps; read once."""
+        """The changes of the model in the order of their steps, read once."""
         return tuple(self.iter_model_changes())
 
     def close(self) -> None:
-        """Close the file; idempotent. What is in memory stays."""
+        """Close the file. Idempotent. Data that was already read stays available."""
         self.is_closed = True
         self.release()
 
@@ -279,8 +294,8 @@ class TrajectoryReader:
     ) -> NDArray[Any] | None:
         if not 0 <= start <= stop <= count:
             raise InvalidArgument(
-                f"{self.path.name} has {count} {part}s; there are none from {start} to "
-                f"{stop}."
+                f"{self.path.name} has {count} {part}s: the range from {start} to "
+                f"{stop} is invalid."
             )
         self._check_open()
         return None if self.kind(part) is None else self.read(part, start, stop)

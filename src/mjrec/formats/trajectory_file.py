@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A recorded episode: in flight still, an HDF5 file, or a group of a bundle."""
+"""Access to recorded episodes: in flight, in an HDF5 file, or in a bundle."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ from .trajectory_log import open_recording
 
 
 def open_trajectory(path: Path) -> TrajectoryReader:
-    """Open a trajectory for reading, whichever of its forms it has.
+    """Open a trajectory for reading, in any of its forms.
 
     Args:
-        path: of its own file, which need not be there; or the name of a clip's part,
-            which never becomes a file.
+        path: the trajectory's own file, which need not exist; or the name of a clip's
+            part, which never becomes a file.
 
     Raises:
-        UnreadableFile: there is neither such a file nor a log of it, or it is damaged,
-            or of a newer format version.
+        UnreadableFile: neither the file nor a log of the recording exists, or it is
+            damaged or has a newer format version.
     """
     if not is_finished(path) and find_recording(path) is not None:
         try:
@@ -36,30 +36,31 @@ def open_trajectory(path: Path) -> TrajectoryReader:
         except UnreadableFile:
             if not is_finished(path):
                 raise
-            # It was finished just now.
+            # Another process has just finished it.
     if (holder := file_of(path)) == path:
         with unreadable(path), open_regular(holder) as file:
             if file.read(len(SIGNATURE)) != SIGNATURE:
-                raise ValueError("it is no trajectory")
+                raise ValueError("it is not a trajectory")
     return open_hdf5(path)
 
 
 def finish_trajectory(path: Path) -> Path:
-    """Make the HDF5 file of an ended recording; its rows are not needed then.
+    """Create the HDF5 file of an ended recording, whose rows are then no longer needed.
 
-    One that does not say how it ended is that of a process that was killed, or whose
-    disk was full: its last row tells whether all of it is there. This may be killed at
-    any point and run again, and two may do it at the same time: the rows are there
-    until the file is.
+    If a recording does not say how it ended, its process was killed or its disk was
+    full; its last row shows whether it is complete. This function can be killed at any
+    point and run again, and two processes can run it at the same time: the rows stay
+    until the file exists.
 
     Args:
-        path: of the file.
+        path: the trajectory's own file.
 
     Returns:
         The path.
 
     Raises:
-        UnreadableFile: there is neither, or the log cannot be read; it stays.
+        UnreadableFile: neither the file nor a log exists, or the log cannot be read;
+            the log stays.
         FileNotWritten: the disk is full; the log stays.
         DirectoryNotWritable: the log cannot be removed.
     """
@@ -71,14 +72,14 @@ def finish_trajectory(path: Path) -> Path:
         except UnreadableFile:
             if not path.is_file():
                 raise
-            # Another process finished it just now.
+            # Another process has just finished it.
     if recording is not None:
         remove_if_done(recording.log)
     return path
 
 
 def finish_trajectories(paths: Iterable[Path]) -> dict[Path, Error]:
-    """Finish recordings that are in flight, and return why others could not be."""
+    """Finish the recordings that are in flight, and return the errors by path."""
     failures: dict[Path, Error] = {}
     for path in paths:
         try:
@@ -90,9 +91,15 @@ def finish_trajectories(paths: Iterable[Path]) -> dict[Path, Error]:
 
 
 def bundle_trajectories(paths: Iterable[Path]) -> dict[Path, Error]:
-    """Do so, and put them into the bundle of their monitor, written once for all.
+    """Finish recordings into their monitor's bundle, written once, and return errors.
 
-    To be called by the process that holds the lock of the monitor that they are of.
+    Call this only in the process that holds the monitor's lock.
+
+    Args:
+        paths: the trajectories' own files, all of one monitor.
+
+    Returns:
+        The error of each trajectory that could not be added, by path.
     """
     recordings: dict[Path, Recording] = {}
     failures: dict[Path, Error] = {}
@@ -118,15 +125,16 @@ def bundle_trajectories(paths: Iterable[Path]) -> dict[Path, Error]:
 def amend_trajectories(changes: Mapping[Path, Callable[[Any], Any]]) -> None:
     """Change the facts of finished trajectories.
 
-    Each file is written anew, whole or not at all: for what is seldom done. Nothing is
-    in it that this package does not write; its arrays stay, bit for bit.
+    Each file is rewritten, whole or not at all, so use this rarely. Only data that this
+    package writes is kept; the arrays stay the same, bit for bit.
 
     Args:
-        changes: returns the new facts, by the path of the trajectory's own file.
+        changes: functions that take a trajectory's facts and return the new ones, by
+            the path of the trajectory's own file.
 
     Raises:
-        UnreadableFile: there is no such file, or it is damaged.
-        FileNotWritten: the disk is full; the file is as before.
+        UnreadableFile: the file is missing or damaged.
+        FileNotWritten: the disk is full; the file is unchanged.
     """
     bundled: dict[Path, dict[Path, Callable[[Any], Any]]] = {}
     for path, change in changes.items():
@@ -142,16 +150,16 @@ def amend_trajectories(changes: Mapping[Path, Callable[[Any], Any]]) -> None:
 
 
 def _ended(path: Path, recording: Recording | None) -> TrajectoryReader:
-    """Open a recording whose facts say how it ended."""
+    """Open a recording, adding how it ended to its facts."""
     reader = open_recording(path)
     reader.facts = {**reader.facts, **_how_it_ended(reader, recording)}
     return reader
 
 
 def _end_time(facts: Mapping[str, Any], recording: Recording | None) -> float:
-    """Return about when an episode ended, and not before it began.
+    """Return about when an episode ended, not before it began.
 
-    What is written into a mapped file may change its time much later, or never.
+    The modification time of a mapped file may be updated late or never.
     """
     start, last = facts.get("start_time"), 0.0
     if recording is not None:
@@ -162,7 +170,7 @@ def _end_time(facts: Mapping[str, Any], recording: Recording | None) -> float:
 def _how_it_ended(
     reader: TrajectoryReader, recording: Recording | None
 ) -> dict[str, Any]:
-    """Return what its rows say of an episode's end; nothing where it is said."""
+    """Return facts about an episode's end from its rows, unless its facts have them."""
     facts = reader.facts
     if "complete" in facts:
         return {}
@@ -172,7 +180,8 @@ def _how_it_ended(
         "reward": added_up(reader.rewards),
     }
     if reader.step_count and (reader.terminated[-1] or reader.truncated[-1]):
-        # All of it is there but the last words, which a kill or a full disk cut off.
+        # All of it is there except the end event, which a kill or a full disk
+        # prevented.
         known |= {
             "complete": True,
             "terminated": bool(reader.terminated[-1]),
@@ -184,6 +193,6 @@ def _how_it_ended(
     video = facts.get("video")
     is_deferred = isinstance(video, dict) and video.get("recording") == "deferred"
     if is_deferred and not reader.frame_count:
-        # So that no process waits for a video of nothing.
+        # So that no process waits for a video without frames.
         known["broken_reason"] = "the process was killed before its first frame"
     return known

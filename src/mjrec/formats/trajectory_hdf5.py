@@ -1,15 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Recorded episodes in HDF5 files: as strangers read them, with plain h5py.
+"""Recorded episodes in HDF5 files, readable with plain h5py.
 
 An episode has a file of its own, or a group of a bundle (`bundle`).
 
-`docs/reference/trajectories.md` has every dataset. States and snapshots are rows of a
-compound type, whose members bear MuJoCo's names: `file["states"]["qpos"]` is an array.
-The shuffle filter, which goes by whole rows there, puts the same byte of one row after
-the other side by side, so that what does not change costs nothing.
+`docs/reference/trajectories.md` describes every dataset. States and snapshots are rows
+of a compound type, whose members have MuJoCo's names: `file["states"]["qpos"]` is an
+array. The shuffle filter works on whole rows there: it stores the same byte of
+consecutive rows next to each other, so values that do not change cost nothing.
 
-Nothing here bounds the memory or time that a file asks for: `foreign_files`
-does.
+Nothing here limits the memory or time that reading a file takes: `foreign_files` does.
 """
 
 from __future__ import annotations
@@ -46,14 +45,14 @@ from .trajectory import (
     row_dtype,
 )
 
-# How every HDF5 file begins.
+# The first bytes of every HDF5 file.
 SIGNATURE = b"\x89HDF\r\n\x1a\n"
 
 _FORMAT = b"mjrec trajectory"
 _BUNDLE = b"mjrec trajectories"
 
-# Written so, h5py of 2019 and later reads it; `latest` makes files that h5py of 2025
-# cannot open.
+# With these versions, h5py from 2019 on can read the files; `latest` makes files that
+# h5py of 2025 cannot open.
 _LIBVER = ("v110", "v110")
 
 _COLUMNS = {
@@ -66,9 +65,9 @@ _COLUMNS = {
 _NO_STATE = np.dtype(("<f8", (0,)))
 
 _CHUNK_BYTES = 1 << 18
-# Of snapshots, so that a frame's can be had without most of the others.
+# For snapshots, so that reading one frame does not read most of the others.
 _ROWS_IN_CHUNK = 32
-# How much is in memory at a time while it is written.
+# Number of bytes that are buffered while writing.
 _BUFFER_BYTES = 1 << 22
 
 _PACKING: Mapping[str, Any] = {"chunks": True, "compression": 1, "shuffle": True}
@@ -76,13 +75,13 @@ _FILTERS = frozenset((h5py.h5z.FILTER_DEFLATE, h5py.h5z.FILTER_SHUFFLE))
 
 
 def write_hdf5(reader: TrajectoryReader, path: Path) -> None:
-    """Write all that `reader` has as the HDF5 file `path`, whole or not at all.
+    """Write all data of `reader` to the HDF5 file `path`, whole or not at all.
 
     Raises:
-        FileNotWritten: the disk is full, or the directory is gone.
-        UnreadableFile: what is read turned out to be damaged.
+        FileNotWritten: the disk is full, or the directory was removed.
+        UnreadableFile: the data that is read turned out to be damaged.
     """
-    # Nothing is read any more after Ctrl-C, so that it is soon over.
+    # Stop reading on Ctrl-C, so that writing ends soon.
     with _new_file(path, reader.close) as (file, _):
         _write(file, reader)
 
@@ -92,20 +91,22 @@ def write_bundle(
     added: Mapping[Path, Callable[[], TrajectoryReader]],
     amended: Mapping[Path, Callable[[Any], Any]],
 ) -> dict[Path, UnreadableFile]:
-    """Write a bundle anew with more trajectories, or other facts, whole or not at all.
+    """Rewrite a bundle with more trajectories or new facts, whole or not at all.
 
-    What is in it already is copied as it is packed.
+    Existing trajectories are copied in compressed form.
 
     Args:
-        bundle: its file, which need not be there yet.
-        added: opens each new trajectory, by the path of its own file.
-        amended: returns the new facts of others.
+        bundle: the bundle's file, which need not exist yet.
+        added: functions that open the new trajectories, by the path of each one's own
+            file.
+        amended: functions that take the facts of existing trajectories and return the
+            new ones, by path.
 
     Returns:
-        Why trajectories that cannot be read were not added.
+        The errors of trajectories that could not be read and were not added, by path.
 
     Raises:
-        FileNotWritten: the disk is full, or the directory is gone.
+        FileNotWritten: the disk is full, or the directory was removed.
         UnreadableFile: the bundle is damaged.
     """
     failures: dict[Path, UnreadableFile] = {}
@@ -150,15 +151,15 @@ def _amend(attributes: Any, change: Callable[[Any], Any]) -> None:
 def _new_file(
     path: Path, on_signal: Callable[[], object], **options: Any
 ) -> Iterator[tuple[h5py.File, _Unfailing]]:
-    """Yield a new HDF5 file, and what it is written through.
+    """Yield a new HDF5 file, and the raw file that it is written through.
 
     Args:
-        path: the name that it gets at the end of the block.
-        on_signal: called at once where a signal comes in the block.
-        **options: of `h5py.File`.
+        path: the name that the file gets at the end of the block.
+        on_signal: called immediately if a signal arrives during the block.
+        **options: further options of `h5py.File`.
 
     Raises:
-        FileNotWritten: the disk is full, or the directory is gone.
+        FileNotWritten: the disk is full, or the directory was removed.
     """
     try:
         with replacing(path) as temporary, temporary.open("x+b", buffering=0) as output:
@@ -170,7 +171,7 @@ def _new_file(
                 yield file, unfailing
             if unfailing.error is not None:
                 raise unfailing.error
-            # The log is removed next: what it held must not be in a cache alone.
+            # The log is removed next, so its data must not be only in a cache.
             os.fsync(output.fileno())
     except OSError as error:
         raise FileNotWritten(path, error.strerror or error) from error
@@ -178,10 +179,10 @@ def _new_file(
 
 @contextlib.contextmanager
 def _signals_waiting(on_signal: Callable[[], object]) -> Iterator[None]:
-    """Handle signals after the block: HDF5 crashes where its file raises an exception.
+    """Handle signals after the block: HDF5 crashes if its file raises an exception.
 
     Args:
-        on_signal: called at once, in the block.
+        on_signal: called immediately, during the block.
     """
     came: list[int] = []
 
@@ -206,10 +207,11 @@ def _signals_waiting(on_signal: Callable[[], object]) -> Iterator[None]:
 
 
 class _Unfailing(io.RawIOBase):
-    """A file in which no write fails, for the HDF5 library.
+    """A file whose writes never fail, for the HDF5 library.
 
-    It does not survive one: it crashes the process when it closes what is left. So what
-    the disk has no room for is held in memory, and `error` says so.
+    The library does not survive a failed write: it crashes the process when it closes
+    the remaining objects. So data that the disk has no room for is held in memory, and
+    `error` is set.
     """
 
     def __init__(self, file: io.FileIO) -> None:
@@ -253,14 +255,16 @@ def open_hdf5(path: Path) -> TrajectoryReader:
     """Open a finished trajectory.
 
     Args:
-        path: of its own file; it may lie in a bundle instead.
+        path: the trajectory's own file; it may be in a bundle instead.
 
     Raises:
-        UnreadableFile: it is no such file, of a newer version, or damaged.
+        UnreadableFile: the file is missing, damaged, not a trajectory or of a newer
+            version.
     """
     with _reading(path), contextlib.ExitStack() as opened:
-        # Without any wish about locking: HDF5 refuses a file that is open in this
-        # process with another one, in the user's own code, say.
+        # Do not request locking: HDF5 refuses to open a file that is already open in
+        # this process, for example in the user's code, with a different locking
+        # setting.
         holder = file_of(path)
         file = opened.enter_context(h5py.File(regular_path(holder), "r"))
         group = file if holder == path else _group(file, group_of(path))
@@ -274,7 +278,7 @@ def _reader_of(
 ) -> TrajectoryReader:
     attributes = file.attrs
     if "format" not in attributes or _attribute(attributes, "format", "S") != _FORMAT:
-        raise ValueError("it is an HDF5 file, but no trajectory")
+        raise ValueError("it is an HDF5 file, but not a trajectory")
     check_version(int(_attribute(attributes, "format_version", "iu")))
     facts = bytes(_attribute(attributes, "facts", "S"))
     if zlib.crc32(facts) != _attribute(attributes, "crc32", "iu"):
@@ -287,12 +291,12 @@ def _reader_of(
     lengths = [len(each) == counts.get(part, rows) for part, each in datasets.items()]
     lengths += [len(columns[name]) == steps for name in ("terminated", "truncated")]
     if not all(lengths) or (rows != steps + 1 and (rows, steps) != (0, 0)):
-        raise ValueError("its datasets are not of the same steps")
+        raise ValueError("its datasets do not have the same number of steps")
     last = max(rows - 1, 0)
-    # Compared, because differences of such numbers may overflow.
+    # Compared, not subtracted: differences of such numbers may overflow.
     bounds = np.concatenate(([0], columns["frame_steps"], [last]))
     if (bounds[1:] < bounds[:-1]).any():
-        raise ValueError("its frames are not of its steps, in order")
+        raise ValueError("its frame steps are out of order or out of range")
     kinds = {p: np.dtype((each.dtype, each.shape[1:])) for p, each in datasets.items()}
     if kinds["state"].names is None:
         # There was no simulation.
@@ -335,7 +339,7 @@ def _reader_of(
 
 @contextlib.contextmanager
 def _reading(path: Path) -> Iterator[None]:
-    """Turn whatever h5py raises about a damaged file into `UnreadableFile`."""
+    """Turn any error that h5py raises for a damaged file into `UnreadableFile`."""
     try:
         with unreadable(path):
             yield
@@ -344,7 +348,7 @@ def _reading(path: Path) -> Iterator[None]:
 
 
 def _linked(group: h5py.Group, name: str) -> Any:
-    # Links may lead into other files of the user who reads this one.
+    # Links may lead to other files of the user who reads this one.
     if not isinstance(group.get(name, getlink=True), h5py.HardLink):
         raise ValueError(f"it has no {name!r} of its own")
     return group[name]
@@ -353,17 +357,17 @@ def _linked(group: h5py.Group, name: str) -> Any:
 def _group(parent: h5py.Group, name: str) -> h5py.Group:
     group = _linked(parent, name)
     if not isinstance(group, h5py.Group):
-        raise ValueError(f"its {name} is no group")
+        raise ValueError(f"its {name} is not a group")
     return group
 
 
 def _dataset(group: h5py.Group, name: str) -> Any:
-    """Return a dataset whose numbers are in this file, packed as mjrec packs them."""
+    """Return a dataset stored in this file itself, with filters that mjrec uses."""
     dataset = _linked(group, name)
     if not isinstance(dataset, h5py.Dataset):
-        raise ValueError(f"its {name} is no dataset")
-    # Before anything else, even its shape: for that, HDF5 opens the other files which
-    # a virtual dataset is put together from.
+        raise ValueError(f"its {name} is not a dataset")
+        # Check the storage before anything else, even the shape: for a virtual
+        # dataset's shape, HDF5 opens the other files that it refers to.
     properties = dataset.id.get_create_plist()
     filters = {
         properties.get_filter(index)[0] for index in range(properties.get_nfilters())
@@ -382,26 +386,26 @@ def _dataset(group: h5py.Group, name: str) -> Any:
 def _column(file: h5py.Group, name: str, kind: str) -> NDArray[Any]:
     dataset = _dataset(file, name)
     if dataset.dtype != kind or dataset.ndim != 1:
-        raise ValueError(f"its {name} are of dtype {dataset.dtype}")
+        raise ValueError(f"its {name} have the wrong dtype {dataset.dtype}")
     return np.asarray(dataset[()])
 
 
 def _attribute(attributes: Any, name: str, kinds: str) -> Any:
-    """Return a single value, of one of NumPy's `kinds` of dtypes."""
+    """Return a scalar attribute whose dtype is of one of NumPy's `kinds`."""
     identifier = attributes.get_id(name)
-    # Asked before anything is read: a text of variable length is in a part of the file
-    # that has no checksum, and the HDF5 library may never come back from there.
+    # Check before reading: a variable-length string is in a part of the file that has
+    # no checksum, and the HDF5 library may hang there.
     if identifier.shape != () or identifier.dtype.kind not in kinds:
-        raise ValueError(f"its attribute {name!r} is of another type")
+        raise ValueError(f"its attribute {name!r} has the wrong type")
     return attributes[name]
 
 
 def _write_facts(attributes: Any, facts: Mapping[str, Any]) -> None:
     text = dumps(dict(facts)).encode()
-    # Texts of fixed length: see _attribute.
+    # Strings of fixed length: see _attribute.
     attributes["facts"] = np.bytes_(text)
-    # HDF5 has checksums of its own for what it thinks of as its structure, and the
-    # deflate filter for what it compressed; long texts have neither.
+    # HDF5 has checksums for its own metadata, and the deflate filter for compressed
+    # data; long strings have neither.
     attributes["crc32"] = np.int64(zlib.crc32(text))
 
 
@@ -419,7 +423,7 @@ def _write(file: h5py.Group, reader: TrajectoryReader) -> None:
     for part in PARTS:
         kind = reader.kind(part)
         if kind is None and part == "state":
-            # There was no simulation; their number is needed all the same.
+            # There was no simulation, but the number of states is still needed.
             kind = _NO_STATE
         if kind is not None:
             count = counts.get(part, reader.row_count)
@@ -444,17 +448,17 @@ def _store(
     count: int,
     read: Callable[[int, int], NDArray[Any]],
 ) -> None:
-    """Write `count` of a kind, which `read(start, stop)` gives."""
+    """Write `count` values of a dtype, which `read(start, stop)` returns."""
     shape, size = (count, *kind.shape), kind.itemsize
     if not count * size:
-        # Nothing to be cut into chunks.
+        # There is nothing to split into chunks.
         file.create_dataset(name, shape, kind.base)
         return
     most = _ROWS_IN_CHUNK if name == "snapshots" else count
     chunk = max(1, min(count, most, _CHUNK_BYTES // size))
     packing = {**_PACKING, "chunks": (chunk, *kind.shape)}
     dataset = file.create_dataset(name, shape, kind.base, **packing)
-    # Whole chunks.
+    # Write whole chunks at a time.
     step = max(1, _BUFFER_BYTES // size // chunk) * chunk
     for start in range(0, count, step):
         stop = min(start + step, count)

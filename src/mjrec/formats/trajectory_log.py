@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A recording in flight as a trajectory: of a living process, a dead one, an ended one.
+"""Reading a recording in flight as a trajectory, even after its process died.
 
-Rows count as far as each says its own number: after a crash of the machine the pages of
-a log may be there without what was written into them.
+Rows are valid only if each has its own number: after a machine crash, a log may have
+pages without the data that was written to them.
 """
 
 from __future__ import annotations
@@ -36,38 +36,38 @@ from .trajectory import (
 # A row has a step, a frame, or both.
 _KINDS = STEP | FRAME
 
-# Read at once while looking through the rows.
+# Number of bytes read at once when scanning the rows.
 _CHUNK_BYTES = 1 << 22
 
-# How a change of the model begins: the row that it holds from, its step, and the length
-# of the record behind it.
+# The header of a change of the model: the row from which it applies, its step, and the
+# length of the record after it.
 _CHANGE = struct.Struct("<QqQ")
 _LONGEST_HEADER = 1 << 16
 _LARGEST_CHANGE = 1 << 30
 
 
 def open_recording(path: Path) -> TrajectoryReader:
-    """Open what a log holds of a recording at this moment.
+    """Open the rows that a log holds of a recording at this moment.
 
     Args:
-        path: the file that the recording will be.
+        path: the file that the recording will become.
 
     Raises:
-        UnreadableFile: there is no such recording, or its log is damaged, or of a newer
-            version.
+        UnreadableFile: the recording does not exist, or its log is damaged or has a
+            newer version.
     """
     recording = find_recording(path)
     if recording is None:
-        raise UnreadableFile(path, "there is no such file, and no log of it")
+        raise UnreadableFile(path, "neither the file nor a log of it exists")
     with unreadable(recording.log), contextlib.ExitStack() as opened:
         rows = opened.enter_context(
             contextlib.closing(RowLogReader(recording.log, recording.dtype.itemsize))
         )
         count = rows.count
-        # Again: what was begun behind it is not its own.
+        # Look it up again: rows of a recording that has begun since are not its own.
         recording = find_recording(path) or recording
         if recording.stop is not None:
-            # All of its rows were counted when that was said.
+            # All of its rows were counted before its end was recorded.
             count = rows.count
         return _reader_of(recording, count, rows, path, opened)
 
@@ -85,7 +85,7 @@ def _reader_of(
     is_step, is_frame = heads["flags"] & STEP != 0, heads["flags"] & FRAME != 0
     places = {
         **dict.fromkeys(("state", "observation"), first + np.flatnonzero(is_step)),
-        # The row of step k has the action that led there; that of the reset has none.
+        # The row of step k has the action that led to it; the reset's row has none.
         "action": first + np.flatnonzero(is_step)[1:],
         "snapshot": first + np.flatnonzero(is_frame),
     }
@@ -124,10 +124,10 @@ def _reader_of(
 
 
 def _stop_of(recording: Recording, count: int) -> int:
-    """Return the row behind the last of a recording, of `count` in the log."""
+    """Return one past the last row of a recording, given `count` rows in the log."""
     stop = recording.stop
     if stop is None:
-        # One that was left without an end is followed by the next one, if there is any.
+        # A recording without an end extends to the next one, if there is one.
         stop = count if recording.following is None else recording.following
     return max(recording.row, min(stop, count))
 
@@ -135,7 +135,7 @@ def _stop_of(recording: Recording, count: int) -> int:
 def _sound_heads(
     rows: RowLogReader, dtype: np.dtype[Any], first: int, stop: int
 ) -> NDArray[Any]:
-    """Return the heads of the rows from `first` on, up to one that cannot be right."""
+    """Return the heads of the rows from `first` on, up to the first invalid one."""
     names = ["row", "step", "reward", "flags"]
     head = np.dtype([(name, dtype[name]) for name in names])
     at_once = max(1, _CHUNK_BYTES // dtype.itemsize)
@@ -147,13 +147,13 @@ def _sound_heads(
             part[name] = found[name]
         parts.append(part)
         if (part["row"] != np.arange(start, start + len(part))).any():
-            # A log may have a hole behind its rows.
+            # A log may have a hole after its rows.
             break
     heads = np.concatenate(parts)
     is_step = heads["flags"] & STEP != 0
     sound = heads["row"] == np.arange(first, first + len(heads))
     sound &= heads["flags"] & _KINDS != 0
-    # States, actions and frames belong together by their places.
+    # States, actions and frames are matched by their positions.
     sound &= heads["step"] == np.cumsum(is_step) - 1
     return heads if sound.all() else heads[: np.argmin(sound)]
 
@@ -166,7 +166,7 @@ def _read_part(
     at_once = max(1, _CHUNK_BYTES // dtype.itemsize)
     start = 0
     while start < len(wanted):
-        # What stands between those that are wanted is read, too.
+        # Rows between the wanted ones are read, too.
         stop = int(np.searchsorted(wanted, wanted[start] + at_once))
         chosen = wanted[start:stop]
         first, behind = int(chosen[0]), int(chosen[-1]) + 1
@@ -174,7 +174,7 @@ def _read_part(
         if (found["row"] != np.arange(first, behind)).any():
             raise ValueError("its log was changed while it was read")
         values = found[part][chosen - first]
-        # One by one: padding holds whatever lies between MuJoCo's arrays.
+        # Copy member by member: the padding contains data between MuJoCo's arrays.
         for name in member.names or ():
             out[name][start:stop] = values[name]
         if member.names is None:
@@ -187,7 +187,8 @@ def _open_looks(recording: Recording, opened: contextlib.ExitStack) -> BinaryIO 
     try:
         return opened.enter_context(open_regular(recording.log.with_suffix(LOOKS)))
     except FileNotFoundError:
-        # All files of a log are removed, and that before this one.
+        # If the log was removed as a whole, this raises: the log is removed before its
+        # looks.
         recording.log.lstat()
         return None
 
@@ -195,7 +196,7 @@ def _open_looks(recording: Recording, opened: contextlib.ExitStack) -> BinaryIO 
 def _find_changes(
     looks: BinaryIO | None, offset: int, stop: int
 ) -> Iterator[tuple[int, int, int]]:
-    """Yield the steps of the changes before row `stop`, and where their records are."""
+    """Yield step, offset and length of each change before row `stop`."""
     if looks is None:
         return
     size = os.fstat(looks.fileno()).st_size
@@ -210,11 +211,11 @@ def _find_changes(
 
 
 def pack_change(row: int, change: ModelChange) -> bytes:
-    """Return what the file of changes holds of one that holds from a row on.
+    """Return the `.looks` record of a model change that takes effect at `row`.
 
     Raises:
-        InvalidArgument: a field is no array of plain numbers, or has no name, or all
-            of them are too large.
+        InvalidArgument: a field is not an array of plain numbers, its name is invalid,
+            or the change is too large.
     """
     arrays = {name: np.asarray(values) for name, values in change.fields.items()}
     record = np.empty(
@@ -232,7 +233,8 @@ def pack_change(row: int, change: ModelChange) -> bytes:
     packed = file.getvalue()
     if len(packed) > _LARGEST_CHANGE:
         raise InvalidArgument(
-            f"A change of a model may have {_LARGEST_CHANGE} bytes, not {len(packed)}."
+            f"A change of a model may have at most {_LARGEST_CHANGE} bytes, got "
+            f"{len(packed)}."
         )
     return _CHANGE.pack(row, change.step, len(packed)) + packed
 
@@ -243,8 +245,8 @@ def _unpack_fields(packed: bytes) -> dict[str, NDArray[Any]]:
             io.BytesIO(packed), allow_pickle=False, max_header_size=_LONGEST_HEADER
         )
         check_dtype(record.dtype)
-        # Copies can be written to, and do not keep the rest.
+        # Copies are writable, and do not keep the whole record alive.
         return {name: record[name].copy() for name in record.dtype.names or ()}
-    # NumPy parses the header as Python, and raises what that raises.
+    # NumPy parses the header as Python, and may raise any error of that.
     except Exception as error:
         raise ValueError(f"a change of the model is damaged ({error})") from error

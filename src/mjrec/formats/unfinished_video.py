@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A live video under its hidden name, and the note by which any process finishes it.
+"""Live videos under their hidden names, with notes that let any process finish them.
 
-The note, `.<name of the video>.note.part`, is there before the video is. The hidden
-video is locked as long as it is written: by the process that feeds ffmpeg, and by
-ffmpeg, which goes on to the end of its file when that process dies.
+The note, `.<name of the video>.note.part`, is written before the video. The hidden
+video is locked while it is written, both by the process that feeds ffmpeg and by ffmpeg
+itself, which completes its file if that process dies.
 """
 
 from __future__ import annotations
@@ -34,13 +34,13 @@ from .video_file import content_facts
 
 @dataclass(frozen=True, kw_only=True)
 class UnfinishedVideo:
-    """A video that is being encoded, or was.
+    """A video that is or was being encoded.
 
     Attributes:
-        path: the file, by its final name.
-        metadata: what its metadata file is to say of what was recorded, as far as it
-            is known.
-        facts: what it is to say of the file and its timing; and `frames_per_step`.
+        path: the final path of the video.
+        metadata: the video's metadata about the recording, as far as it is known.
+        facts: the video's metadata about the file and its timing; and
+            `frames_per_step`.
     """
 
     path: Path
@@ -49,28 +49,28 @@ class UnfinishedVideo:
 
     @property
     def temporary(self) -> Path:
-        """The file now."""
+        """The video's current path."""
         return next(iter(unfinished_files(self.path)), self.path)
 
     @property
     def hashes(self) -> list[Path]:
-        """Its frame hashes now, where there are some."""
+        """The current paths of its frame hashes, if there are any."""
         return unfinished_files(frame_hash_path(self.path))
 
     @property
     def hashed_frames(self) -> int:
-        """How many frames the encoder was given, or was to be given next."""
+        """Number of frames that the encoder was given, or was about to be given."""
         texts = [path.read_text("ascii", "replace") for path in self.hashes]
         return sum(not line.startswith("#") for t in texts for line in t.splitlines())
 
     def finish(self) -> dict[str, Any]:
-        """Give the video and the hashes of its frames their names.
+        """Rename the video and its frame hashes to their final names.
 
         Returns:
-            `facts` with what the file holds.
+            `facts`, completed with facts about the file's content.
 
         Raises:
-            EncoderError: it cannot be decoded to its end.
+            EncoderError: the video cannot be decoded to its end.
             DirectoryNotWritable: the files cannot be renamed.
         """
         part = self.temporary
@@ -92,32 +92,32 @@ class UnfinishedVideo:
         return {**self.facts, **found, "ffmpeg_sha256": sha256}
 
     def forget(self) -> None:
-        """Remove the note, and before it what it is about."""
+        """Remove the unfinished video and its frame hashes, then the note."""
         parts = [*unfinished_files(self.path), *self.hashes]
         for path in (*parts, note_path(self.path)):
             path.unlink(missing_ok=True)
 
 
 def note_path(video: Path) -> Path:
-    """Return the name of the note beside an unfinished video."""
+    """Return the path of the note about an unfinished video."""
     return video.with_name(f".{video.name}.note.part")
 
 
 def write_note(video: UnfinishedVideo) -> None:
-    """Write a note, or replace it, whole or not at all.
+    """Write or replace a note, whole or not at all.
 
     Raises:
-        FileNotWritten: the disk is full, or the directory is gone.
+        FileNotWritten: the disk is full, or the directory was removed.
     """
     content = {"metadata": video.metadata, "facts": video.facts}
     write_text(note_path(video.path), dumps(content))
 
 
 def read_note(video: Path) -> UnfinishedVideo:
-    """Return what the note beside a video says.
+    """Read the note about a video.
 
     Raises:
-        UnreadableFile: it is missing or damaged.
+        UnreadableFile: the note is missing or damaged.
     """
     path = note_path(video)
     with unreadable(path):
@@ -135,10 +135,10 @@ def read_note(video: Path) -> UnfinishedVideo:
 
 def _finish_hashes(part: Path, final: Path, frame_count: int) -> None:
     try:
-        # Frames whose hashes are there need not have come into the file.
+        # Frames that have hashes may not have reached the file.
         cut_frame_hashes(part, frame_count)
     except ValueError:
-        # No hashes are better than some.
+        # Incomplete hashes are worse than none.
         part.unlink()
     else:
         part.replace(final)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One video from its first frame to its last: the encoder, and what it has written."""
+"""Encoding one video from its first frame to its last, and checking the result."""
 
 from __future__ import annotations
 
@@ -35,19 +35,20 @@ class VideoFile:
 
     Attributes:
         path: the file.
-        height: of a frame as it was written, in pixels; the file's is even.
-        width: likewise.
+        height: height of a written frame in pixels; that of the file is even.
+        width: width of a written frame in pixels; that of the file is even.
         fps: frames per second.
         codec: ffmpeg's name of the encoder.
         pixel_format: ffmpeg's name of the encoded pixels' format.
-        encoder: `ffmpeg` (the binary's base name), `version` (its first line),
-            `sha256` (the binary's) and `arguments` (all of them; the output file is
-            its base name, so that they stay true when the directory moves).
-        frame_hash_path: the `.framehash` file, if one was asked for.
-        frame_count: how many frames it holds, counted by decoding it.
-        file_sha256: of the file's bytes.
-        decoded_sha256: of the decoded frames, one after the other: the planes Y, U, V
-            for yuv420p, else rgb24.
+        encoder: `ffmpeg` (the binary's base name), `version` (the first line of its
+            version), `sha256` (the binary's) and `arguments` (all of them; the output
+            file is given by its base name, so that they stay true if the directory
+            moves).
+        frame_hash_path: the `.framehash` file, if requested.
+        frame_count: number of frames in the file, counted by decoding it.
+        file_sha256: SHA-256 of the file's bytes.
+        decoded_sha256: SHA-256 of the decoded frames in order: the planes Y, U, V for
+            yuv420p, otherwise rgb24.
     """
 
     path: Path
@@ -64,37 +65,37 @@ class VideoFile:
 
     @property
     def padded_height(self) -> int:
-        """The file's, even where the codec needs it."""
+        """Height of the file's frames, which is always even."""
         return self.height + self.height % 2
 
     @property
     def padded_width(self) -> int:
-        """The file's, even where the codec needs it."""
+        """Width of the file's frames, which is always even."""
         return self.width + self.width % 2
 
 
 def content_facts(
     path: Path, *, height: int, width: int, pixel_format: str
 ) -> dict[str, Any]:
-    """Decode a video; return what metadata says of its content.
+    """Decode a video, and return the metadata of its content.
 
     That is `frame_count`, `file_sha256` and `decoded_sha256`.
 
     Args:
         path: the file.
-        height: of a frame in the file.
-        width: likewise.
-        pixel_format: of the encoded pixels. They are decoded as yuv420p, or as rgb24
-            if it is another.
+        height: height of a frame in the file, in pixels.
+        width: width of a frame in the file, in pixels.
+        pixel_format: pixel format of the file. Frames are decoded as yuv420p if it is
+            yuv420p, otherwise as rgb24.
 
     Raises:
-        EncoderError: it cannot be decoded to its end.
+        EncoderError: the video cannot be decoded to its end.
     """
     decoded = "yuv420p" if pixel_format == "yuv420p" else "rgb24"
     frame_bytes = 3 * height * width // (2 if decoded == "yuv420p" else 1)
     arguments = [
         *("-hide_banner", "-loglevel", "error", "-nostdin", "-xerror"),
-        # More would take a third more of the CPUs, which others are drawing with.
+        # More threads would take a third more CPU time, which the render workers need.
         *("-threads", "1", "-filter_threads", "1"),
         *("-i", as_file(path), "-map", "0:v:0", *every_frame_arguments()),
         *("-f", "rawvideo", "-pix_fmt", decoded, "pipe:1"),
@@ -114,7 +115,7 @@ def content_facts(
 
 
 class Encoding:
-    """A video in the making: ffmpeg, the thread that feeds it, temporary files."""
+    """A video being encoded: ffmpeg, the thread that feeds it, and temporary files."""
 
     def __init__(self, file: VideoFile, temporary: Path, hashes: Path | None) -> None:
         self.size = (file.height, file.width)
@@ -127,8 +128,8 @@ class Encoding:
         self._hashes: TextIO | None = None
         with contextlib.ExitStack() as on_failure:
             try:
-                # First of all: what is not locked may be swept up. With the mode that a
-                # new file gets from every program.
+                # Lock it first: an unlocked file may be cleaned up. The mode is the
+                # usual default for new files.
                 self._lock = Lock(temporary, "", mode=0o666)
             except OSError as error:
                 raise DirectoryNotWritable(file.path.parent, error) from error
@@ -139,14 +140,16 @@ class Encoding:
                     height=file.height, width=file.width, fps=file.fps
                 )
                 with self._naming_the_hashes():
-                    # A line is with the operating system before the next one.
+                    # Line buffering: each line reaches the operating system before the
+                    # next.
                     self._hashes = hashes.open("w", encoding="ascii", buffering=1)
                     self._hashes.write(header)
             self._process = FfmpegProcess(
                 [*file.encoder["arguments"][:-1], as_file(temporary)],
                 what=f"The video {file.path} could not be encoded.",
                 reads=True,
-                # It shares the lock, which it holds to its own end when we die.
+                # ffmpeg shares the lock, and holds it until it ends if this process
+                # dies.
                 keeps=self._lock.fileno(),
             )
             on_failure.callback(self._process.release)
@@ -161,9 +164,9 @@ class Encoding:
             on_failure.pop_all()
 
     def finish(self) -> VideoFile:
-        """Complete the file, check it and give it its name.
+        """Complete the file, check it and rename it to its final name.
 
-        Each part can be done again, where Ctrl-C came in between.
+        Can be called again if Ctrl-C interrupted it.
         """
         self.is_ending = True
         self.thread.close()
@@ -171,12 +174,12 @@ class Encoding:
         if not self._file.file_sha256:
             self._file = self._checked()
         if self._hashes is None:
-            # Those of the video that is replaced now would be wrong.
+            # Hashes of the video that is being replaced would be wrong for this one.
             frame_hash_path(self._file.path).unlink(missing_ok=True)
         else:
             self._hashes.close()
         try:
-            # The hashes first: where there is a video, what belongs to it is there too.
+            # The hashes first, so that a finished video always has its companion files.
             for part, final in reversed(self._parts.items()):
                 if part.exists():
                     part.replace(final)
@@ -187,15 +190,15 @@ class Encoding:
         return self._file
 
     def abort(self) -> None:
-        """End everything and remove the temporary files."""
-        # First the process: the thread may be waiting for it to read.
+        """Stop everything and remove the temporary files."""
+        # Kill the process first: the thread may be waiting for it to read.
         self._process.kill()
         self.thread.abort()
         self._process.release()
         self._remove_files()
 
     def leave(self) -> None:
-        """Let the encoder go on to the end of what it was given, by itself."""
+        """Let the encoder finish the frames that it was given, on its own."""
         self._is_left = True
         self.thread.leave()
         if self._input_ended:
@@ -204,7 +207,8 @@ class Encoding:
 
     def _encode(self, frame: Frame) -> None:
         if not self._encoded:
-            # It is remembered, and the next frames are still being drawn.
+            # Hash ffmpeg now, while the next frames are still being rendered; the
+            # result is cached.
             ffmpeg_sha256()
         if self._hashes is not None:
             with self._naming_the_hashes():
@@ -219,7 +223,7 @@ class Encoding:
             self._wait_and_close()
 
     def _wait_and_close(self) -> None:
-        """Wait for ffmpeg, which has its input; another process owns its file."""
+        """Wait for ffmpeg, whose input has ended; another process owns its file."""
         if self._hashes is not None:
             self._hashes.close()
         with contextlib.suppress(EncoderError):
@@ -227,10 +231,10 @@ class Encoding:
         self._process.release()
 
     def _checked(self) -> VideoFile:
-        """Return the finished file, which has its temporary name, with what it holds.
+        """Decode the temporary file, and return the video's facts with its content's.
 
         Raises:
-            FrameCountError: it does not hold what was encoded.
+            FrameCountError: the file does not hold the frames that were encoded.
         """
         file = self._file
         found = content_facts(
@@ -241,7 +245,7 @@ class Encoding:
         )
         if found["frame_count"] != self._encoded:
             raise FrameCountError(
-                f"{file.path} was to hold {self._encoded} frames, and decoding gives "
+                f"{file.path} should hold {self._encoded} frames, but decoding gives "
                 f"{found['frame_count']}. It was not kept.",
                 command=self._process.command,
                 returncode=0,
@@ -252,10 +256,10 @@ class Encoding:
 
     def _remove_files(self) -> None:
         with contextlib.suppress(OSError):
-            # What cannot be written any more need not be.
+            # The files are removed anyway, so a failed write does not matter.
             if self._hashes is not None:
                 self._hashes.close()
-        # ffmpeg may have put another file in the place of the one that is locked.
+        # ffmpeg may have replaced the locked file with a different one.
         for part in self._parts:
             part.unlink(missing_ok=True)
         self._lock.release()

@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the metadata file of a video says about the video itself.
+"""The metadata file of a video.
 
-A video that was made while its episode ran and one that was rendered later say it with
-the same keys, because both take it from here. Who made the video adds what it knows
-besides: of the episode, of the frames, of what went wrong.
+Live and deferred videos describe themselves with the same keys, because both take them
+from here. The caller adds what it knows about the episode, the frames and any failures.
 """
 
 from __future__ import annotations
@@ -22,24 +21,24 @@ from .json_fields import read_object, unreadable
 from .video_file import VideoFile
 
 _FAILED = ".failed.json"
-# What ffmpeg or a driver says can be long; what matters is where it begins and ends.
+# Output of ffmpeg or a driver can be long; its beginning and end matter most.
 _LONGEST_REASON = 1000
 _CUT = " [...] "
 
-# Of a file's name, as `camera_part` makes them.
+# A part of a file's name, as `camera_part` makes them.
 _PART = re.compile(r"[A-Za-z0-9_%-]{1,200}", re.ASCII)
 
 
-# What a recording says of its episode, and metadata too.
+# Keys about the episode that metadata takes from a recording's facts.
 _OF_EPISODE = ("episode_id", "type", "env_id", "seed", "options", "versions")
 
 
 def recording_facts(facts: Mapping[str, Any], *, recording: str) -> dict[str, Any]:
-    """Return what metadata says of the recording that a video shows.
+    """Return the metadata about the recording that a video shows.
 
     Args:
-        facts: of the recording, as far as they are known: of a clip its first part's.
-        recording: when the frames are drawn, "live" or "deferred".
+        facts: the known facts of the recording; for a clip, of its first part.
+        recording: when the frames are rendered, "live" or "deferred".
     """
     video = facts.get("video") or {}
     further = {"recording_reason": video.get("reason")} if recording == "live" else {}
@@ -55,13 +54,13 @@ class StepRuns:
     """The step of every frame, as runs, so that memory does not grow with frames.
 
     Args:
-        steps: of the frames so far, in their order.
+        steps: the steps of the frames so far, in order.
         stride: the usual number of steps from one frame to the next.
 
     Attributes:
-        ranges: the first and the last step of each run; the frames of a run are a
-            stride apart.
-        total: the number of frames.
+        ranges: the first and the last step of each run; consecutive frames in a run are
+            one stride apart.
+        total: number of frames.
     """
 
     def __init__(self, steps: Iterable[int] = (), *, stride: int = 1) -> None:
@@ -72,7 +71,7 @@ class StepRuns:
             self.add(step)
 
     def add(self, step: int) -> None:
-        """Note a frame of `step`."""
+        """Add a frame at `step`."""
         self.total += 1
         if self.ranges and self.ranges[-1][1] == step - self._stride:
             self.ranges[-1][1] = step
@@ -88,14 +87,14 @@ def timing_facts(
     stride: int = 1,
     frames_per_step: int = 1,
 ) -> dict[str, Any]:
-    """Return what is said about time.
+    """Return the metadata about timing.
 
     Args:
         steps: the step of every frame.
-        fps: the rate in the file.
-        timestep: simulated seconds of a step, where they are known.
+        fps: the frame rate of the file.
+        timestep: simulated seconds per step, if known.
         stride: the usual number of steps from one frame to the next.
-        frames_per_step: how many frames a step gives; 1 with any other stride.
+        frames_per_step: number of frames per step; must be 1 unless the stride is 1.
     """
     speed = playback_speed(fps, timestep, Fraction(stride, frames_per_step))
     return {
@@ -111,17 +110,17 @@ def timing_facts(
 def playback_speed(
     fps: Fraction | None, timestep: Fraction | None, steps_per_frame: Fraction
 ) -> float | None:
-    """Return the simulated seconds that pass in a second of the video, if known."""
+    """Return the simulated seconds per second of video, if known."""
     if fps is None or timestep is None:
         return None
     return float(fps * timestep * steps_per_frame)
 
 
 def file_facts(file: VideoFile) -> dict[str, Any]:
-    """Return what is said about a finished file and how it was encoded."""
+    """Return the metadata about a finished file and its encoding."""
     return {
-        # gym's three keys; the command line names no directory, so that it stays true
-        # when the recordings are moved.
+        # gym's three keys; the command line contains no directory, so that it stays
+        # true when the recordings are moved.
         "encoder_version": {
             "backend": "ffmpeg",
             "version": file.encoder["version"],
@@ -140,7 +139,7 @@ def file_facts(file: VideoFile) -> dict[str, Any]:
 
 
 def metadata_path(video: Path) -> Path:
-    """Return the name of the metadata file of a video."""
+    """Return the path of a video's metadata file."""
     return video.with_suffix(".meta.json")
 
 
@@ -148,16 +147,16 @@ def write_metadata(video: Path, metadata: Mapping[str, Any]) -> None:
     """Write the metadata file of a video.
 
     Raises:
-        FileNotWritten: the disk is full, or the directory is gone.
+        FileNotWritten: the disk is full, or the directory was removed.
     """
     write_text(metadata_path(video), json_text.dumps(metadata))
 
 
 def amend_metadata(video: Path, facts: Mapping[str, Any]) -> None:
-    """Add to what the metadata file of a finished video says.
+    """Add facts to the metadata file of a finished video.
 
     Raises:
-        UnreadableFile: there is none, or it is damaged.
+        UnreadableFile: the metadata file is missing or damaged.
         FileNotWritten: the disk is full.
     """
     path = metadata_path(video)
@@ -168,11 +167,11 @@ def amend_metadata(video: Path, facts: Mapping[str, Any]) -> None:
 
 
 def finished_videos(video: Path) -> list[tuple[str, str]]:
-    """Return the names of an episode's videos that are there, each with its metadata's.
+    """Return the names of an episode's finished videos, each with its metadata file's.
 
-    The first one comes first, and is there. Its metadata, which is written last of all,
-    names those of further cameras (`further_videos`); it may be anybody's, so only
-    names of that very episode count.
+    The first video comes first; it must exist. Its metadata, which is written last,
+    lists the videos of further cameras (`further_videos`). The list is untrusted, so
+    only names that belong to this episode are accepted.
 
     Args:
         video: the first video.
@@ -188,10 +187,10 @@ def finished_videos(video: Path) -> list[tuple[str, str]]:
 
 
 def further_live_videos(video: Path) -> list[str]:
-    """Return the names of what further cameras saw of an episode, drawn as it ran.
+    """Return the names of an episode's live videos from further cameras.
 
-    For a reader who finds only these files: what is rendered from a
-    trajectory, now or once more, says so in its metadata.
+    For readers that have only these files. Videos rendered from a trajectory are
+    excluded, because their metadata does not say "live".
 
     Args:
         video: the first video of the episode, which need not exist.
@@ -205,18 +204,18 @@ def further_live_videos(video: Path) -> list[str]:
 
 
 def is_done(video: Path) -> bool:
-    """Return whether nothing is left to do about a video: it is there, or given up."""
+    """Return whether a video needs no more work: it is finished or was given up."""
     metadata = metadata_path(video)
     return metadata.exists() and (video.exists() or is_broken(metadata))
 
 
 def is_broken(metadata: Path) -> bool:
-    """Return whether a video's metadata says that it broke."""
+    """Return whether a video's metadata marks it as broken."""
     return bool(_read_or_nothing(metadata).get("broken"))
 
 
 def metadata_of(video: Path) -> Mapping[str, Any]:
-    """Return what a video's metadata file says; nothing where it cannot be read."""
+    """Return the content of a video's metadata file; empty if it cannot be read."""
     return _read_or_nothing(metadata_path(video))
 
 
@@ -234,32 +233,32 @@ def _is_further(name: str, video: Path) -> bool:
 
 
 def failure_path(video: Path) -> Path:
-    """Return the name of the file that says why a video could not be rendered.
+    """Return the path of the file with the reason why a video could not be rendered.
 
-    It is `{"reason": "no OpenGL backend works here: ..."}`, written when rendering has
-    failed, and removed once the video is there.
+    The file holds `{"reason": "no OpenGL backend works here: ..."}`. It is written when
+    rendering has failed, and removed once the video exists.
 
     Args:
-        video: or a part of a clip, whose video may not be known.
+        video: the video, or a part of a clip, whose video may not be known.
     """
     return video.with_suffix(_FAILED)
 
 
 def note_failure(video: Path, reason: str) -> None:
-    """Write down why a video could not be rendered, as far as that can be written."""
+    """Record why a video could not be rendered, ignoring errors in doing so."""
     with contextlib.suppress(Error, OSError):
         text = json_text.dumps({"reason": _shortened(reason)})
         write_text(failure_path(video), text)
 
 
 def forget_failure(video: Path) -> None:
-    """Remove what was said of a video that is there now."""
+    """Remove the record of a failure, because the video now exists."""
     with contextlib.suppress(OSError):
         failure_path(video).unlink(missing_ok=True)
 
 
 def reason_of(video: Path) -> str | None:
-    """Return why a video could not be rendered; None where it has not failed."""
+    """Return why a video could not be rendered, or None if it has not failed."""
     try:
         reason = read_object(failure_path(video)).get("reason")
     except (OSError, ValueError):

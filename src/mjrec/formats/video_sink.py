@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where all frames end, live and deferred: frames in, one finished video out.
+"""The sink of all frames, live and deferred: frames in, one finished video out.
 
-Of images an mp4 with its frame hashes, of text an asciicast. The metadata file comes
-last: where it is, the video is there and whole.
+Images become an mp4 with its frame hashes, text an asciicast. The metadata file is
+written last: if it exists, the video is complete.
 """
 
 from __future__ import annotations
@@ -26,22 +26,22 @@ _Note = Callable[[], tuple[Mapping[str, Any], Mapping[str, Any]]]
 
 
 class VideoSink:
-    """Makes one video, and what belongs to it, of the frames that it is given.
+    """A writer of one video and its companion files from a stream of frames.
 
     Args:
         path: the video: `.mp4` for images, `.json` for text.
         fps: frames per second.
-        frame_hashes: whether to write the `.framehash` of images.
-        note: returns the metadata so far, and what is known of the timing, for the
-            note beside the unfinished mp4, by which it is finished when this process is
-            killed. None where there is to be none, because it can be rendered again.
+        frame_hashes: whether to write the `.framehash` file of images.
+        note: returns the metadata and the timing known so far, for the note about the
+            unfinished mp4, with which another process finishes it if this one is
+            killed. None writes no note, because the video can be rendered again.
 
     Raises:
-        Error: as `VideoWriter`.
+        Error: see `VideoWriter`.
 
     Attributes:
         path: the video.
-        blank: whether its frames show anything.
+        blank: records whether the frames show anything.
     """
 
     def __init__(
@@ -64,18 +64,18 @@ class VideoSink:
 
     @property
     def file(self) -> VideoFile | None:
-        """The finished mp4; None before, and for text."""
+        """The finished mp4 file; None before it is finished, and for text."""
         return getattr(self._writer, "result", None)
 
     def write(self, frame: Frame | str, caption: Caption | None = None) -> None:
-        """Add a frame, and wait while the encoder is behind.
+        """Add a frame, waiting while the encoder is behind.
 
         Args:
-            frame: an image, or text.
-            caption: what is written on the image.
+            frame: an image or a string.
+            caption: the caption to draw on the image.
 
         Raises:
-            Error: as `VideoWriter.write`.
+            Error: see `VideoWriter.write`.
         """
         if isinstance(self._writer, AsciicastWriter):
             assert isinstance(frame, str)
@@ -83,32 +83,32 @@ class VideoSink:
             return
         assert not isinstance(frame, str)
         if self._note is not None and not self._writer.frame_count:
-            # The note is there before the file that it is about.
+            # Write the note before the file that it describes.
             self._write_note(self._note, *frame.shape[:2])
         self._writer.write(frame if caption is None else annotated(frame, caption))
         self._is_annotated |= caption is not None
-        # Without the caption: whatever is written on it, it may show nothing.
+        # Without the caption, which would make a blank frame look non-blank.
         self.blank.add(frame)
 
     def finish(self) -> None:
-        """Give the video its name. Where it was interrupted, another call goes on.
+        """Give the video its final name. Call again to continue after an interrupt.
 
         Raises:
-            Error: as `VideoWriter.close`.
+            Error: see `VideoWriter.close`.
         """
-        # An older video's would not be true of this one.
+        # The metadata of an older video would not be true of this one.
         metadata_path(self.path).unlink(missing_ok=True)
         self._writer.close()
         self._is_finished = True
 
     def describe(self, metadata: Mapping[str, Any]) -> dict[str, Any]:
-        """Write the metadata of the finished video; it may be called again.
+        """Write the metadata of the finished video. Can be called more than once.
 
         Args:
-            metadata: what is known of it besides.
+            metadata: the facts that the sink does not know.
 
         Returns:
-            What was written.
+            The metadata as written.
 
         Raises:
             FileNotWritten: the disk is full.
@@ -119,13 +119,13 @@ class VideoSink:
         return described
 
     def discard(self) -> None:
-        """Leave nothing of the video. An older one stays, unless this has replaced it.
+        """Remove everything of this video. An older video stays unless it was replaced.
 
         Idempotent.
         """
         self._writer.abort()
         if self._is_finished:
-            # The metadata first: where that is, the video is.
+            # The metadata first: if it exists, the video must exist.
             for path in (
                 metadata_path(self.path),
                 self.path,
@@ -135,7 +135,7 @@ class VideoSink:
         self._forget_note()
 
     def leave(self) -> None:
-        """Let go of the unfinished file and its note, by which others finish it."""
+        """Close the unfinished file, leaving it and its note for another process."""
         self._writer.leave()
 
     def _facts(self) -> dict[str, Any]:

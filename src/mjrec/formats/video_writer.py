@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Writing videos: every frame, once, in order, in a file that anybody can play.
+"""Writing videos: every frame, once, in order, in a file that plays everywhere.
 
-Frames go through a bounded queue to a thread that feeds ffmpeg; the caller waits when
-the encoder is slower and never loses a frame. The file has a temporary name until it
-is complete and its frames have been counted again.
+Frames go through a bounded queue to a thread that feeds ffmpeg; the caller waits if the
+encoder is slower, and no frame is lost. The file has a temporary name until it is
+complete and its frames have been recounted.
 """
 
 from __future__ import annotations
@@ -37,13 +37,13 @@ from .ffmpeg import ffmpeg_executable, ffmpeg_version
 from .frame_hashes import frame_hash_path
 from .video_file import Encoding, VideoFile
 
-# ffmpeg takes no larger number, above or below, for a rate as a fraction: given one, it
-# silently takes the nearest fraction that fits.
+# The largest numerator and denominator of a rate in ffmpeg: it silently replaces larger
+# ones with the nearest fraction that fits.
 _MAX_RATE_TERM = 10**6
 
 
 class VideoWriter:
-    """Writes one video.
+    """A writer of one video file.
 
     ::
 
@@ -51,41 +51,43 @@ class VideoWriter:
             for frame in frames:
                 video.write(frame)
 
-    By default H.264 High, yuv420p, bt709, which every browser plays. The same frames
-    give the same file, byte for byte, on any CPU, with the same ffmpeg.
+    By default, the video is H.264 High, yuv420p, bt709, which every browser plays. The
+    same frames give the same file, byte for byte, on any CPU, with the same ffmpeg.
 
-    An existing file is replaced when the new one is complete. Without a frame there is
-    no file and no error. An exception that leaves `with` finishes the file with the
-    frames so far, unless the encoder failed. Use a writer on one thread at a time.
+    An existing file is replaced when the new one is complete. If no frame is written,
+    there is no file and no error. An exception that leaves `with` finishes the file
+    with the frames so far, unless the encoder failed. Use a writer on one thread at a
+    time.
 
     Args:
         path: the file: `.mp4`, `.mov`, `.mkv`, `.webm` or `.avi`.
         fps: frames per second. A fraction is exact in the file; a float becomes the
             simplest fraction within a millionth.
-        crf: from 0 (largest) to 51 (worst). None is 18, which looks like the original.
-            Below 1, x264 is lossless except for colour conversion, and browsers do not
-            play it.
+        crf: quality, from 0 (largest file) to 51 (worst). None is 18, which looks like
+            the original. Below 1, x264 is lossless except for colour conversion, and
+            browsers do not play it.
         codec: ffmpeg's name of an encoder. None is libx264. Lossless RGB encoders
             (`ffv1` and `libx264rgb` in `.mkv`) keep every pixel.
-        frame_hashes: also write the sha256 of each frame, to a `.framehash` file with
-            the video's name.
+        frame_hashes: whether to write the SHA-256 of each frame to a `.framehash` file
+            with the video's name.
         encoder_arguments: further output arguments for ffmpeg.
 
     Attributes:
         path: the file.
-        fps: as a `Fraction`.
+        fps: the rate as a `Fraction`.
         frame_count: frames written so far.
         closed: whether the file is finished or abandoned.
-        result: what was written, once closed. None without frames.
-        temporary: name of the file until it is complete.
-        temporary_hashes: likewise for the `.framehash`, if there is one.
+        result: the finished file, once closed. None without frames.
+        temporary: path of the file until it is complete.
+        temporary_hashes: path of the `.framehash` file until it is complete, if
+            requested.
 
     Raises:
-        InvalidArgument: an argument has a wrong value.
+        InvalidArgument: an argument is invalid.
         UnknownName: ffmpeg has no such encoder.
         DirectoryNotWritable: the directory is missing or not writable.
         EncoderError: ffmpeg cannot encode with this combination of options.
-        MissingDependency: there is no ffmpeg.
+        MissingDependency: ffmpeg is not installed.
     """
 
     def __init__(
@@ -101,7 +103,7 @@ class VideoWriter:
         self.closed = True
         self.result: VideoFile | None = None
         self.frame_count = 0
-        # From the first frame on.
+        # Set when the first frame is written.
         self._encoding: Encoding | None = None
         self.path = _check_path(path)
         self.fps = _check_fps(fps)
@@ -121,23 +123,24 @@ class VideoWriter:
     def write(self, frame: Frame) -> None:
         """Add a `(height, width, 3) uint8` frame; the first one fixes the size.
 
-        The frame is copied. Waits while the encoder is behind.
+        The frame is copied. The call waits while the encoder is behind.
 
         Raises:
-            InvalidFrame: it is no such array. The writer stays usable.
-            ClosedError: after `close` or `abort`, or in a forked process.
-            EncoderError: ffmpeg failed or died. Nothing is left of the video.
+            InvalidFrame: the frame is not such an array, or has a different size. The
+                writer stays usable.
+            ClosedError: the writer was closed or aborted, or this is a forked process.
+            EncoderError: ffmpeg failed or died. No file is left.
         """
         encoding = self._encoding
         if self.closed or (encoding is not None and encoding.is_ending):
             raise ClosedError(
-                f"The video {self.path} is closed after {self.frame_count} frames; a "
-                "file cannot be reopened: write another one."
+                f"The video {self.path} is closed after {self.frame_count} frames, and "
+                "a file cannot be reopened: write to a new one."
             )
         if self._was_forked():
             raise ClosedError(
                 f"The video {self.path} belongs to process {self._process_id}, from "
-                "which this one was forked: write it there, or another one here."
+                "which this one was forked: write it there, or write a new one here."
             )
         checked = check_frame(frame, size=None if encoding is None else encoding.size)
         height, width = check_size(*checked.shape[:2])
@@ -146,7 +149,8 @@ class VideoWriter:
                 encoding = self._encoding = Encoding(
                     self.file_of(height, width), self.temporary, self.temporary_hashes
                 )
-            # A plain copy in rows from top to bottom, whatever the view was.
+            # A plain copy with rows from top to bottom, even if the frame is a strided
+            # view.
             encoding.thread.put(np.array(checked, order="C", copy=True, subok=False))
         except Exception:
             self.abort()
@@ -154,11 +158,11 @@ class VideoWriter:
         self.frame_count += 1
 
     def file_of(self, height: int, width: int) -> VideoFile:
-        """Return what is known of the file before it is finished.
+        """Return the facts known about the file before it is finished.
 
         Args:
-            height: of a frame, in pixels.
-            width: likewise.
+            height: height of a frame in pixels.
+            width: width of a frame in pixels.
         """
         has_hashes = self.temporary_hashes is not None
         return VideoFile(
@@ -171,7 +175,8 @@ class VideoWriter:
             encoder={
                 "ffmpeg": Path(ffmpeg_executable()).name,
                 "version": ffmpeg_version(),
-                # Reading the whole program takes a while, and is not for the beginning.
+                # Hashing the whole binary takes a while, so it is not done at the
+                # start.
                 "sha256": None,
                 "arguments": self._settings.arguments(
                     height=height + height % 2,
@@ -184,13 +189,13 @@ class VideoWriter:
         )
 
     def close(self) -> None:
-        """Finish the file: encode the rest, count the frames, and give it its name.
+        """Finish the file: encode the rest, count the frames, and rename it.
 
-        Idempotent. After Ctrl-C interrupted it, no more frames are taken, and another
+        Idempotent. If Ctrl-C interrupts it, no more frames are accepted, and another
         call continues.
 
         Raises:
-            EncoderError: ffmpeg failed or died. Nothing is left of the video.
+            EncoderError: ffmpeg failed or died. No file is left.
             FrameCountError: the file does not hold the frames that were written.
         """
         if self.closed:
@@ -204,13 +209,13 @@ class VideoWriter:
         self.closed = True
 
     def abort(self) -> None:
-        """Stop at once and leave no new file; an older one stays. Idempotent."""
+        """Stop at once without leaving a new file; an older file stays. Idempotent."""
         if not self.closed and self._encoding is not None and not self._was_forked():
             self._encoding.abort()
         self.closed = True
 
     def leave(self) -> None:
-        """Take no more frames and let the encoder finish alone. Idempotent."""
+        """Accept no more frames and let the encoder finish on its own. Idempotent."""
         if not self.closed and self._encoding is not None and not self._was_forked():
             self._encoding.leave()
         self.closed = True
@@ -229,14 +234,14 @@ class VideoWriter:
         except Exception as failure:
             if error is None:
                 raise
-            # The reason for leaving matters more than what happens to the video.
+            # The original error matters more than what happens to the video.
             error.add_note(f"The video {self.path} could not be finished: {failure}")
 
     def __del__(self) -> None:
         if self.closed or self._encoding is None or self._was_forked():
             return
-        # Waiting is not for a finaliser. The thread encodes what waits and ffmpeg
-        # finishes its file, under the temporary name.
+        # A finaliser must not wait. The thread encodes the queued frames, and ffmpeg
+        # finishes its file under the temporary name.
         self.leave()
         warnings.warn(
             f"The VideoWriter of {self.path} was never closed; its frames are in "
@@ -271,23 +276,24 @@ def save_video(
 ) -> None:
     """Write videos of one episode's frames, like Gymnasium's `save_video`.
 
-    `<prefix>-episode-<episode_index>.mp4` holds the episode, if `episode_trigger` says
-    so. `<prefix>-step-<n>.mp4` starts with the frame of step n, if `step_trigger` says
-    so. The first frame belongs to the reset, the second to step `step_starting_index`.
-    Every frame is in the file.
+    `<prefix>-episode-<episode_index>.mp4` holds the episode if `episode_trigger`
+    selects it. `<prefix>-step-<n>.mp4` starts with the frame of step n if
+    `step_trigger` selects it. The first frame belongs to the reset, the second to step
+    `step_starting_index`. Every frame is in the file.
 
-    `frames` can be any iterable. With an episode trigger it is streamed, up to
+    `frames` can be any iterable. With only an episode trigger it is streamed, up to
     `video_length`, and not read if no video is due. With a step trigger, whose videos
-    can overlap, all frames are in memory. An existing video is replaced when the new
-    one is complete. Without frames there is no file. If `frames` raises, the frames so
-    far are kept.
+    can overlap, all frames are held in memory. An existing video is replaced when the
+    new one is complete. Without frames, no file is written. If `frames` raises, the
+    frames so far are kept.
 
     Args:
         frames: `(height, width, 3) uint8` arrays.
-        video_folder: the directory; created if needed.
-        episode_trigger: maps an episode number to whether it gets a video. If both
-            triggers are None: 0, 1, 8, 27 ... 729 and every 1000th.
-        step_trigger: maps a step number to whether a video starts there.
+        video_folder: the directory; created if necessary.
+        episode_trigger: returns whether the episode with a given number gets a video.
+            If both triggers are None, episodes 0, 1, 8, 27 ... 729 and every 1000th do.
+        step_trigger: returns whether a video starts at a given step.
+        video_length: maximum number of frames in a video. None means all that follow.
         video_length: most frames of a video. None is all that follow.
         name_prefix: start of the file names.
         episode_index: the episode's number.
@@ -295,10 +301,10 @@ def save_video(
         **kwargs: `fps`, which is required, and other options of `VideoWriter`.
 
     Raises:
-        InvalidArgument: `fps` is missing, an option is unknown, or a value is wrong.
+        InvalidArgument: `fps` is missing, an option is unknown, or a value is invalid.
         DirectoryNotWritable: `video_folder` cannot be created or written to.
-        InvalidFrame: a frame has a wrong shape or type.
-        EncoderError: as `VideoWriter.write` and `close`.
+        InvalidFrame: a frame has the wrong shape or dtype.
+        EncoderError: ffmpeg failed or died, see `VideoWriter`.
     """
     _check_options(kwargs, video_length)
     if episode_trigger is None and step_trigger is None:
@@ -309,14 +315,14 @@ def save_video(
     except OSError as error:
         raise DirectoryNotWritable(folder, error) from error
     if step_trigger is not None:
-        # Copies: a generator may fill the same array again and again.
+        # Copy them: a generator may reuse the same array.
         is_held = isinstance(frames, Sequence | np.ndarray)
         frames = held = list(frames if is_held else map(np.array, frames))
     if episode_trigger is not None and episode_trigger(episode_index):
         path = folder / f"{name_prefix}-episode-{episode_index}.mp4"
         _write_video(itertools.islice(frames, video_length), path, kwargs)
     if step_trigger is not None:
-        # The first frame is the reset's.
+        # The first frame belongs to the reset.
         for step, first in enumerate(range(1, len(held)), start=step_starting_index):
             if step_trigger(step):
                 last = None if video_length is None else first + video_length
@@ -359,14 +365,15 @@ def _check_path(path: str | os.PathLike[str]) -> Path:
         ) from error
     if checked.suffix.lower() not in MUXERS:
         raise InvalidArgument(
-            f"The name of a video ends in {', '.join(MUXERS)}, got {str(path)!r}."
+            f"A video's name must end in {', '.join(MUXERS)}, got {str(path)!r}."
         )
     if checked.is_dir():
         raise InvalidArgument(f"{checked} is a directory; path must be a file's name.")
-    # Absolute, so that a change of the working directory moves nothing.
+    # Absolute, so that changing the working directory does not move the file.
     checked = checked.absolute()
     try:
-        # The permissions alone do not tell: root may all, and a disk may be read-only.
+        # Checking permissions is not enough: root may do anything, and a disk may be
+        # read-only.
         tempfile.TemporaryFile(dir=checked.parent).close()
     except OSError as error:
         raise DirectoryNotWritable(checked.parent, error.strerror) from error
@@ -374,7 +381,7 @@ def _check_path(path: str | os.PathLike[str]) -> Path:
 
 
 def _check_fps(fps: float | Fraction) -> Fraction:
-    """Return the rate, if the file can say it; the nearest that it can, for a float."""
+    """Return the rate, rounding a float to the nearest rate that the file can hold."""
     rate = to_rate(fps)
     nearest = (
         rate.limit_denominator(_MAX_RATE_TERM)
@@ -383,7 +390,7 @@ def _check_fps(fps: float | Fraction) -> Fraction:
     )
     if nearest != rate and isinstance(fps, numbers.Rational):
         raise InvalidArgument(
-            f"fps={rate} cannot be written exactly: above and below may be at most "
-            f"{_MAX_RATE_TERM}. The nearest that can is {nearest}."
+            f"fps={rate} cannot be stored exactly: numerator and denominator can be at "
+            f"most {_MAX_RATE_TERM}. The nearest valid rate is {nearest}."
         )
     return nearest
