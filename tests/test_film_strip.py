@@ -147,7 +147,7 @@ def test_usual_columns(video, frames, columns):
         ("mp4", {"frames": True}, "frames"),
         ("mp4", {"columns": -1}, "columns"),
         ("mp4", {"camera": "track"}, "trajectory"),
-        ("mp4", {"frames": 4}, "Ask for fewer or smaller"),
+        ("mp4", {"frames": 4}, "Request fewer or smaller"),
     ],
 )
 def test_what_cannot_be_shown(recorded, monkeypatch, kind, options, said):
