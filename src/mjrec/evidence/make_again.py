@@ -369,7 +369,10 @@ class _Playing:
         kind: type[BaseException] = KeyboardInterrupt
         if episode.cut == EXCEPTION:
             kind = _exception_kind(str(said.get("type", "Exception")))
-        self._monitor.recorder.note_error(kind(said.get("message", "")))
+        recorder = self._monitor.recorder
+        recorder.note_error(kind(said.get("message", "")))
+        if episode.failed is not None:
+            recorder.note_event("failed", dict(episode.failed))
 
     def _note(self, episode: EpisodeInputs, excuse: str, reason: str) -> None:
         self._notes.add(self._recording.item(episode), excuse, reason)
