@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The videos that an evaluation chose among the episodes of many recordings.
 
-Most of these may not be in the archive: the choice is not made again.
+Most of these may not be in the archive: the choice is not recreated.
 """
 
 from __future__ import annotations

@@ -361,8 +361,9 @@ def _steps_taken(reader: TrajectoryReader) -> dict[str, NDArray[Any]]:
 
 def _selection(video: Any) -> Mapping[str, Any] | None:
     said = video.get("selection") if isinstance(video, Mapping) else None
-    is_evaluation = isinstance(said, Mapping) and said.get("scope") == EVALUATION
-    return _known(said, _SELECTION) if is_evaluation else None
+    if not isinstance(said, Mapping) or said.get("scope") != EVALUATION:
+        return None
+    return _known(said, _SELECTION)
 
 
 def _provenance(said: Mapping[str, Any]) -> Mapping[str, Any]:

@@ -120,7 +120,7 @@ class Verdict:
     Attributes:
         source: what was verified, and which file says so.
         verdict: `PASS`, `PARTLY` or `FAIL`.
-        counts: how many findings say made again, within tolerance, believed, different.
+        counts: how many findings say recreated, within tolerance, believed, different.
         level: how deep it went.
     """
 
