@@ -155,20 +155,6 @@ def killed(directory: Path) -> None:
     mjrec.render_videos(directory)
 
 
-def faulty(observation: Any) -> Any:
-    """Act as a policy that has no answer to a cart on the right."""
-    if observation[0] > 0:
-        raise ArithmeticError("no answer")
-    return np.zeros(1)
-
-
-def failed(directory: Path) -> None:
-    """Evaluate a policy that raises in the second of its two episodes."""
-    small = {"height": 32, "width": 32, "max_steps": 3, "keep": "none"}
-    counts = {"num_seeds": 1, "episodes": 2, "workers": 1}
-    mjrec.evaluate(_POLE, policy=faulty, directory=directory, **counts, **small)
-
-
 def unseeded(directory: Path) -> None:
     """Record episodes whose beginning nothing leads to."""
     env = gymnasium.make(_POLE, max_episode_steps=5, **_SMALL)

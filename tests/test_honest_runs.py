@@ -54,7 +54,6 @@ HONEST = (
     Honest(honest.several, PARTLY),
     Honest(honest.resumed, PARTLY),
     Honest(honest.killed, PARTLY, {"kill"}, quick=True),
-    Honest(honest.failed, PARTLY, {"exception"}),
     Honest(honest.unseeded, PARTLY, {"unseeded beginning"}),
     Honest(honest.early, PARTLY, {"early reset"}),
     Honest(honest.wrapped),

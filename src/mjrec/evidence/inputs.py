@@ -80,7 +80,6 @@ class EpisodeInputs:
         believed: `reward`, `terminated`, `truncated` and `success` of a complete
             episode. They are used only where actions were not kept.
         evaluation: `seed` and `episode` of an evaluation that it belongs to; None else.
-        failed: what is stated of an evaluation's episode that failed; None of others.
         selection: what its video says of the choice among an evaluation's episodes.
     """
 
@@ -105,7 +104,6 @@ class EpisodeInputs:
     end_time: float | None = None
     believed: Mapping[str, Any] = field(default_factory=dict)
     evaluation: Mapping[str, Any] | None = None
-    failed: Mapping[str, Any] | None = None
     selection: Mapping[str, Any] | None = None
 
 

@@ -369,10 +369,7 @@ class _Playing:
         kind: type[BaseException] = KeyboardInterrupt
         if episode.cut == EXCEPTION:
             kind = _exception_kind(str(said.get("type", "Exception")))
-        recorder = self._monitor.recorder
-        recorder.note_error(kind(said.get("message", "")))
-        if episode.failed is not None:
-            recorder.note_event("failed", dict(episode.failed))
+        self._monitor.recorder.note_error(kind(said.get("message", "")))
 
     def _note(self, episode: EpisodeInputs, excuse: str, reason: str) -> None:
         self._notes.add(self._recording.item(episode), excuse, reason)

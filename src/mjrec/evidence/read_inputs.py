@@ -48,9 +48,6 @@ _PROVENANCE: Mapping[str, tuple[str, ...]] = {
 # Of the choice among an evaluation's episodes: in a video's facts, and in a journal.
 _SELECTION = ("rule", "decided", "scope", "finished", "roles")
 _EVALUATION_KEEP = (*_SELECTION[:-1], "chosen", "recorded", "recording")
-# Of an evaluation's episode: that it begins, and that it has failed.
-_BEGUN = ("seed", "episode")
-_FAILED = (*_BEGUN, "episode_id", "failure", "length", "start_time", "seconds")
 _DTYPES = frozenset(
     f"{kind}{bits}" for kind in ("float", "int", "uint") for bits in (8, 16, 32, 64)
 ) | {"bool"}
@@ -177,8 +174,6 @@ class _Journal:
         self.provenance_after = self._lines = 0
         self.entries: dict[int, JournalEntry] = {}
         self.cuts: dict[int, Mapping[str, Any]] = {}
-        self.begun: Mapping[str, Any] | None = None
-        self.failed: dict[int, Mapping[str, Any]] = {}
         self.irregular: dict[int, list[Mapping[str, Any]]] = {}
         self.clips: list[Mapping[str, Any]] = []
         self.evaluation_keep: Mapping[str, Any] | None = None
@@ -211,13 +206,8 @@ class _Journal:
             case "provenance", dict():
                 self.provenance = _provenance(facts)
                 self.provenance_after = self._lines
-            case "begun", _:
-                is_any = isinstance(facts, Mapping)
-                self.begun = _known(facts, _BEGUN) if is_any else None
-            case "failed", {"episode_id": int(number)}:
-                self.failed[number] = _known(facts, _FAILED)
             case "cut", {"episode_id": int(number)}:
-                self.cuts[number] = {**facts, "evaluation": self.begun}
+                self.cuts[number] = facts
             case "action", {"episode_id": int(number), "step": int()}:
                 self.irregular.setdefault(number, []).append(facts)
             case "clip", dict():
@@ -255,8 +245,6 @@ def _episodes(
             episode = dataclasses.replace(
                 episode,
                 cut=str(cut.get("reason")),
-                evaluation=cut["evaluation"],
-                failed=journal.failed.get(number),
                 is_chosen=cut.get("chosen") is True,
             )
         yield episode
