@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import mjrec
+from mjrec.formats.dataclass_json import to_json
 from mjrec.rendering.views import View
 
 from .children import call
@@ -103,7 +104,7 @@ def draw_as_worker(trajectory: str, height: int, width: int) -> dict[str, float]
     from mjrec.simulation.renderer import Canvas
 
     start = time.perf_counter()
-    view = View(height=height, width=width).as_json()
+    view = to_json(View(height=height, width=width))
     drawing = open_drawing({"trajectory": trajectory, "view": view}, Canvas())
     count = _frame_count(trajectory)
     return _timed((drawing.draw(index) for index in range(count)), start)

@@ -3,7 +3,6 @@
 
 import re
 
-from mjrec.evaluation.dataclass_json import to_json
 from mjrec.evaluation.episode_results import EpisodeResult
 from mjrec.evaluation.evaluation import ChosenEpisode, write_results
 from mjrec.evaluation.plan import EvaluatedTask, EvaluationPlan
@@ -14,6 +13,7 @@ from mjrec.evaluation.summaries import (
     default_score_range,
     summarize_results,
 )
+from mjrec.formats.dataclass_json import to_json
 from mjrec.json_text import dumps
 from report_recordings import entry, write_journal
 

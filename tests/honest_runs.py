@@ -105,6 +105,62 @@ def vector(directory: Path, **options: Any) -> None:
     monitor.close()
 
 
+def evaluated(directory: Path, **options: Any) -> None:
+    """Evaluate episodes in several chunks, whose videos are chosen among all."""
+    given = {"policy": "random", "num_seeds": 3, "keep": "best,failures"}
+    given |= {"max_steps": 4, **options}
+    mjrec.evaluate(
+        [_POLE],
+        directory=directory,
+        episodes=1,
+        height=32,
+        width=32,
+        workers=1,
+        **given,
+    )
+
+
+def evaluated_in_part(directory: Path) -> None:
+    """Evaluate a policy that raises in some episodes."""
+
+    def policy(observation: Any) -> Any:
+        if observation[0] > 0:
+            raise ValueError("it is on the right")
+        return np.zeros(1, np.float32)
+
+    evaluated(directory, policy=policy)
+
+
+def evaluated_to_death(directory: Path) -> None:
+    """Evaluate a policy that kills its process in some episodes."""
+
+    def policy(observation: Any) -> Any:
+        if observation[0] > 0:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return np.zeros(1, np.float32)
+
+    evaluated(directory, policy=policy)
+
+
+def evaluated_again(directory: Path) -> None:
+    """Evaluate a policy that kills its process at its seventh action."""
+    calls = []
+
+    def policy(observation: Any) -> Any:
+        calls.append(observation)
+        if len(calls) == 7:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return np.zeros(1, np.float32)
+
+    evaluated(directory, policy=policy)
+
+
+def extended(directory: Path) -> None:
+    """Evaluate one seed, and later one more."""
+    evaluated(directory, num_seeds=1)
+    evaluated(directory, num_seeds=2, resume=True)
+
+
 def clips(directory: Path) -> None:
     """Record clips of four steps, which cross episodes."""
     pendulum(directory, step_trigger=_every_sixth, video_length=4)
@@ -224,7 +280,7 @@ def views(directory: Path) -> None:
         directory,
         mode="evaluation",
         workers=1,
-        camera=["track", -1],
+        camera=[{"azimuth": 70.0, "distance": 3.0}, "track", -1],
         width=48,
         height=32,
         max_fps=10,

@@ -37,6 +37,7 @@ from mjrec.evidence.findings import (
     Verification,
 )
 from mjrec.evidence.notes import REWARDS_FILE, Notes
+from mjrec.formats.dataclass_json import from_json, to_json
 
 Edit = Callable[[Path], object]
 
@@ -520,4 +521,4 @@ def test_findings_travel_between_processes() -> None:
     finding = Finding(
         topic=Topic.PICTURES, item="a", outcome=Outcome.NOTED, figures={"psnr": 30.0}
     )
-    assert Finding.from_json(json.loads(json.dumps(finding.as_json()))) == finding
+    assert from_json(Finding, json.loads(json.dumps(to_json(finding)))) == finding

@@ -9,6 +9,7 @@ import pytest
 from verifications import excuse, finding, verification
 
 from mjrec.evidence.findings import Excuse, Finding, Level, Outcome, Topic, Verdict
+from mjrec.formats.dataclass_json import from_json
 
 MADE, WITHIN = finding(), finding(Outcome.WITHIN_TOLERANCE, excuse="gl")
 BELIEVED = finding(Outcome.BELIEVED, reason="actions were not kept")
@@ -57,6 +58,6 @@ def test_all_of_it_is_json() -> None:
     made = verification(MADE, excuses=(excuse(),), inputs={"a": 1}, facts={"b": 2})
     said = json.loads(json.dumps(made.as_json()))
     assert said["verdict"] == "PASS"
-    assert Finding.from_json(said["findings"][0]) == MADE
-    assert Excuse.from_json(said["excuses"][0]) == excuse()
+    assert from_json(Finding, said["findings"][0]) == MADE
+    assert from_json(Excuse, said["excuses"][0]) == excuse()
     assert (said["inputs"], said["facts"]) == ({"a": 1}, {"b": 2})

@@ -28,11 +28,15 @@ import honest_runs as honest
 import lying_environments as lying
 import mjrec
 from forged_runs import ForgedRun
+from mjrec.evaluation.chunk_results import recorded_results
 from mjrec.evidence.findings import Outcome, Verdict, Verification
+from mjrec.formats.monitor_directory import Infix
 from mjrec.formats.trajectory import added_up
 from mjrec.formats.trajectory_file import open_trajectory
 from mjrec.formats.trajectory_hdf5 import write_hdf5
 from mjrec.formats.video_writer import VideoWriter
+from mjrec.rendering.chosen_videos import write_choice
+from mjrec.rendering.jobs import RecordingKey
 
 FAIL, PARTLY, PASS = Verdict.FAIL, Verdict.PARTLY, Verdict.PASS
 
@@ -782,6 +786,19 @@ def by_hand(directory: Path) -> None:
     honest.pendulum(directory, video_callable=lambda episode: episode in (0, 1))
 
 
+def evaluated_and_swapped(directory: Path) -> None:
+    """Call the worst episode of an evaluation its best, as `evaluate` writes it."""
+    honest.evaluated(directory, keep="none")
+    ended = [*recorded_results(directory)]
+    folder, worst = min(ended, key=lambda each: each[1].total_reward or 0.0)
+    infix = Infix.parse(worst.monitor or "")
+    assert infix is not None
+    assert worst.episode_id is not None
+    chosen = {RecordingKey(infix, worst.episode_id): ["best"]}
+    write_choice(folder, chosen, rule="best", finished=len(ended))
+    mjrec.render_videos(folder)
+
+
 # The table.
 
 FORGERIES = (
@@ -965,6 +982,7 @@ FORGERIES = (
     Forgery("a video called made smaller", bag=say_it_was_made_smaller),
     # What was chosen.
     Forgery("the best called the worst", call_the_best_worst, of=best, quick=True),
+    Forgery("the worst of an evaluation called its best", of=evaluated_and_swapped),
     Forgery("another schedule named", name_another_schedule),
     Forgery("a scheduled video left out", choose_by_hand),
     # Identity.

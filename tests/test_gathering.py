@@ -19,8 +19,8 @@ from evaluations import write_evaluation, write_recorded
 from mjrec.commands import main
 from mjrec.errors import InvalidArgument, UnreadableFile
 from mjrec.evaluation.evaluation import read_results
-from mjrec.evaluation.kept_episodes import keep_rule
 from mjrec.formats.monitor_directory import infix_of
+from mjrec.recorder.keep_rules import keep_rule
 from mjrec.reporting.contents import EPISODE
 from mjrec.reporting.episode_rows import episodes_with_roles
 from mjrec.reporting.gathering import gather

@@ -1,142 +1,105 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The rules by which episodes are chosen after they ended, against naive ones."""
+"""The rules by which episodes are chosen after they ended."""
 
 import math
+from typing import NamedTuple
 
-import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
-from mjrec.errors import InvalidArgument
-from mjrec.recorder.keep_rules import Standing, selection_from
-from mjrec.recorder.tracking import FinishedEpisode
+from mjrec import InvalidArgument, UnknownName
+from mjrec.recorder.keep_rules import RULES, keep_rule
 
 
-def episode(number, reward=0.0, *, terminated=True, success=None):
-    """Return an episode that has ended."""
-    return FinishedEpisode(
-        episode_id=number,
-        length=1,
-        reward=reward,
-        type="t",
-        terminated=terminated,
-        truncated=not terminated,
-        success=success,
-        seed=None,
-        options=None,
-        start_time=0.0,
-        end_time=1.0,
-        total_steps=number + 1,
-    )
+class Ended(NamedTuple):
+    """An episode that has ended; one without a reward could not be completed."""
+
+    number: int
+    reward: float | None
+    terminated: bool | None = False
+    success: bool | None = None
 
 
-def told(keep, episodes):
-    """Return a selection that has been told of the episodes."""
-    selection = selection_from(keep)
-    for each in episodes:
-        selection.add(each)
-    return selection
-
-
-def chosen(keep, episodes):
-    """Return what is chosen in the end."""
-    selection = told(keep, episodes)
-    selection.close()
-    assert selection.undecided == 0
-    return selection.chosen
-
-
-# Few different ones, so that there are ties.
-some_rewards = st.lists(
-    st.sampled_from([0.0, -0.0, 1.0, -2.5, 7.25, math.nan, math.inf, -math.inf]),
-    max_size=12,
-)
-
-
-def with_rewards(rewards):
-    """Return episodes with these returns; not every number is that of one."""
-    return [episode(3 + 2 * k, reward) for k, reward in enumerate(rewards)]
-
-
-@given(some_rewards, st.integers(1, 5))
-def test_returns_are_ranked(rewards, count):
-    """NaN is the worst; of equal ones the earlier counts; the median is the lower."""
-    episodes = with_rewards(rewards)
-    # Python's sort is stable, and so is it in reverse.
-    known = {e.episode_id: not math.isnan(e.reward) for e in episodes}
-    rank = {e.episode_id: (known[e.episode_id], e.reward) for e in episodes}
-    rank |= {number: (False, 0.0) for number in known if not known[number]}
-    worst = sorted(rank, key=lambda number: rank[number])
-    best = sorted(rank, key=lambda number: rank[number], reverse=True)
-    assert chosen(f"worst:{count}", episodes) == sorted(worst[:count])
-    assert chosen(f"best:{count}", episodes) == sorted(best[:count])
-    middle = [rank[number] for number in worst][(len(worst) - 1) // 2 :][:1]
-    first = [number for number in rank if rank[number] in middle][:1]
-    assert chosen("median", episodes) == first
-
-
-@given(
-    st.lists(st.tuples(st.booleans(), st.sampled_from([True, False, None]))),
-    st.integers(1, 4),
-)
-def test_failures_are_what_the_environment_calls_so(flags, most):
-    """Where it says nothing of success, what was terminated; the first, if limited."""
-    episodes = [
-        episode(k, terminated=terminated, success=success)
-        for k, (terminated, success) in enumerate(flags)
+def episodes(*returns, **of):
+    """Return episodes 0, 1 ... of one run."""
+    return [
+        Ended(number, value, **{name: values[number] for name, values in of.items()})
+        for number, value in enumerate(returns)
     ]
-    failed = [
-        k
-        for k, (terminated, success) in enumerate(flags)
-        if success is False or (success is None and terminated)
-    ]
-    assert chosen("failures", episodes) == failed
-    assert chosen(f"failures:{most}", episodes) == failed[:most]
-    # At the end of each, so that after the last nothing is recorded any more.
-    selection = told(f"failures:{most}", episodes)
-    assert selection.chosen == failed[:most]
-    assert selection(99) == (len(failed) < most)
 
 
-def test_a_function_gets_the_finished_episodes():
-    """All of them, in their order, once; NumPy's numbers will do."""
-    calls = []
-
-    def longest(episodes):
-        calls.append([each.episode_id for each in episodes])
-        return np.array([4, 0])
-
-    selection = told(longest, [episode(k) for k in range(5)])
-    assert selection.name.endswith("finished_episodes.<locals>.longest")
-    assert {selection.standing(k) for k in range(5)} == {Standing.CANDIDATE}
-    selection.close()
-    selection.close()
-    assert calls == [[0, 1, 2, 3, 4]]
-    assert selection.chosen == [0, 4]
-    assert selection.standing(1) is Standing.DROPPED
-
-
-def no_function(episodes):
-    raise ZeroDivisionError("of the user")
+def chosen(keep, ended):
+    return [(each.number, role) for each, role in keep_rule(keep).choose(ended)]
 
 
 @pytest.mark.parametrize(
-    ("keep", "what"),
+    ("returns", "keep", "expected"),
     [
-        (no_function, "no_function .*ZeroDivisionError: of the user"),
-        (lambda episodes: [7, 0], "returned 7, .* there are 0, 1, 2"),
-        (lambda episodes: None, "TypeError"),
-        (lambda episodes: 2, "TypeError"),
-        (lambda episodes: [0.5], "TypeError"),
-        (lambda episodes: [True, False, True], "True is no number of an episode"),
-        (lambda episodes: episodes[:1], "TypeError"),
+        # In the order of the rule, and within a part by rank.
+        ([5, 1, 4, 2, 3], "best,median,worst", "0 best, 4 median, 1 worst"),
+        (
+            *([5, 1, 4, 2, 3], "worst:2,best:3"),
+            "1 worst, 3 worst, 0 best, 2 best, 4 best",
+        ),
+        # Of equal returns the earlier counts; one episode may be all three.
+        ([2, 2, 2], "best,median,worst", "0 best, 0 median, 0 worst"),
+        ([9, 5, 0, 5, 5], "median", "1 median"),
+        # An episode that was played, never a mean of two: the lower.
+        ([1, 2, 3, 4], "median", "1 median"),
+        # What is no number is below minus infinity.
+        (
+            *([1, math.nan, -math.inf, math.inf], "worst:2,best"),
+            "1 worst, 2 worst, 3 best",
+        ),
+        # What failed is neither best nor worst.
+        ([None, None], "best:9,median,worst", ""),
+        ([None, 3, 2], "worst", "2 worst"),
+        # Over all runs of a task; failed ones count, so that others keep numbers.
+        ([None] + [0.0] * 29, "cubic", "0 cubic, 1 cubic, 8 cubic, 27 cubic"),
+        ([1, 2, None], "all", "0 all, 1 all, 2 all"),
+        ([1, 2], "none", ""),
     ],
 )
-def test_a_function_that_cannot_choose_is_named(keep, what):
-    """And nothing is decided, so that nothing needs to be deleted."""
-    selection = told(keep, [episode(k) for k in range(3)])
-    with pytest.raises(InvalidArgument, match=what):
-        selection.close()
-    assert selection.chosen == []
-    assert selection.undecided == 3
+def test_episodes_are_chosen_by_return(returns, keep, expected):
+    """By what each part of a rule says."""
+    found = chosen(keep, episodes(*returns))
+    assert ", ".join(f"{number} {role}" for number, role in found) == expected
+
+
+def test_failures_are_what_was_no_success():
+    """By the environment's word, else by its termination; and what broke."""
+    results = episodes(1, 2, 3, None, success=[True, False, None, None])
+    assert chosen("failures", results) == [(1, "failure"), (3, "failure")]
+    assert chosen("failures:1", results) == [(1, "failure")]
+    assert chosen("failures", episodes(1, terminated=[True])) == [(0, "failure")]
+
+
+def test_what_was_never_begun_is_counted_and_never_chosen():
+    """Later episodes keep their numbers, and the next failure takes its place."""
+    ended = [None, *episodes(None, 1.0)]
+    assert chosen("cubic", ended) == [(0, "cubic")]
+    assert chosen("all", ended) == [(0, "all"), (1, "all")]
+    assert chosen("failures:1", ended) == [(0, "failure")]
+    assert chosen("best,median,worst", [None]) == []
+
+
+def test_a_rule_has_a_name():
+    """Without what is only spelling."""
+    assert keep_rule("best, worst").name == "best,worst"
+    assert keep_rule("none").keeps_none
+
+
+@pytest.mark.parametrize("keep", ["bset", "", "best:0", "best:x", "median:2", "best,"])
+def test_an_unknown_rule_lists_the_rules(keep):
+    """With each form; a monitor's are fewer."""
+    with pytest.raises(UnknownName, match=r"best:N.*cubic, all, none"):
+        keep_rule(keep)
+    for only_of_evaluations in (keep, "cubic"):
+        with pytest.raises(UnknownName, match=r"best:N.*failures:N\."):
+            keep_rule(only_of_evaluations, RULES)
+
+
+@pytest.mark.parametrize("keep", ["best,all", "none,none", "best,best:2", None])
+def test_what_does_not_go_together_is_refused(keep):
+    """Each of them once, and what stands alone alone."""
+    with pytest.raises(InvalidArgument):
+        keep_rule(keep)

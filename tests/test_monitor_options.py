@@ -66,11 +66,12 @@ IMPOSSIBLE = {
     "cheetah": [
         *(({"render": v}, "InvalidArgument", "deferred") for v in ("later", 3, "")),
         *(({"workers": v}, "InvalidArgument", "workers") for v in (-1, 1.5, True, "2")),
-        ({"keep": "wurst:3"}, "UnknownName", "'wurst:3'. There are: best:N"),
-        ({"keep": "median:2"}, "UnknownName", "There are: best:N"),
+        ({"keep": "wurst:3"}, "UnknownName", "'wurst:3'. There are: best"),
+        ({"keep": "median:2"}, "UnknownName", "There are: best"),
+        ({"keep": "worst,worst:2"}, "InvalidArgument", "something twice"),
         *(
             ({"keep": rule}, "InvalidArgument", "1 or more")
-            for rule in ("worst:0", "best:x", "failures:1.5", "worst")
+            for rule in ("worst:0", "best:x", "failures:1.5")
         ),
         ({"keep": 3}, "InvalidArgument", "must be one of"),
         ({"keep": "worst:3", "video_callable": False}, "InvalidArgument", "before"),

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """`mjrec.render_videos`: pending or another way, here or by an engine's workers."""
 
+import dataclasses
 import json
 import os
 import shutil
@@ -30,9 +31,12 @@ from mjrec import (
     UnknownName,
     render_videos,
 )
+from mjrec.formats.dataclass_json import from_json, to_json
 from mjrec.rendering.engine_jobs import VideoWorker
-from mjrec.rendering.jobs import Progress, RecordingKey, RenderedVideos
+from mjrec.rendering.jobs import Progress, RecordingKey, RenderedVideos, VideoJob
 from mjrec.rendering.recordings import claim
+from mjrec.rendering.render_videos import name_of_variant
+from mjrec.rendering.views import Variant, View
 from mjrec.simulation.model_trust import note_models
 
 VIDEO = "openaigym.video.0.7.video000000"
@@ -121,6 +125,32 @@ def test_every_engine_makes_them(tmp_path, given):
     other = render_videos(run, episode=1, **view, out=out, engine=given)
     assert (list(other.videos), other.directory) == (["other.mp4"], tmp_path)
     assert frames_of(out)[0].shape == (24, 24, 3)
+
+
+def test_every_part_of_a_variant_is_in_its_name_and_reaches_workers(tmp_path):
+    """A part that was forgotten would be lost, or give two videos one name."""
+    views = [
+        View(camera="side"),
+        View(camera={"type": 0, "distance": 5.0}),
+        View(height=32),
+        View(width=32),
+        View(quality="draft"),
+    ]
+    others = [
+        Variant(max_fps=Fraction(30000, 1001)),
+        Variant(fps=12.5),
+        Variant(annotate=True),
+    ]
+    tried = {n for view in views for n, v in vars(view).items() if v is not None}
+    tried |= {n for each in others for n, v in vars(each).items() if v is not None}
+    parts = (*dataclasses.fields(View), *dataclasses.fields(Variant))
+    assert {each.name for each in parts} == tried
+    variants = [*others, *(Variant(view=view) for view in views)]
+    names = {name_of_variant(f"{VIDEO}.h5", each) for each in variants}
+    assert len(names) == len(variants)
+    for each in variants:
+        job = VideoJob(directory=tmp_path, recording="a", variant=each)
+        assert from_json(VideoJob, json.loads(json.dumps(to_json(job)))) == job
 
 
 @pytest.mark.parametrize("options", [{}, {"fps": 30}], ids=["pending", "another way"])

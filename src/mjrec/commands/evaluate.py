@@ -16,17 +16,17 @@ import rich.table
 import tyro
 
 from ..errors import InvalidArgument, UnknownName
-from ..evaluation.dataclass_json import to_json
 from ..evaluation.episode_results import EpisodeResult
 from ..evaluation.evaluating import evaluate as evaluate_policy
 from ..evaluation.evaluation import Evaluation
 from ..evaluation.following import EvaluationProgress
-from ..evaluation.kept_episodes import keep_rule
 from ..evaluation.plan import PLAN_NAME
 from ..evaluation.statistics import Interval
 from ..evaluation.summaries import TaskSummary
 from ..evaluation.task_sets import tasks_from
+from ..formats.dataclass_json import to_json
 from ..monitors.progress import ShowProgress, progress_bar
+from ..recorder.keep_rules import keep_rule
 from .options import NO_ENGINE, AsJson, Engine, camera_of, kwargs_of, size_of
 from .terminal import (
     and_more,
@@ -384,7 +384,7 @@ def _example_lines(evaluation: Evaluation) -> Iterator[str]:
     for task in evaluation.plan.tasks[:_SHOWN]:
         known = [
             each
-            for each in evaluation.results
+            for each in sorted(evaluation.results, key=lambda each: each.unit)
             if each.task == task.name and _name(each) not in not_finite
         ]
         for each, role in keep_rule("best,median,worst").choose(known):

@@ -191,7 +191,7 @@ class ViewerScene:
 def _pose(camera: Any) -> tuple[Any, ...]:
     return (
         *(int(camera.type), camera.fixedcamid, camera.trackbodyid),
-        *(camera.distance, camera.azimuth, camera.elevation),
+        *(camera.distance, camera.azimuth, camera.elevation, camera.orthographic),
         *camera.lookat.tolist(),
     )
 

@@ -28,6 +28,7 @@ from ..errors import (
     PolicyError,
 )
 from ..formats.bundle import FINISHED, finished_trajectories
+from ..formats.dataclass_json import to_json
 from ..formats.locks import try_lock
 from ..formats.monitor_directory import (
     Infix,
@@ -38,9 +39,9 @@ from ..formats.monitor_directory import (
 )
 from ..gl.choice import choose
 from ..provenance import versions
+from ..recorder.keep_rules import keep_rule
 from ..rendering.engine_jobs import environ_for_drawing
 from ..results import clear_monitor_files
-from .dataclass_json import to_json
 from .episode_results import EpisodeResult
 from .evaluation import (
     RESULT_NAMES,
@@ -58,8 +59,8 @@ from .following import (
     results_of,
     run_chunks,
 )
-from .kept_episodes import NO_GL, keep_rule
 from .plan import (
+    NO_GL,
     PLAN_NAME,
     SEEDED,
     EvaluationPlan,

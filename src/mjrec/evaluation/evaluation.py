@@ -28,6 +28,7 @@ from typing import Any, TextIO
 
 from ..atomic_files import replacing, write_text
 from ..errors import FileNotWritten, UnreadableFile
+from ..formats.dataclass_json import from_json, to_json
 from ..formats.json_fields import (
     field,
     integer,
@@ -42,7 +43,6 @@ from ..formats.monitor_directory import Infix, video_prefix
 from ..formats.notebook import shown
 from ..formats.spans import find_trajectory
 from ..json_text import dumps
-from .dataclass_json import from_json, to_json
 from .episode_results import EpisodeResult
 from .plan import FORMAT_VERSION, PLAN_NAME, EvaluationPlan
 from .result_tables import (

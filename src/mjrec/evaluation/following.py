@@ -19,16 +19,16 @@ from ..engines.jobs import Run
 from ..errors import EnvironmentNotMade, Error
 from ..formats.monitor_directory import Infix
 from ..messages import unpacked
+from ..recorder.keep_rules import keep_rule
+from ..rendering.chosen_videos import write_choice
 from ..rendering.engine_jobs import do_on_engine
 from ..rendering.finish import bring_up_to_date
 from ..rendering.finisher import do_jobs
 from ..rendering.jobs import Progress, RecordingKey, VideoJob
 from ..simulation.model_trust import note_models
-from .choosing import write_choice
 from .chunk_results import ChunkResults, read_chunk
 from .episode_results import EpisodeResult
 from .evaluation import ChosenEpisode
-from .kept_episodes import keep_rule
 from .plan import Chunk, EvaluatedTask, EvaluationPlan
 
 logger = logging.getLogger(__name__)
@@ -243,7 +243,10 @@ def choose_videos(
         by_task[result.task].append(result)
     for task, own in by_task.items():
         chosen: dict[str, dict[RecordingKey, list[ChosenEpisode]]] = {}
-        kept = list(keep_rule(plan.keep).choose(own))
+        # So that nothing but what was recorded decides among equals.
+        own.sort(key=lambda each: each.unit)
+        begun = [each if each.episode_id is not None else None for each in own]
+        kept = keep_rule(plan.keep).choose(begun)
         for result, role in kept:
             chunk = plan.chunk_of(result.unit)
             infix = Infix.parse(result.monitor or "")

@@ -15,13 +15,19 @@ from typing import Annotated, Any, Literal, TypeAlias
 from ..atomic_files import write_text
 from ..errors import DifferentEvaluation, UnreadableFile
 from ..formats import json_fields
+from ..formats.dataclass_json import from_json, to_json
 from ..formats.json_fields import base_name, one_of, positive, unreadable
 from ..frames import QUALITIES
 from ..json_text import dumps
-from .dataclass_json import from_json, to_json
 
 FORMAT_VERSION = 1
 PLAN_NAME = "evaluation.json"
+
+# What is logged, with the reason, where no video can be drawn.
+NO_GL = (
+    "No video can be drawn here, and those that are chosen will stay pending "
+    "(--keep none wants none): %s"
+)
 
 Protocol: TypeAlias = Literal["seeded", "suite"]
 SEEDED: Protocol = "seeded"
@@ -96,7 +102,7 @@ class EvaluationPlan:
         protocol: `"seeded"`: episode i of seed s starts from `SeedSequence([s, i])`.
             `"suite"`: the environment has one random stream for each task and seed.
         chunks: in which the episodes of each task are run.
-        keep: which episodes get a video, as `evaluation.kept_episodes` reads it.
+        keep: which episodes get a video, see `recorder.keep_rules`.
         max_steps: ends an episode as truncated; None is the environment's own limit,
             and 1000 where it has none.
         episode_timeout: seconds after which an episode has failed; None is never.

@@ -20,7 +20,7 @@ from ..errors import InvalidArgument, UnknownName
 from ..frames import check_quality
 from ..json_text import loads
 from ..rates import to_rate
-from .kept_episodes import keep_rule
+from ..recorder.keep_rules import keep_rule
 from .plan import SEEDED, SUITE, Chunk, EvaluatedTask, EvaluationPlan
 from .policy_objects import SentPolicy
 from .task_sets import tasks_from

@@ -37,10 +37,10 @@ from ..formats.monitor_directory import Infix, journal_name
 from ..json_text import dumps
 from ..monitors import Monitor
 from ..monitors.base import rendering_choice
+from ..recorder.keep_rules import keep_rule
 from ..recorder.options import LIVE
 from ..schedules import record_all
 from .chunk_results import read_chunk
-from .kept_episodes import keep_rule
 from .plan import SUITE, Chunk, EvaluationPlan, Unit
 
 if TYPE_CHECKING:

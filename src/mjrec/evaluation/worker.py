@@ -25,14 +25,13 @@ from typing import Any
 
 from ..environments.scenes import simulation_below
 from ..errors import DirectoryNotWritable, Error, GLError
+from ..formats.dataclass_json import from_json
 from ..formats.locks import wait_for_lock
 from ..gl import use_gl
 from ..messages import carried
 from ..rendering.recovery import recover
 from ..simulation.model_trust import noting_models
-from .dataclass_json import from_json
-from .kept_episodes import NO_GL
-from .plan import Chunk, EvaluationPlan
+from .plan import NO_GL, Chunk, EvaluationPlan
 from .running import Evaluator
 
 logger = logging.getLogger(__name__)

@@ -1,60 +1,138 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The videos that an evaluation chose among the episodes of many recordings.
+"""The choice among the episodes of an evaluation, recreated.
 
-Most of these may not be in the archive: the choice is not recreated.
+An evaluation chooses videos among the episodes of all recordings of an environment.
+Where all of these are in the archive, its rule is asked again. Where some are missing,
+or the evaluation was extended, the choice is believed.
 """
 
 from __future__ import annotations
 
-import contextlib
-import functools
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
-from ..formats.journal import JournalWriter
+from .. import json_text
+from ..errors import InvalidArgument
+from ..formats.journal import read_journal
 from ..formats.monitor_directory import Infix, journal_name
-from ..formats.spans import find_trajectory
-from ..formats.trajectory_file import amend_trajectories
-from ..results.manifest_writing import write_manifest_and_stats
+from ..plain_text import counted
+from ..recorder.keep_rules import keep_rule
+from ..rendering.chosen_videos import write_choice
+from ..rendering.jobs import RecordingKey
 from .inputs import RecordingInputs
 from .notes import Notes
 
 
-def choose_for_evaluation(
-    recording: RecordingInputs, directory: Path, notes: Notes
+class _Ended(NamedTuple):
+    """An episode of an evaluation that is over."""
+
+    key: RecordingKey
+    reward: float | None
+    terminated: bool | None
+    success: bool | None
+
+
+# Those that were chosen among so many episodes.
+_Choices = dict[int, dict[RecordingKey, list[str]]]
+
+
+def choose_for_evaluations(
+    recordings: Iterable[RecordingInputs], directory: Path, notes: Notes
 ) -> None:
-    """Let the trajectories that were chosen promise their videos.
+    """Choose the videos of evaluations, and write it down where they were played.
 
     Args:
-        recording: its inputs.
-        directory: where it was played; its monitor is closed.
-        notes: that the choice is believed.
+        recordings: the inputs of all recordings.
+        directory: where they were played; their monitors are closed.
+        notes: which choices are believed.
     """
-    infix, keep = Infix.parse(recording.infix), recording.evaluation_keep
-    assert infix is not None
-    assert keep is not None
-    amend_trajectories(
-        {
-            path: functools.partial(_with_promise, dict(episode.selection))
-            for episode in recording.episodes
-            if episode.selection is not None
-            and (path := find_trajectory(directory, infix, episode.episode_id))
-        }
-    )
-    with contextlib.closing(JournalWriter(directory / journal_name(infix))) as journal:
-        journal.note("keep", dict(keep))
-    write_manifest_and_stats(directory, infix, is_own=True)
-    notes.add(
-        recording.name,
-        "rule",
-        "its videos were chosen among all episodes of an evaluation: that is believed",
-        count=len(recording.episodes),
-    )
+    groups: dict[str, list[RecordingInputs]] = {}
+    for each in recordings:
+        if (directory / journal_name(each.infix)).exists() and each.is_evaluation:
+            what = json_text.dumps([each.env_id, each.environment])
+            groups.setdefault(what, []).append(each)
+    for group in groups.values():
+        rules = {str(keep.get("rule")) for e in group for keep in e.evaluation_keeps}
+        for rule in sorted(rules):
+            _choose(group, rule, directory, notes)
 
 
-def _with_promise(
-    selection: Mapping[str, Any], known: Mapping[str, Any]
-) -> Mapping[str, Any]:
-    video = {**known["possible_video"], "selection": selection}
-    return {**known, "video": video}
+def _choose(
+    group: list[RecordingInputs], rule: str, directory: Path, notes: Notes
+) -> None:
+    choices = _stated(group)
+    again = _made_again(group, rule, directory)
+    if choices.keys() == again.keys():
+        choices = again
+    else:
+        among = " and later ".join(map(str, sorted(choices)))
+        here = counted(sum(len(each.episodes) for each in group), "episode")
+        notes.add(
+            group[0].name,
+            "rule",
+            f"its videos were chosen among {among} episodes of an evaluation, and here "
+            f"are {here}: that the rule {rule!r:.80} chose them is believed",
+            count=sum(map(len, choices.values())),
+            unit="video",
+        )
+    for finished, chosen in sorted(choices.items()):
+        for each in group:
+            infix = Infix.parse(each.infix)
+            own = {key: roles for key, roles in chosen.items() if key.infix == infix}
+            write_choice(directory, own, rule=rule, finished=finished, among=each.infix)
+
+
+def _stated(group: Iterable[RecordingInputs]) -> _Choices:
+    """Return what the archive says of the choice."""
+    found: _Choices = {}
+    for recording in group:
+        infix = Infix.parse(recording.infix)
+        assert infix is not None, "it was read"
+        known: set[int] = set()
+        for keep in recording.evaluation_keeps:
+            numbers = {*keep["chosen"]} - known
+            chosen = found.setdefault(_count(keep), {})
+            # What they were called is overwritten where they were chosen again.
+            chosen |= {RecordingKey(infix, number): [] for number in numbers}
+            known |= numbers
+        for episode in recording.episodes:
+            if (selection := episode.selection) is not None:
+                key = RecordingKey(infix, episode.episode_id)
+                roles = selection.get("roles")
+                found.setdefault(_count(selection), {})[key] = [*map(str, roles or ())]
+    return found
+
+
+def _made_again(
+    group: Iterable[RecordingInputs], rule: str, directory: Path
+) -> _Choices:
+    """Return what the rule chooses among the episodes that were played."""
+    ended: dict[tuple[Any, Any], _Ended | None] = {}
+    for recording in group:
+        infix = Infix.parse(recording.infix)
+        assert infix is not None, "it was read"
+        for facts in recording.failed:
+            number, key = facts.get("episode_id"), None
+            if isinstance(number, int):
+                key = RecordingKey(infix, number)
+            failed = None if key is None else _Ended(key, None, None, None)
+            ended[facts["seed"], facts["episode"]] = failed
+        for entry in read_journal(directory / journal_name(infix)):
+            unit, key = entry.evaluation or {}, RecordingKey(infix, entry.episode_id)
+            ended[unit.get("seed"), unit.get("episode")] = _Ended(
+                key, entry.reward, entry.terminated, entry.success
+            )
+    try:
+        chosen = keep_rule(rule).choose([ended[unit] for unit in sorted(ended)])
+    except InvalidArgument:
+        return {}
+    roles: dict[RecordingKey, list[str]] = {}
+    for each, role in chosen:
+        roles.setdefault(each.key, []).append(role)
+    return {len(ended): roles}
+
+
+def _count(facts: Mapping[str, object]) -> int:
+    finished = facts.get("finished")
+    return finished if isinstance(finished, int) else 0

@@ -8,13 +8,14 @@ them to be other than recreated.
 
 from __future__ import annotations
 
-import dataclasses
 import enum
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Final
+
+from ..formats.dataclass_json import to_json
 
 _NOTHING: Final[Mapping[str, Any]] = MappingProxyType({})
 
@@ -107,16 +108,6 @@ class Finding:
     figures: Mapping[str, Any] = field(default_factory=lambda: _NOTHING)
     is_headline: bool = False
 
-    def as_json(self) -> dict[str, Any]:
-        """Return it as JSON has it."""
-        return {**_fields(self), "figures": dict(self.figures)}
-
-    @classmethod
-    def from_json(cls, said: Mapping[str, Any]) -> Finding:
-        """Return the finding that `as_json` turned into this."""
-        kinds = {"topic": Topic(said["topic"]), "outcome": Outcome(said["outcome"])}
-        return cls(**{**said, **kinds})
-
 
 @dataclass(frozen=True, kw_only=True)
 class Excuse:
@@ -145,16 +136,6 @@ class Excuse:
     is_needed: bool = True
     refuted: bool = False
     allowed: bool = False
-
-    def as_json(self) -> dict[str, Any]:
-        """Return it as JSON has it."""
-        return {**_fields(self), "items": list(self.items)}
-
-    @classmethod
-    def from_json(cls, said: Mapping[str, Any]) -> Excuse:
-        """Return the excuse that `as_json` turned into this."""
-        kinds = {"kind": ExcuseKind(said["kind"]), "items": tuple(said["items"])}
-        return cls(**{**said, **kinds})
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -211,15 +192,7 @@ class Verification:
 
     def as_json(self) -> dict[str, Any]:
         """Return all of it as JSON has it."""
-        return {
-            "path": str(self.path),
-            "level": str(self.level),
-            "verdict": str(self.verdict),
-            "findings": [finding.as_json() for finding in self.findings],
-            "excuses": [excuse.as_json() for excuse in self.excuses],
-            "inputs": dict(self.inputs),
-            "facts": dict(self.facts),
-        }
+        return {**to_json(self), "verdict": str(self.verdict)}
 
 
 def _is_proof(finding: Finding) -> bool:
@@ -231,7 +204,3 @@ def _is_proof(finding: Finding) -> bool:
 
 
 _MADE: Final = (Topic.PHYSICS, Topic.REWARDS, Topic.PICTURES)
-
-
-def _fields(facts: Finding | Excuse) -> dict[str, Any]:
-    return {each.name: getattr(facts, each.name) for each in dataclasses.fields(facts)}

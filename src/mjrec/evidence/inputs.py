@@ -125,7 +125,9 @@ class RecordingInputs:
         kept: the episodes that the rule has chosen in the end.
         clip_starts: the numbers of steps at which clips were begun by a trigger.
         episodes: in their order.
-        evaluation_keep: what the choice among all recordings of an evaluation said.
+        evaluation_events: kind and facts of what the journal says of an evaluation's
+            episodes that began and failed, in its order.
+        evaluation_keeps: what the choices among all recordings of an evaluation said.
         monitor_csv_start: the time in Stable-Baselines3's file, a statement; None where
             that was not asked for.
         provenance: the provenance, a statement; None where it was not known.
@@ -146,13 +148,25 @@ class RecordingInputs:
     kept: Sequence[int] = ()
     clip_starts: Sequence[int] = ()
     episodes: Sequence[EpisodeInputs] = ()
-    evaluation_keep: Mapping[str, Any] | None = None
+    evaluation_events: Sequence[tuple[str, Mapping[str, Any] | None]] = ()
+    evaluation_keeps: Sequence[Mapping[str, Any]] = ()
     monitor_csv_start: float | None = None
     provenance: Mapping[str, Any] | None = None
     provenance_after: int = 0
     was_killed: bool = False
     has_sources: bool = False
     is_closed: bool = False
+
+    @property
+    def is_evaluation(self) -> bool:
+        """Whether it has an evaluation's episodes."""
+        return bool(self.evaluation_events)
+
+    @property
+    def failed(self) -> Sequence[Mapping[str, Any]]:
+        """What is said of an evaluation's episodes that could not be completed."""
+        events = self.evaluation_events
+        return [facts for kind, facts in events if kind == "failed" and facts]
 
     @property
     def name(self) -> str:
@@ -250,6 +264,8 @@ def _unusual(recording: RecordingInputs) -> Iterator[tuple[str, Any]]:
         yield "schedule", recording.schedule
     if recording.rule is not None:
         yield "keep", recording.rule
+    for keep in recording.evaluation_keeps[-1:]:
+        yield "keep", str(keep.get("rule"))
     resets = [each.options for each in recording.episodes if each.options]
     if resets:
         different = dict.fromkeys(map(json_text.dumps, resets))

@@ -30,7 +30,6 @@ from ..errors import Error, UnreadableFile
 from ..formats.journal import KILLED
 from ..recorder.ending_reasons import EXCEPTION, INTERRUPT, RESET
 from ..simulation.model_sources import read_authored
-from .evaluation_choice import choose_for_evaluation
 from .inputs import EpisodeInputs, RecordingInputs, given_actions
 from .notes import Notes, read_notes
 from .recorder_again import monitor_again
@@ -162,6 +161,7 @@ class _Playing:
         self._only_counted = only_counted
         self._now = 0.0
         self._warned: Mapping[str, int] = {}
+        self._events = [*recording.evaluation_events]
         self.rewards: dict[str, NDArray[np.float64]] = {}
         # Of either framework.
         self._monitor: Any = monitor_again(
@@ -180,11 +180,11 @@ class _Playing:
         """Play all episodes. Where the recording was killed, so is this process."""
         recorder = self._monitor.recorder
         for episode in self._recording.episodes:
-            if episode.evaluation is not None:
+            if self._recording.is_evaluation:
                 self._monitor.forget_frames()
-                recorder.note_event("begun", dict(episode.evaluation))
+                self._say_begun(episode)
                 recorder.evaluation_facts = functools.partial(
-                    self._evaluation_facts, episode.evaluation
+                    self._evaluation_facts, episode.evaluation or {}
                 )
             self._begin(episode)
             self._warned = self._recreated.warnings()
@@ -193,16 +193,46 @@ class _Playing:
             elif episode.cut is None or episode.steps:
                 self._believe(episode)
             self._cut_off(episode)
+            self._say_failed()
             if episode.cut == KILLED:
                 break
+        for event in self._events:
+            self._say(*event)
+        if self._recording.was_killed and not self._recording.episodes:
+            self._notes.add(
+                self._recording.name,
+                "kill",
+                "it was killed before the first step of an episode: that is believed",
+            )
         if self._recording.has_sources:
             recorder.finish_models()
         if self._recording.was_killed:
             self._notes.write(self._directory.parent)
             os.kill(os.getpid(), signal.SIGKILL)
         self._monitor.close()
-        if self._recording.evaluation_keep is not None:
-            choose_for_evaluation(self._recording, self._directory, self._notes)
+
+    def _say_begun(self, episode: EpisodeInputs) -> None:
+        """Say what the journal says of an evaluation until an episode begins."""
+        while self._events:
+            kind, facts = self._events.pop(0)
+            self._say(kind, facts)
+            if kind == "begun" and facts and facts == episode.evaluation:
+                break
+
+    def _say_failed(self) -> None:
+        """Say that an episode failed, if that comes next."""
+        while self._events and self._events[0][0] == "failed":
+            self._say(*self._events.pop(0))
+
+    def _say(self, kind: str, facts: Mapping[str, Any] | None) -> None:
+        self._monitor.recorder.note_event(kind, None if facts is None else dict(facts))
+        if kind == "failed" and facts is not None:
+            self._notes.add(
+                self._recording.name,
+                "exception",
+                f"seed {facts['seed']}, episode {facts['episode']} failed, as its "
+                f"author says: {facts.get('failure')!s:.200}",
+            )
 
     def abandon(self) -> None:
         """Let go of a recording that cannot go on; what is there is of no use."""

@@ -48,6 +48,9 @@ _PROVENANCE: Mapping[str, tuple[str, ...]] = {
 # Of the choice among an evaluation's episodes: in a video's facts, and in a journal.
 _SELECTION = ("rule", "decided", "scope", "finished", "roles")
 _EVALUATION_KEEP = (*_SELECTION[:-1], "chosen", "recorded", "recording")
+# What the journal says of an evaluation's episodes.
+_UNIT = ("seed", "episode")
+_FAILED = (*_UNIT, "episode_id", "failure", "length", "start_time", "seconds")
 _DTYPES = frozenset(
     f"{kind}{bits}" for kind in ("float", "int", "uint") for bits in (8, 16, 32, 64)
 ) | {"bool"}
@@ -139,7 +142,8 @@ def _recording(files: MonitorFiles, arrays: dict[str, NDArray[Any]]) -> Recordin
         kept=journal.kept,
         clip_starts=tuple(sorted(journal.clip_starts())),
         episodes=tuple(_episodes(files, journal, arrays)),
-        evaluation_keep=journal.evaluation_keep,
+        evaluation_events=tuple(journal.evaluation_events),
+        evaluation_keeps=tuple(journal.evaluation_keeps),
         monitor_csv_start=_monitor_csv_start(files),
         provenance=journal.provenance,
         provenance_after=journal.provenance_after,
@@ -176,7 +180,8 @@ class _Journal:
         self.cuts: dict[int, Mapping[str, Any]] = {}
         self.irregular: dict[int, list[Mapping[str, Any]]] = {}
         self.clips: list[Mapping[str, Any]] = []
-        self.evaluation_keep: Mapping[str, Any] | None = None
+        self.evaluation_events: list[tuple[str, Mapping[str, Any] | None]] = []
+        self.evaluation_keeps: list[Mapping[str, Any]] = []
         self.kept: tuple[int, ...] = ()
         self.was_killed = self.is_closed = False
         if path is None:
@@ -195,6 +200,13 @@ class _Journal:
             if marker and digits.isdecimal():
                 yield int(digits)
 
+    def failed_unit(self, number: int) -> Mapping[str, Any] | None:
+        """Return which of an evaluation's episodes one is that failed; None else."""
+        for kind, facts in self.evaluation_events:
+            if kind == "failed" and facts and facts.get("episode_id") == number:
+                return {name: facts[name] for name in _UNIT}
+        return None
+
     def _note(self, kind: str, facts: Any) -> None:
         self._note_facts(kind, facts)
         self._lines += kind != "run"
@@ -212,8 +224,15 @@ class _Journal:
                 self.irregular.setdefault(number, []).append(facts)
             case "clip", dict():
                 self.clips.append(facts)
-            case "keep", {"scope": "evaluation"}:
-                self.evaluation_keep = _known(facts, _EVALUATION_KEEP)
+            case "begun", None:
+                self.evaluation_events.append((kind, None))
+            case "begun" | "failed", dict():
+                self.evaluation_events.append((kind, _of_evaluation(kind, facts)))
+            case "keep", {"scope": "evaluation", "chosen": list(numbers)}:
+                chosen = [*map(_count, numbers)]
+                self.evaluation_keeps.append(
+                    {**_known(facts, _EVALUATION_KEEP), "chosen": chosen}
+                )
             case "keep", {"recorded": list(numbers)}:
                 self.kept = tuple(map(_count, numbers))
             case "recovered", _:
@@ -246,6 +265,7 @@ def _episodes(
                 episode,
                 cut=str(cut.get("reason")),
                 is_chosen=cut.get("chosen") is True,
+                evaluation=journal.failed_unit(number),
             )
         yield episode
 
@@ -345,6 +365,16 @@ def _steps_taken(reader: TrajectoryReader) -> dict[str, NDArray[Any]]:
         "terminated": reader.terminated,
         "truncated": reader.truncated,
     }
+
+
+def _of_evaluation(kind: str, facts: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Return facts of an event of an evaluation, if it has these and no others."""
+    known = {"begun": _UNIT, "failed": _FAILED}[kind]
+    if not facts.keys() <= {*known} or not all(
+        type(facts.get(k)) is int for k in _UNIT
+    ):
+        raise ValueError(f"{facts!r:.200} are no facts of an event {kind!r}")
+    return facts
 
 
 def _selection(video: Any) -> Mapping[str, Any] | None:

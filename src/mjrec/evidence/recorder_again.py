@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import re
 from collections.abc import Callable, Iterable, Sequence
 from fractions import Fraction
@@ -10,10 +11,10 @@ from pathlib import Path
 from typing import Any
 
 from ..environments.recreate import NotRecreated, Recreated
-from ..environments.scenes import simulation_below
-from ..errors import Error
+from ..errors import Error, InvalidArgument
 from ..formats.monitor_directory import Infix
 from ..monitors.base import EnvironmentMonitor
+from ..recorder.keep_rules import RULES, keep_rule
 from ..recorder.opening import JOIN, Statements
 from ..recorder.options import RecorderOptions
 from ..recorder.tracking import FinishedEpisode, Tracker
@@ -29,7 +30,6 @@ _SCHEDULES = {
     "disable_videos": "none",
 }
 _SCHEDULE = re.compile(r"(every|at):[\d,]+", re.ASCII)
-_RULE = re.compile(r"(best|worst|failures):\d{1,18}|failures|median", re.ASCII)
 
 
 def monitor_again(
@@ -91,7 +91,7 @@ def monitor_again(
             recreated.environment,
             directory,
             options,
-            camera=_camera(given.get("camera"), recreated),
+            camera=given.get("camera"),
             height=given.get("height"),
             width=given.get("width"),
             env_id=recording.env_id,
@@ -133,8 +133,10 @@ def _rule(
     recording: RecordingInputs, notes: Notes
 ) -> str | Callable[[Sequence[FinishedEpisode]], Iterable[int]] | None:
     name = recording.rule
-    if name is None or _RULE.fullmatch(name):
-        return name
+    if name is None:
+        return None
+    with contextlib.suppress(InvalidArgument):
+        return keep_rule(name, RULES).name
     notes.add(
         recording.name,
         "rule",
@@ -193,17 +195,3 @@ def _rate(text: str | None) -> float | Fraction | None:
         return None
     is_float = "." in text or "e" in text
     return float(text) if is_float else Fraction(text)
-
-
-def _camera(said: Any, recreated: Recreated) -> Any:
-    if isinstance(said, list):
-        return [_camera(each, recreated) for each in said]
-    if not isinstance(said, dict):
-        return said
-    # Loads MuJoCo, which not every recording needs.
-    from ..simulation.cameras import resolve_camera
-
-    simulated = simulation_below(recreated.environment)
-    if simulated is None:
-        raise ValueError("it has no cameras")
-    return resolve_camera(simulated.model, said)

@@ -23,6 +23,7 @@ from typing import Any, Final
 from numpy.typing import NDArray
 
 from ..errors import Error, FileNotWritten, UnreadableArchive
+from ..formats.dataclass_json import to_json
 from ..sandbox import enter
 from .findings import Level
 from .inputs import ARRAYS_FILE, Inputs
@@ -86,10 +87,10 @@ def _open(request: Mapping[str, Any], say: _Say) -> None:
     is_bag = (given / BAG_DECLARATION).exists()
     objections = list(check_bag(given, counter)) if is_bag else []
     for finding in objections:
-        say(finding=finding.as_json())
+        say(finding=to_json(finding))
     if request["level"] == Level.FILES:
         if is_bag and not objections:
-            say(finding=unchanged(given).as_json())
+            say(finding=to_json(unchanged(given)))
         return
     inputs, arrays = read_inputs(given / PAYLOAD)
     folder = Path(request["inputs"])
@@ -102,7 +103,7 @@ def _open(request: Mapping[str, Any], say: _Say) -> None:
                 shutil.copyfile(sources, folder / recording.sources)
     say(inputs=inputs.unusual())
     for finding in remarks(inputs, arrays):
-        say(finding=finding.as_json())
+        say(finding=to_json(finding))
 
 
 def _make(request: Mapping[str, Any], say: _Say) -> None:
@@ -112,6 +113,7 @@ def _make(request: Mapping[str, Any], say: _Say) -> None:
     from ..formats.monitor_directory import infix_of, iter_monitor_files
     from ..rendering.recovery import recover
     from .draw_again import draw_all, draw_sample
+    from .evaluation_choice import choose_for_evaluations
     from .make_again import play_recording
     from .pack import pack_folder
     from .read_inputs import packing_options
@@ -154,6 +156,7 @@ def _make(request: Mapping[str, Any], say: _Say) -> None:
                 notes.add(recording.name, error.excuse, str(error), count=episodes)
     if any(recording.was_killed for recording in inputs.recordings):
         recover(played)
+    choose_for_evaluations(inputs.recordings, played, notes)
     say(phase="drawing")
     if not any(played.iterdir()):
         is_packed = False
@@ -188,8 +191,8 @@ def _compare(request: Mapping[str, Any], say: _Say) -> None:
         on_progress=_Counter(say),
     )
     for finding in comparison:
-        say(finding=finding.as_json())
-    say(excuses=[excuse.as_json() for excuse in comparison.excuses])
+        say(finding=to_json(finding))
+    say(excuses=[to_json(excuse) for excuse in comparison.excuses])
 
 
 if __name__ == "__main__":

@@ -25,6 +25,7 @@ from ..errors import (
     UnknownName,
     UnreadableArchive,
 )
+from ..formats.dataclass_json import from_json
 from ..formats.locks import Lock, is_locked
 from ..machine import machine_fingerprint
 from ..sandbox import Sandbox
@@ -225,9 +226,9 @@ class _Verifying:
             case {"error": text}:
                 raise Error(text)
             case {"finding": finding}:
-                self.findings.append(Finding.from_json(finding))
+                self.findings.append(from_json(Finding, finding))
             case {"excuses": excuses}:
-                self.excuses = [Excuse.from_json(each) for each in excuses]
+                self.excuses = [from_json(Excuse, each) for each in excuses]
             case {"inputs": inputs}:
                 self.inputs = inputs
             case {"facts": facts}:

@@ -10,8 +10,8 @@ from ..schedules import (
     schedule_name,
     to_schedule,
 )
-from .keep_rules import Selection, selection_from
 from .options import OFF, RecorderOptions
+from .selection import Selection, selection_from
 
 _EVALUATION = "e"
 

@@ -1,273 +1,195 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which episodes get a video, decided after they ended: `Monitor(..., keep=...)`.
+"""Which episodes get a video, by how they ended: `keep`.
 
-A selection gets every finished episode, one after the other, and says of each
-how it stands. It knows nothing of files.
+A rule is one or several of these, separated by commas:
+
+==============  ======================================================================
+`best[:N]`      the N of the highest return, one if no number is given
+`worst[:N]`     the N of the lowest return
+`median`        the one whose return is the median, of an even number the lower one
+`failures[:N]`  the first N, or all, that were no success; where the environment does
+                not say, those that it terminated; and those that could not be completed
+==============  ======================================================================
+
+or, of an evaluation only, one of these:
+
+==========  ==========================================================================
+`cubic`     0, 1, 8, 27 ... and every 1000th, counted over all seeds
+`all`       every one
+`none`      none
+==========  ==========================================================================
+
+Of equal returns the earlier episode counts. A return that is not a number is the worst.
+What could not be completed has no return, and is neither best, median nor worst. An
+episode may be several of these: where all returns are equal, the first is the best, the
+median and the worst.
 """
 
 from __future__ import annotations
 
-import enum
 import math
-import operator
 import re
-from collections.abc import Callable, Iterable, Sequence
-from typing import Any, TypeAlias
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol, TypeVar
 
 from ..errors import InvalidArgument, UnknownName
-from ..schedules import check_takes_one, schedule_name
-from .tracking import FinishedEpisode
+from ..schedules import capped_cubic_video_schedule
 
-Keep: TypeAlias = str | Callable[[Sequence[FinishedEpisode]], Iterable[int]]
+RULES = ("best", "best:N", "worst", "worst:N", "median", "failures", "failures:N")
+RULES_OF_EVALUATIONS = (*RULES, "cubic", "all", "none")
 
-
-RULES = ("best:N", "worst:N", "failures", "failures:N", "median")
-
-_RULE = re.compile(r"(?P<kind>[^:]*)(?P<colon>:(?P<count>.*))?", re.DOTALL)
-_COUNT = re.compile(r"[+-]?\d{1,18}", re.ASCII)
-_KINDS = ("best", "worst", "failures", "median")
+_ALONE = ("cubic", "all", "none")
+_COUNTED = re.compile(
+    r"(?P<kind>best|worst|failures)(:(?P<count>[1-9]\d{0,17}))?", re.ASCII
+)
 
 
-class Standing(enum.Enum):
-    """How an episode stands.
-
-    Attributes:
-        CHOSEN: it gets its video, for good.
-        CANDIDATE: later episodes, or the end of the run, decide.
-        DROPPED: it gets none, for good.
-    """
-
-    CHOSEN = "chosen"
-    CANDIDATE = "candidate"
-    DROPPED = "dropped"
-
-
-class Selection:
-    """Chooses among the finished episodes of one run.
-
-    It is a schedule too: of every episode that may be chosen when it has ended.
-
-    Args:
-        name: of the rule, as the manifest has it.
-
-    Attributes:
-        name: as given.
-        finished: how many episodes it got.
-        holds_all: every episode is a candidate until `close`.
-    """
-
-    holds_all = False
-
-    def __init__(self, name: str) -> None:
-        self.name = name
-        # Under which a schedule is written into the manifest.
-        self.__qualname__ = f"keep:{name}"
-        self.finished = 0
-        self._last_id = -1
-        self._candidates: dict[int, FinishedEpisode] = {}
-        self._chosen: set[int] = set()
-
-    def facts(self) -> dict[str, Any]:
-        """Return what a run says of it."""
-        return {"rule": self.name}
-
-    def __call__(self, episode_id: int) -> bool:
-        """Return whether an episode is to be recorded, as if it got a video."""
-        return True
-
-    def add(self, episode: FinishedEpisode) -> None:
-        """Take note of an episode; their numbers rise. Of the same one it counts once.
-
-        A candidate that has fallen out never comes back.
-        """
-        if episode.episode_id > self._last_id:
-            self._take(episode)
-            self.finished += 1
-            self._last_id = episode.episode_id
-
-    def standing(self, episode_id: int) -> Standing:
-        """Return how an episode stands that it got."""
-        if episode_id in self._chosen:
-            return Standing.CHOSEN
-        is_candidate = episode_id in self._candidates
-        return Standing.CANDIDATE if is_candidate else Standing.DROPPED
+class Ended(Protocol):
+    """An episode that is over."""
 
     @property
-    def undecided(self) -> int:
-        """How many episodes are candidates."""
-        return len(self._candidates)
+    def reward(self) -> float | None:
+        """The return; None where it could not be completed."""
 
     @property
-    def chosen(self) -> list[int]:
-        """The numbers of those that are chosen, rising."""
-        return sorted(self._chosen)
+    def terminated(self) -> bool | None:
+        """Whether the task ended it."""
 
-    def close(self) -> None:
-        """Decide about all candidates: there are no more episodes. Idempotent.
+    @property
+    def success(self) -> bool | None:
+        """What the environment said of it; None where it said nothing."""
 
-        Raises:
-            InvalidArgument: the user's function raised, or did not return numbers of
-                finished episodes. Nothing is decided then.
+
+_E = TypeVar("_E", bound=Ended)
+
+
+@dataclass(frozen=True)
+class Part:
+    """A part of a rule.
+
+    Attributes:
+        role: what it chooses: `"best"`, `"worst"`, `"median"`, `"failure"`, `"cubic"`
+            or `"all"`.
+        count: the most episodes; None where that is not limited.
+    """
+
+    role: str
+    count: int | None = None
+
+    def choose(self, episodes: Sequence[_E | None]) -> list[_E]:
+        """Return the chosen episodes, in the order of the rule.
+
+        Args:
+            episodes: in their order; None stands for one that was never begun.
         """
-        self._chosen.update(self._candidates)
-        self._candidates.clear()
+        begun = [each for each in episodes if each is not None]
+        match self.role:
+            case "best":
+                chosen = sorted(_completed(begun), key=_rank, reverse=True)
+            case "worst":
+                chosen = sorted(_completed(begun), key=_rank)
+            case "median":
+                chosen = _median(_completed(begun))
+            case "failure":
+                chosen = [each for each in begun if has_failed(each)]
+            case "cubic":
+                numbered = enumerate(episodes)
+                is_chosen = capped_cubic_video_schedule
+                chosen = [e for k, e in numbered if e is not None and is_chosen(k)]
+            case _:
+                chosen = begun
+        return chosen[: self.count]
 
-    def _take(self, episode: FinishedEpisode) -> None:
-        self._candidates[episode.episode_id] = episode
+
+@dataclass(frozen=True)
+class KeepRule:
+    """A rule.
+
+    Attributes:
+        name: as the manifest has it.
+        parts: of it.
+    """
+
+    name: str
+    parts: tuple[Part, ...]
+
+    @property
+    def keeps_none(self) -> bool:
+        """Whether no episode gets a video."""
+        return not self.parts
+
+    def choose(self, episodes: Sequence[_E | None]) -> list[tuple[_E, str]]:
+        """Return the chosen episodes with their roles, in the order of the rule."""
+        return [(e, part.role) for part in self.parts for e in part.choose(episodes)]
 
 
-def selection_from(keep: object) -> Selection:
-    """Return a new selection by the rule that `keep` names or is.
+def keep_rule(text: str, rules: Sequence[str] = RULES_OF_EVALUATIONS) -> KeepRule:
+    """Return the rule that `text` names.
 
     Args:
-        keep: `"best:N"` or `"worst:N"` (by return; of equal ones the earlier; a return
-            that is not a number is the worst), `"failures"` or the first
-            `"failures:N"`, `"median"` (the lower one; of equal ones the earliest), or
-            a function from the finished episodes to the numbers of the chosen.
+        text: see the module.
+        rules: those that there are, for messages; without them, `cubic`, `all` and
+            `none` are none.
 
     Raises:
         UnknownName: there is no such rule.
-        InvalidArgument: it is neither text nor a function, or N is not 1 or more.
+        InvalidArgument: it is no text, a part of it is there twice, or one that stands
+            alone is not alone.
     """
-    if callable(keep):
-        check_takes_one(keep, "keep", "the sequence of finished episodes")
-        return _ByFunction(schedule_name(keep), keep)
-    if not isinstance(keep, str):
+    if not isinstance(text, str):
         raise InvalidArgument(
-            f"keep must be one of {', '.join(RULES)}, or a function from the finished "
-            f"episodes to the numbers of those to keep, got {keep!r}."
+            f"keep must be a text such as 'best,median,worst', got {text!r}."
         )
-    rule = _RULE.fullmatch(keep)
-    kind = "" if rule is None else rule["kind"]
-    if rule is None or kind not in _KINDS or (kind == "median" and rule["colon"]):
-        raise UnknownName("keep rule", keep, RULES, hint="A function is one too.")
-    if kind == "median":
-        return _ByFunction(keep, _median)
-    if kind == "failures":
-        return _Failures(keep, None if not rule["colon"] else _count(keep, rule))
-    return _Extremes(keep, _count(keep, rule), _better if kind == "best" else _worse)
-
-
-def _count(keep: str, rule: re.Match[str]) -> int:
-    text = rule["count"] or ""
-    count = int(text) if _COUNT.fullmatch(text) else 0
-    if count < 1:
+    names = [name.strip() for name in text.split(",")]
+    for name in names:
+        if name not in rules and not _COUNTED.fullmatch(name):
+            raise UnknownName("keep rule", name, rules, hint="N is 1 or more.")
+    kinds = [name.partition(":")[0] for name in names]
+    if len(kinds) > 1 and set(kinds) & set(_ALONE):
         raise InvalidArgument(
-            f"keep={keep!r} names no number of episodes: a whole number, 1 or more, "
-            f'stands behind the colon, as in "{rule["kind"]}:3".'
+            f"keep={text!r}: {', '.join(_ALONE)} stand alone; only best, median, worst "
+            "and failures go together."
         )
-    return count
+    if len(set(kinds)) < len(kinds):
+        raise InvalidArgument(f"keep={text!r} names something twice.")
+    parts = () if names == ["none"] else tuple(map(_part, names))
+    return KeepRule(",".join(names), parts)
 
 
-_Key: TypeAlias = tuple[bool, float, int]
+def has_failed(episode: Ended) -> bool:
+    """Return whether an episode is a failure.
 
-
-def _worse(episode: FinishedEpisode) -> _Key:
-    """Return what sorts the worst episode first, and of equal ones the earliest."""
-    is_number = not math.isnan(episode.reward)
-    return is_number, episode.reward if is_number else 0.0, episode.episode_id
-
-
-def _better(episode: FinishedEpisode) -> _Key:
-    is_number, reward, episode_id = _worse(episode)
-    return not is_number, -reward, episode_id
-
-
-class _Extremes(Selection):
-    """The first N in an order, as far as it is known."""
-
-    def __init__(
-        self, name: str, count: int, order: Callable[[FinishedEpisode], _Key]
-    ) -> None:
-        super().__init__(name)
-        self._count = count
-        self._order = order
-
-    def _take(self, episode: FinishedEpisode) -> None:
-        super()._take(episode)
-        if len(self._candidates) > self._count:
-            del self._candidates[max(map(self._order, self._candidates.values()))[-1]]
-
-
-class _Failures(Selection):
-    """Those that failed, decided at once."""
-
-    def __init__(self, name: str, most: int | None) -> None:
-        super().__init__(name)
-        self._most = most
-
-    def __call__(self, episode_id: int) -> bool:
-        return self._most is None or len(self._chosen) < self._most
-
-    def _take(self, episode: FinishedEpisode) -> None:
-        if _has_failed(episode) and self(episode.episode_id):
-            self._chosen.add(episode.episode_id)
-
-
-def _has_failed(episode: FinishedEpisode) -> bool:
-    """Tell it by what the environment says; by its termination where it says nothing.
-
-    That is right for tasks that end when the robot falls.
+    By what the environment says; by its termination where it says nothing, which is
+    right for tasks that end when the robot falls.
     """
-    return episode.terminated if episode.success is None else not episode.success
+    if episode.reward is None:
+        return True
+    return bool(episode.terminated) if episode.success is None else not episode.success
 
 
-class _ByFunction(Selection):
-    """What a function of all episodes returns, at the end."""
-
-    holds_all = True
-
-    def __init__(
-        self,
-        name: str,
-        function: Callable[[Sequence[FinishedEpisode]], Iterable[int]],
-    ) -> None:
-        super().__init__(name)
-        self._function = function
-        self._is_decided = False
-
-    def close(self) -> None:
-        if not self._is_decided:
-            self._chosen.update(self._ask())
-            self._is_decided = True
-            self._candidates.clear()
-
-    def _ask(self) -> frozenset[int]:
-        try:
-            answer = self._function(tuple(self._candidates.values()))
-            numbers = frozenset(map(_number, answer))
-        except Exception as error:
-            raise InvalidArgument(
-                f"keep={self.name} could not choose among {len(self._candidates)} "
-                f"finished episodes: {type(error).__name__}: {error}. It must return "
-                "the numbers (episode_id) of those to keep."
-            ) from error
-        unknown = sorted(numbers - self._candidates.keys())
-        if unknown:
-            raise InvalidArgument(
-                f"keep={self.name} returned {_listed(unknown)}, and no finished "
-                f"episode has that number: there are {_listed([*self._candidates])}."
-            )
-        return numbers
+def _part(name: str) -> Part:
+    counted = _COUNTED.fullmatch(name)
+    if counted is None:
+        return Part(name, 1 if name == "median" else None)
+    count = None if counted["count"] is None else int(counted["count"])
+    if counted["kind"] == "failures":
+        return Part("failure", count)
+    return Part(counted["kind"], count or 1)
 
 
-def _number(value: Any) -> int:
-    if isinstance(value, bool):
-        # Most likely a list of yes and no, which would name the episodes 0 and 1.
-        raise TypeError(f"{value} is no number of an episode")
-    return operator.index(value)
+def _completed(episodes: Sequence[_E]) -> list[_E]:
+    return [each for each in episodes if each.reward is not None]
 
 
-def _listed(numbers: Sequence[int], most: int = 10) -> str:
-    shown = ", ".join(map(str, numbers[:most])) or "none"
-    more = len(numbers) - most
-    return f"{shown} and {more} more" if more > 0 else shown
+def _rank(episode: Ended) -> tuple[bool, float]:
+    reward = episode.reward
+    # No number is below minus infinity.
+    return (False, 0.0) if reward is None or math.isnan(reward) else (True, reward)
 
 
-def _median(episodes: Sequence[FinishedEpisode]) -> list[int]:
-    """Return the number of the episode whose return is the lower median."""
-    if not episodes:
-        return []
-    ordered = sorted(map(_worse, episodes))
-    middle = ordered[(len(ordered) - 1) // 2]
-    return [next(number for *reward, number in ordered if reward == [*middle[:2]])]
+def _median(episodes: Sequence[_E]) -> list[_E]:
+    # Sorting keeps the order of equal ones, in reverse too.
+    ordered = sorted(map(_rank, episodes))
+    middle = ordered[(len(ordered) - 1) // 2 :][:1]
+    return [each for each in episodes if _rank(each) in middle][:1]

@@ -13,8 +13,8 @@ from collections.abc import Iterable
 from typing import Any
 
 from ..errors import Error, InvalidArgument
-from .keep_rules import Selection, Standing
 from .recording import EpisodeRecording
+from .selection import Selection, Standing
 from .tracking import FinishedEpisode
 
 logger = logging.getLogger(__name__)

@@ -20,8 +20,8 @@ from ..formats.row_log import TAIL_BYTES
 from ..frames import check_quality
 from ..rates import to_rate
 from ..schedules import check_takes_one, schedule_name
-from .keep_rules import selection_from
 from .opening import JOIN, Statements
+from .selection import selection_from
 from .tracking import FinishedEpisode, Tracker
 
 DEFERRED, LIVE, OFF = "deferred", "live", "off"

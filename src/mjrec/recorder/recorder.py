@@ -30,13 +30,13 @@ from .ending_reasons import CLOSE, RESET, ending
 from .episode_choice import EpisodeChoice
 from .fast_path import FastPath
 from .finishers import Finisher, LaterFinisher
-from .keep_rules import Standing
 from .kept_videos import KeptVideos
 from .monitored_run import BegunEpisode, MonitoredRun
 from .opening import open_directory
 from .options import DEFERRED, LIVE, RecorderOptions, type_of_mode
 from .recorded_environment import RecordedEnvironment, check_frames
 from .recording import EpisodeRecording
+from .selection import Standing
 from .states import DeferredVideo
 from .stats_recorder import StatsRecorder, reward_to_float
 from .tracking import FinishedEpisode

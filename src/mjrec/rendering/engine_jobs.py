@@ -16,6 +16,7 @@ from dataclasses import replace
 from typing import Any
 
 from ..engines.jobs import JobOutcome, Run, Work
+from ..formats.dataclass_json import from_json, to_json
 from ..simulation.model_trust import TRUST_VARIABLE, note_models, stored_models
 from .finisher import Finisher, note_failure
 from .jobs import Progress, RenderedVideos, VideoJob
@@ -64,7 +65,7 @@ def do_on_engine(
     )
     with Run(engine, work) as run:
         for name, job in by_name.items():
-            run.submit(name, **job.as_json())
+            run.submit(name, **to_json(_everywhere(job)))
         for done in run.results():
             # Without timeout there is always one.
             assert done is not None
@@ -94,7 +95,13 @@ def result_of(done: JobOutcome, job: VideoJob) -> RenderedVideos:
         return RenderedVideos(directory=directory, failures=failures)
     assert done.value is not None
     # Under the name by which this process knows it.
-    return replace(RenderedVideos.from_json(done.value), directory=directory)
+    return replace(from_json(RenderedVideos, done.value), directory=directory)
+
+
+def _everywhere(job: VideoJob) -> VideoJob:
+    """Return a job with paths that mean the same in other working directories."""
+    video = None if job.video is None else job.video.absolute()
+    return replace(job, directory=job.directory.absolute(), video=video)
 
 
 def _name_of(job: VideoJob) -> str:
@@ -128,11 +135,11 @@ class VideoWorker:
 
     def __call__(self, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
         """Do a job."""
-        job = VideoJob.from_json(arguments)
+        job = from_json(VideoJob, arguments)
         result = RenderedVideos(directory=job.directory)
         if self._finisher.add(job):
             _, result = self._finisher.do_next()
-        return result.as_json()
+        return to_json(result)
 
     def close(self) -> None:
         """End the process that draws."""

@@ -10,9 +10,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from fractions import Fraction
 from pathlib import Path
-from typing import Any, Self
+from typing import Self
 
 from ..formats.monitor_directory import (
     ClipPart,
@@ -27,8 +26,7 @@ from ..formats.monitor_directory import (
     video_prefix,
 )
 from ..formats.notebook import shown
-from ..rates import to_rate
-from .views import Variant, View
+from .views import Variant
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -143,41 +141,6 @@ class VideoJob:
         assert key is not None
         return key
 
-    def as_json(self) -> dict[str, Any]:
-        """Return what JSON can hold, for `from_json` in another process."""
-        variant = self.variant and {
-            "view": self.variant.view.as_json(),
-            # As texts they stay exact.
-            "max_fps": self.variant.max_fps and str(to_rate(self.variant.max_fps)),
-            "fps": self.variant.fps and str(to_rate(self.variant.fps)),
-            "annotate": self.variant.annotate,
-        }
-        return {
-            "directory": str(self.directory.absolute()),
-            "recording": self.recording,
-            "strict": self.strict,
-            "variant": variant,
-            "video": self.video and str(self.video.absolute()),
-        }
-
-    @classmethod
-    def from_json(cls, plain: Mapping[str, Any]) -> Self:
-        """Return what another process of ours said with `as_json`."""
-        variant = plain["variant"] and Variant(
-            view=View(**plain["variant"]["view"]),
-            max_fps=plain["variant"]["max_fps"]
-            and Fraction(plain["variant"]["max_fps"]),
-            fps=plain["variant"]["fps"] and Fraction(plain["variant"]["fps"]),
-            annotate=plain["variant"]["annotate"],
-        )
-        return cls(
-            directory=Path(plain["directory"]),
-            recording=plain["recording"],
-            strict=plain["strict"],
-            variant=variant,
-            video=plain["video"] and Path(plain["video"]),
-        )
-
 
 @dataclass(frozen=True, kw_only=True)
 class RenderedVideos:
@@ -227,12 +190,3 @@ class RenderedVideos:
     def is_empty(self) -> bool:
         """Whether there was nothing to do."""
         return not (self.videos or self.trajectories or self.failures or self.elsewhere)
-
-    def as_json(self) -> dict[str, Any]:
-        """Return what JSON can hold, for `from_json` in another process."""
-        return {**vars(self), "directory": str(self.directory)}
-
-    @classmethod
-    def from_json(cls, values: Mapping[str, Any]) -> Self:
-        """Return what another process of ours wrote with `as_json`."""
-        return cls(**{**values, "directory": Path(values["directory"])})

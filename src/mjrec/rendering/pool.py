@@ -29,6 +29,7 @@ from ..errors import (
     Error,
     GLError,
 )
+from ..formats.dataclass_json import to_json
 from ..formats.locks import Lock, try_lock
 from ..formats.monitor_directory import render_lock_name
 from ..frames import Frame
@@ -143,7 +144,7 @@ class WorkerPool:
         are asked for.
         """
         if self._job is None:
-            drawing = {"trajectory": str(trajectory), "view": View().as_json()}
+            drawing = {"trajectory": str(trajectory), "view": to_json(View())}
             for worker in self._workers:
                 if worker.child is not None:
                     worker.child.send(prepares=drawing)
@@ -185,7 +186,7 @@ class WorkerPool:
         """
         drawing: dict[str, Any] = {
             "trajectory": str(Path(trajectory).absolute()),
-            "view": (view or View()).as_json(),
+            "view": to_json(view or View()),
         }
         if cameras is not None:
             drawing["cameras"] = [c if c is None else plain_camera(c) for c in cameras]

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 from numpy.typing import ArrayLike
 
 from ..errors import InvalidArgument
+from ..formats.dataclass_json import to_json
 from ..frames import Frame
 from .pool import WorkerPool
 from .recorded_facts import (
@@ -155,7 +156,7 @@ def render_states(
     pool = WorkerPool(workers)
     temporary = tempfile.TemporaryDirectory(prefix="mjrec-states-")
     directory = Path(temporary.name)
-    drawing = {"states": str(directory), "spec": int(spec), "view": view.as_json()}
+    drawing = {"states": str(directory), "spec": int(spec), "view": to_json(view)}
 
     def begin() -> Iterator[Frame]:
         save_states(directory, model, rows)

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from fractions import Fraction
 from typing import Any, TypeAlias
 
@@ -14,7 +14,7 @@ from ..errors import InvalidArgument, UnknownName
 from ..frames import check_quality, check_size
 from ..rates import to_rate
 
-PlainCamera: TypeAlias = "str | int | dict[str, Any]"
+PlainCamera: TypeAlias = str | int | dict[str, Any]
 
 # The public members of an `mujoco.MjvCamera`.
 CAMERA_MEMBERS = (
@@ -60,10 +60,6 @@ class View:
         for name, make in plain.items():
             if (value := getattr(self, name)) is not None:
                 object.__setattr__(self, name, make(value))
-
-    def as_json(self) -> dict[str, Any]:
-        """Return what JSON can hold, for `View(**...)` in another process."""
-        return asdict(self)
 
 
 @dataclass(frozen=True, kw_only=True)

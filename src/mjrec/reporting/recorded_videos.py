@@ -183,10 +183,7 @@ def _camera(camera: Any) -> str | None:
             return "free camera" if camera == -1 else f"camera {camera}"
         case [_, *_]:
             return ", ".join(_camera(one) or "?" for one in camera[:100])
-        case {"type": "mjCAMERA_FIXED"}:
-            fixed = camera.get("fixedcamid")
-            return f"camera {fixed}" if type(fixed) is int else None
-        case {"type": "mjCAMERA_TRACKING"}:
+        case {"type": 1}:
             return "tracking camera"
         case {}:
             return "free camera"

@@ -170,19 +170,22 @@ def camera_label(model: mujoco.MjModel, camera: Any) -> str | int | dict[str, An
 
     Args:
         model: has the camera.
-        camera: a name, a number (-1 is the free camera) or an `mujoco.MjvCamera`.
+        camera: as `resolve_camera` takes it.
     """
     if isinstance(camera, str):
         return camera
+    if isinstance(camera, Mapping):
+        camera = resolve_camera(model, camera)
     if isinstance(camera, mujoco.MjvCamera):
         if int(camera.type) != int(mujoco.mjtCamera.mjCAMERA_FIXED):
             return {
-                "type": mujoco.mjtCamera(camera.type).name,
+                "type": int(camera.type),
                 "trackbodyid": int(camera.trackbodyid),
                 "lookat": camera.lookat.tolist(),
                 "distance": float(camera.distance),
                 "azimuth": float(camera.azimuth),
                 "elevation": float(camera.elevation),
+                "orthographic": int(camera.orthographic),
             }
         camera = camera.fixedcamid
     return _name_of(model, int(camera))

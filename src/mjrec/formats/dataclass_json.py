@@ -4,13 +4,16 @@
 from __future__ import annotations
 
 import dataclasses
+import enum
 import functools
 import types
 import typing
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from fractions import Fraction
+from pathlib import Path
 from typing import Any, TypeVar
 
-from ..formats.json_fields import (
+from .json_fields import (
     boolean,
     field,
     integer,
@@ -32,12 +35,26 @@ _PLAIN: dict[object, _Read] = {
     float: number,
     int: integer,
     str: text,
+    Fraction: lambda value: Fraction(text(value)),
+    Path: lambda value: Path(text(value)),
 }
 
 
 def to_json(instance: Any) -> dict[str, Any]:
-    """Return a dataclass as what `json_text` writes; what is NaN becomes null there."""
-    return dataclasses.asdict(instance)
+    """Return a dataclass as JSON can hold it; `json_text` writes NaN as null."""
+    names = [each.name for each in dataclasses.fields(instance)]
+    return {name: _plain(getattr(instance, name)) for name in names}
+
+
+def _plain(value: Any) -> Any:
+    if dataclasses.is_dataclass(value):
+        return to_json(value)
+    if isinstance(value, Mapping):
+        return {key: _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    # Fractions stay exact as strings.
+    return str(value) if isinstance(value, Path | Fraction) else value
 
 
 def from_json(kind: type[D], value: Any) -> D:
@@ -77,6 +94,8 @@ def _reader(hint: Any) -> _Read:
         return _PLAIN[hint]
     if dataclasses.is_dataclass(hint):
         return functools.partial(from_json, typing.cast(type, hint))
+    if isinstance(hint, enum.EnumType):
+        return hint
     origin, inner = typing.get_origin(hint), typing.get_args(hint)
     if origin is typing.Annotated:
         return typing.cast(_Read, hint.__metadata__[0])
@@ -86,6 +105,8 @@ def _reader(hint: Any) -> _Read:
         return optional(
             _any_of([_reader(each) for each in inner if each is not types.NoneType])
         )
+    if origin is Sequence:
+        return list_of(_reader(inner[0]))
     if origin is tuple:
         return _tuple(inner)
     return _values(_reader(inner[1]))

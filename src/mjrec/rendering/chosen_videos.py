@@ -28,15 +28,15 @@ from ..formats.monitor_directory import Infix, infix_of, journal_name
 from ..formats.trajectory_file import amend_trajectories
 from ..formats.trajectory_hdf5 import open_hdf5
 from ..formats.video_metadata import amend_metadata, finished_videos, metadata_path
-from ..rendering.jobs import RecordingKey
 from ..results.manifest_writing import manifest_lock, write_manifest_and_stats
 from ..results.run import EVALUATION, Run
+from .jobs import RecordingKey
 
 Chosen = Mapping[RecordingKey, Sequence[str]]
 
 
 def write_choice(
-    folder: Path, chosen: Chosen, *, rule: str, finished: int
+    folder: Path, chosen: Chosen, *, rule: str, finished: int, among: str = "*"
 ) -> set[RecordingKey]:
     """Write down which episodes of a chunk get a video. Idempotent.
 
@@ -47,6 +47,8 @@ def write_choice(
         chosen: the episodes, each with its roles.
         rule: by which they were chosen.
         finished: among how many.
+        among: the infix of the monitor, where others of the directory are no part of
+            the chunk.
 
     Returns:
         Those of the chosen ones that can be drawn.
@@ -58,7 +60,7 @@ def write_choice(
     """
     facts = {"rule": rule, "decided": True, "scope": EVALUATION, "finished": finished}
     drawable: set[RecordingKey] = set()
-    for path in sorted(folder.glob("openaigym.episodes.*.jsonl")):
+    for path in sorted(folder.glob(journal_name(among))):
         infix = Infix.parse(infix_of(path.name) or "")
         if infix is None:
             continue
@@ -70,10 +72,11 @@ def write_choice(
             if key.infix == infix
         }
         filmed = {key for key in selections if key.number in live}
-        for key in filmed:
+        for key, selection in selections.items():
+            # Drawn live, or chosen before among fewer episodes.
             video = folder / key.video_name
             if metadata_path(video).exists():
-                amend_metadata(video, {"selection": selections[key]})
+                amend_metadata(video, {"selection": selection})
         others = {key: selections[key] for key in selections if key not in filmed}
         can_be_drawn = filmed | _promise_videos(folder, others)
         drawable |= can_be_drawn
