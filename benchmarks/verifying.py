@@ -21,7 +21,7 @@ from .results import Reference, Result, at_most
 from .rounds import Say, take_turns
 from .setups import random_actions
 
-TITLE = "Verifying: packed runs of HalfCheetah-v5, made again"
+TITLE = "Verifying: packed runs of HalfCheetah-v5, recreated"
 
 _ENV_ID = "HalfCheetah-v5"
 _STATS, _PHYSICS, _PIXELS = "--level stats", "--level physics", "all frames"

@@ -34,6 +34,6 @@ mjrec.pack(directory, archive, title="A random cheetah", license="CC0-1.0")
 
 verification = mjrec.verify(archive, report="recordings/evidence.html")
 for finding in verification.findings:
-    if finding.outcome != "made again":
+    if finding.outcome != "recreated":
         print(f"{finding.outcome}: {finding.topic}, {finding.item}: {finding.reason}")
 print(verification.verdict)

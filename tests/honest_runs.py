@@ -12,6 +12,7 @@ from typing import Any
 
 import gymnasium
 import numpy as np
+import pytest
 
 import mjrec
 from mjrec.environments.mjcf_environments import MjcfEnvironment
@@ -75,8 +76,7 @@ def cheetah(directory: Path, **options: Any) -> None:
 
 def suite(directory: Path, **options: Any) -> None:
     """Record a task of dm_control's suite."""
-    from dm_control import suite as tasks
-
+    tasks = pytest.importorskip("dm_control.suite")
     given = {"random": 3, "time_limit": 0.04}
     env = tasks.load("cartpole", "balance", task_kwargs=given)
     options = {"mode": "evaluation", "env_id": "dm_control/cartpole-balance", **options}

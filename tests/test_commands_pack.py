@@ -32,7 +32,7 @@ def test_it_says_what_it_made(
     assert f"({path.stat().st_size} bytes)" in size
     assert digest == f"  sha256 {hashlib.sha256(path.read_bytes()).hexdigest()}"
     assert advice.endswith(f"mjrec verify {path}")
-    # Whole; nothing was made again.
+    # Whole; nothing was recreated.
     assert main(["verify", str(path), "--level", "files"]) == 3
 
 

@@ -140,7 +140,7 @@ def test_equal_runs_are_made_again(packed: Path) -> None:
     verification = compared(packed, packed)
     assert verification.verdict is Verdict.PASS
     counts = {(f.topic, f.unit): f.count for f in verification.findings}
-    assert {f.outcome for f in verification.findings} == {Outcome.MADE_AGAIN}
+    assert {f.outcome for f in verification.findings} == {Outcome.RECREATED}
     assert counts[Topic.REWARDS, "episode"] == 3
     assert counts[Topic.PHYSICS, "step"] == 12
     assert counts[Topic.PICTURES, "frame"] == 14
@@ -191,7 +191,7 @@ def test_equal_runs_are_made_again(packed: Path) -> None:
         (
             in_json("*000000.meta.json", lambda m: m.pop("stride")),
             Topic.VIDEOS,
-            "only what was made again has it",
+            "only the recreated run has it",
         ),
         (
             in_json(
@@ -233,7 +233,7 @@ def test_equal_runs_are_made_again(packed: Path) -> None:
         (
             lambda bag: (bag / "data" / "notes.txt").write_text("best"),
             Topic.FILES,
-            "nothing made this file again",
+            "nothing recreated this file",
         ),
         (
             lambda bag: the(bag, "*video000001.framehash").unlink(),
@@ -356,7 +356,7 @@ def test_some_frames_are_drawn_and_compared(packed: Path, given: Path) -> None:
     counts = {
         f.outcome: f.count for f in verification.findings if f.topic is Topic.PICTURES
     }
-    assert counts == {Outcome.MADE_AGAIN: 2, Outcome.BELIEVED: 5 + 7}
+    assert counts == {Outcome.RECREATED: 2, Outcome.BELIEVED: 5 + 7}
     brighter(the(given, "*video000000.mp4"))
     failed = compared(given, made, sampled=True).failures
     assert {f.topic for f in failed} == {Topic.PICTURES}
@@ -384,7 +384,7 @@ def test_an_undrawn_run_has_the_same_videos_to_draw(packed: Path, given: Path) -
 
 
 def test_what_was_fed_to_the_maker_is_believed(packed: Path, given: Path) -> None:
-    """Its episode is not counted as made again, though it is equal."""
+    """Its episode is not counted as recreated, though it is equal."""
     notes = Notes()
     notes.add("episode 2 of 0.u", "actions not kept", "its return is believed")
     notes.write(given)
@@ -395,7 +395,7 @@ def test_what_was_fed_to_the_maker_is_believed(packed: Path, given: Path) -> Non
         for f in verification.findings
         if (f.topic, f.unit) == (Topic.REWARDS, "episode")
     }
-    assert counts == {Outcome.MADE_AGAIN: 2, Outcome.BELIEVED: 1}
+    assert counts == {Outcome.RECREATED: 2, Outcome.BELIEVED: 1}
     assert [excuse.name for excuse in verification.excuses] == ["actions not kept"]
 
 

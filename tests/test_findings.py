@@ -31,7 +31,7 @@ PARTLY = Verdict.PARTLY
         ((MADE, WITHIN), (excuse(allowed=True), excuse()), Level.PIXELS, PARTLY),
         ((MADE, DIFFERENT), (), Level.PIXELS, Verdict.FAIL),
         ((MADE,), (excuse(refuted=True, allowed=True),), Level.PIXELS, Verdict.FAIL),
-        # Nothing of what only a simulation gives was made again.
+        # Nothing of what only a simulation gives was recreated.
         ((OF_FILES, BELIEVED), (), Level.PIXELS, Verdict.FAIL),
         ((), (), Level.PIXELS, Verdict.FAIL),
         ((OF_FILES,), (), Level.FILES, Verdict.PARTLY),

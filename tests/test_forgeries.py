@@ -1146,7 +1146,7 @@ def told(found: Verification) -> str:
     lines = [
         f"{each.outcome} {each.topic} {each.item}: {each.reason} [{each.excuse}]"
         for each in found.findings
-        if each.outcome is not Outcome.MADE_AGAIN
+        if each.outcome is not Outcome.RECREATED
     ]
     lines += [
         f"{'refuted' if each.refuted else 'excuse'} {each.name}: {each.claimed}"

@@ -309,7 +309,7 @@ def test_roles_are_those_of_an_evaluation(tmp_path):
 def test_verdicts_are_found_and_given(tmp_path):
     """In the directory, and as a file."""
     write_journal(tmp_path / "run", "0.a", "X-v0", [entry(0)])
-    findings = [{"outcome": each} for each in ("made again", "believed", "noted")]
+    findings = [{"outcome": each} for each in ("recreated", "believed", "noted")]
     said = {"path": "run", "level": "physics", "verdict": "PARTLY"}
     said["findings"] = findings
     (tmp_path / "run" / "verification.json").write_text(json.dumps(said))
@@ -317,7 +317,7 @@ def test_verdicts_are_found_and_given(tmp_path):
     (tmp_path / "other.json").write_text(json.dumps(bad))
     contents = gather(tmp_path / "run", verifications=[tmp_path / "other.json"])
     assert [each.verdict for each in contents.verdicts] == ["PARTLY", "FAIL"]
-    assert contents.verdicts[0].counts == {"made again": 1, "believed": 1}
+    assert contents.verdicts[0].counts == {"recreated": 1, "believed": 1}
     assert contents.verdicts[0].level == "physics"
 
 

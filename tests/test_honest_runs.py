@@ -77,14 +77,14 @@ HONEST = (
 
 
 def said(found: Verification) -> str:
-    """Return what is not made again."""
+    """Return what is not recreated."""
     return "\n".join(
         f"{each.outcome} {each.topic} {each.item}: {each.reason} [{each.excuse}]"
         for each in found.findings
     )
 
 
-# Some take more than five seconds: a run is recorded, packed, made again and drawn.
+# Some take more than five seconds: a run is recorded, packed, recreated and drawn.
 @parametrize(
     "run", HONEST, default=[each for each in HONEST if each.quick], ids=lambda r: r.name
 )

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which environments are made again from a recording, and that nothing else runs."""
+"""Which environments are recreated from a recording, and that nothing else runs."""
 
 import sys
 

@@ -36,7 +36,7 @@ def gl_frames(outcome: Outcome = Outcome.WITHIN_TOLERANCE) -> Finding:
 @pytest.mark.parametrize(
     ("made", "words"),
     [
-        (verification(finding()), "PASS  run.zip: everything was made again"),
+        (verification(finding()), "PASS  run.zip: everything was recreated"),
         (
             verification(finding(), gl_frames(), excuses=(excuse(allowed=True),)),
             "is equal, or allowed (gl).",
@@ -47,7 +47,7 @@ def gl_frames(outcome: Outcome = Outcome.WITHIN_TOLERANCE) -> Finding:
             "PARTLY  run.zip: files are unchanged",
         ),
         (verification(finding(Outcome.DIFFERENT)), "it is not what its inputs give"),
-        (verification(), "FAIL  run.zip: nothing could be made again"),
+        (verification(), "FAIL  run.zip: nothing could be recreated"),
     ],
 )
 def test_the_verdict_comes_first(made: Verification, words: str) -> None:
@@ -105,10 +105,10 @@ def test_each_topic_has_a_line_with_counts() -> None:
     shown = verification(finding(), made, believed, noted)
     lines = {line.topic: (line.outcome, line.text) for line in summary.lines(shown)}
     assert list(lines) == list(Topic)
-    assert lines[Topic.PHYSICS] == ("made again", "12 steps")
+    assert lines[Topic.PHYSICS] == ("recreated", "12 steps")
     assert lines[Topic.REWARDS] == (
         "believed",
-        "12 episodes made again; 988 episodes believed: their actions were not kept",
+        "12 episodes recreated; 988 episodes believed: their actions were not kept",
     )
     assert lines[Topic.VIDEOS] == (
         "not looked at",

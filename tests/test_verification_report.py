@@ -71,7 +71,7 @@ def test_the_verdict_comes_first_and_then_what_differs(tmp_path: Path) -> None:
         "one is missing",
         "frame 3 is another",
         "NVIDIA H100 (here llvmpipe)",
-        "What was made again",
+        "What was recreated",
         "max_episode_steps 12",
         "All findings",
         "seven steps",

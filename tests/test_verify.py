@@ -65,7 +65,7 @@ def test_honest_archive_is_whole(packed: Path, bag: Path) -> None:
     for path in (packed, bag, bag.parent):
         found = mjrec.verify(path, level="files")
         assert found.failures == ()
-        # Nothing was made again.
+        # Nothing was recreated.
         assert found.verdict is Verdict.PARTLY
 
 

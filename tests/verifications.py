@@ -21,7 +21,7 @@ HOSTILE = (
 )
 
 
-def finding(outcome: Outcome = Outcome.MADE_AGAIN, **changes: Any) -> Finding:
+def finding(outcome: Outcome = Outcome.RECREATED, **changes: Any) -> Finding:
     """Return a finding about physics."""
     usual = {"topic": Topic.PHYSICS, "item": "a.h5", "count": 12, "unit": "step"}
     return Finding(**{**usual, "outcome": outcome, **changes})

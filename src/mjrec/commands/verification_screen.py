@@ -21,7 +21,7 @@ _STYLES: Final = {
     str(Verdict.PASS): "bold green",
     str(Verdict.PARTLY): "bold yellow",
     str(Verdict.FAIL): "bold red",
-    str(Outcome.MADE_AGAIN): "green",
+    str(Outcome.RECREATED): "green",
     str(Outcome.WITHIN_TOLERANCE): "yellow",
     str(Outcome.BELIEVED): "yellow",
     str(Outcome.DIFFERENT): "bold red",

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Two packed runs, item by item: an archive's, and the same run made again.
+"""Two packed runs, item by item: an archive's, and the same run recreated.
 
 Equal bytes need no second look; else one comparator for each kind of file says where
 the two differ, and an excuse may allow it. A file that only one of the two has is a
@@ -83,7 +83,7 @@ _TOPICS: Final = {
     "text": Topic.PICTURES,
 }
 _OF_MANIFEST: Final = (Topic.SELECTION, Topic.IDENTITY)
-_NOT_MADE: Final = "nothing made this file again"
+_NOT_MADE: Final = "nothing recreated this file"
 _NO_DIFFERENCES: Final = (Aspect.CLAIM, Aspect.STATEMENT)
 # Excuses of what was not played.
 _UNPLAYED: Final = ("environment", "wrappers", "actions not kept")
@@ -95,7 +95,7 @@ class Comparison:
 
     Args:
         given: the archive's: the folder that holds `data/`.
-        made: the run that was made again, likewise; `maker.json` there says what could
+        made: the run that was recreated, likewise; `maker.json` there says what could
             not be.
         level: how deep. Below PIXELS, `made` was not drawn.
         sampled: some frames were drawn, and lie in `made`.
@@ -210,7 +210,7 @@ class Comparison:
             file=file,
             # A compiled model that is not there is none that was compiled elsewhere.
             aspect=Aspect.MODEL if kind == "model" and is_given else Aspect.EXACT,
-            how=_NOT_MADE if is_given else "no such file, but one was made again",
+            how=_NOT_MADE if is_given else "no such file, but one was recreated",
         )
 
     def _compare_file(self, file: str) -> Iterator[Same | Difference | Finding]:
@@ -309,7 +309,7 @@ class Comparison:
         )
 
     def _compare_rewards(self) -> _Found:
-        """Compare what was made again instead of trajectories."""
+        """Compare what was recreated instead of trajectories."""
         path = self._made.parent / REWARDS_FILE
         if not path.exists():
             return
@@ -345,7 +345,7 @@ class Comparison:
                 except Error as error:
                     yield _damaged(file, error)
         if videos:
-            undone = "videos were not made again"
+            undone = "videos were not recreated"
             yield _believed(Topic.VIDEOS, undone, len(videos), "video")
         if frames > drawn:
             reason = "frames were not drawn again"
@@ -421,7 +421,7 @@ def _other_choice(given: set[int], made: set[int], file: str) -> Difference:
         topic=Topic.SELECTION,
         file=file,
         where="episodes with a video",
-        how=f"only the archive has {_listed(given - made)}, only what was made again "
+        how=f"only the archive has {_listed(given - made)}, only the recreated run "
         f"has {_listed(made - given)}",
     )
 

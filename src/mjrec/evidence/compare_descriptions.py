@@ -40,9 +40,9 @@ def compare_descriptions(bag: Path) -> Iterator[Same | Difference]:
     there |= {name: bag / name for name in texts if (bag / name).exists()}
     for name in sorted(there.keys() | texts.keys()):
         if name not in texts:
-            yield _difference(name, "nothing made this file again")
+            yield _difference(name, "nothing recreated this file")
         elif name not in there:
-            yield _difference(name, "no such file, but one was made again")
+            yield _difference(name, "no such file, but one was recreated")
         else:
             yield _compare(name, there[name], texts[name])
 

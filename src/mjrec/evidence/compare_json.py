@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Two files of JSON, value by value: journal, statistics, manifest, metadata.
 
-Each key that may be other than made again stands in a table here, with what it tells
+Each key that may be other than recreated stands in a table here, with what it tells
 about and how it may differ. Any other key has to be equal, and to be there.
 """
 
@@ -36,7 +36,7 @@ class Rule(NamedTuple):
 
 
 _OF_FILES: Final = Rule(Topic.FILES)
-# Whether a value that is other than made again is right for the archive's own file:
+# Whether a value that is other than recreated is right for the archive's own file:
 # its hash, its size. Called with the file's name and the value, ABSENT for none.
 Own: TypeAlias = Callable[[str, Any], bool]
 
@@ -52,7 +52,7 @@ class Rules:
             nothing can recreate.
         claims: keys whose values are versions by the names of packages.
         left_out: keys that are not looked at.
-        renamed: names in the archive, and those of the same files made again: a
+        renamed: names in the archive, and those of the same files recreated: a
             compiled model has its hash in its name.
         is_packed: packing took the lines about rows out of journals.
     """
@@ -66,7 +66,7 @@ class Rules:
     is_packed: bool = False
 
     def translated(self, text: bytes) -> bytes:
-        """Return a text of the archive with the names that were made again."""
+        """Return a text of the archive with the names that were recreated."""
         for name, again in self.renamed.items():
             text = text.replace(name.encode(), again.encode())
         return text
@@ -139,7 +139,7 @@ def compare_objects(
 
 
 def _translated_object(given: Path, rules: Rules) -> Mapping[str, Any]:
-    """Return an object of the archive, with the names that were made again."""
+    """Return an object of the archive, with the names that were recreated."""
     with unreadable(given):
         return json_object(rules.translated(read_regular(given, limit=_LONGEST_FILE)))
 
@@ -211,7 +211,7 @@ def json_differences(
 
     Args:
         given: the archive's.
-        made: made again.
+        made: the recreated one.
         file: where both stand.
         rules: how they are compared.
         where: their place in it.

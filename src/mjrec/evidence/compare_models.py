@@ -40,7 +40,7 @@ def model_name(file: str) -> str:
 
 
 def renamed_models(given: Path, made: Path) -> dict[str, str]:
-    """Return the models that have another name made again, of the same sources."""
+    """Return the models that have another name when recreated, of the same sources."""
     sources: list[dict[str, str]] = []
     for folder in (given, made):
         names: dict[str, str] = {}
@@ -64,7 +64,7 @@ def compare_sources(given: Path, made: Path, file: str) -> Iterator[Same | Diffe
         file=file,
         # The name of the main file is a statement.
         aspect=Aspect.STATEMENT if is_equal else Aspect.EXACT,
-        how="its sources are not those of the model that was made again",
+        how="its sources are not those of the model that was recreated",
     )
 
 

@@ -52,7 +52,7 @@ def compare_trajectories(
 
     Args:
         given: the archive's.
-        made: made again.
+        made: the recreated one.
         file: the name of both, below `data/`.
         rules: of their facts.
 
@@ -88,7 +88,7 @@ def same_trajectory(path: Path, file: str) -> Iterator[Same]:
 def compare_rewards(
     given: Path, made: NDArray[np.float64], file: str
 ) -> Iterator[Same | Difference]:
-    """Yield how the rewards of a trajectory compare with those made again.
+    """Yield how the rewards of a trajectory compare with the recreated ones.
 
     Raises:
         UnreadableFile: it is damaged.

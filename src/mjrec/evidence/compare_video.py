@@ -56,7 +56,7 @@ def compare_videos(
 
     Args:
         given: the archive's.
-        made: made again.
+        made: the recreated one.
         file: the name of both, below `data/`.
         on_decoded: called with the sha256 of all planes of the archive's.
 
@@ -245,7 +245,7 @@ class Worst:
             unit="frame",
             aspect=Aspect.PICTURE,
             where=f"frame {self._worst}",
-            how=f"{plain.psnr:.1f} dB from the one made again, "
+            how=f"{plain.psnr:.1f} dB from the recreated one, "
             f"{plain.block:.0f} levels in the worst block",
             figures={
                 **plain._asdict(),

@@ -127,12 +127,12 @@ class Difference(Place):
 
 def unlike(given: Any, made: Any) -> str:
     """Return how two values differ, as a clause."""
-    return f"the archive has {short(given)}, made again it is {short(made)}"
+    return f"the archive has {short(given)}, the recreated run has {short(made)}"
 
 
 def only_in(is_given: bool, value: Any) -> str:
     """Return that only one of the two has a value, as a clause."""
-    who = "the archive" if is_given else "what was made again"
+    who = "the archive" if is_given else "the recreated run"
     return f"only {who} has it: {short(value)}"
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Drawing the videos of a run that was made again: all of them, or some frames."""
+"""Drawing the videos of a run that was recreated: all of them, or some frames."""
 
 from __future__ import annotations
 

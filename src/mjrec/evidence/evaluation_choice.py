@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The choice among the episodes of an evaluation, made again.
+"""The choice among the episodes of an evaluation, recreated.
 
 An evaluation chooses videos among the episodes of all recordings of an environment.
 Where all of these are in the archive, its rule is asked again. Where some are missing,

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a verification says: findings, excuses and one verdict.
 
-A packed run is made again from its inputs and compared, item by item. Each finding is
+A packed run is recreated from its inputs and compared, item by item. Each finding is
 about one or several items; each excuse is a claim of the archive that allows some of
-them to be other than made again.
+them to be other than recreated.
 """
 
 from __future__ import annotations
@@ -49,13 +49,13 @@ class Topic(enum.StrEnum):
 
 
 class Outcome(enum.StrEnum):
-    """How an item compares with what was made again."""
+    """How an item compares with the recreated one."""
 
-    MADE_AGAIN = "made again"
+    RECREATED = "recreated"
     WITHIN_TOLERANCE = "within tolerance"
     BELIEVED = "believed"
     DIFFERENT = "different"
-    # A remark about what was made again; it does not lower the verdict.
+    # A remark about what was recreated; it does not lower the verdict.
     NOTED = "noted"
 
 
@@ -111,7 +111,7 @@ class Finding:
 
 @dataclass(frozen=True, kw_only=True)
 class Excuse:
-    """A claim that allows some items to be other than made again.
+    """A claim that allows some items to be other than recreated.
 
     Attributes:
         kind: which of the three kinds (other versions or hardware; code that the
@@ -174,7 +174,7 @@ class Verification:
         allowed -= {excuse.name for excuse in needed if not excuse.allowed}
         # Less deep levels leave files and frames out.
         is_whole = self.level is Level.PIXELS and all(
-            finding.outcome in (Outcome.MADE_AGAIN, Outcome.NOTED)
+            finding.outcome in (Outcome.RECREATED, Outcome.NOTED)
             or finding.excuse in allowed
             for finding in self.findings
         )
@@ -182,7 +182,7 @@ class Verification:
 
     @property
     def passed(self) -> bool:
-        """Whether everything was made again and is equal, or allowed."""
+        """Whether everything was recreated and is equal, or allowed."""
         return self.verdict is Verdict.PASS
 
     @property
@@ -198,7 +198,7 @@ class Verification:
 def _is_proof(finding: Finding) -> bool:
     """Return whether something that the environment or the renderer gives came out."""
     return finding.topic in _MADE and finding.outcome in (
-        Outcome.MADE_AGAIN,
+        Outcome.RECREATED,
         Outcome.WITHIN_TOLERANCE,
     )
 

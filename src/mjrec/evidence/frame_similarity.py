@@ -70,7 +70,7 @@ class Similarity(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Limits:
-    """How far a frame may be from one made again.
+    """How far a frame may be from the recreated one.
 
     Attributes:
         psnr: the least, in dB.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a reader should know of a run that can be made again: that is not yet honest.
+"""What a reader should know of a run that can be recreated: that is not yet honest.
 
 Its author may have chosen the seeds, shown one episode as two, or left some out. A
 video may show a part of its episode, or be faster than real time.

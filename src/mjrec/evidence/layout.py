@@ -49,7 +49,7 @@ STATISTICS_COLUMNS: Final = (
 # thirty thousand recorded episodes has fewer.
 MOST_ENTRIES: Final = 100_000
 
-# Beside the payload of a run that was made again: the frames that were drawn.
+# Beside the payload of a run that was recreated: the frames that were drawn.
 SAMPLED: Final = "sampled"
 
 # In the key `mjrec` of a packed manifest: the episodes that were chosen for packing.

@@ -3,7 +3,7 @@
 
 Each recording is played in order in one environment, so that the states of its random
 generators follow from the first seed. What can never come out again (names of files,
-the clock, the provenance) is told to the recorder. What could not be made again is
+the clock, the provenance) is told to the recorder. What could not be recreated is
 noted, with the excuse for it.
 """
 
@@ -70,7 +70,7 @@ def play_recording(
         sources: the folder with what the author's models were made from.
         only_counted: only rewards and ends are asked for: no states are kept but of
             episodes with a video.
-        notes: what could not be made again, and why.
+        notes: what could not be recreated, and why.
         on_steps: called with a number of steps that were just taken.
 
     Returns:

@@ -14,7 +14,7 @@ from typing import Any, Final
 from .. import json_text
 
 NOTES_FILE: Final = "maker.json"
-# Beside it, where only rewards and ends were made again: the rewards of each step, by
+# Beside it, where only rewards and ends were recreated: the rewards of each step, by
 # "<infix>.<episode's number>".
 REWARDS_FILE: Final = "rewards.npz"
 

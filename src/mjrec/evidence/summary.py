@@ -32,7 +32,7 @@ _ORDER: Final = (
     Outcome.DIFFERENT,
     Outcome.BELIEVED,
     Outcome.WITHIN_TOLERANCE,
-    Outcome.MADE_AGAIN,
+    Outcome.RECREATED,
 )
 _NOT_LOOKED_AT: Final = "not looked at"
 # At the level of files.
@@ -52,7 +52,7 @@ class Line:
     Attributes:
         topic: its name.
         outcome: the worst of its findings; "not looked at" without one.
-        text: how many were made again, and what else is to be said.
+        text: how many were recreated, and what else is to be said.
     """
 
     topic: Topic
@@ -67,16 +67,16 @@ def headline(verification: Verification) -> str:
         case Verdict.PASS:
             taken = [e.name for e in verification.excuses if e.allowed]
             allowed = f", or allowed ({', '.join(taken)})" if taken else ""
-            return f"{name}: everything was made again and is equal{allowed}."
+            return f"{name}: everything was recreated and is equal{allowed}."
         case Verdict.PARTLY if verification.level is Level.FILES:
-            return f"{name}: files are unchanged; nothing was made again."
+            return f"{name}: files are unchanged; nothing was recreated."
         case Verdict.PARTLY:
             return f"{name}: nothing contradicts it, but not everything is proved."
     count = sum(finding.count for finding in verification.failures)
     if count or any(excuse.refuted for excuse in verification.excuses):
         differ = f"{counted(count, 'place')} differ{'s' if count == 1 else ''}"
         return f"{name}: it is not what its inputs give; {differ}."
-    return f"{name}: nothing could be made again, so nothing is proved."
+    return f"{name}: nothing could be recreated, so nothing is proved."
 
 
 def remarks(verification: Verification) -> list[str]:

@@ -28,7 +28,7 @@ class Sums:
             Finding(
                 topic=found.topic,
                 item=found.item,
-                outcome=Outcome.MADE_AGAIN,
+                outcome=Outcome.RECREATED,
                 count=found.count,
                 unit=found.unit,
             ),

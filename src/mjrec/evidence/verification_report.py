@@ -25,7 +25,7 @@ _STYLES: Final = {
     str(Verdict.PASS): "pass",
     str(Verdict.PARTLY): "open",
     str(Verdict.FAIL): "fail",
-    str(Outcome.MADE_AGAIN): "pass",
+    str(Outcome.RECREATED): "pass",
     str(Outcome.WITHIN_TOLERANCE): "open",
     str(Outcome.BELIEVED): "open",
     str(Outcome.DIFFERENT): "fail",
@@ -43,7 +43,7 @@ _MEANINGS: Final = {
 # Failures first.
 _ORDER: Final = (
     *(Outcome.DIFFERENT, Outcome.BELIEVED, Outcome.WITHIN_TOLERANCE),
-    *(Outcome.NOTED, Outcome.MADE_AGAIN),
+    *(Outcome.NOTED, Outcome.RECREATED),
 )
 # What a browser shows at once, and a person reads.
 _MOST_LISTED: Final = 200

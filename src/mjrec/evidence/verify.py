@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Verifying a packed run: made again from its inputs, and compared."""
+"""Verifying a packed run: recreated from its inputs, and compared."""
 
 from __future__ import annotations
 

@@ -121,7 +121,7 @@ class Verdict:
     Attributes:
         source: the path that was verified, and the file with the verdict.
         verdict: `PASS`, `PARTLY` or `FAIL`.
-        counts: number of findings by outcome: made again, within tolerance, believed,
+        counts: number of findings by outcome: recreated, within tolerance, believed,
             different.
         level: the level of the verification.
     """

@@ -63,7 +63,7 @@ _NO_MONITOR: Final = -2
 # The file of a verdict, in a directory with recordings.
 _VERIFICATION_NAME: Final = "verification.json"
 _VERDICTS: Final = ("PASS", "PARTLY", "FAIL")
-_OUTCOMES: Final = ("made again", "within tolerance", "believed", "different")
+_OUTCOMES: Final = ("recreated", "within tolerance", "believed", "different")
 _LEVELS: Final = ("files", "stats", "physics", "pixels")
 
 
