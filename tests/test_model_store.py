@@ -137,7 +137,8 @@ def test_a_full_disk_is_one_error_and_can_be_tried_again(directory):
                 store.finish()
     assert list(directory.iterdir()) == []
     store.finish()
-    assert load_model(directory, facts).ngeom == 1
+    # The list of this user's models may have been too large to be written, too.
+    assert load_model(directory, facts, trust_models=True).ngeom == 1
     store.finish()
 
 
