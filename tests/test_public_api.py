@@ -203,10 +203,11 @@ def test_no_module_hides_a_public_name():
     assert _run(
         "import contextlib, importlib, importlib.util, pkgutil, types, mjrec\n"
         "lacks = not importlib.util.find_spec('dm_control')\n"
+        "missing = (ModuleNotFoundError, mjrec.MissingDependency) * lacks\n"
         "for module in pkgutil.walk_packages(mjrec.__path__, 'mjrec.'):\n"
         "    if module.name != 'mjrec.__main__':\n"
         # Without the extras there is nothing of theirs to hide a name.
-        "        with contextlib.suppress(*[ModuleNotFoundError, mjrec.MissingDependency] * lacks):\n"
+        "        with contextlib.suppress(*missing):\n"
         "            importlib.import_module(module.name)\n"
         "names = {name: getattr(mjrec, name) for name in mjrec.__all__}\n"
         "print([n for n, v in names.items() if isinstance(v, types.ModuleType)])\n"
