@@ -175,6 +175,11 @@ def kept(directory: Path, *, rule: str = "worst:1") -> None:
     pendulum(directory, episodes=5, longest=9, keep=rule)
 
 
+def kept_in_training(directory: Path) -> None:
+    """Record as `mjrec record --keep` does, which keeps no actions of other videos."""
+    pendulum(directory, episodes=4, longest=9, keep="best:1", mode="training")
+
+
 def live(directory: Path) -> None:
     """Record frames of `env.render()` itself."""
     pendulum(directory, episodes=2, render="live")

@@ -42,6 +42,8 @@ class Honest(NamedTuple):
         return f"{self.record.__name__} {' '.join(map(str, options))}".strip()
 
 
+_STATS = {"level": "stats"}
+
 HONEST = (
     Honest(honest.pendulum, quick=True),
     Honest(honest.cheetah),
@@ -54,6 +56,8 @@ HONEST = (
     Honest(honest.extended, PARTLY, {"rule"}),
     Honest(honest.clips, PARTLY, {"schedule"}),
     Honest(honest.kept, quick=True),
+    Honest(honest.kept_in_training, PARTLY, {"actions not kept"}),
+    Honest(honest.kept_in_training, PARTLY, {"actions not kept"}, verifying=_STATS),
     Honest(honest.live),
     Honest(honest.text, verifying={"trust": ["Taxi-v4"]}),
     Honest(honest.several, PARTLY),

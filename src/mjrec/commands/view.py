@@ -25,7 +25,7 @@ def view(
     port: ssh -L PORT:127.0.0.1:PORT HOST.
 
     Args:
-        directory: a monitor directory.
+        directory: a monitor directory, or one with several, such as an evaluation.
         port: port to listen on. By default a free one.
         trust_models: load compiled models that another user or machine wrote. A crafted
             model can run any code, so use it only if you trust the author.

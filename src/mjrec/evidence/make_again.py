@@ -378,7 +378,7 @@ class _Playing:
         recorder, said = self._monitor.recorder, episode.believed
         ends = {name: said.get(name) is True for name in ("terminated", "truncated")}
         for left in range(max(1, episode.steps) - 1, -1, -1):
-            recorder.before_step(None)
+            recorder.before_step()
             reward = 0.0 if left or said.get("reward") is None else said["reward"]
             last = (
                 ends

@@ -10,7 +10,7 @@ import weakref
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from ..errors import DirectoryNotWritable, Error, FileNotWritten
 from ..formats.bundle import FINISHED
@@ -43,6 +43,9 @@ from .tracking import FinishedEpisode
 from .video_recorder import VideoRecorder
 
 logger = logging.getLogger(__name__)
+
+# Any object can be an action, even None.
+UNKNOWN_ACTION: Final = object()
 
 
 class Recorder:
@@ -284,8 +287,11 @@ class Recorder:
         if self.stats_recorder.done is False and self._ending is None:
             self._ending = ending(error)
 
-    def before_step(self, action: Any = None) -> None:
+    def before_step(self, action: Any = UNKNOWN_ACTION) -> None:
         """Check that a step is allowed now, and note its action.
+
+        Args:
+            action: the action; left out if it is unknown.
 
         Raises:
             ResetNeeded: there has been no reset yet, or the episode is over.
@@ -295,7 +301,9 @@ class Recorder:
         self.stats_recorder.before_step()
         if self._clips is not None:
             self._clips.before_step()
-        if self._recording is not None and self._recording.states is not None:
+        if action is UNKNOWN_ACTION or self._recording is None:
+            return
+        if self._recording.states is not None:
             self._recording.states.before_step(action)
 
     def step(

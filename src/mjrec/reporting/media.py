@@ -165,7 +165,7 @@ def write_replays(
         if video.roles and video.trajectory is not None
     ]
     done: dict[Path, str] = {}
-    for stem, video, path in wanted:
+    for number, (stem, video, path) in enumerate(wanted, 1):
         try:
             if path not in done:
                 page = f"{REPLAYS}/{stem}.html"
@@ -175,7 +175,7 @@ def write_replays(
             video.replay = done[path]
         except (InvalidArgument, UnreadableFile) as error:
             contents.problems.append(f"An episode is not shown in 3D: {error}")
-        on_progress(ReportProgress(REPLAYS, len(done), len(wanted)))
+        on_progress(ReportProgress(REPLAYS, number, len(wanted)))
 
 
 def with_embedded_videos(

@@ -6,22 +6,39 @@ from __future__ import annotations
 from pathlib import Path
 
 from ..errors import InvalidArgument
-from ..formats.monitor_directory import episode_of, where_recordings_are
-from ..results.monitor_files import monitors_of
+from ..formats.monitor_directory import (
+    episode_of,
+    recording_directories,
+    where_recordings_are,
+)
+from ..results.monitor_files import MonitorFiles, monitors_of
 
 _SHOWN = 10
 
 
 def recorded_episodes(directory: Path) -> list[Path]:
-    """Return a monitor directory's trajectories, finished or in flight.
+    """Return a directory's trajectories, finished or in flight.
 
-    They are grouped by monitor and sorted by episode number.
+    They are grouped by monitor, the one that was written last at the end, and sorted by
+    episode number.
+
+    Args:
+        directory: a monitor directory, or one with several, such as an evaluation.
     """
+    places = recording_directories(directory)
+    monitors = [files for place in places for files in monitors_of(place)]
     return [
         path
-        for files in monitors_of(directory)
+        for files in sorted(monitors, key=_written_at)
         for _, path in sorted(files.trajectories.items())
     ]
+
+
+def _written_at(files: MonitorFiles) -> int:
+    try:
+        return 0 if files.journal is None else files.journal.stat().st_mtime_ns
+    except FileNotFoundError:
+        return 0
 
 
 def trajectory_in(target: Path, episode: int | None) -> Path:

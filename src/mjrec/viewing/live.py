@@ -26,7 +26,7 @@ from urllib.parse import parse_qs, urlsplit
 import numpy as np
 
 from ..errors import Error, InvalidArgument
-from ..formats.monitor_directory import episode_of
+from ..formats.monitor_directory import episode_of, infix_of, recording_directories
 from ..results import iter_episodes
 from ..simulation.trajectories import Trajectory, load_trajectory
 from .episodes import recorded_episodes
@@ -196,7 +196,7 @@ class _Answers:
         motion = stage.motion(trajectory, np.arange(1))
         live = {
             "live": True,
-            "episode": path.name,
+            "episode": self._name(path),
             "scene": _scene_id(trajectory, stage),
         }
         return "text/html", replay_page(trajectory, stage, motion, additions=live)
@@ -204,14 +204,19 @@ class _Answers:
     def _episodes(self, asked: dict[str, str]) -> tuple[str, str]:
         ended = {}
         returns = []
-        for episode in iter_episodes(self._directory):
-            returns.append(episode.reward)
-            if episode.trajectory is not None:
-                ended[episode.trajectory.name] = episode
+        for place in recording_directories(self._directory):
+            for episode in iter_episodes(place):
+                returns.append(episode.reward)
+                if episode.trajectory is not None:
+                    ended[episode.trajectory] = episode
+        paths = recorded_episodes(self._directory)
+        are_of_one = len({infix_of(path.name) for path in paths}) <= 1
         listed = []
-        for path in recorded_episodes(self._directory)[-_MOST_EPISODES:]:
-            entry: dict[str, Any] = {"name": path.name, "id": episode_of(path.name)}
-            if (over := ended.get(path.name)) is not None:
+        for path in paths[-_MOST_EPISODES:]:
+            number = str(episode_of(path.name))
+            label = number if are_of_one else f"{infix_of(path.name)} {number}"
+            entry: dict[str, Any] = {"name": self._name(path), "label": label}
+            if (over := ended.get(path)) is not None:
                 entry |= {"length": over.length, "return": _number(over.reward)}
             listed.append(entry)
         stride = max(1, -(-len(returns) // _MOST_POINTS))
@@ -237,8 +242,11 @@ class _Answers:
             told["chunk"] = motion_chunk(motion, keep_all=True)
         return "application/json", json.dumps(told)
 
+    def _name(self, path: Path) -> str:
+        return str(path.relative_to(self._directory))
+
     def _path(self, name: str) -> Path:
-        known = {path.name: path for path in recorded_episodes(self._directory)}
+        known = {self._name(path): path for path in recorded_episodes(self._directory)}
         return known[name]
 
     def _load(self, path: Path, first: int = 0) -> tuple[Trajectory, Stage]:

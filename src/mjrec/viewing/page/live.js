@@ -43,8 +43,8 @@
       const button = document.createElement("button");
       button.type = "button";
       button.textContent = each.length === undefined
-        ? `${each.id}: running`
-        : `${each.id}: ${each.length} steps, return ${each.return?.toPrecision(5) ?? "NaN"}`;
+        ? `${each.label}: running`
+        : `${each.label}: ${each.length} steps, return ${each.return?.toPrecision(5) ?? "NaN"}`;
       button.setAttribute("aria-pressed", each.name === episode);
       button.addEventListener("click", () => {
         element("live-follow").checked = false;
