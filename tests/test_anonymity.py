@@ -302,6 +302,16 @@ def test_placeholders_stand_for_what_was_there(anonymous: Path) -> None:
     assert provenance["policy"]["file"] == "policy.pt"
 
 
+def test_names_of_environments_stay_in_commands(tmp_path: Path) -> None:
+    """Only paths lose their directories."""
+    command = ["mjrec", "record", "dm_control/cartpole-balance", "/opt/lab/policy.pt"]
+    manifest = tmp_path / "openaigym.manifest.0.1.manifest.json"
+    manifest.write_text(json.dumps({"mjrec": {"provenance": {"command": command}}}))
+    make_anonymous(tmp_path, identity=Identity())
+    kept = _read(manifest)["mjrec"]["provenance"]["command"]
+    assert kept == [*command[:3], "policy.pt"]
+
+
 def test_the_model_compiles_to_the_same(recorded: Path, anonymous: Path) -> None:
     """From sources without comments, and without the compiled one, which had a path."""
     assert not list((anonymous / "pendulum").glob("*.mjb.gz"))

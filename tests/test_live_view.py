@@ -7,6 +7,7 @@ import base64
 import json
 import threading
 import urllib.error
+import urllib.parse
 import urllib.request
 import zlib
 from collections.abc import Iterator
@@ -64,7 +65,7 @@ def ask(view: LiveView, page: str, **options: Any) -> Any:
 def test_new_states_of_a_running_episode_are_served(run: Any, view: LiveView) -> None:
     """A page gets the states that came since it last asked, and their rewards."""
     episodes = ask(view, "/episodes")
-    assert [each["id"] for each in episodes["episodes"]] == [0, 1]
+    assert [each["label"] for each in episodes["episodes"]] == ["0", "1"]
     assert episodes["episodes"][0]["length"] == _STEPS
     assert "length" not in episodes["episodes"][1]
     assert len(episodes["returns"]) == episodes["count"] == 1
@@ -76,6 +77,29 @@ def test_new_states_of_a_running_episode_are_served(run: Any, view: LiveView) ->
     assert (then["steps"], then["chunk"]["count"]) == (2, 1)
     data = zlib.decompress(base64.b64decode(then["chunk"]["data"]))
     assert np.frombuffer(data, "<f4")[2] == pytest.approx(reward, rel=1e-6)
+
+
+def test_an_evaluation_is_shown_as_one(tmp_path: Path) -> None:
+    """Its episodes are named by their recordings, and the newest comes last."""
+    for number, name in enumerate(("Hopper-v5/seed-000", "Hopper-v5/seed-001")):
+        env = gymnasium.make("Hopper-v5", max_episode_steps=2)
+        place, uid = tmp_path / name, f"s{number}"
+        place.mkdir(parents=True)
+        with mjrec.Monitor(env, place, uid=uid, workers=0, mode="evaluation") as env:
+            env.reset(seed=number)
+            for _ in range(2):
+                env.step(env.action_space.sample() * 0)
+    with LiveView(tmp_path) as opened:
+        thread = threading.Thread(target=opened.serve)
+        thread.start()
+        listed = ask(opened, "/episodes")
+        newest = listed["episodes"][-1]["name"]
+        motion = ask(opened, "/motion", episode=urllib.parse.quote(newest))
+        opened.close()
+        thread.join()
+    assert [each["label"] for each in listed["episodes"]] == ["0.s0 0", "0.s1 0"]
+    assert newest.startswith("Hopper-v5/seed-001/")
+    assert (listed["count"], motion["steps"]) == (2, 2)
 
 
 def test_nothing_is_served_without_the_token(view: LiveView) -> None:

@@ -298,6 +298,8 @@ def test_what_a_policy_raises_is_named(write):
         "    def reset(self, seed): raise KeyError('in reset')\n"
         "    def __call__(self, o): raise KeyError('in call')\n"
         "class Early(Late):\n"
+        "    def __init__(self, environment): raise TypeError('in init')\n"
+        "class Alone(Late):\n"
         "    def __init__(self): pass\n"
     )
     policy = load("Late")
@@ -306,8 +308,10 @@ def test_what_a_policy_raises_is_named(write):
     assert isinstance(e.value.__cause__, KeyError)
     with pytest.raises(mjrec.PolicyError, match=r"in call.*line 4"):
         policy(None)
-    with pytest.raises(mjrec.PolicyError, match=r"Building .*Early.*TypeError"):
+    with pytest.raises(mjrec.PolicyError, match=r"Building .*Early.*in init"):
         load("Early")
+    with pytest.raises(mjrec.PolicyError, match=r"Alone.* Give it a parameter"):
+        load("Alone")
 
 
 def test_an_object_is_a_policy_as_what_a_name_names():

@@ -375,8 +375,8 @@ class IdentityLeft(PackError):
         )
         super().__init__(
             f"The packed run would not be anonymous, so it was not written: {listed}. "
-            "Record again without these names (uid, camera, body, title), or leave out "
-            "the episodes that contain them."
+            "Change the title, record again without these names (uid, camera, body), "
+            "or leave out the episodes that contain them."
         )
 
 

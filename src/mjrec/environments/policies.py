@@ -201,11 +201,27 @@ def policy_from(
             cause, or the result is not a policy.
     """
     if inspect.isclass(chosen) or name.endswith("()"):
+        _check_takes_environment(name, chosen, environment, kwargs)
         with _failures_named(f"Building the policy {name} with the environment"):
             chosen = chosen(environment, **kwargs)
     else:
         _check_no_arguments(name, kwargs)
     return _ForeignPolicy(environment, name, chosen)
+
+
+def _check_takes_environment(
+    name: str, chosen: Callable[..., Any], environment: Any, kwargs: Mapping[str, Any]
+) -> None:
+    try:
+        inspect.signature(chosen).bind(environment, **kwargs)
+    except TypeError as error:
+        raise PolicyError(
+            f"The policy {name} cannot be called with the environment: {error}. Give "
+            f"it a parameter for that{' and for --policy-kwargs' if kwargs else ''}."
+        ) from error
+    except ValueError:
+        # Some classes written in C have no signature.
+        return
 
 
 def policy_file(text: str) -> Path | None:

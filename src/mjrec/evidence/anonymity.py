@@ -52,7 +52,7 @@ _SHARED = r"(?!(?:usr|bin|sbin|lib|lib64|opt|etc|proc|sys|dev)(?:/|$))"
 _DIRECTORY = re.compile(rf"(?<![\w./])/{_SHARED}[^\s\"':,;<>=]+")
 # What is a path for sure: `dm_control/cheetah-run` is none.
 _PATH_OF_FILE = re.compile(
-    r"(?:[/~]|\.\.?/)[^\s\"':,;<>=]*|[^\s\"':,;<>=]*/[^\s\"':,;<>=/]*\.\w+"
+    r"(?<![\w.-])(?:[/~]|\.\.?/)[^\s\"':,;<>=]*|[^\s\"':,;<>=]*/[^\s\"':,;<>=/]*\.\w+"
 )
 # Of a card, or of a part of one; `CUDA_VISIBLE_DEVICES` takes a beginning too.
 _GPU = re.compile(r"(?<![\w-])(?:GPU|MIG)-[0-9a-fA-F][0-9a-fA-F/-]*")

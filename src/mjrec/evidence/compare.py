@@ -8,6 +8,7 @@ difference. Memory does not grow with the number of episodes, time does in propo
 
 from __future__ import annotations
 
+import contextlib
 import filecmp
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
@@ -191,7 +192,9 @@ class Comparison:
             kinds = (*kinds, "")
         return {f: size for f, size in found.items() if _kind(f) in kinds}
 
-    def _compare_names(self, file: str, is_given: bool, is_made: bool) -> _Found:
+    def _compare_names(
+        self, file: str, is_given: bool, is_made: bool
+    ) -> Iterator[Same | Difference | Finding]:
         kind, model = _kind(file), model_name(file)
         if is_given and is_made:
             return
@@ -205,6 +208,15 @@ class Comparison:
                 if reader.facts.get("kept") is False:
                     # It is removed once its video is drawn.
                     return
+        if is_given and kind in ("model", "sources") and self._is_unplayed(model):
+            yield _believed(
+                Topic.IDENTITY,
+                "the recordings of this model could not be recreated",
+                1,
+                "model",
+                excuse="environment",
+            )
+            return
         yield Difference(
             topic=_TOPICS.get(kind, Topic.FILES),
             file=file,
@@ -212,6 +224,17 @@ class Comparison:
             aspect=Aspect.MODEL if kind == "model" and is_given else Aspect.EXACT,
             how=_NOT_MADE if is_given else "no such file, but one was recreated",
         )
+
+    def _is_unplayed(self, model: str | None) -> bool:
+        """Return whether a model belongs only to recordings that were not recreated."""
+        unplayed = {n.item for n in self._notes if n.excuse == "environment"}
+        played: set[str | None] = set()
+        for path in (self._given / RECORDINGS).glob("*.h5") if unplayed else ():
+            if f"recording {infix_of(path.name)}" not in unplayed:
+                with contextlib.suppress(Error), open_hdf5(path) as reader:
+                    names = reader.facts.get("model") or {}
+                    played |= {model_name(str(names.get(k))) for k in ("mjb", "xml")}
+        return bool(unplayed) and model not in played
 
     def _compare_file(self, file: str) -> Iterator[Same | Difference | Finding]:
         given, made, kind = self._given / file, self._made / file, _kind(file)
@@ -435,12 +458,15 @@ def _frame_count(video: Path) -> int:
     return count if isinstance(count, int) else 0
 
 
-def _believed(topic: Topic, reason: str, count: int, unit: str) -> Finding:
+def _believed(
+    topic: Topic, reason: str, count: int, unit: str, *, excuse: str | None = None
+) -> Finding:
     return Finding(
         topic=topic,
         item="",
         outcome=Outcome.BELIEVED,
         reason=reason,
+        excuse=excuse,
         count=count,
         unit=unit,
     )

@@ -18,6 +18,7 @@ from ..plain_text import counted
 from ..results import Episode, iter_episodes
 from ..results.journal_or_stats import MonitorResults
 from ..results.monitor_files import MonitorFiles, monitors_of
+from ..results.run import EVALUATION
 from .layout import STATES_LEFT_OUT
 from .statements import Statements, state
 
@@ -142,6 +143,12 @@ class PackedRun:
         return list(dict.fromkeys(session.env_id for session in self.sessions))
 
     @property
+    def extras(self) -> list[str]:
+        """The extras of mjrec that verifying it needs."""
+        is_of_suite = any(name.startswith("dm_control/") for name in self.env_ids)
+        return ["evidence", *(["dm-control"] if is_of_suite else [])]
+
+    @property
     def title(self) -> str:
         """The title that was stated, or one that says what was recorded."""
         ids = self.env_ids
@@ -220,7 +227,11 @@ def _session(
     with_states = [each for each in facts if not each.get(STATES_LEFT_OUT)]
     named = [facts_in(each.get("model")) for each in facts]
     models = {n for m in named for n in (m.get("xml"), m.get("mjb")) if n}
-    rule = facts_in(details.get("schedule")).get("name")
+    # An evaluation chooses among all its recordings, whatever each one's schedule.
+    keep = facts_in(details.get("keep"))
+    is_of_evaluation = keep.get("scope") == EVALUATION
+    chosen_by = keep if is_of_evaluation else facts_in(details.get("schedule"))
+    rule = chosen_by.get("rule" if is_of_evaluation else "name")
     versions = facts_in(details.get("versions"))
     return Session(
         infix=monitor.infix,

@@ -223,7 +223,9 @@ def _recordings_of(
         listed = ", ".join(map(str, numbers[:_SHOWN])) or "none"
         raise InvalidArgument(
             f"{target} has no recorded states of episode {episode}. Available: "
-            f"{listed}{' ...' * (len(numbers) > _SHOWN)}."
+            f"{listed}{' ...' * (len(numbers) > _SHOWN)}. Only episodes with a video "
+            "keep their states, unless recorded with keep=, trajectory_callable= or "
+            'mode="evaluation".'
         )
     return target, chosen
 
