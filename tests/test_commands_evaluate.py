@@ -65,7 +65,7 @@ def test_tasks_with_a_scale_are_summarized_together(run):
     status, out, _ = run(*tasks, "--score-range", *ranges)
     assert status == 0
     assert "Over 2 tasks, as scores from 0 to 1: IQM" in out
-    assert "without Hopper-v5: it has no default scale" in out
+    assert "left out: Hopper-v5: it has no default scale" in out
 
 
 def test_json_is_one_object_and_nothing_else(run):
@@ -117,7 +117,7 @@ def test_a_directory_is_enough_to_go_on(run, tmp_path, capsys):
     path = Path(worst.split()[-1])
     assert len(mjrec.load_trajectory(path)) > 0
     assert commands.main(["evaluate", "--resume", "e", "--seeds", "0-1"]) == 1
-    assert "seeds was (0, 1, 2)" in capsys.readouterr().err
+    assert "seeds was [0, 1, 2]" in capsys.readouterr().err
 
 
 def test_an_evaluation_is_recovered_and_rendered_as_one(

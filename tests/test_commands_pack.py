@@ -62,7 +62,7 @@ def test_anonymous_is_a_flag(recorded: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "part"),
     [
-        (["--episodes", "one"], "--episodes is a list"),
+        (["--episodes", "one"], "--episodes must be a comma-separated list"),
         (["--episodes", "7"], "Available: 0, 1."),
         (["--max-size", "1k"], "The largest files"),
     ],

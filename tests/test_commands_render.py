@@ -169,7 +169,7 @@ def test_out_names_the_file(name, tmp_path, mjrec, painter):
         (["--size", "0x64"], "width"),
         (["--fps", "-1"], "fps"),
         (["--out", "x.mp4"], "several episodes"),
-        (["--out", f"{VIDEO}.mkv", "--episode", "0"], "name of a recorded video"),
+        (["--out", f"{VIDEO}.mkv", "--episode", "0"], "original video"),
         (["--out", "x.txt", "--episode", "0"], "must end in"),
         (["--out", "/no/such/directory/x.mp4", "--episode", "0"], "/no/such/directory"),
         (["--engine", "local", "--engine-option", "partition"], "KEY=VALUE"),

@@ -506,7 +506,7 @@ def test_a_killed_evaluation_goes_on_where_it_was(whole, tmp_path, moment, engin
         ({"policy": "zero"}, "policy was 'random' and is now 'zero'"),
         ({"max_steps": 6}, "max_steps was 5"),
         ({"episodes": 1}, "episodes was 2 and is now 1"),
-        ({"num_seeds": 1}, r"seeds was \(0, 1\) and is now \(0,\)"),
+        ({"num_seeds": 1}, r"seeds was \[0, 1\] and is now \[0\]"),
         ({"keep": "all"}, "keep was 'none'"),
         # Though they are the defaults.
         ({"keep": "best,median,worst"}, "keep was 'none' and is now 'best,median"),

@@ -68,7 +68,7 @@ IMPOSSIBLE = {
         *(({"workers": v}, "InvalidArgument", "workers") for v in (-1, 1.5, True, "2")),
         ({"keep": "wurst:3"}, "UnknownName", "'wurst:3'. Available: best"),
         ({"keep": "median:2"}, "UnknownName", "Available: best"),
-        ({"keep": "worst,worst:2"}, "InvalidArgument", "something twice"),
+        ({"keep": "worst,worst:2"}, "InvalidArgument", "names the same rule twice"),
         *(
             ({"keep": rule}, "InvalidArgument", "1 or more")
             for rule in ("worst:0", "best:x", "failures:1.5")

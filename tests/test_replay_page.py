@@ -329,7 +329,7 @@ def test_the_command_writes_an_episode_of_a_directory(
     # Every fourth of 13 states, at twenty a second.
     assert capsys.readouterr().out.startswith(f"{page}: 4 states, ")
     assert main(["replay", str(cheetah.parent), "--episode", "3"]) == 1
-    assert "Recorded: 0." in capsys.readouterr().err
+    assert "Recorded episodes: 0." in capsys.readouterr().err
 
 
 def test_the_page_holds_no_code_of_a_name(cheetah: Path, tmp_path: Path) -> None:

@@ -419,7 +419,7 @@ def _not_started(executable: str, error: OSError) -> Error:
     if error.filename != executable:
         return Error(f"ffmpeg ({executable}) could not be started: {error}.")
     reason = str(error.strerror)
-    return _unusable(f"a working ffmpeg ({executable}: {reason})", reason)
+    return _unusable(f"a working ffmpeg (not {executable}: {reason})", reason)
 
 
 def _unusable(package: str, reason: str) -> Error:
