@@ -18,9 +18,9 @@ from ..evaluation.comparing import TASK_FIGURES, Comparison
 from ..evaluation.comparing import compare as compare_evaluations
 from ..evaluation.requirements import parse_requirement
 from ..evaluation.statistics import Estimate
+from ..plain_text import counted
 from .options import AsJson
 from .terminal import (
-    counted,
     print_json,
     print_lines,
     printable,

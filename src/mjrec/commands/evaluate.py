@@ -26,11 +26,11 @@ from ..evaluation.summaries import TaskSummary
 from ..evaluation.task_sets import tasks_from
 from ..formats.dataclass_json import to_json
 from ..monitors.progress import ShowProgress, progress_bar
+from ..plain_text import counted
 from ..recorder.keep_rules import keep_rule
 from .options import NO_ENGINE, AsJson, Engine, camera_of, kwargs_of, size_of
 from .terminal import (
     and_more,
-    counted,
     names_by,
     print_json,
     print_lines,

@@ -117,8 +117,8 @@ def _summary(directory: Path) -> tuple[str, bool]:
     """Return a summary of a directory, and whether a video is pending."""
     from ..errors import Error
     from ..evaluation.evaluation import is_evaluation
+    from ..plain_text import counted
     from ..results import iter_episodes
-    from .terminal import counted
 
     try:
         if is_evaluation(directory):

@@ -16,6 +16,7 @@ import tyro
 from ..environments.named_environment import EnvironmentOptions
 from ..formats.video_metadata import finished_videos
 from ..monitors.progress import progress_bar
+from ..plain_text import counted
 from ..recorder.options import RecorderOptions
 from ..sessions import (
     Session,
@@ -24,7 +25,7 @@ from ..sessions import (
     with_chosen_videos,
 )
 from .options import AsJson, camera_of, kwargs_of, number_or_name, size_of
-from .terminal import counted, print_json, print_lines
+from .terminal import print_json, print_lines
 
 _FAILED = 1
 _INTERRUPTED = 130

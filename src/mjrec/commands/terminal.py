@@ -35,11 +35,6 @@ def printable(text: str) -> str:
     return "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
 
 
-def counted(number: int, noun: str) -> str:
-    """Return `1 video`, `2 videos`."""
-    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
-
-
 def and_more(names: Sequence[str]) -> str:
     """Return the first name, and how many more there are."""
     more = len(names) - 1

@@ -48,6 +48,7 @@ from ..formats.trajectory_file import (
     finish_trajectory,
     open_trajectory,
 )
+from ..plain_text import counted
 from ..results.journal_or_stats import MonitorResults, locked_run
 from ..results.manifest_writing import manifest_lock, write_manifest_and_stats
 from ..results.monitor_files import MonitorFiles, files_of
@@ -347,7 +348,7 @@ class _KilledMonitor:
                     writer.note(kind, facts)
         added = sum(kind == "episode" for kind, _ in lines)
         if added:
-            self._report.note(path.name, f"{_counted(added, 'episode')} added")
+            self._report.note(path.name, f"{counted(added, 'episode')} added")
 
     def _run_facts(self, now: MonitorFiles) -> Mapping[str, Any]:
         """Return the first line for a journal that is lost or was never written."""
@@ -368,17 +369,17 @@ class _KilledMonitor:
         assert written is not None
         manifest, note = written.manifest, self._report.note
         if written.stats is not None and written.is_new_stats:
-            note(manifest.stats, _counted(len(written.stats.timestamps), "episode"))
+            note(manifest.stats, counted(len(written.stats.timestamps), "episode"))
         if written.is_new_manifest:
             pending = len(written.pending)
             rest = f", {pending} pending: mjrec render" if pending else ""
-            what = f"{_counted(len(manifest.videos), 'video')}{rest}"
+            what = f"{counted(len(manifest.videos), 'video')}{rest}"
             note(manifest_name(self._infix), what)
 
 
 def _how_long(path: Path) -> str:
     with open_trajectory(path) as reader:
-        steps = _counted(reader.step_count, "step")
+        steps = counted(reader.step_count, "step")
         is_cut = reader.facts.get("reason") == KILLED
     return f"{steps}, incomplete: killed" if is_cut else steps
 
@@ -397,7 +398,3 @@ def _numbers(files: MonitorFiles) -> set[int]:
 def _facts_of(path: Path) -> Mapping[str, Any]:
     with open_for_rendering(path) as reader:
         return reader.facts
-
-
-def _counted(count: int, what: str) -> str:
-    return f"{count} {what}" if count == 1 else f"{count} {what}s"

@@ -29,6 +29,7 @@ from ..formats.video_metadata import (
     write_metadata,
 )
 from ..formats.video_sink import VideoSink
+from ..plain_text import counted
 
 # Only the metadata of clips has this key.
 _FIRST_STEP = "first_step"
@@ -94,7 +95,7 @@ def finish_video(path: Path, known: Mapping[str, Any]) -> Iterator[tuple[str, st
 
 def _counted(count: int, metadata: Mapping[str, Any]) -> str:
     ending = "" if metadata["complete"] else f", incomplete: {metadata['reason']}"
-    return f"{count} {'frame' if count == 1 else 'frames'}{ending}"
+    return f"{counted(count, 'frame')}{ending}"
 
 
 def _metadata(
