@@ -921,7 +921,7 @@ FORGERIES = (
     Forgery(
         "closed whenever an episode goes wrong, and resumed",
         of=close_and_go_on,
-        line="goes on after them",
+        line="continues after them",
         verdict=PARTLY,
     ),
     Forgery("actions called float64", call_it_double, of=honest.cheetah),
