@@ -1094,7 +1094,7 @@ FORGERIES = (
         "an option of packing that tells more",
         packing={"anonymous": True},
         bag=tell_in_options,
-        line="options of packing",
+        line="packing options",
     ),
     Forgery(
         "another graphics card in environment.json",
