@@ -292,7 +292,7 @@ def test_live_videos_are_never_encoded_again(
         play(env, 1)
     video = the(runs, "*.mp4").read_bytes()
     message = refusal(mjrec.ArchiveTooLarge, runs, place, max_size=1000)
-    assert "never encoded again" in message
+    assert "never re-encoded" in message
     assert the(runs, "*.mp4").read_bytes() == video
 
 

@@ -1043,7 +1043,11 @@ FORGERIES = (
         quick=True,
     ),
     Forgery("a note in the data", bag=add_a_file("data/notes.txt"), line="notes.txt"),
-    Forgery("a video of no recording", bag=add_a_video, line="of no recording"),
+    Forgery(
+        "a video of no recording",
+        bag=add_a_video,
+        line="does not belong to a recording",
+    ),
     Forgery(
         "a note in the recordings",
         bag=add_a_file("data/recordings/notes.txt"),
