@@ -90,7 +90,7 @@ def test_directory_that_was_not_packed_is_verified(
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["--sample", "0"], "sample is how many"),
+        (["--sample", "0"], "sample must be"),
         (["--allow", "gl"], "allow takes"),
         (["--report", "/no/such/place.html"], "no such directory"),
     ],
@@ -115,4 +115,4 @@ def test_what_cannot_be_read_is_one_message(
     assert main(["verify", str(path)]) == 1
     said = capsys.readouterr()
     assert said.out == ""
-    assert said.err.startswith(f"mjrec: Cannot verify {path}: it is no zip file")
+    assert said.err.startswith(f"mjrec: Cannot verify {path}: it is not a zip file")

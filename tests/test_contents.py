@@ -168,7 +168,7 @@ def test_an_existing_archive_is_never_replaced(recorded: Path, tmp_path: Path) -
     path = tmp_path / "run.zip"
     path.symlink_to("nowhere")
     message = refusal(mjrec.InvalidArgument, recorded, path)
-    assert "exists already" in message
+    assert "already exists" in message
     assert [p.name for p in tmp_path.iterdir()] == ["run.zip"]
 
 
@@ -185,7 +185,7 @@ def test_an_archive_has_a_name_of_its_own(
 def test_there_must_be_recordings(tmp_path: Path, place: Path) -> None:
     """The message says how to make some."""
     message = refusal(mjrec.InvalidArgument, tmp_path / "nothing", place)
-    assert "There is no directory" in message
+    assert "does not exist" in message
     message = refusal(mjrec.InvalidArgument, tmp_path, place)
     assert "mjrec record" in message
 
@@ -193,9 +193,9 @@ def test_there_must_be_recordings(tmp_path: Path, place: Path) -> None:
 @pytest.mark.parametrize(
     ("stated", "part"),
     [
-        ({"authors": ["Ada <0000-0002-1825-0098>"]}, "An author is"),
-        ({"authors": ["Ada <not an address>"]}, "An author is"),
-        ({"authors": "Ada"}, "a list of texts"),
+        ({"authors": ["Ada <0000-0002-1825-0098>"]}, "An author must be"),
+        ({"authors": ["Ada <not an address>"]}, "An author must be"),
+        ({"authors": "Ada"}, "a list of strings"),
         ({"authors": ["A\nB"]}, "one line"),
         ({"license": "my own"}, "SPDX"),
         ({"license": "MIT OR Apache-2.0"}, "SPDX"),
@@ -292,7 +292,7 @@ def test_live_videos_are_never_encoded_again(
         play(env, 1)
     video = the(runs, "*.mp4").read_bytes()
     message = refusal(mjrec.ArchiveTooLarge, runs, place, max_size=1000)
-    assert "never encoded again" in message
+    assert "never re-encoded" in message
     assert the(runs, "*.mp4").read_bytes() == video
 
 

@@ -921,7 +921,7 @@ FORGERIES = (
     Forgery(
         "closed whenever an episode goes wrong, and resumed",
         of=close_and_go_on,
-        line="goes on after them",
+        line="continues after them",
         verdict=PARTLY,
     ),
     Forgery("actions called float64", call_it_double, of=honest.cheetah),
@@ -1043,7 +1043,11 @@ FORGERIES = (
         quick=True,
     ),
     Forgery("a note in the data", bag=add_a_file("data/notes.txt"), line="notes.txt"),
-    Forgery("a video of no recording", bag=add_a_video, line="of no recording"),
+    Forgery(
+        "a video of no recording",
+        bag=add_a_video,
+        line="does not belong to a recording",
+    ),
     Forgery(
         "a note in the recordings",
         bag=add_a_file("data/recordings/notes.txt"),
@@ -1094,7 +1098,7 @@ FORGERIES = (
         "an option of packing that tells more",
         packing={"anonymous": True},
         bag=tell_in_options,
-        line="options of packing",
+        line="packing options",
     ),
     Forgery(
         "another graphics card in environment.json",

@@ -66,7 +66,7 @@ def episode(number: int, **inputs: Any) -> EpisodeInputs:
                 for n in range(2)
             ],
             {},
-            "SeedSequence([S, i]) for episode i, S of 2",
+            "SeedSequence([S, i]) for episode i, S in 2",
         ),
         ([episode(0, seed=3), episode(1, seed=9)], {}, "seeds chosen by the author"),
         (
@@ -136,7 +136,7 @@ def test_closing_and_going_on_leaves_episodes_out() -> None:
     second = recording(1, [episode(2)], first_episode_id=2)
     [finding] = remarks(Inputs(recordings=[first, second]), {})
     assert finding.outcome is Outcome.BELIEVED
-    assert "goes on after them" in finding.reason
+    assert "continues after them" in finding.reason
 
 
 @pytest.mark.parametrize(
@@ -161,7 +161,7 @@ def test_training_episodes_among_evaluations_are_named() -> None:
     """An average over the others would leave them out."""
     [finding] = said([episode(0, type="t"), episode(1, type="e")])
     assert finding.is_headline
-    assert "1 of 2 episodes are called training" in finding.reason
+    assert "1 of 2 episodes are labelled training" in finding.reason
 
 
 def test_episodes_of_an_evaluation_are_numbered_without_gaps() -> None:

@@ -141,7 +141,7 @@ HARMS: list[tuple[Make, str]] = [
             *(("../evil", "leads out"), ("run/../../evil", "leads out")),
             *(("run/..", "leads out"), (str(EVIL), "absolute")),
             *(("C:/evil", "absolute"), ("run\\..\\..\\evil", "backslash")),
-            *(("run/a\0b", "cannot be seen"), ("run/a\nb", "cannot be seen")),
+            *(("run/a\0b", "invisible character"), ("run/a\nb", "invisible character")),
             *(("run//evil", "empty part"), ("run/./evil", "empty part")),
             *((f"run/{'e' * 300}", "too long"), (f"run/{'e/' * 600}e", "too long")),
             (f"run/{'e/' * 20}e", "folders deep"),
@@ -159,10 +159,10 @@ HARMS: list[tuple[Make, str]] = [
     *(
         (partial(write_both, first, second), reason)
         for first, second, reason in [
-            ("run/data/a", "run/data/a", "one file"),
-            ("run/data/a", "run/data/A", "one file"),
-            ("run/data/\u00e4", "run/data/a\u0308", "one file"),
-            ("run/data/a", "run/data/a/b", "a folder"),
+            ("run/data/a", "run/data/a", "same file"),
+            ("run/data/a", "run/data/A", "same file"),
+            ("run/data/\u00e4", "run/data/a\u0308", "same file"),
+            ("run/data/a", "run/data/a/b", "the folder"),
             ("run/data/a", "other/a", "one folder"),
             ("run/data/a", "a", "one folder"),
         ]
@@ -179,7 +179,7 @@ HARMS: list[tuple[Make, str]] = [
             (lambda data: b"evil" + data, "before its first file"),
             (lambda data: data + b"evil", "at its end"),
             # A download that broke off.
-            *((lambda data, n=n: data[:n], "no zip file") for n in (0, 10, 200)),
+            *((lambda data, n=n: data[:n], "not a zip file") for n in (0, 10, 200)),
         ]
     ),
     (with_comment, "has a comment"),
@@ -189,10 +189,10 @@ HARMS: list[tuple[Make, str]] = [
         lambda path: write(path, (GOOD, b"1"), ("run/All succeeded/", b"")),
         "is an empty",
     ),
-    (bomb, "made to fill a disk"),
-    (many_files, "would be many"),
+    (bomb, "zip bomb"),
+    (many_files, "more than the limit"),
     (two_entries_over_the_same_bytes, "overlaps"),
-    (rare_compression, "not everybody can unpack"),
+    (rare_compression, "unsupported compression"),
     (lambda path: write(path, ("run/readme.txt", b"1")), "data/recordings"),
     (linked_folder, "neither a file nor a folder"),
 ]
@@ -251,6 +251,8 @@ def test_words_about_a_bad_archive_say_what_to_do(tmp_path: Path) -> None:
     archive.write_bytes(b"PK")
     with pytest.raises(mjrec.UnreadableArchive) as raised:
         mjrec.verify(archive)
-    assert str(raised.value).startswith(f"Cannot verify {archive}: it is no zip file.")
+    assert str(raised.value).startswith(
+        f"Cannot verify {archive}: it is not a zip file."
+    )
     assert "ask for the original file" in str(raised.value)
     assert "directory" not in str(raised.value)

@@ -122,7 +122,7 @@ def test_wrappers_are_listed_with_their_arguments() -> None:
     }
     recording = RecordingInputs(infix="0.u", env_id="A-v0", environment=environment)
     [said] = Inputs(recordings=[recording]).unusual().values()
-    assert said["environment"] == "A-v0, a model (MJCF) of the author's"
+    assert said["environment"] == "A-v0, the author's own model (MJCF)"
     assert said["wrappers"] == [
         "gymnasium.ClipReward(min_reward=100.0)",
         "mine.Wrapper(...)",

@@ -46,7 +46,10 @@ def gl_frames(outcome: Outcome = Outcome.WITHIN_TOLERANCE) -> Finding:
             verification(finding(Outcome.NOTED, topic=Topic.FILES), level=Level.FILES),
             "PARTLY  run.zip: files are unchanged",
         ),
-        (verification(finding(Outcome.DIFFERENT)), "it is not what its inputs give"),
+        (
+            verification(finding(Outcome.DIFFERENT)),
+            "it does not match what its inputs produce",
+        ),
         (verification(), "FAIL  run.zip: nothing could be recreated"),
     ],
 )
@@ -81,7 +84,7 @@ def test_claims_that_nothing_needs_share_a_line() -> None:
     names = ("python", "zlib")
     idle = [excuse(name=n, claimed="1", here="2", is_needed=False) for n in names]
     assert summary.excuses(verification(excuses=tuple(idle))) == [
-        "claimed, and nothing rests on it: python 1 (here 2); zlib 1 (here 2)"
+        "claimed, but not needed: python 1 (here 2); zlib 1 (here 2)"
     ]
 
 

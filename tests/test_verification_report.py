@@ -67,7 +67,7 @@ def test_the_verdict_comes_first_and_then_what_differs(tmp_path: Path) -> None:
         )
     )
     order = [
-        "FAIL run.zip: it is not what its inputs give",
+        "FAIL run.zip: it does not match what its inputs produce",
         "one is missing",
         "frame 3 is another",
         "NVIDIA H100 (here llvmpipe)",

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a verification says: findings, excuses and one verdict.
+"""The result of a verification: findings, excuses and one verdict.
 
-A packed run is recreated from its inputs and compared, item by item. Each finding is
-about one or several items; each excuse is a claim of the archive that allows some of
-them to be other than recreated.
+A packed run is recreated from its inputs and compared with the archive, item by item.
+Each finding is about one or several items. Each excuse is a claim in the archive that
+allows some items to differ from the recreated ones.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ _NOTHING: Final[Mapping[str, Any]] = MappingProxyType({})
 
 
 class Level(enum.StrEnum):
-    """How deep a verification goes; each level includes those before it."""
+    """The depth of a verification; each level includes those before it."""
 
     FILES = "files"
     STATS = "stats"
@@ -36,7 +36,7 @@ class Level(enum.StrEnum):
 
 
 class Topic(enum.StrEnum):
-    """What is proved: a line of the one screen each, in its order."""
+    """The topics of a verification, in the order of their lines on the screen."""
 
     IDENTITY = "identity"
     BEGINNING = "beginning"
@@ -49,7 +49,7 @@ class Topic(enum.StrEnum):
 
 
 class Outcome(enum.StrEnum):
-    """How an item compares with the recreated one."""
+    """The result of comparing an item with the recreated one."""
 
     RECREATED = "recreated"
     WITHIN_TOLERANCE = "within tolerance"
@@ -60,7 +60,7 @@ class Outcome(enum.StrEnum):
 
 
 class ExcuseKind(enum.StrEnum):
-    """Why an item need not come out again; there are no other reasons."""
+    """The only reasons for which an item may differ from the recreated one."""
 
     VERSION = "version"
     HARDWARE = "hardware"
@@ -77,25 +77,27 @@ class Verdict(enum.StrEnum):
 
     @property
     def exit_status(self) -> int:
-        """What `mjrec verify` exits with."""
+        """The exit status of `mjrec verify`."""
         return {Verdict.PASS: 0, Verdict.FAIL: 1, Verdict.PARTLY: 3}[self]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Finding:
-    """One compared item, or several alike.
+    """One compared item, or several with the same result.
 
     Attributes:
-        topic: its line on the screen.
-        item: "episode 27 of 0.4711", a file's name below `data/`, or "" for the whole.
-        outcome: how it compares.
-        reason: a clause. DIFFERENT: where, the archive's value, the recreated value.
-            BELIEVED: why it was not recreated.
+        topic: the topic under which the finding is listed.
+        item: "episode 27 of 0.4711", a file's name below `data/`, or "" for the whole
+            run.
+        outcome: the result of the comparison.
+        reason: a clause. DIFFERENT: the place, the archive's value and the recreated
+            value. BELIEVED: why the item was not recreated.
         excuse: name of the excuse that allows it. None if none was needed or applies.
-        count: how many `unit` it stands for.
-        unit: what is counted: "episode", "step", "frame", "video", "file".
+        count: number of units that the finding covers.
+        unit: the unit of `count`: "episode", "step", "frame", "video", "file".
         figures: numbers by name, for JSON: `maximum`, `tolerance`, `psnr` ...
-        is_headline: shown beside the verdict: gaps, identical episodes.
+        is_headline: whether it is shown next to the verdict (gaps, identical
+            episodes).
     """
 
     topic: Topic
@@ -111,20 +113,22 @@ class Finding:
 
 @dataclass(frozen=True, kw_only=True)
 class Excuse:
-    """A claim that allows some items to be other than recreated.
+    """A claim that allows some items to differ from the recreated ones.
 
     Attributes:
-        kind: which of the three kinds (other versions or hardware; code that the
-            reader does not have; events from outside).
+        kind: a different version, different hardware, code that the reader does not
+            have, or an event from outside.
         name: "mujoco", "cpu", "gl", "environment", "unseeded beginning" ...
         claimed: the archive's value: "NVIDIA H100", "3.17.0", "episode 0 of 0.4711".
-        here: the reader's value; "" where there is none.
-        items: what it applies to: infixes of recordings, files' names below
+        here: the reader's value; "" if there is none.
+        items: the items it applies to: infixes of recordings, files' names below
             `recordings/`, or "episode 27 of 0.4711"; empty for the whole archive.
-        costs: what it takes away from the proof, a clause.
-        is_needed: something differs that it allows.
-        refuted: the difference that it claims ought to show, and nothing differs.
-        allowed: the reader takes it (`--allow`), so that it does not lower the verdict.
+        costs: a clause that says how it weakens the proof.
+        is_needed: whether it allows a difference that was found.
+        refuted: whether the difference that it claims should be visible, but nothing
+            differs.
+        allowed: whether the reader accepts it (`--allow`), so that it does not lower
+            the verdict.
     """
 
     kind: ExcuseKind
@@ -143,13 +147,13 @@ class Verification:
     """The result of `mjrec.verify`.
 
     Attributes:
-        path: as given.
-        level: as given.
-        findings: in the order of the comparison.
-        excuses: those that were claimed.
-        inputs: inputs that are not default, by name.
-        facts: versions, machine, the archive's sha256, sample and its seed, trusted
-            environments.
+        path: the path given to `verify`.
+        level: the level given to `verify`.
+        findings: the findings, in the order of the comparison.
+        excuses: the excuses that the archive claims.
+        inputs: the inputs that are not the default, by name.
+        facts: versions, machine, the archive's sha256, the sample and its seed, and
+            trusted environments.
     """
 
     path: Path
@@ -170,9 +174,9 @@ class Verification:
             return Verdict.FAIL
         needed = [excuse for excuse in self.excuses if excuse.is_needed]
         allowed = {excuse.name for excuse in needed if excuse.allowed}
-        # Of several claims of one kind, the reader may take one only.
+        # Allowing one of several claims with the same name does not allow the others.
         allowed -= {excuse.name for excuse in needed if not excuse.allowed}
-        # Less deep levels leave files and frames out.
+        # Shallower levels do not check files and frames.
         is_whole = self.level is Level.PIXELS and all(
             finding.outcome in (Outcome.RECREATED, Outcome.NOTED)
             or finding.excuse in allowed
@@ -182,7 +186,7 @@ class Verification:
 
     @property
     def passed(self) -> bool:
-        """Whether everything was recreated and is equal, or allowed."""
+        """Whether everything was recreated and is equal or allowed."""
         return self.verdict is Verdict.PASS
 
     @property
@@ -191,12 +195,12 @@ class Verification:
         return tuple(f for f in self.findings if f.outcome is Outcome.DIFFERENT)
 
     def as_json(self) -> dict[str, Any]:
-        """Return all of it as JSON has it."""
+        """Return the verification as a JSON object, with the verdict."""
         return {**to_json(self), "verdict": str(self.verdict)}
 
 
 def _is_proof(finding: Finding) -> bool:
-    """Return whether something that the environment or the renderer gives came out."""
+    """Return whether the finding confirms output of the environment or the renderer."""
     return finding.topic in _MADE and finding.outcome in (
         Outcome.RECREATED,
         Outcome.WITHIN_TOLERANCE,

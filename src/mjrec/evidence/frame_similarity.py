@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How alike two frames are, seen as an encoder sees them.
+"""Similarity of two frames, measured on the planes that an encoder works with.
 
-Frames are compared as the planes that a video holds: luma, and colour at half the
-height and width. Turned back into red, green and blue, a frame without any loss but
-that of its colours' resolution would seem as far off as a forged one.
+Frames are compared as the planes that a video holds: luma, and chroma at half the
+height and width. Converted back to RGB, a frame that has lost nothing but chroma
+resolution would seem to differ as much as a forged one.
 """
 
 from __future__ import annotations
@@ -17,33 +17,34 @@ from numpy.typing import NDArray
 
 from ..frames import Frame, pad_to_even
 
-# Two frames that are equal have an infinite one, which JSON cannot say.
+# The PSNR of two equal frames is infinite, which JSON cannot represent.
 _BEST_PSNR: Final = 100.0
-# In pixels, and the samples of all planes in it.
+# Side of a block in pixels, and the number of samples of all planes in a block.
 BLOCK: Final = 8
 SAMPLES_OF_BLOCK: Final = BLOCK**2 * 3 // 2
-# Of a cell of two by two pixels that is in shadow in one frame only: by how many
-# levels its lumas differ at least, and its colours at most from those in shadow.
+# A 2x2 cell counts as shadowed in one frame only if its lumas differ by at least
+# _LEAST_SHADOW levels, and its chroma is within _SHADOW_COLOUR levels of the darkened
+# one.
 _LEAST_SHADOW: Final = 12
 _SHADOW_COLOUR: Final = 10
-# Of the definition of SSIM, for samples of eight bits.
+# The constants in the definition of SSIM, for 8-bit samples.
 _C1: Final = (0.01 * 255) ** 2
 _C2: Final = (0.03 * 255) ** 2
 
-# BT.709, limited range, as the encoder uses it: what red, green and blue weigh, and how
-# far each plane reaches.
+# BT.709, limited range, as the encoder uses it: the weights of red, green and blue,
+# and the range of each plane.
 _RED, _BLUE = 0.2126, 0.0722
 _LUMA = np.array([_RED, 1 - _RED - _BLUE, _BLUE], np.float32)
 _LUMA_RANGE, _COLOUR_RANGE = 219.0, 224.0
 
 
 class Planes(NamedTuple):
-    """A frame as yuv420p holds it.
+    """The planes of a frame in yuv420p.
 
     Attributes:
         luma: `(height, width) uint8`.
-        blue: the difference from blue, `(height / 2, width / 2) uint8`.
-        red: the difference from red, likewise.
+        blue: the blue difference (Cb), `(height / 2, width / 2) uint8`.
+        red: the red difference (Cr), `(height / 2, width / 2) uint8`.
     """
 
     luma: NDArray[np.uint8]
@@ -52,15 +53,14 @@ class Planes(NamedTuple):
 
 
 class Similarity(NamedTuple):
-    """How alike two frames are.
+    """Similarity of two frames.
 
     Attributes:
-        psnr: peak signal to noise of all samples of the three planes, in dB; 100 where
-            they are equal.
-        ssim: structural similarity of luma, the mean over blocks of 8 by 8 pixels.
-        block: the root mean square of the difference in that block of 8 by 8 pixels in
-            which it is largest, in levels of 255. A change of a few pixels moves the
-            other two by next to nothing.
+        psnr: peak signal-to-noise ratio over all samples of the three planes, in dB;
+            100 if the frames are equal.
+        ssim: structural similarity of luma, the mean over blocks of 8x8 pixels.
+        block: the largest root mean square difference of any block of 8x8 pixels, in
+            levels (0 to 255). A change of a few pixels hardly moves the other two.
     """
 
     psnr: float
@@ -70,13 +70,14 @@ class Similarity(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Limits:
-    """How far a frame may be from the recreated one.
+    """Limits for the difference between a frame and the recreated one.
 
     Attributes:
-        psnr: the least, in dB.
-        ssim: the least.
-        block: the most, in levels.
-        shadow: how much of it may be in shadow in one of the two only, from 0 to 1.
+        psnr: the minimum PSNR, in dB.
+        ssim: the minimum SSIM.
+        block: the maximum block difference, in levels.
+        shadow: the maximum share of the frame that may be in shadow in only one of the
+            two, from 0 to 1.
     """
 
     psnr: float
@@ -85,46 +86,47 @@ class Limits:
     shadow: float = 0.0
 
     def strain(self, found: Similarity) -> float:
-        """Return how much of what is allowed was found; more than 1 is too much."""
+        """Return the difference as a fraction of what is allowed; above 1 fails."""
         noise = 10 ** ((self.psnr - found.psnr) / 20)
         return max(noise, (1 - found.ssim) / (1 - self.ssim), found.block / self.block)
 
 
-# The same frames through x264 at crf 18: in 23 scenes of dm_control's suite and of
+# The same frames through x264 at crf 18: in 23 scenes from dm_control's suite and
 # Gymnasium, from 32x32 to 640x480, the worst frames had 35.7 dB, 0.987 and 11.5 levels
-# against the drawn ones. Two encodings of them are apart by at most twice the noise.
-# A square of two by two pixels that is painted over has 21 levels or more.
+# against the rendered ones. Two encodings of them differ by at most twice the noise.
+# Painting over a square of 2x2 pixels gives 21 levels or more.
 OTHER_ENCODER: Final = Limits(psnr=32.0, ssim=0.97, block=20.0)
-# The same rasteriser and ffmpeg on another CPU. llvmpipe draws alike on all that have
-# AVX. Without it (128 bits instead of 256) no frame of five videos of six was equal:
-# HalfCheetah, Humanoid, Ant, Hopper, Pusher and Swimmer of Gymnasium, from 64x64 to
-# 480x480, had 41.7 dB, 0.998 and 9.4 levels at the worst, apart from shadows in 0.14
+# The same rasteriser and ffmpeg on a different CPU. llvmpipe renders the same on all
+# CPUs with AVX. Without AVX (128 bits instead of 256), five of six videos had no equal
+# frame: Gymnasium's HalfCheetah, Humanoid, Ant, Hopper, Pusher and Swimmer, from 64x64
+# to 480x480, had 41.7 dB, 0.998 and 9.4 levels at worst, apart from shadows in 0.14
 # per cent of a frame.
 OTHER_CPU: Final = Limits(psnr=38.0, ssim=0.985, block=14.0, shadow=0.01)
-# Its name says so many bits, and which LLVM built it.
+# A different build of llvmpipe: its name includes the vector width in bits and the
+# version of LLVM.
 OTHER_BUILD: Final = Limits(psnr=32.0, ssim=0.97, block=20.0, shadow=0.01)
-# Another rasteriser besides, in the same scenes: Mesa's softpipe, which smooths no
-# edges, against llvmpipe gave 29.3 dB (32x32; 35.5 from 120x160 on), 0.903 and 34
-# levels at the worst. An NVIDIA H100 (driver 580.159) against llvmpipe, in 31 videos of
-# 23 scenes, gave 31.2 dB, 0.932 and 25 levels, apart from shadows. Five by five pixels
-# that are painted over are beyond it, and a frame that is one step off where limbs move
-# fast (80 levels), not where they creep.
+# A different rasteriser as well, in the same scenes: Mesa's softpipe, which does not
+# antialias, against llvmpipe gave 29.3 dB (32x32; 35.5 from 120x160 on), 0.903 and 34
+# levels at worst. An NVIDIA H100 (driver 580.159) against llvmpipe, in 31 videos of
+# 23 scenes, gave 31.2 dB, 0.932 and 25 levels, apart from shadows. These limits detect
+# 5x5 pixels that are painted over, and a frame that is one step off if limbs move fast
+# (80 levels), but not if they creep.
 #
-# MuJoCo's shadows of a large floor on itself are a matter of rounding: at 480x480,
-# llvmpipe drew patches of them far away in one frame of five of HalfCheetah, 2.1 per
-# cent of it, and the H100 none. Without them the same frames had 42.9 dB.
+# Whether a large floor casts shadows on itself in MuJoCo depends on rounding: at
+# 480x480, llvmpipe drew patches of them far away in one of five frames of HalfCheetah
+# (2.1 per cent of the frame), the H100 none. Without them the same frames had 42.9 dB.
 OTHER_RENDERER: Final = Limits(psnr=28.0, ssim=0.88, block=44.0, shadow=0.04)
 
 
 def planes_of(frame: Frame) -> Planes:
-    """Return the planes of a drawn frame, its sides padded to even ones.
+    """Return the planes of a rendered frame, its sides padded to even lengths.
 
-    They are those that the encoder is given, to within a level.
+    They equal those that the encoder is given to within one level.
     """
     rgb = pad_to_even(frame).astype(np.float32) / 255
     luma = rgb @ _LUMA
     height, width = luma.shape
-    # The colours of two by two pixels are their mean.
+    # The chroma of a 2x2 cell is the mean of its pixels' colours.
     quarter = rgb.reshape(height // 2, 2, width // 2, 2, 3).mean(axis=(1, 3))
     quarter_luma = quarter @ _LUMA
     blue = (quarter[..., 2] - quarter_luma) / (2 * (1 - _BLUE))
@@ -137,7 +139,7 @@ def planes_of(frame: Frame) -> Planes:
 
 
 def similarity(one: Planes, other: Planes) -> Similarity:
-    """Return how alike two frames of one size are."""
+    """Return the similarity of two frames of the same size."""
     squares = [
         np.square(a.astype(np.float32) - b) for a, b in zip(one, other, strict=True)
     ]
@@ -147,13 +149,13 @@ def similarity(one: Planes, other: Planes) -> Similarity:
 
 
 def but_for_shadows(one: Planes, other: Planes) -> tuple[Planes, float]:
-    """Return `other` with the samples of `one` where only their light differs.
+    """Return `other` with samples of `one` wherever the two differ only in brightness.
 
-    There either is the other one made darker: the same colour, times a number from
-    0 to 1. So a shadow changes it; and so does painting it black.
+    There, one frame has the colour of the other times a factor from 0 to 1. Shadows
+    have this effect, but so does painting pixels black.
 
     Returns:
-        The frame, and how much of it is from `one`, from 0 to 1.
+        The frame, and the share of it that is from `one`, from 0 to 1.
     """
     lumas = [_halved(planes.luma) - 16 for planes in (one, other)]
     is_one_lighter = lumas[0] >= lumas[1]
@@ -194,7 +196,7 @@ def _block(squares: list[NDArray[np.float32]]) -> float:
         + _blocks(blue, half // 2).sum(axis=(1, 3))
         + _blocks(red, half // 2).sum(axis=(1, 3))
     )
-    # Blocks overlap by half, so that no corner of four of them hides what is small.
+    # Blocks overlap by half, so that a small change is never split among four blocks.
     cells = np.pad(cells, ((0, 1), (0, 1)))
     sums = cells[:-1, :-1] + cells[1:, :-1] + cells[:-1, 1:] + cells[1:, 1:]
     return math.sqrt(float(sums.max()) / SAMPLES_OF_BLOCK)
@@ -213,7 +215,7 @@ def _ssim(one: NDArray[np.uint8], other: NDArray[np.uint8]) -> float:
 
 
 def _blocks(plane: NDArray[np.float32], side: int) -> NDArray[np.float32]:
-    """Return a plane in blocks, its last rows and columns repeated to fill them."""
+    """Return a plane in blocks; its last rows and columns are repeated to fill them."""
     height, width = plane.shape
     rows, columns = -(-height // side), -(-width // side)
     padding = (0, rows * side - height), (0, columns * side - width)

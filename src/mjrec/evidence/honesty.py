@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a reader should know of a run that can be recreated: that is not yet honest.
+"""Remarks on a run that may be misleading even if it can be recreated.
 
 Its author may have chosen the seeds, shown one episode as two, or left some out. A
-video may show a part of its episode, or be faster than real time.
+video may show only part of its episode, or be faster than real time.
 """
 
 from __future__ import annotations
@@ -25,16 +25,16 @@ from .findings import Finding, Outcome, Topic
 from .inputs import EpisodeInputs, Inputs, RecordingInputs
 
 _MOST_SHOWN = 5
-# How the environments of Gymnasium's registry and of dm_control's suite are called.
+# The form of ids in Gymnasium's registry and dm_control's suite.
 _REGISTERED = re.compile(r"dm_control/.+|.+-v\d+")
 
 
 def remarks(inputs: Inputs, arrays: Mapping[str, NDArray[Any]]) -> Iterator[Finding]:
-    """Yield what a reader should know, whatever else comes out.
+    """Yield what a reader should know regardless of the comparison's result.
 
     Args:
-        inputs: of the run.
-        arrays: the actions that they name.
+        inputs: the run's inputs.
+        arrays: the arrays that the inputs name.
     """
     for recording in inputs.recordings:
         yield from _name(recording)
@@ -47,16 +47,16 @@ def remarks(inputs: Inputs, arrays: Mapping[str, NDArray[Any]]) -> Iterator[Find
 
 
 def read_metadata(video: Path) -> Mapping[str, Any]:
-    """Return what the metadata file of a video says; nothing where it is damaged."""
+    """Return a video's metadata; empty if the metadata file cannot be read."""
     return _read(metadata_path(video))
 
 
 def remarks_on_video(metadata: Path, file: str) -> Iterator[Finding]:
-    """Yield what a reader would not expect of a video.
+    """Yield the facts about a video that a reader would not expect.
 
     Args:
-        metadata: its metadata file.
-        file: the name of that, below `data/`.
+        metadata: the video's metadata file.
+        file: the metadata file's name below `data/`.
     """
     for reason in _of_video(_read(metadata)):
         yield Finding(
@@ -69,7 +69,7 @@ def remarks_on_video(metadata: Path, file: str) -> Iterator[Finding]:
 
 
 def _name(recording: RecordingInputs) -> Iterator[Finding]:
-    """Yield that an environment is called by the name of another one."""
+    """Yield a remark if an environment goes by a name that is not its own."""
     environment = recording.environment or {}
     env_id, name = environment.get("id"), recording.env_id
     if env_id is not None and name != env_id:
@@ -77,7 +77,7 @@ def _name(recording: RecordingInputs) -> Iterator[Finding]:
         yield _headline(
             Topic.IDENTITY,
             recording.name,
-            f"it is called {name!r:.80}, and its environment is {env_id!r:.80}",
+            f"its name is {name!r:.80}, but its environment is {env_id!r:.80}",
             outcome=Outcome.DIFFERENT if is_anothers else Outcome.BELIEVED,
             unit="recording",
         )
@@ -85,7 +85,7 @@ def _name(recording: RecordingInputs) -> Iterator[Finding]:
         yield _headline(
             Topic.IDENTITY,
             recording.name,
-            f"{name!r:.80} is a model (MJCF) of the author's, not the environment of "
+            f"{name!r:.80} is the author's own model (MJCF), not the environment of "
             "that name",
             outcome=Outcome.NOTED,
             unit="recording",
@@ -117,8 +117,8 @@ def _gaps(
         yield _headline(
             Topic.SELECTION,
             recording.name,
-            f"it begins with episode {first}, and the recordings of its environment "
-            f"that it went on from are not here: {missing} are missing",
+            f"it begins with episode {first}, and the earlier recordings of its "
+            f"environment are not included: {missing} are missing",
             outcome=Outcome.BELIEVED,
             count=count,
         )
@@ -127,20 +127,21 @@ def _gaps(
 def _cuts(
     recording: RecordingInputs, all_of_them: Sequence[RecordingInputs]
 ) -> Iterator[Finding]:
-    """Yield which episodes are in no statistics, as they were cut off."""
+    """Yield the episodes that are not in the statistics because they were cut off."""
     cut = [each.episode_id for each in recording.episodes if each.cut is not None]
     if not cut:
         return
-    # A run is closed once. Whoever closes and goes on can leave out what goes wrong.
+    # A run is normally closed once. Closing it early and continuing in a new recording
+    # is a way to leave out bad episodes.
     goes_on = any(
         other.first_episode_id > max(cut) and other.env_id == recording.env_id
         for other in all_of_them
     )
-    then = ", and another recording goes on after them" if goes_on else ""
+    then = ", and another recording continues after them" if goes_on else ""
     yield _headline(
         Topic.SELECTION,
         recording.name,
-        f"episodes that are not in the statistics, as they were cut off: "
+        f"episodes not in the statistics because they were cut off: "
         f"{_listed(cut)}{then}",
         outcome=Outcome.BELIEVED if goes_on else Outcome.NOTED,
         count=len(cut),
@@ -148,14 +149,14 @@ def _cuts(
 
 
 def _types(recording: RecordingInputs) -> Iterator[Finding]:
-    """Yield which episodes are called training among those called evaluation."""
+    """Yield the training episodes of a recording that mixes them with evaluation."""
     complete = [each for each in recording.episodes if each.cut is None]
     training = [each.episode_id for each in complete if each.type != "e"]
     if training and len(training) < len(complete):
         yield _headline(
             Topic.SELECTION,
             recording.name,
-            f"{len(training)} of {len(complete)} episodes are called training, the "
+            f"{len(training)} of {len(complete)} episodes are labelled training, the "
             f"others evaluation: {_listed(training)}",
             outcome=Outcome.NOTED,
             count=len(training),
@@ -163,9 +164,9 @@ def _types(recording: RecordingInputs) -> Iterator[Finding]:
 
 
 def _gaps_of_evaluations(recordings: Sequence[RecordingInputs]) -> Iterator[Finding]:
-    """Yield which episodes of an evaluation's seeds are not here.
+    """Yield the episodes of each evaluation seed that are missing.
 
-    They are numbered from 0, over all recordings of an environment.
+    Episodes are numbered from 0, across all recordings of an environment.
     """
     numbers: dict[tuple[str, int], set[int]] = {}
     for recording in recordings:
@@ -180,14 +181,14 @@ def _gaps_of_evaluations(recordings: Sequence[RecordingInputs]) -> Iterator[Find
             yield _headline(
                 Topic.SELECTION,
                 f"{env_id:.80}, seed {seed}",
-                f"episodes of the evaluation that are not here, or failed: {missing}",
+                f"episodes of the evaluation that are missing or failed: {missing}",
                 outcome=Outcome.BELIEVED,
                 count=count,
             )
 
 
 def _seeds(recording: RecordingInputs) -> Iterator[Finding]:
-    """Yield by which rule the seeds of a recording follow."""
+    """Yield the rule that the seeds of a recording follow."""
     given = [each for each in recording.episodes if each.seed is not None]
     if not given:
         return
@@ -196,7 +197,7 @@ def _seeds(recording: RecordingInputs) -> Iterator[Finding]:
         topic=Topic.BEGINNING,
         item=recording.name,
         outcome=Outcome.NOTED,
-        reason=rule or "seeds chosen by the author: they follow no stated rule",
+        reason=rule or "seeds chosen by the author: they do not follow a stated rule",
         count=len(given),
         unit="seed",
     )
@@ -231,11 +232,11 @@ def _rule_of_evaluation(episodes: Sequence[EpisodeInputs]) -> str | None:
         if each.seed != episode_seeds(seed, number).environment:
             return None
         seeds.add(seed)
-    return f"SeedSequence([S, i]) for episode i, S of {_listed(seeds)}"
+    return f"SeedSequence([S, i]) for episode i, S in {_listed(seeds)}"
 
 
 def _repeated(inputs: Inputs, arrays: Mapping[str, NDArray[Any]]) -> Iterator[Finding]:
-    """Yield which episodes are the same, anywhere: they count once."""
+    """Yield the groups of identical episodes in all recordings; each counts once."""
     found: dict[str, list[str]] = {}
     for recording in inputs.recordings:
         for each in recording.episodes:
@@ -251,8 +252,8 @@ def _repeated(inputs: Inputs, arrays: Mapping[str, NDArray[Any]]) -> Iterator[Fi
             yield _headline(
                 Topic.SELECTION,
                 items[0],
-                f"the same episode, begun and acted alike: {_listed(items)}; it counts "
-                "once",
+                "the same episode, with the same beginning and actions: "
+                f"{_listed(items)}; it counts once",
                 outcome=Outcome.BELIEVED,
                 count=len(items) - 1,
             )
@@ -284,7 +285,7 @@ def _headline(
 
 
 def _missing(known: set[int], start: int, stop: int) -> tuple[int, str]:
-    """Return how many numbers of a range are not known, and the first of them."""
+    """Return the number of unknown numbers in a range, and the first few as a list."""
     count = max(0, stop - start) - sum(start <= number < stop for number in known)
     missing = (number for number in range(start, stop) if number not in known)
     return count, _shown(itertools.islice(missing, min(count, _MOST_SHOWN)), count)
@@ -308,27 +309,27 @@ def _of_video(said: Mapping[str, Any]) -> Iterator[str]:
     if isinstance(speed, int | float) and abs(speed - 1) > 1e-9:
         yield f"plays at {speed:g} times real time"
     elif speed is None and said.get("content_type") == "video/mp4":
-        yield "does not say how fast it plays: how long a step lasts is not known"
+        yield "does not state its playback speed: the length of a step is unknown"
     if said.get("broken"):
         yield f"broke off: {said.get('broken_reason')}"
     elif said.get("complete") is False:
-        yield f"shows an episode that did not end: {said.get('reason')}"
+        yield f"shows an incomplete episode: {said.get('reason')}"
     if "first_step" in said:
         yield "is a clip, not a whole episode"
     elif (runs := said.get("frame_steps")) and not _is_whole(runs, said.get("length")):
-        yield "does not show its episode from the reset to the last step"
+        yield "does not show the whole episode, from the reset to the last step"
     if said.get("first_video"):
         yield "shows a further camera"
     if said.get("recording") == "live":
-        yield f"was drawn while its episode ran: {said.get('recording_reason')}"
+        yield f"was rendered during the episode: {said.get('recording_reason')}"
     for key, meaning in (
         ("annotated", "has captions drawn into its frames"),
-        ("packed_smaller", "was drawn again in a smaller size to be packed"),
+        ("packed_smaller", "was re-rendered at a smaller size for packing"),
     ):
         if said.get(key):
             yield meaning
     if said.get("quality") == "draft":
-        yield "is drawn in draft quality"
+        yield "was rendered in draft quality"
 
 
 def _is_whole(runs: Any, length: Any) -> bool:

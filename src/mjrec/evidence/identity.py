@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What names a person or a machine: of the user who packs, and of who recorded."""
+"""Names of people and machines: of the user who packs and of those who recorded."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ _VARIABLES = {
 _GIT_SETTINGS = r"^(user\.(name|email)|remote\..*\.(url|pushurl))$"
 _GIT_SECONDS = 10.0
 
-# What is shorter (`../x`) could stand anywhere.
+# Shorter remotes (`../x`) could occur anywhere.
 _SHORTEST_REMOTE = 6
-# Where homes are, on Linux, on clusters and on a Mac.
+# Home directories on Linux, on clusters and on macOS.
 HOME_OF_ANYBODY = r"/(?:[\w.-]+/)*?(?:home|Users)/[^/\s\"':,;<>]+"
 _HOME = re.compile(rf"(?<!\w){HOME_OF_ANYBODY}")
 _ABSOLUTE = re.compile(r"(?<![\w./])(/[^\s\"':,;<>=]+)")
@@ -42,7 +42,7 @@ _REPOSITORY = re.compile(
     r"(?P<path>(?P<owner>[^/]+)/.+?)(?:\.git)?/*"
 )
 _AFFILIATION = re.compile(r"\s*[(\[].*?[)\]]")
-# These name no one, and where programs are is the same for everybody.
+# Directories that identify nobody. Below _SHARED are programs, the same for all users.
 _EVERYBODYS = frozenset(
     ("/", "/tmp", "/var/tmp", "/home", "/Users", "/usr", "/opt", "/var", "/dev/shm")
 )
@@ -51,15 +51,15 @@ _SHARED = ("/usr", "/bin", "/sbin", "/lib", "/opt", "/etc", "/proc", "/sys", "/d
 
 @dataclass(frozen=True, kw_only=True)
 class Identity:
-    """The texts that name a person or a machine.
+    """The strings that name a person or a machine.
 
     Attributes:
         users: login names.
         people: full names, as their owners write them.
-        addresses: of mail, and ORCIDs.
-        hosts: names of machines, whole and without their domain.
+        addresses: email addresses and ORCIDs.
+        hosts: host names, with and without their domain.
         homes: absolute paths of home directories.
-        directories: absolute paths of where the work is: working directories, roots of
+        directories: absolute paths of the work: working directories, roots of
             repositories, directories of policies and programs.
         remotes: URLs of git repositories, and their `owner/name`.
     """
@@ -73,7 +73,7 @@ class Identity:
     remotes: set[str] = field(default_factory=set)
 
     def add(self, kind: str, value: object) -> None:
-        """Add a text, and what else follows from it; anything else says nothing."""
+        """Add a string and the names derived from it; ignore any other value."""
         text = value.strip() if isinstance(value, str) else ""
         if not text or "\0" in text:
             return
@@ -84,7 +84,7 @@ class Identity:
             case "homes" | "directories":
                 path = os.path.normpath(text)
                 if path.startswith("/") and path not in _EVERYBODYS:
-                    # Also what it is a link to: both are met in messages.
+                    # Messages may contain the path or the target of its link.
                     getattr(self, kind).update((path, os.path.realpath(path)))
             case "people" if " " not in text:
                 self.users.add(text)
@@ -112,15 +112,15 @@ class Identity:
 def identity_of_user(
     provenance: Iterable[Mapping[str, Any]] = (), authors: Iterable[Author] = ()
 ) -> Identity:
-    """Return what names the user of this process, its machine, and who recorded.
+    """Return the names of this process's user and machine, and of those who recorded.
 
-    Asks the system, the environment variables, and git's settings in the working
-    directory and in the recorded repositories; no name server.
+    They come from the system, the environment variables, and git's settings in the
+    working directory and in the recorded repositories. No name server is queried.
 
     Args:
-        provenance: what the manifests say of where their recordings were made, which
-            may have been another machine and another user.
-        authors: as they were stated.
+        provenance: the provenance in the recordings' manifests, which may be from a
+            different machine and a different user.
+        authors: the stated authors.
     """
     identity = Identity()
     _add_system(identity)
@@ -147,7 +147,7 @@ def identity_of_user(
 def _add_system(identity: Identity) -> None:
     try:
         identity.add("users", getpass.getuser())
-    except (KeyError, OSError):  # nothing says it; which of them, depends on Python
+    except (KeyError, OSError):  # which of the two depends on Python's version
         logger.debug("This process has no login name.")
     try:
         entry = pwd.getpwuid(os.geteuid())
@@ -155,7 +155,7 @@ def _add_system(identity: Identity) -> None:
         pass
     else:
         identity.add("users", entry.pw_name)
-        # Room, telephones and so on follow.
+        # Office, telephone numbers and so on follow the name.
         identity.add("people", entry.pw_gecos.split(",")[0])
         identity.add("homes", entry.pw_dir)
     for name in _host_names():
@@ -180,14 +180,14 @@ def _add_provenance(identity: Identity, said: Mapping[str, Any]) -> None:
     files = [facts_in(said.get("policy")).get("file")]
     for text in texts:
         if isinstance(text, str):
-            # No more of them: a variable may be a list of directories of everybody's.
+            # Only homes: a variable may be a list of directories that all users share.
             for home in _HOME.findall(text):
                 identity.add("homes", home)
     for argument in texts[len(variables) :]:
         files += _ABSOLUTE.findall(argument) if isinstance(argument, str) else []
     for file in files:
         if isinstance(file, str) and file.startswith("/"):
-            directory = os.path.dirname(os.path.normpath(file))  # noqa: PTH120  text, of another machine perhaps
+            directory = os.path.dirname(os.path.normpath(file))  # noqa: PTH120  a string, maybe from another machine
             if not directory.startswith(_SHARED):
                 identity.add("directories", directory)
 
@@ -195,7 +195,7 @@ def _add_provenance(identity: Identity, said: Mapping[str, Any]) -> None:
 def _host_names() -> Iterator[str]:
     name = os.uname().nodename
     yield name
-    # The whole name of the machine, where it has one that needs no name server.
+    # The machine's full name, if /etc/hosts has it.
     try:
         lines = Path("/etc/hosts").read_text(errors="replace").splitlines()
     except OSError:
@@ -214,7 +214,7 @@ def _working_directory() -> str | None:
 
 
 def _is_directory(path: Any) -> bool:
-    # A null character, which a file may name, is a ValueError.
+    # A recorded path may contain a null character, which raises ValueError.
     try:
         return isinstance(path, str) and path.startswith("/") and Path(path).is_dir()
     except (OSError, ValueError):
@@ -233,7 +233,7 @@ def _git_settings(directory: Any) -> list[tuple[str, str]]:
             check=False,
         )
     except (OSError, subprocess.TimeoutExpired) as error:
-        logger.debug("git says nothing of %s: %s", directory, error)
+        logger.debug("Git's settings in %s cannot be read: %s", directory, error)
         return []
     settings = done.stdout.decode(errors="replace").split("\0")
     pairs = (setting.partition("\n") for setting in settings)

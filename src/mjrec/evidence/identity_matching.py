@@ -1,20 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where in a text an identity is, and the text without it.
+"""Finding and replacing an identity in strings, file names and bytes.
 
-What is matched how, in capitals or not:
+Matching ignores case. The rules are:
 
-- URLs of repositories, addresses of mail and ORCIDs: anywhere.
-- Paths of homes and working directories: with everything that begins with them;
-  and all that is called `/home/<name>` or `/Users/<name>`.
+- Repository URLs, email addresses and ORCIDs: anywhere.
+- Paths of homes and working directories: with everything that begins with them. Any
+  `/home/<name>` or `/Users/<name>` matches too.
 - Full names: their words in this order or with the last one first, joined by a space,
-  a dot, a comma, a hyphen, an underline or nothing; the last word alone where it has
-  six letters or more, between what is no letter.
-- Login names and names of machines with six letters or more: anywhere, also inside
-  other words. With four or five: between what is no letter, or as a word of
+  a dot, a comma, a hyphen, an underscore or nothing. The last word matches alone if it
+  has at least six letters and no letters next to it.
+- Login names and host names of at least six letters: anywhere, even inside other
+  words. Those of four or five letters: with no letters next to them, or as a word in
   `CamelCase`.
-- Those with fewer, and those that are ordinary words here (`root`, `user`, `hopper`):
-  only as a whole part of a path, before `@` of a name of a machine, or after it.
-  HalfCheetah has joints called `rootx`, which are no account's.
+- Shorter ones, and those that are ordinary words here (`root`, `user`, `hopper`): only
+  as a whole part of a path, before `@` and a host name, or after it. HalfCheetah has
+  joints called `rootx`, which do not name an account.
 """
 
 from __future__ import annotations
@@ -38,28 +38,28 @@ _SHORTEST_PERSON_INSIDE_WORDS = 9
 _NO_LETTER_BEFORE = r"(?<![^\W\d_])"
 _NO_LETTER_AFTER = r"(?![^\W\d_])"
 _JOINTS = r"[\s._,-]*"
-# What may follow a part of a path.
+# The characters that may follow a part of a path.
 _PART_END = r"(?=[/\\\s\"':,;)\]>]|$)"
 _MACHINE = r"[a-z0-9][\w.-]*"
 
-# Texts in what is no text: as long as what is believed there.
+# Runs of printable characters in binary data, of at least _SHORTEST_INSIDE_WORDS.
 _ASCII_RUN = re.compile(rb"[\x20-\x7e]{6,}")
 _UTF16_RUNS = {
     "utf-16-le": re.compile(rb"(?:[\x20-\x7e]\0){6,}"),
     "utf-16-be": re.compile(rb"(?:\0[\x20-\x7e]){6,}"),
 }
-# In compressed data and in numbers any four letters occur by chance, in every few
-# hundred megabytes; inside so long a run of text they do not.
+# Any four letters occur by chance in every few hundred megabytes of compressed data or
+# numbers, but not inside a run of printable characters of this length.
 _LONG_RUN = 12
 
 _ESCAPED = re.compile(r"\\u([0-9a-fA-F]{4})")
 
 
 class IdentityMatcher:
-    """Finds an identity in texts, in names of files and in bytes.
+    """Finds an identity in strings, file names and bytes.
 
     Args:
-        identity: what to look for.
+        identity: the identity to look for.
     """
 
     def __init__(self, identity: Identity) -> None:
@@ -75,34 +75,36 @@ class IdentityMatcher:
         ]
 
     def replaced(self, text: str) -> str:
-        """Return a text with placeholders: `<home>`, `<path>`, `<user>`, `<host>`."""
+        """Return a string with placeholders: `<home>`, `<path>`, `<user>`, `<host>`."""
         return self._texts.sub(lambda match: f"<{_placeholder(match)}>", text)
 
     def replaced_in_name(self, name: str) -> str:
-        """Return a file's name, or a part of one, with words that are portable there.
+        """Return a file name, or a part of one, with portable words as placeholders.
 
-        A short login name counts there too, between dots, hyphens and underlines.
+        Short login names also match, between dots, hyphens and underscores.
         """
         return self._names.sub(_placeholder, name)
 
     def found_in(self, text: str) -> list[str]:
-        """Return what of the identity is in a text, each once."""
+        """Return the parts of the identity in a string, each once."""
         return _unique(match[0] for match in self._texts.finditer(text))
 
     def found_in_name(self, name: str) -> list[str]:
-        """Return what of the identity is in a file's name, each once."""
+        """Return the parts of the identity in a file name, each once."""
         return _unique(match[0] for match in self._names.finditer(name))
 
     def found_in_bytes(self, content: bytes, *, by_chance: bool = False) -> list[str]:
-        r"""Return what is in bytes, which are a text, in UTF-8 or UTF-16, or hold some.
+        r"""Return the parts of the identity in bytes, as UTF-8 or UTF-16, each once.
 
-        In what is no text, fewer than six letters count only in a line of a dozen
-        characters and more: among numbers, and in what is compressed, they occur by
-        chance. Letters that JSON has as `\u00e9` are read.
+        The bytes may be text or contain some. In binary data, matches of fewer than six
+        letters count only in a run of at least twelve characters, because they occur
+        by chance in numbers and in compressed data. JSON escapes such as `\u00e9` are
+        decoded.
 
         Args:
-            content: anything.
-            by_chance: whether it is compressed or numbers, which hold no UTF-16.
+            content: the bytes.
+            by_chance: whether the bytes are compressed data or numbers, which contain
+                no UTF-16.
         """
         found = [text for text, data in self._literals if data in content]
         try:
@@ -121,7 +123,7 @@ class IdentityMatcher:
     def _found_in_runs(
         self, runs: re.Pattern[bytes], content: bytes, encoding: str
     ) -> Iterator[str]:
-        # In one text, because there are many.
+        # One search in the joined runs, because there are many.
         text = "\n".join(run.decode(encoding) for run in runs.findall(content))
         for match in self._texts.finditer(text):
             start = text.rfind("\n", 0, match.start()) + 1
@@ -132,7 +134,7 @@ class IdentityMatcher:
 
 
 def _alternatives(patterns: Iterable[tuple[str, str]]) -> re.Pattern[str]:
-    """Return one pattern; the name of the group that matched ends in a placeholder."""
+    """Return one pattern whose group names each end in a placeholder."""
     groups = (
         f"(?P<_{number}_{placeholder}>{pattern})"
         for number, (placeholder, pattern) in enumerate(patterns)
@@ -145,7 +147,7 @@ def _placeholder(match: re.Match[str]) -> str:
 
 
 def _patterns(identity: Identity) -> Iterator[tuple[str, str]]:
-    """Yield placeholders and what they replace; of two that fit, the first does."""
+    """Yield placeholders and the patterns they replace; the first match wins."""
     for remote in _longest_first(identity.remotes):
         yield "path", re.escape(remote)
     for address in _longest_first(identity.addresses):
@@ -173,7 +175,7 @@ def _of_person(words: Sequence[str]) -> str:
     pattern = "|".join(sorted(orders))
     if sum(map(len, words)) >= _SHORTEST_PERSON_INSIDE_WORDS:
         return pattern
-    # Of "An Li", "italian" would be one.
+    # Otherwise "An Li" would match "italian".
     return f"{_NO_LETTER_BEFORE}(?:{pattern}){_NO_LETTER_AFTER}"
 
 
@@ -198,7 +200,10 @@ def _short_parts(identity: Identity) -> Iterator[tuple[str, str]]:
 
 
 def _is_distinctive(name: str, length: int) -> bool:
-    """Return whether a name of at least `length` is no ordinary word, and no number."""
+    """Return whether a name has at least `length` characters and is distinctive.
+
+    It must contain a letter and must not be an ordinary word.
+    """
     has_letters = any(character.isalpha() for character in name)
     return len(name) >= length and has_letters and name.lower() not in _ORDINARY_WORDS
 

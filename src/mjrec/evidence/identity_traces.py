@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is left of an identity in files, however it is packed there.
+"""Search for traces of an identity in files, including packed ones.
 
-Archives are opened, compressed files are unpacked, and of HDF5 files every name,
-attribute and text is looked at.
+Archives are opened, compressed files are decompressed, and every name, attribute and
+string in HDF5 files is checked.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ from .identity_matching import IdentityMatcher
 _GZIP = b"\x1f\x8b"
 _ZIP = b"PK\3\4"
 _FILM = re.compile(rb"....ftyp|RIFF....AVI ", re.DOTALL)
-# An archive in an archive in an archive ...
+# Maximum depth of archives inside archives.
 _DEEPEST = 8
 _PIECE = 1 << 24
 _LONGEST_NAME = 1 << 12
 
-# Where something is, and what is there: a name, or bytes; and whether these may hold
-# any few letters by chance.
+# A place, its content (a name or bytes), and whether the bytes may contain short
+# strings by chance.
 _Place = tuple[str, str | bytes, bool]
 
 _DAMAGE = (
@@ -49,18 +49,18 @@ _DAMAGE = (
 
 
 def remaining_identity(stage: Path, identity: Identity) -> list[tuple[str, str]]:
-    """Return what names a person or a machine below a directory.
+    """Return the names of people and machines that remain below a directory.
 
     Args:
-        stage: the directory; its own name, and the path of it, do not count.
-        identity: what to look for; how it is matched, `identity_matching` says.
+        stage: the directory; its own name and path are not searched.
+        identity: the identity to look for; `identity_matching` lists the rules.
 
     Returns:
-        Where, and what: the name of a file relative to `stage`, followed by the place
-        inside of it; and the text that was found there. Each once, sorted.
+        Pairs of a place and the string found there, each once, sorted. A place is a
+        file's path relative to `stage`, followed by the place inside the file.
 
     Raises:
-        UnreadableFile: something cannot be unpacked.
+        UnreadableFile: a file cannot be unpacked.
     """
     matcher = IdentityMatcher(identity)
     found: set[tuple[str, str]] = set()
@@ -88,7 +88,7 @@ def _places_in_file(path: Path, where: str) -> Iterator[_Place]:
         if not _FILM.match(piece):
             yield from _places(where, piece + file.read(), 0)
             return
-        # Films are large, and nothing in them is packed that could name anyone.
+        # Videos are large and contain nothing packed that could name a person.
         while piece:
             following = file.read(_PIECE)
             yield where, piece + following[:_LONGEST_NAME], True
@@ -97,9 +97,9 @@ def _places_in_file(path: Path, where: str) -> Iterator[_Place]:
 
 def _places(where: str, content: bytes, depth: int) -> Iterator[_Place]:
     if depth > _DEEPEST:
-        raise ValueError("it is packed in itself")
+        raise ValueError(f"it contains archives more than {_DEEPEST} levels deep")
     is_packed = content.startswith((SIGNATURE, _ZIP, _GZIP))
-    # Also of what is packed: a header may have the name of a file.
+    # Packed data too: a header may contain a file's name.
     yield where, content, is_packed
     if content.startswith(SIGNATURE):
         yield from _places_in_hdf5(where, content)
@@ -120,7 +120,7 @@ def _places_in_zip(where: str, content: bytes, depth: int) -> Iterator[_Place]:
 
 
 def _places_in_hdf5(where: str, content: bytes) -> Iterator[_Place]:
-    """Yield the texts of an HDF5 file; a place in it is `/group/dataset@attribute`."""
+    """Yield the strings in an HDF5 file; its places are `/group/dataset@attribute`."""
     found: list[tuple[str, Any]] = []
     with h5py.File(io.BytesIO(content), "r") as file:
         file.visititems(lambda name, item: found.append((name, item)))

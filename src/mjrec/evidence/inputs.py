@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The inputs of a run: all that is taken from an archive to make the run again.
+"""The inputs of a run: everything taken from an archive to recreate the run.
 
-The list is closed. What does not stand here is an output, and has to come out again:
-states, rewards, ends, statistics, frames, videos. An input that is not the default
-stands in the report.
+The list is complete. Everything else is an output and must be reproduced: states,
+rewards, ends, statistics, frames, videos. The report lists each input that is not the
+default.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from ..environments.scenes import shown_wrappers
 INPUTS_FILE: Final = "inputs.json"
 ARRAYS_FILE: Final = "arrays.npz"
 
-# Of the options in a journal, with the types that they may have.
+# The options in a journal that are inputs, and the types that each may have.
 OPTIONS: Final[Mapping[str, tuple[type, ...]]] = {
     "fps": (str,),
     "max_fps": (str,),
@@ -47,40 +47,40 @@ OPTIONS: Final[Mapping[str, tuple[type, ...]]] = {
 
 @dataclass(frozen=True, kw_only=True)
 class EpisodeInputs:
-    """What an episode was begun with, what was done in it, and what cut it off.
+    """The inputs of one episode: its reset, its actions, and what cut it off.
 
     Attributes:
-        episode_id: its number.
+        episode_id: the episode's number.
         type: "t" or "e".
-        seed: given to the reset.
-        options: given to the reset.
-        random_state: of the environment's generators just before the reset, as the
-            archive has it. It is used only where no seed leads to it.
+        seed: the seed given to the reset.
+        options: the options given to the reset.
+        random_state: the archive's state of the environment's random generators just
+            before the reset. It is used only if no seed leads to it.
         first_state: the name of the array with the state after the reset. It is used
-            only where neither a seed nor a random state leads there.
-        states: the name of the array of all states, where another MuJoCo or machine is
-            claimed: each step is then made from the recorded state before it, so that
-            differences of the last bits do not grow; None else.
-        steps: how many were taken.
-        actions: the name of the array of actions, also where some are irregular; None
-            where they were not kept.
-        steps_taken: the name of the arrays `<name>.<part>` of `RecordedSteps`, where
-            wrappers are not here; None else.
-        dtypes: from which step on they were given as which dtype.
-        parts: name and shape of the arrays of a dictionary; None for plain arrays.
-        irregular: `step`, `value` and, of an array, `dtype` of those that fit into no
-            array.
-        cut: why the episode is no part of the statistics (`reset`, `close`, `killed`
-            ...); None of a complete one.
-        exception: what was raised, where that cut it off.
-        has_trajectory: its trajectory was kept.
-        is_chosen: its video was chosen.
-        start_time: a statement, as `end_time`.
-        end_time: likewise.
+            only if neither a seed nor a random state leads there.
+        states: the name of the array of all states if the archive claims a different
+            MuJoCo or machine, otherwise None. Each step then starts from the recorded
+            state before it, so that differences in the last bits do not grow.
+        steps: number of steps taken.
+        actions: the name of the array of actions, even if some are irregular; None if
+            the actions were not kept.
+        steps_taken: the name of the arrays `<name>.<part>` of `RecordedSteps` if
+            the environment has wrappers; otherwise None.
+        dtypes: pairs of a step and the dtype of the actions from that step on.
+        parts: names and shapes of a dictionary's arrays; None for plain arrays.
+        irregular: `step`, `value` and, for an array, `dtype` of each action that does
+            not fit into the array.
+        cut: the reason why the episode is not in the statistics (`reset`, `close`,
+            `killed` ...); None for a complete episode.
+        exception: the exception, if one cut the episode off.
+        has_trajectory: whether its trajectory was kept.
+        is_chosen: whether its video was chosen.
+        start_time: the stated start time.
+        end_time: the stated end time.
         believed: `reward`, `terminated`, `truncated` and `success` of a complete
-            episode. They are used only where actions were not kept.
-        evaluation: `seed` and `episode` of an evaluation that it belongs to; None else.
-        selection: what its video says of the choice among an evaluation's episodes.
+            episode. They are used only if actions were not kept.
+        evaluation: `seed` and `episode` of the evaluation that it belongs to, or None.
+        selection: its video's facts about the choice among an evaluation's episodes.
     """
 
     episode_id: int
@@ -109,32 +109,34 @@ class EpisodeInputs:
 
 @dataclass(frozen=True, kw_only=True)
 class RecordingInputs:
-    """What one monitor recorded, and how it was asked to.
+    """The inputs of one monitor's recording: its options and its episodes.
 
     Attributes:
-        infix: what the names of its files have in the middle.
+        infix: the middle part of its files' names.
         env_id: the environment's name in the recordings.
-        sources: the name of the file with what the author's MJCF model was made from;
-            None of other environments.
+        sources: the name of the file with the sources of the author's MJCF model; None
+            for other environments.
         environment: `framework`, `id`, `kwargs`, `wrappers`, `wrapper_arguments` and
-            `max_episode_steps`; None where the journal does not say.
-        options: of the recorder, those that are not the default; see `OPTIONS`.
+            `max_episode_steps`; None if they are not in the journal.
+        options: the recorder's options that are not the default; see `OPTIONS`.
         schedule: the name of the schedule.
-        rule: the name of the rule of `keep`; None where there is none.
+        rule: the name of the `keep` rule, or None.
         first_episode_id: the number of its first episode.
-        kept: the episodes that the rule has chosen in the end.
-        clip_starts: the numbers of steps at which clips were begun by a trigger.
-        episodes: in their order.
-        evaluation_events: kind and facts of what the journal says of an evaluation's
-            episodes that began and failed, in its order.
-        evaluation_keeps: what the choices among all recordings of an evaluation said.
-        monitor_csv_start: the time in Stable-Baselines3's file, a statement; None where
-            that was not asked for.
-        provenance: the provenance, a statement; None where it was not known.
-        provenance_after: how many lines the journal had before it, after its first.
-        was_killed: another process has put the recording in order.
-        has_sources: it had stored what its models were made from, when it was killed.
-        is_closed: it was closed by its monitor.
+        kept: the episodes that the rule chose in the end.
+        clip_starts: the numbers of the steps at which a trigger started clips.
+        episodes: the episodes, in order.
+        evaluation_events: kind and facts of the journal's events of an evaluation's
+            episodes ("begun" or "failed"), in the journal's order.
+        evaluation_keeps: the facts of each choice among all recordings of an
+            evaluation.
+        monitor_csv_start: the stated time in Stable-Baselines3's file; None if that
+            file was not requested.
+        provenance: the stated provenance, or None if unknown.
+        provenance_after: number of lines in the journal before the provenance, not
+            counting the first.
+        was_killed: whether another process recovered the recording.
+        has_sources: whether its models' sources had been stored when it was killed.
+        is_closed: whether its monitor closed it.
     """
 
     infix: str
@@ -159,22 +161,22 @@ class RecordingInputs:
 
     @property
     def is_evaluation(self) -> bool:
-        """Whether it has an evaluation's episodes."""
+        """Whether the recording has an evaluation's episodes."""
         return bool(self.evaluation_events)
 
     @property
     def failed(self) -> Sequence[Mapping[str, Any]]:
-        """What is said of an evaluation's episodes that could not be completed."""
+        """The facts about each of an evaluation's episodes that failed."""
         events = self.evaluation_events
         return [facts for kind, facts in events if kind == "failed" and facts]
 
     @property
     def name(self) -> str:
-        """What findings call it."""
+        """The recording's name in findings."""
         return f"recording {self.infix}"
 
     def item(self, episode: EpisodeInputs) -> str:
-        """Return what findings call one of its episodes."""
+        """Return the name of one of its episodes in findings."""
         return f"episode {episode.episode_id} of {self.infix}"
 
 
@@ -183,15 +185,15 @@ class Inputs:
     """All inputs of a packed run, or of a monitor directory.
 
     Attributes:
-        recordings: by the times of their first resets.
-        packing: what `mjrec pack` was asked for; empty of a directory.
+        recordings: the recordings, sorted by the times of their first resets.
+        packing: the options of `mjrec pack`; empty for a monitor directory.
     """
 
     recordings: Sequence[RecordingInputs]
     packing: Mapping[str, Any] = field(default_factory=dict)
 
     def unusual(self) -> dict[str, dict[str, Any]]:
-        """Return environments and inputs that are not default, by what they are of."""
+        """Return environments and non-default inputs, keyed by recording or "pack"."""
         found = {each.name: dict(_unusual(each)) for each in self.recordings}
         packing = {
             name: value
@@ -204,8 +206,8 @@ class Inputs:
         """Write the inputs into a folder, for another process.
 
         Args:
-            folder: an empty one.
-            arrays: that the episodes name.
+            folder: an empty folder.
+            arrays: the arrays that the episodes name.
         """
         text = json_text.dumps(dataclasses.asdict(self))
         (folder / INPUTS_FILE).write_text(text)
@@ -213,7 +215,7 @@ class Inputs:
 
     @classmethod
     def read(cls, folder: Path) -> Inputs:
-        """Return the inputs that were written into a folder."""
+        """Read the inputs that `write` wrote into a folder."""
         said = json_text.loads((folder / INPUTS_FILE).read_text())
         recordings = [
             RecordingInputs(
@@ -232,12 +234,12 @@ class Inputs:
 def given_actions(
     episode: EpisodeInputs, arrays: Mapping[str, NDArray[Any]]
 ) -> Iterator[Any]:
-    """Yield the actions of an episode, each of the dtype that it was given in.
+    """Yield the actions of an episode, each with its original dtype.
 
-    A float32 action may give another reward than the same number as float64 does.
+    A float32 action may give a different reward from the same number as float64.
 
     Args:
-        episode: its inputs.
+        episode: the episode's inputs.
         arrays: recorded actions by the names in the inputs.
     """
     irregular = {int(each["step"]): each for each in episode.irregular}
@@ -248,7 +250,7 @@ def given_actions(
 
 def _unusual(recording: RecordingInputs) -> Iterator[tuple[str, Any]]:
     environment = recording.environment or {}
-    of_author = ", a model (MJCF) of the author's"
+    of_author = ", the author's own model (MJCF)"
     is_mjcf = environment.get("framework") == "mjcf"
     yield "environment", f"{environment.get('id')}{of_author if is_mjcf else ''}"
     for name, value in (environment.get("kwargs") or {}).items():
@@ -286,7 +288,7 @@ def _regular(episode: EpisodeInputs, recorded: NDArray[Any] | None) -> Iterator[
 
 
 def _split(action: NDArray[Any], parts: Any) -> dict[str, NDArray[Any]]:
-    """Return the dictionary of arrays that one vector was made from."""
+    """Return the dictionary of arrays that one vector was concatenated from."""
     taken: dict[str, NDArray[Any]] = {}
     offset = 0
     for name, shape in parts:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What stands where in a packed run.
+"""The layout of a packed run.
 
 ::
 
@@ -13,12 +13,12 @@
             ├── ro-crate-metadata.json
             ├── README.md
             ├── CITATION.cff
-            ├── environment.json        what the recording was made with
+            ├── environment.json        how the recording was made
             ├── statistics.csv          a row for each episode
             └── recordings/             the monitor directory
                 └── openaigym.*
 
-Packing writes it and verifying reads it.
+`pack` writes it and `verify` reads it.
 """
 
 from __future__ import annotations
@@ -34,26 +34,26 @@ ENVIRONMENT: Final = "environment.json"
 STATISTICS: Final = "statistics.csv"
 RECORDINGS: Final = "recordings"
 
-# In bag-info.txt. It rises when a reader must know of a change.
+# In bag-info.txt. The version increases when readers must handle a change.
 FORMAT_KEY: Final = "Mjrec-Evidence-Version"
 FORMAT_VERSION: Final = 1
 
-# Of the table of episodes, in their order.
+# The columns of the table of episodes, in order.
 STATISTICS_COLUMNS: Final = (
     *("monitor", "episode_id", "type", "length", "reward"),
     *("start_time", "end_time", "seed", "terminated", "truncated"),
     *("video", "video_sha256", "trajectory"),
 )
 
-# Packing refuses to make archives of more files, and verifying to read them. That of
-# thirty thousand recorded episodes has fewer.
+# Archives with more files are neither written nor read. An archive of thirty thousand
+# recorded episodes has fewer.
 MOST_ENTRIES: Final = 100_000
 
-# Beside the payload of a run that was recreated: the frames that were drawn.
+# The folder of sampled frames, next to the payload of a recreated run.
 SAMPLED: Final = "sampled"
 
 # In the key `mjrec` of a packed manifest: the episodes that were chosen for packing.
 PACKED_EPISODES: Final = "packed_episodes"
-# In the facts of a packed trajectory of another episode, whose actions, rewards and
-# seeds are packed: its states and snapshots were left out.
+# In the facts of the packed trajectory of an episode that was not chosen: its states
+# and snapshots were left out, but its actions, rewards and seeds are packed.
 STATES_LEFT_OUT: Final = "states_left_out"

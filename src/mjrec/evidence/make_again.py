@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Making a run again from its inputs: played and recorded as before.
+"""Recreation of a run from its inputs: it is replayed and recorded as before.
 
-Each recording is played in order in one environment, so that the states of its random
-generators follow from the first seed. What can never come out again (names of files,
-the clock, the provenance) is told to the recorder. What could not be recreated is
-noted, with the excuse for it.
+Each recording is replayed in order in one environment, so that the states of its random
+generators follow from the first seed. Facts that can never be reproduced (file names,
+the clock, the provenance) are passed to the recorder. Anything that could not be
+recreated is noted with its excuse.
 """
 
 from __future__ import annotations
@@ -34,11 +34,11 @@ from .inputs import EpisodeInputs, RecordingInputs, given_actions
 from .notes import Notes, read_notes
 from .recorder_again import monitor_again
 
-# Steps that an archive only claims are counted one by one.
+# A limit, because steps without recorded actions are counted one by one.
 _MOST_BELIEVED_STEPS = 100_000_000
 _STEPS_BETWEEN_COUNTS = 1000
-# What cuts an episode off from outside, and the excuse that it is. A run that is closed
-# in the middle of its last episode is a usual one.
+# Events that cut an episode off from outside, and their excuses. Closing a run in the
+# middle of its last episode is normal, so it needs no excuse.
 _EVENTS = {
     RESET: "early reset",
     EXCEPTION: "exception",
@@ -60,29 +60,32 @@ def play_recording(
     notes: Notes,
     on_steps: Callable[[int], object],
 ) -> Mapping[str, NDArray[np.float64]]:
-    """Play a recording again into a monitor directory; its videos are pending then.
+    """Replay a recording into a monitor directory, with pending videos.
 
     Args:
-        recording: its inputs.
-        directory: where others of the same run may be already.
+        recording: the recording's inputs.
+        directory: the monitor directory, which may already contain other recordings of
+            the same run.
         arrays: actions and first states by the names in the inputs.
-        trust: ids of environments that may be made besides those of the registries.
-        sources: the folder with what the author's models were made from.
-        only_counted: only rewards and ends are asked for: no states are kept but of
-            episodes with a video.
-        notes: what could not be recreated, and why.
-        on_steps: called with a number of steps that were just taken.
+        trust: ids of environments that may be created in addition to those in the
+            registries.
+        sources: the folder with the sources of the author's models.
+        only_counted: record only rewards and ends, and keep states only of episodes
+            with a video.
+        notes: receives the facts that could not be recreated, with their excuses.
+        on_steps: called with the number of steps taken since the last call.
 
     Returns:
-        The rewards of each episode that was played, by the name of its actions, where
-        only they are asked for.
+        If `only_counted`, the rewards of each replayed episode by the name of its
+        actions; otherwise, or if the recording was killed, an empty mapping.
 
     Raises:
-        NotRecreated: its environment cannot be made here.
-        Error: it could not be recorded.
+        NotRecreated: the environment cannot be created here, or the recording cannot
+            be replayed.
+        Error: the run could not be recorded.
     """
     if recording.environment is None:
-        raise NotRecreated("the journal does not say which environment it is of")
+        raise NotRecreated("the journal does not name its environment")
     mjcf = None
     if recording.sources is not None:
         mjcf = _unpack_sources(sources / recording.sources, directory.parent)
@@ -97,7 +100,7 @@ def play_recording(
         notes.add(
             recording.name,
             "rk4",
-            "MuJoCo 4.0 turns free bodies otherwise by the integrator RK4",
+            "MuJoCo 4.0 rotates free bodies differently with the integrator RK4",
             count=len(recording.episodes),
         )
 
@@ -120,26 +123,26 @@ def play_recording(
 
     if not recording.was_killed:
         return play()
-    # What a kill leaves is left by a kill.
+    # A child process is killed in the same place, so that it leaves the same files.
     child = os.fork()
     if child == 0:
         with contextlib.suppress(BaseException):
             play()
-        # It should not have come here.
+        # Only reached if the replay failed: a successful one kills the process.
         os._exit(1)
     _, status = os.waitpid(child, 0)
     if os.waitstatus_to_exitcode(status) != -signal.SIGKILL:
-        raise NotRecreated("the recording that was killed could not be played")
+        raise NotRecreated("the killed recording could not be replayed")
     notes.all = list(read_notes(directory.parent))
     if not recording.has_sources:
-        # A thread may have stored them just before.
+        # A thread may have stored the sources just before the kill.
         for path in directory.glob("openaigym.model.*.zip"):
             path.unlink()
     return {}
 
 
 class _Playing:
-    """One recording, being played; as of `play_recording`."""
+    """The replay of one recording; see `play_recording` for its arguments."""
 
     def __init__(
         self,
@@ -163,7 +166,7 @@ class _Playing:
         self._warned: Mapping[str, int] = {}
         self._events = [*recording.evaluation_events]
         self.rewards: dict[str, NDArray[np.float64]] = {}
-        # Of either framework.
+        # A monitor for Gymnasium or dm_env.
         self._monitor: Any = monitor_again(
             recording,
             recreated,
@@ -177,7 +180,7 @@ class _Playing:
         return self._now
 
     def run(self) -> None:
-        """Play all episodes. Where the recording was killed, so is this process."""
+        """Replay all episodes; if the recording was killed, kill this process too."""
         recorder = self._monitor.recorder
         for episode in self._recording.episodes:
             if self._recording.is_evaluation:
@@ -202,7 +205,7 @@ class _Playing:
             self._notes.add(
                 self._recording.name,
                 "kill",
-                "it was killed before the first step of an episode: that is believed",
+                "it was killed before the first step of an episode, which is believed",
             )
         if self._recording.has_sources:
             recorder.finish_models()
@@ -212,7 +215,7 @@ class _Playing:
         self._monitor.close()
 
     def _say_begun(self, episode: EpisodeInputs) -> None:
-        """Say what the journal says of an evaluation until an episode begins."""
+        """Note the journal's events of an evaluation until this episode begins."""
         while self._events:
             kind, facts = self._events.pop(0)
             self._say(kind, facts)
@@ -220,7 +223,7 @@ class _Playing:
                 break
 
     def _say_failed(self) -> None:
-        """Say that an episode failed, if that comes next."""
+        """Note the journal's next events for as long as they are failures."""
         while self._events and self._events[0][0] == "failed":
             self._say(*self._events.pop(0))
 
@@ -230,12 +233,12 @@ class _Playing:
             self._notes.add(
                 self._recording.name,
                 "exception",
-                f"seed {facts['seed']}, episode {facts['episode']} failed, as its "
-                f"author says: {facts.get('failure')!s:.200}",
+                f"seed {facts['seed']}, episode {facts['episode']} failed, according "
+                f"to its author: {facts.get('failure')!s:.200}",
             )
 
     def abandon(self) -> None:
-        """Let go of a recording that cannot go on; what is there is of no use."""
+        """Close a recording that cannot continue; its files are of no use."""
         with contextlib.suppress(Error):
             self._monitor.close()
 
@@ -244,7 +247,7 @@ class _Playing:
         return {**said, "warnings": warnings}
 
     def _begin(self, episode: EpisodeInputs) -> None:
-        """Reset the environment, with the random state that leads to the beginning."""
+        """Reset the environment with the episode's seed or random state."""
         self._monitor.set_monitor_mode(_MODES.get(episode.type))
         if episode.start_time is not None:
             self._now = episode.start_time
@@ -268,7 +271,7 @@ class _Playing:
         if stated is None or stated == self._recreated.random_state():
             return
         if seed is not None and not self._recreated.is_dm_env:
-            # Nothing depends on it: the reset seeds the generator anew.
+            # No belief is needed, because the reset reseeds the generator.
             self._recreated.set_random_state(stated)
             return
         if seed is None and (fresh := self._recreated.seed_behind(stated)) is not None:
@@ -278,15 +281,16 @@ class _Playing:
         self._note(
             episode,
             "unseeded beginning",
-            "no seed leads to its beginning: the state of the random generator before "
+            "no seed leads to its beginning; the state of the random generator before "
             "its reset is believed",
         )
 
     @contextlib.contextmanager
     def _set_into_first_state(self, episode: EpisodeInputs) -> Iterator[None]:
-        """Let the reset of an episode end in its recorded first state.
+        """Make the reset of an episode end in its recorded first state.
 
-        Only where nothing leads there: no seed was given, and no generator was there.
+        This happens only if nothing leads there: no seed was recorded and the
+        environment has no random generator.
         """
         known = self._arrays.get(episode.first_state or "")
         base = getattr(self._recreated.environment, "unwrapped", None)
@@ -296,7 +300,7 @@ class _Playing:
         self._note(
             episode,
             "unseeded beginning",
-            "it was begun without a seed: its first state is believed",
+            "it was started without a seed; its first state is believed",
         )
         reset = base.reset
 
@@ -311,7 +315,7 @@ class _Playing:
             del base.reset
 
     def _play(self, episode: EpisodeInputs) -> None:
-        """Take the steps of an episode, until the environment ends it."""
+        """Take the recorded actions of an episode until the environment ends it."""
         step, is_dm_env = self._monitor.step, self._recreated.is_dm_env
         self._begin_stand_in(episode)
         counted, rewards = 0, []
@@ -338,7 +342,7 @@ class _Playing:
             return
         if name is None:
             raise NotRecreated(
-                "wrappers are not here, and what they made of actions is not recorded",
+                "wrappers are missing, and the controls they produced are not recorded",
                 excuse="wrappers",
             )
         fields = (each.name for each in dataclasses.fields(RecordedSteps))
@@ -356,22 +360,22 @@ class _Playing:
                 episode,
                 "wrappers",
                 f"{without} the rewards or the end of {stand_in.differing} of its "
-                "steps are others: they are believed",
+                "steps differ; they are believed",
             )
         if stand_in.translated:
             self._note(
                 episode,
                 "wrappers",
                 f"{without} the actions of {stand_in.translated} of its steps are not "
-                "its controls: that they led to these is believed",
+                "its controls; that they led to these is believed",
             )
 
     def _believe(self, episode: EpisodeInputs) -> None:
-        """Tell the recorder what the archive says of an episode without actions."""
+        """Record an episode without actions from its length, return and end."""
         self._note(
             episode,
             "actions not kept",
-            "its actions were not kept: its length, return and end are believed",
+            "its actions were not kept; its length, return and end are believed",
         )
         if episode.steps > _MOST_BELIEVED_STEPS:
             raise NotRecreated(f"an episode cannot have {episode.steps} steps")
@@ -388,10 +392,10 @@ class _Playing:
             recorder.step(reward, **last, success=None if left else said.get("success"))
 
     def _cut_off(self, episode: EpisodeInputs) -> None:
-        """Let happen what an episode was cut off by."""
+        """Note a cut-off from outside, and record the exception that caused it."""
         if (excuse := _EVENTS.get(episode.cut or "")) is not None:
             self._note(
-                episode, excuse, "it was cut off: that it ended there is believed"
+                episode, excuse, "it was cut off; that it ended there is believed"
             )
         if episode.cut not in (EXCEPTION, INTERRUPT):
             return
@@ -406,23 +410,24 @@ class _Playing:
 
 
 def _exception_kind(name: str) -> type[BaseException]:
-    """Return an exception whose name in files is this one; nothing is imported."""
+    """Return a new exception class that files record by this name; import nothing."""
     module, _, qualified = name.rpartition(".")
     return type(qualified, (Exception,), {"__module__": module or "builtins"})
 
 
 def _unpack_sources(path: Path, into: Path) -> tuple[Path, Any]:
-    """Return an MJCF file, with all that it refers to beside it, and its model.
+    """Unpack an MJCF file and the files that it refers to; return it and its model.
 
     Args:
-        path: of the zip file that a recorder wrote.
-        into: a folder.
+        path: the zip file that a recorder wrote.
+        into: the folder to unpack into.
 
     Raises:
-        NotRecreated: it is not there, damaged or dangerous, or MuJoCo refuses it.
+        NotRecreated: the zip file is missing, damaged or dangerous, or MuJoCo rejects
+            the model.
     """
     try:
-        # It looks at all names in it.
+        # This checks all names in the zip file.
         model = read_authored(path)
     except (OSError, UnreadableFile) as error:
         raise NotRecreated(f"its model cannot be compiled: {error}") from error

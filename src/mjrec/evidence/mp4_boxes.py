@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The boxes of an mp4 file: tracks, times, the shape of frames, what else is in it.
+"""The boxes of an mp4 file: tracks, times, the shape of frames, and other content.
 
-A player does what they say, whatever the frames are: a second track on top, an edit
-list that skips the end, longer pixels. So they are compared besides the frames.
+Players follow the boxes, whatever the frames are: a second track on top, an edit list
+that skips the end, non-square pixels. So the boxes are compared as well as the frames.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from ..formats.json_fields import unreadable
 from ..formats.regular_files import open_regular
 
-# Of boxes that hold boxes: how many bytes of their own come first.
+# Boxes that contain boxes, and the number of bytes of their own that come first.
 _CONTAINERS: Final = {
     **dict.fromkeys(("moov", "trak", "edts", "mdia", "minf", "dinf", "stbl"), 0),
     "stsd": 8,
@@ -33,12 +33,12 @@ _MOST_BOXES: Final = 1000
 
 @dataclass(frozen=True)
 class Box:
-    """A box of a file.
+    """A box in a file.
 
     Attributes:
-        path: its name, behind those that it is in: "moov/trak/mdia".
-        content: its own bytes; of `mdat` none.
-        size: how many bytes of content it has.
+        path: its name after those of the boxes around it: "moov/trak/mdia".
+        content: its own bytes; empty for `mdat`.
+        size: size of its content in bytes, including boxes inside it.
     """
 
     path: str
@@ -47,15 +47,15 @@ class Box:
 
     @property
     def name(self) -> str:
-        """Its own name."""
+        """The box's own name."""
         return self.path.rpartition("/")[2]
 
 
 def read_boxes(path: Path) -> list[Box]:
-    """Return the boxes of an mp4 file, in their order; those inside one follow it.
+    """Return the boxes of an mp4 file in order; each comes before those inside it.
 
     Raises:
-        UnreadableFile: it is damaged, or has far too many.
+        UnreadableFile: the file is damaged or has far too many boxes.
     """
     with unreadable(path), open_regular(path) as file:
         end = file.seek(0, 2)
@@ -93,48 +93,48 @@ def _boxes(file: BinaryIO, start: int, end: int, outer: str) -> Iterator[Box]:
 
 
 def shown_times(boxes: Sequence[Box]) -> tuple[int, Fraction] | str:
-    """Return how many frames are shown and how long each; or why none are evenly.
+    """Return the number of frames shown and the duration of each in seconds.
+
+    If the frames are not shown evenly, return the reason instead.
 
     Raises:
-        ValueError: the tables contradict each other.
+        ValueError: the tables contradict each other, or are not as mjrec writes them.
     """
     try:
         duration, offsets = _table(boxes, "stts"), _table(boxes, "ctts")
         [scale] = struct.unpack(">I", _one(boxes, "mdhd").content[12:16])
         sizes = np.frombuffer(_one(boxes, "stsz").content[12:], ">u4")
-        # Written by others only: 64-bit times, several edits.
+        # Only other programs write 64-bit times or several edits.
         edits, _, begin, rate = struct.unpack(">4xIIiI", _one(boxes, "elst").content)
     except (KeyError, struct.error) as error:
-        raise ValueError(
-            f"its tables are not those that mjrec writes: {error}"
-        ) from error
+        raise ValueError(f"its tables are not as mjrec writes them: {error}") from error
     if len(set(duration.tolist())) != 1 or edits != 1 or rate != 1 << 16:
-        return "its frames are not shown equally long"
+        return "its frames are not all shown for the same time"
     each, count = int(duration[0]), len(duration)
     shown = np.arange(count) * each - begin
     if len(offsets):
         if len(offsets) != count:
-            raise ValueError("its tables are not of as many frames")
+            raise ValueError("its tables have different numbers of frames")
         shown = shown + offsets
     if not each or not np.array_equal(np.sort(shown), np.arange(count) * each):
-        return "its frames do not follow each other evenly from the beginning on"
+        return "its frames are not evenly spaced from the beginning"
     if int(sizes.sum()) != sum(box.size for box in boxes if box.name == _MEDIA):
-        return "it holds more than its frames"
+        return "it contains more than its frames"
     return count, Fraction(each, scale)
 
 
 def _one(boxes: Sequence[Box], name: str) -> Box:
     found = [box for box in boxes if box.name == name]
     if len(found) != 1:
-        raise KeyError(f"there are {len(found)} of {name!r}")
+        raise KeyError(f"it has {len(found)} boxes {name!r}")
     return found[0]
 
 
 def _table(boxes: Sequence[Box], name: str) -> NDArray[np.int64]:
-    """Return a table of runs, one number for each frame; empty where it is missing."""
+    """Return a run-length table as one number per frame; empty if it is missing."""
     if not any(box.name == name for box in boxes):
         return np.empty(0, np.int64)
     runs = np.frombuffer(_one(boxes, name).content[8:], ">u4").reshape(-1, 2)
     if int(runs[:, 0].sum()) > _LARGEST_BOX:
-        raise ValueError("it says that it has far too many frames")
+        raise ValueError("it claims to have far too many frames")
     return np.repeat(runs[:, 1].astype(">u4").view(">i4").astype(np.int64), runs[:, 0])

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a maker could not make again, and had to believe.
+"""Notes on facts that could not be recreated and had to be believed.
 
-It is written down beside what was made, for the process that compares the two.
+They are stored next to the recreated run, for the process that compares it with the
+archive.
 """
 
 from __future__ import annotations
@@ -14,21 +15,21 @@ from typing import Any, Final
 from .. import json_text
 
 NOTES_FILE: Final = "maker.json"
-# Beside it, where only rewards and ends were recreated: the rewards of each step, by
+# Next to it if only rewards and ends were recreated: the rewards of each step, keyed by
 # "<infix>.<episode's number>".
 REWARDS_FILE: Final = "rewards.npz"
 
 
 @dataclass(frozen=True, kw_only=True)
 class Note:
-    """One thing that was believed.
+    """One fact that was believed.
 
     Attributes:
         item: "episode 27 of 0.4711" or "recording 0.4711".
         excuse: the name of the excuse that claims it.
-        reason: why, and what is believed, a clause.
-        count: how many of `unit` it stands for.
-        unit: what is counted.
+        reason: a clause with the reason and the fact that is believed.
+        count: number of units that the note covers.
+        unit: the unit of `count`.
     """
 
     item: str
@@ -39,23 +40,23 @@ class Note:
 
 
 class Notes:
-    """What was believed so far."""
+    """The facts believed so far."""
 
     def __init__(self) -> None:
         self.all: list[Note] = []
 
     def add(self, item: str, excuse: str, reason: str, **counted: Any) -> None:
-        """Note one thing; `counted` are `count` and `unit`."""
+        """Add a note; `counted` may set its `count` and `unit`."""
         self.all.append(Note(item=item, excuse=excuse, reason=reason, **counted))
 
     def write(self, folder: Path) -> None:
-        """Write them down in a folder."""
+        """Write the notes into a folder."""
         said = [dataclasses.asdict(note) for note in self.all]
         (folder / NOTES_FILE).write_text(json_text.dumps(said))
 
 
 def read_notes(folder: Path) -> tuple[Note, ...]:
-    """Return what was written down in a folder; nothing where there is nothing."""
+    """Return the notes in a folder; empty if it has none."""
     path = folder / NOTES_FILE
     if not path.exists():
         return ()

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Packing: from a monitor directory to one zip file that can be verified.
+"""Packing of a monitor directory into one zip file that can be verified.
 
-It is put together in a hidden folder beside the archive. Files get there as hard links
-where that is possible, so that a run of many gigabytes needs little room. Nothing there
-is ever written in place: what is to become different is written anew and renamed.
+The archive is built in a hidden folder next to it. Files are hard-linked into the
+folder if possible, so that a run of many gigabytes needs little space. Nothing in it is
+written in place: a changed file is written under a temporary name and renamed.
 """
 
 from __future__ import annotations
@@ -51,11 +51,11 @@ from .size_limit import archive_within, byte_count
 from .statements import state
 
 _ENDING = ".zip"
-# Its name until it is whole.
+# The archive's name until it is complete.
 _ARCHIVE = "archive.zip"
-# How many files beside the recordings there are: the bag's own, and what describes it.
+# Number of files in addition to the recordings: the bag's own and the descriptions.
 _DESCRIPTIONS = 9
-# Of a recording, what episodes keep that were not chosen says nothing of these.
+# Facts that are left out of the trajectories of episodes that were not chosen.
 _OF_STATES = ("model", "video")
 
 
@@ -88,31 +88,33 @@ def pack(
         directory: the monitor directory, or a folder of several, such as an
             evaluation's; with closed monitors and rendered videos.
         path: the archive, a new file that ends in `.zip`.
-        title: of the run. None is what was recorded.
+        title: the run's title. None generates one from the recorded environments.
         authors: each "Name", "Name <address>" or "Name <ORCID>".
         license: SPDX identifier of the licence, such as "CC-BY-4.0", or its URL.
-        episodes: numbers of the episodes whose videos and states are packed. None is
-            all, as always of several directories. Statistics, actions and seeds of all
-            are packed in any case, and the archive says that a choice was made.
+        episodes: numbers of the episodes whose videos and states are packed. None means
+            all, and must be used for a folder of several directories. The statistics,
+            actions and seeds of all episodes are packed in any case, and the archive
+            records the choice.
         anonymous: remove everything that names a user, a machine or an author, for
             blind review.
-        max_size: size limit in bytes, a number or `"50M"` (50 million). A larger
-            archive gets smaller videos, drawn from the states at 3/4, 1/2, 3/8 or 1/4
-            of width and height, and says so.
-        on_progress: called with the progress of that drawing.
+        max_size: size limit in bytes, a number or a string such as `"50M"` (50
+            million). If the archive is larger, its videos are re-rendered from the
+            states at 3/4, 1/2, 3/8 or 1/4 of their width and height, and the archive
+            records that.
+        on_progress: called with the progress of re-rendering.
 
     Returns:
         The path of the archive.
 
     Raises:
         MissingDependency: the extra `evidence` is not installed.
-        InvalidArgument: an argument has a wrong value, `directory` is no monitor
+        InvalidArgument: an argument is invalid, `directory` is not a monitor
             directory, or `path` exists.
-        UnknownName: there is no such episode.
-        DirectoryInUse: a monitor is open, or a process renders.
+        UnknownName: one of `episodes` does not exist.
+        DirectoryInUse: a monitor is open, or a process is rendering.
         UnfinishedRecordings: videos are pending, or a monitor was killed.
         ArchiveTooLarge: `max_size` is too small.
-        IdentityLeft: `anonymous`, but a name could not be removed.
+        IdentityLeft: `anonymous` is set, but a name could not be removed.
         PackError: a file is missing or cannot be packed, or there are more files than
             `verify` accepts.
         UnreadableFile: a file is damaged.
@@ -153,12 +155,13 @@ def pack(
 
 
 def pack_folder(directory: Path, folder: Path, options: PackingOptions) -> None:
-    """Pack a monitor directory into a new folder: what the archive would hold.
+    """Pack a monitor directory into a new folder with the content of the archive.
 
-    Where it is anonymous nothing is searched for names: the recordings have none.
+    If the archive is anonymous, no names are searched for, because the recordings
+    contain none.
 
     Raises:
-        Error: as `pack`.
+        Error: packing failed; see `pack`.
     """
     contents = look_for_contents(directory, options.episodes)
     identity = Identity() if options.anonymous else None
@@ -173,7 +176,7 @@ def _bag(
     identity: Identity | None,
     on_progress: Callable[[Progress], object],
 ) -> Path:
-    """Return the bag, below `folder`; with a largest size, the archive is there too."""
+    """Make the bag below `folder`; with a size limit, also make the archive there."""
     check_bagit()
     _check_count(contents)
     staged, bag = folder / "staged", folder / "whole" / options.name
@@ -196,7 +199,7 @@ def _bag(
 def _make_bag(
     staged: Path, bag: Path, options: PackingOptions, identity: Identity | None
 ) -> None:
-    """Make the bag of what is staged, in the place of an earlier one."""
+    """Make a bag from the staged files; an earlier one is replaced."""
     shutil.rmtree(bag, ignore_errors=True)
     recordings = bag / PAYLOAD / RECORDINGS
     recordings.mkdir(parents=True)
@@ -216,28 +219,28 @@ def _make_bag(
 
 def _checked_paths(path: Path, directory: Path) -> tuple[Path, Path]:
     if not directory.is_dir():
-        raise InvalidArgument(f"There is no directory {directory} to pack.")
+        raise InvalidArgument(f"The directory {directory} does not exist.")
     if path.suffix != _ENDING or path.name.startswith("."):
         raise InvalidArgument(
-            f"The archive is a zip file: its name ends in {_ENDING} and does not begin "
-            f"with a dot, got {str(path)!r}."
+            f"The archive is a zip file: its name must end in {_ENDING} and must not "
+            f"begin with a dot, got {str(path)!r}."
         )
     if not path.name.isprintable() or "\\" in path.name:
-        raise InvalidArgument(f"{path.name!r} is no name for an archive.")
+        raise InvalidArgument(f"{path.name!r} is not a valid name for an archive.")
     if path.name.startswith(FILE_PREFIX):
         raise InvalidArgument(
-            f"{path.name} is called as files of monitors are. Choose another name."
+            f"{path.name} looks like the name of a monitor's file. Choose another name."
         )
     if os.path.lexists(path):
         raise _exists(path)
-    # The working directory may be another one by the time it is written.
+    # The working directory may change before the archive is written.
     return path.absolute(), directory.absolute()
 
 
 def _exists(path: Path) -> InvalidArgument:
     return InvalidArgument(
-        f"{path} exists already, and evidence is never replaced. Choose another name, "
-        "or move it away."
+        f"{path} already exists, and evidence is never replaced. Choose another name, "
+        "or move the file away."
     )
 
 
@@ -247,15 +250,15 @@ def _check_count(contents: Contents) -> None:
     count = sum(len(files) for files in (*kinds, *trajectories))
     if count > MOST_ENTRIES - _DESCRIPTIONS:
         raise PackError(
-            f"The archive would hold {count} recorded files, and mjrec verify takes "
-            f"archives of at most {MOST_ENTRIES} files. Choose episodes with "
+            f"The archive would contain {count} recorded files, but mjrec verify "
+            f"accepts archives of at most {MOST_ENTRIES} files. Choose episodes with "
             "--episodes, or record into several directories."
         )
 
 
 @contextlib.contextmanager
 def _folder_beside(archive: Path) -> Iterator[Path]:
-    """Yield a new hidden folder beside `archive`, and remove it at the end."""
+    """Yield a new hidden folder next to `archive`, and remove it at the end."""
     folder = temporary_path(archive)
     try:
         folder.mkdir(mode=0o700)
@@ -268,7 +271,7 @@ def _folder_beside(archive: Path) -> Iterator[Path]:
 
 
 def _stage(contents: Contents, folder: Path) -> None:
-    """Put what is to be packed into a new folder."""
+    """Put the files to pack into a new folder."""
     folder.mkdir()
     for name, path in contents.files.items():
         _link_or_copy(path, folder / name)
@@ -284,17 +287,17 @@ def _stage(contents: Contents, folder: Path) -> None:
 
 
 def _leave_rows_out(journal: Path) -> None:
-    """Leave out of a copy of a journal what it says of logs, which are gone."""
+    """Remove the lines about row logs, which are not packed, from a journal's copy."""
     lines = journal.read_bytes().splitlines(keepends=True)
     rest = [line for line in lines if not is_of_spans(line)]
     if len(rest) < len(lines):
-        # It may be a link.
+        # The copy may be a link to the original.
         journal.unlink()
         journal.write_bytes(b"".join(rest))
 
 
 def _write_without_states(source: Path, target: Path) -> None:
-    """Write a trajectory with its actions, rewards and facts, and nothing to draw."""
+    """Write a trajectory's actions, rewards and facts, without states to render."""
     with open_hdf5(source) as reader:
         facts = {k: v for k, v in reader.facts.items() if k not in _OF_STATES}
         kept = dataclasses.replace(
@@ -308,13 +311,13 @@ def _write_without_states(source: Path, target: Path) -> None:
 
 
 def _publish(finished: Path, path: Path) -> None:
-    """Give a finished archive its name, and replace nothing."""
+    """Give a finished archive its name without replacing a file."""
     try:
         path.hardlink_to(finished)
     except FileExistsError:
         raise
     except OSError:
-        # A file system without links: the moment between look and renaming stays.
+        # On a file system without links, a race between check and rename remains.
         if os.path.lexists(path):
             raise FileExistsError(path) from None
         finished.rename(path)
@@ -324,10 +327,10 @@ def _link_or_copy(source: Path, target: Path) -> None:
     try:
         os.link(source, target, follow_symlinks=False)
     except OSError:
-        # Another file system, one without links, or another user's file.
+        # A different file system, one without links, or a different user's file.
         _copy(source, target)
     if not stat.S_ISREG(target.lstat().st_mode):
-        raise UnreadableFile(source, "it is no regular file any more")
+        raise UnreadableFile(source, "it is no longer a regular file")
     if not os.access(target, os.R_OK):
         raise UnreadableFile(source, "permission denied")
 

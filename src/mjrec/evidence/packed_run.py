@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the descriptions of a packed run are written from."""
+"""The facts about a packed run that its descriptions are written from."""
 
 from __future__ import annotations
 
@@ -28,16 +28,16 @@ _NEVER = "1970-01-01"
 
 @dataclass(frozen=True, kw_only=True)
 class PackingOptions:
-    """How a run is packed; `environment.json` says it.
+    """Options for packing a run, as `environment.json` records them.
 
     Attributes:
-        name: of the archive, without its ending.
-        title: as it was stated, likewise:
-        authors: none, where it is anonymous.
-        license: SPDX identifier or URL.
-        episodes: the numbers of those that were chosen; None where all were.
-        anonymous: whether what names a user, a machine or an author is taken out.
-        max_size: the most bytes of the archive.
+        name: the archive's name without its extension.
+        title: the stated title, or None.
+        authors: the stated authors; empty if the archive is anonymous.
+        license: the stated SPDX identifier or URL, or None.
+        episodes: numbers of the chosen episodes; None for all.
+        anonymous: whether names of users, machines and authors are removed.
+        max_size: maximum size of the archive in bytes; None for no limit.
     """
 
     name: str
@@ -51,13 +51,13 @@ class PackingOptions:
 
 @dataclass
 class Tally:
-    """What episodes amount to.
+    """Totals over episodes.
 
     Attributes:
-        episodes: how many.
-        steps: of these.
-        start: when the first began, in ISO 8601 in UTC; None where nothing says it.
-        end: when the last ended, likewise.
+        episodes: number of episodes.
+        steps: number of their steps.
+        start: the time when the first began, in ISO 8601 in UTC; None if unknown.
+        end: the time when the last ended, in ISO 8601 in UTC; None if unknown.
     """
 
     episodes: int = 0
@@ -66,35 +66,36 @@ class Tally:
     end: str | None = None
 
     def add(self, episode: Episode) -> None:
-        """Count one more."""
+        """Add an episode to the totals."""
         self.episodes += 1
         self.steps += episode.length
         starts = (self.start, _iso_time(episode.start_time))
         ends = (self.end, _iso_time(episode.end_time))
-        # Of one length and one zone, so that the order is that of the texts.
+        # All have the same length and time zone, so strings sort by time.
         self.start = min(filter(None, starts), default=None)
         self.end = max(filter(None, ends), default=None)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Session:
-    """What one monitor recorded, as far as it is in the archive.
+    """One monitor's recording, as far as it is in the archive.
 
     Attributes:
-        infix: of its files.
-        env_id: what was recorded.
-        versions: of Python and the packages that recorded, by their names.
-        provenance: what it was recorded with; empty where nothing says it.
-        rule: the name of the rule by which the recorded episodes were chosen.
-        was_killed: whether its process was, and what it left was recovered.
+        infix: the infix of its files' names.
+        env_id: the recorded environment's id.
+        versions: versions of Python and the recording packages, by name.
+        provenance: the recording's provenance; empty if unknown.
+        rule: the name of the rule that chose the recorded episodes.
+        was_killed: whether its process was killed and the recording recovered.
         files: the names of its files.
-        models: the names of the models among what its trajectories refer to.
-        videos: the name of each video that the manifest lists, and its metadata.
-        made_with: the arguments that its environments were made with, each set once,
-            as text; "" is one that had none, or about which nothing is known.
-        tally: of the complete episodes.
-        with_states: how many recorded episodes have their states in the archive.
-        with_actions: how many have their actions there.
+        models: the names of the model files that its trajectories refer to and that
+            are in the archive.
+        videos: the name of each video in the manifest, with its metadata.
+        made_with: the environments' arguments as text, each set once; "" stands for no
+            arguments or unknown ones.
+        tally: totals over the complete episodes.
+        with_states: number of recorded episodes whose states are in the archive.
+        with_actions: number of recorded episodes whose actions are in the archive.
     """
 
     infix: str
@@ -112,7 +113,7 @@ class Session:
     with_actions: int
 
     def different(self, *keys: str) -> list[dict[str, Any]]:
-        """Return each different set of facts that its videos' metadata has."""
+        """Return the distinct sets of values of `keys` in its videos' metadata."""
         found: list[dict[str, Any]] = []
         for _, metadata in self.videos:
             facts = {key: metadata.get(key) for key in keys}
@@ -125,12 +126,12 @@ class Session:
 
 @dataclass(frozen=True, kw_only=True)
 class PackedRun:
-    """What is described.
+    """A packed run and its recordings.
 
     Attributes:
-        options: how it is packed.
-        statements: what the author states.
-        sessions: what was recorded, monitor by monitor.
+        options: the options for packing.
+        statements: the author's statements.
+        sessions: the recordings, one for each monitor.
     """
 
     options: PackingOptions
@@ -139,7 +140,7 @@ class PackedRun:
 
     @property
     def env_ids(self) -> list[str]:
-        """What was recorded, each once."""
+        """The ids of the recorded environments, each once."""
         return list(dict.fromkeys(session.env_id for session in self.sessions))
 
     @property
@@ -150,14 +151,14 @@ class PackedRun:
 
     @property
     def title(self) -> str:
-        """The title that was stated, or one that says what was recorded."""
+        """The stated title, or one made of the recorded environments' ids."""
         ids = self.env_ids
         more = f" and {len(ids) - _SHOWN} more" if len(ids) > _SHOWN else ""
         return self.statements.title or f"Recordings of {', '.join(ids[:_SHOWN])}{more}"
 
     @property
     def holds(self) -> str:
-        """How much of what is in the archive, in words."""
+        """A summary of the archive's content in words."""
         episodes = sum(session.tally.episodes for session in self.sessions)
         return (
             f"statistics of {counted(episodes, 'episode')} of "
@@ -172,19 +173,19 @@ class PackedRun:
     def date(self) -> str:
         """The day on which the last episode ended, in UTC, as YYYY-MM-DD.
 
-        It depends on nothing but the recordings. Where they tell no time it is the
-        first day of 1970.
+        It depends only on the recordings. If they contain no times, it is the first day
+        of 1970.
         """
         ends = (session.tally.end for session in self.sessions)
         return max(filter(None, ends), default=_NEVER)[:10]
 
 
 def read_run(recordings: Path, *, options: PackingOptions) -> PackedRun:
-    """Return what there is to say of the recordings in a folder.
+    """Read the facts about the recordings in a folder.
 
     Raises:
         UnreadableFile: a file is damaged.
-        InvalidArgument: a title, an author or a licence that cannot be.
+        InvalidArgument: a title, an author or a licence is invalid.
     """
     statements = state(
         title=options.title, authors=options.authors, license=options.license
@@ -206,14 +207,14 @@ def read_run(recordings: Path, *, options: PackingOptions) -> PackedRun:
                 tallies.get(monitor.infix, Tally()),
             )
             for monitor in monitors_of(recordings)
-            # What no manifest speaks of is not packed.
+            # Recordings without a manifest are not packed.
             if monitor.manifest is not None
         ),
     )
 
 
 def facts_in(value: object) -> Mapping[str, Any]:
-    """Return a mapping as it is; an empty one for anything else."""
+    """Return a mapping unchanged, or an empty one for any other value."""
     return value if isinstance(value, Mapping) else {}
 
 
@@ -278,6 +279,6 @@ def _iso_time(seconds: float | None) -> str | None:
         return None
     try:
         moment = datetime.datetime.fromtimestamp(seconds, datetime.UTC)
-    except (OverflowError, ValueError, OSError):  # no calendar has it
+    except (OverflowError, ValueError, OSError):  # out of range
         return None
     return moment.isoformat(timespec="milliseconds")

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Names of files inside an archive that mean the same wherever it is unpacked.
 
-Whatever system reads it, such a name stands for a file below the folder that the
-archive is unpacked into, and two of them stand for two files.
+On every system, such a name refers to a file below the folder that the archive is
+unpacked into, and two different names refer to two different files.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import re
 import unicodedata
 from collections.abc import Iterable
 
-# In bytes of UTF-8: what every file system of today takes.
+# Limits in bytes of UTF-8 that every current file system accepts.
 _LONGEST_NAME = 1000
 _LONGEST_PART = 255
 _DEEPEST = 16
@@ -24,8 +24,8 @@ def portable_parts(name: str) -> tuple[str, ...]:
     """Return the parts of a relative name, folders first.
 
     Raises:
-        ValueError: it could lead out of its folder on some system, or could not be
-            there on another.
+        ValueError: the name could lead out of its folder on some system, or is invalid
+            on some system.
     """
     parts = tuple(name.split("/"))
     reason = _objection(name, parts)
@@ -35,13 +35,13 @@ def portable_parts(name: str) -> tuple[str, ...]:
 
 
 def check_distinct(names: Iterable[str]) -> None:
-    """Check that no two names stand for one file, and none for a file and a folder.
+    """Check that no two names are one file, or one file and folder, on any system.
 
-    Some systems do not tell upper case from lower case, or an accent from a letter
-    with an accent.
+    Some systems do not distinguish upper case from lower case, or composed from
+    decomposed accents.
 
     Raises:
-        ValueError: two do; they are named.
+        ValueError: two names collide; the message contains both.
     """
     files: dict[str, str] = {}
     folders: dict[str, str] = {}
@@ -50,7 +50,7 @@ def check_distinct(names: Iterable[str]) -> None:
         if alike in files:
             raise ValueError(
                 f"{files[alike][:_LONGEST_SHOWN]!r} and {name[:_LONGEST_SHOWN]!r} are "
-                "one file on some systems"
+                "the same file on some systems"
             )
         files[alike] = name
         parts = alike.split("/")[:-1]
@@ -58,23 +58,23 @@ def check_distinct(names: Iterable[str]) -> None:
             folders.setdefault("/".join(parts[: depth + 1]), name)
     for alike in files.keys() & folders.keys():
         raise ValueError(
-            f"{files[alike][:_LONGEST_SHOWN]!r} is a file, and a folder of "
+            f"{files[alike][:_LONGEST_SHOWN]!r} is both a file and the folder of "
             f"{folders[alike][:_LONGEST_SHOWN]!r}"
         )
 
 
 def _objection(name: str, parts: tuple[str, ...]) -> str | None:
-    """Return what is wrong with a name; None where nothing is."""
+    """Return the problem with a name, or None."""
     try:
         sizes = [len(part.encode()) for part in parts]
     except UnicodeEncodeError:
-        return "is no text that a file can be called"
+        return "is not a valid file name"
     if name.startswith("/") or _DRIVE.match(name):
-        return "is absolute: it leads out of the folder that it is unpacked into"
+        return "is absolute and leads out of the folder that it is unpacked into"
     if ".." in parts:
         return "leads out of the folder that it is unpacked into"
     if "\\" in name or not name.isprintable():
-        return "has a backslash or a character in it that cannot be seen"
+        return "contains a backslash or an invisible character"
     if "" in parts or "." in parts:
         return "has an empty part"
     if max(sizes) > _LONGEST_PART or sum(sizes) + len(sizes) > _LONGEST_NAME:

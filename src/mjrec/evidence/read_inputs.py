@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reading the inputs of a run from an unpacked archive, which may be anybody's.
+"""Reading of a run's inputs from an unpacked, untrusted archive.
 
-It is done in a sandbox: what is read are journals and HDF5 files.
+It is done in a sandbox, because journals and HDF5 files are parsed.
 """
 
 from __future__ import annotations
@@ -35,11 +35,11 @@ _SOURCES = re.compile(r"openaigym\.model\.[0-9a-f]{16}\.zip", re.ASCII)
 _UNREADABLE = "Its inputs cannot be read"
 _LONGEST_HEADER = 10_000
 _MOST_EPISODES = 1_000_000
-# What the journal says of an evaluation's episodes.
+# The keys of the journal's events of an evaluation's episodes.
 _UNIT = ("seed", "episode")
 _FAILED = (*_UNIT, "episode_id", "failure", "length", "start_time", "seconds")
-# Of a provenance, the keys that a recorder writes; and those below them, where they
-# are always the same.
+# The keys of a provenance that a recorder writes, and those below them if they are
+# always the same.
 _PROVENANCE: Mapping[str, tuple[str, ...]] = {
     **dict.fromkeys(("command", "working_directory", "python", "packages"), ()),
     **dict.fromkeys(("system", "variables"), ()),
@@ -48,7 +48,7 @@ _PROVENANCE: Mapping[str, tuple[str, ...]] = {
     "code": ("root", "commit", "dirty", "remote"),
     "policy": ("file", "sha256"),
 }
-# Of the choice among an evaluation's episodes: in a video's facts, and in a journal.
+# The keys of a choice among an evaluation's episodes, in a video's facts and a journal.
 _SELECTION = ("rule", "decided", "scope", "finished", "roles")
 _EVALUATION_KEEP = (*_SELECTION[:-1], "chosen", "recorded", "recording")
 _DTYPES = frozenset(
@@ -57,14 +57,14 @@ _DTYPES = frozenset(
 
 
 def read_inputs(data: Path) -> tuple[Inputs, dict[str, NDArray[Any]]]:
-    """Return the inputs of a run, and the arrays of actions that they name.
+    """Return the inputs of a run and the arrays that they name.
 
     Args:
-        data: the folder that holds the recordings and, of a packed run, its
+        data: the folder that contains the recordings and, for a packed run, its
             descriptions.
 
     Raises:
-        Error: a file is damaged, or says what cannot be.
+        Error: a file is damaged or contains invalid values.
     """
     arrays: dict[str, NDArray[Any]] = {}
     try:
@@ -73,7 +73,7 @@ def read_inputs(data: Path) -> tuple[Inputs, dict[str, NDArray[Any]]]:
         strays = [files for files in monitors if packing and files.manifest is None]
         if strays:
             name = strays[0].paths[0].name
-            raise ValueError(f"{name} is of no recording: none has its manifest")
+            raise ValueError(f"{name} does not belong to a recording with a manifest")
         recordings = [_recording(files, arrays) for files in monitors]
     except UnreadableFile as error:
         raise Error(f"{_UNREADABLE}: {error.path.name}: {error.reason}") from error
@@ -102,30 +102,30 @@ def _packing(path: Path) -> Mapping[str, Any]:
 
 
 def packing_options(said: Mapping[str, Any]) -> PackingOptions:
-    """Return the options of packing that an archive says.
+    """Return the packing options that an archive records.
 
     Raises:
-        ValueError: they cannot be.
+        ValueError: an option is invalid.
     """
     name, episodes = said.get("name"), said.get("episodes")
     if not isinstance(name, str) or len(portable_parts(name)) != 1:
-        raise ValueError(f"an archive cannot be called {name!r:.80}")
+        raise ValueError(f"{name!r:.80} is not a valid name for an archive")
     try:
         chosen = None if episodes is None else tuple(map(_count, episodes))
         lists = {"authors": tuple(said.get("authors", ())), "episodes": chosen}
         options = PackingOptions(**{**said, **lists})
     except TypeError as error:
-        raise ValueError(f"its options of packing cannot be: {error}") from error
+        raise ValueError(f"its packing options are invalid: {error}") from error
     if type(options.anonymous) is not bool or not isinstance(
         options.max_size, int | None
     ):
-        raise ValueError(f"its options of packing cannot be {said!r:.200}")
+        raise ValueError(f"its packing options are invalid: {said!r:.200}")
     return options
 
 
 def _recording(files: MonitorFiles, arrays: dict[str, NDArray[Any]]) -> RecordingInputs:
     if Infix.parse(files.infix) is None:
-        raise ValueError(f"{files.infix!r} is no name that a monitor has")
+        raise ValueError(f"{files.infix!r} is not a valid infix of a monitor's files")
     journal = _Journal(files.journal)
     run = journal.run
     env_info, keep = run.get("env_info"), run.get("keep")
@@ -166,10 +166,10 @@ def _monitor_csv_start(files: MonitorFiles) -> float | None:
 
 
 class _Journal:
-    """What a journal says.
+    """The content of a journal.
 
     Args:
-        path: of it; None where there is none.
+        path: the journal, or None if it is missing.
     """
 
     def __init__(self, path: Path | None) -> None:
@@ -193,7 +193,7 @@ class _Journal:
                 raise ValueError(f"more than {_MOST_EPISODES} episodes")
 
     def clip_starts(self) -> Iterator[int]:
-        """Yield the numbers of steps at which a trigger began clips."""
+        """Yield the numbers of the steps at which a trigger started clips."""
         for clip in self.clips:
             _, marker, number = str(clip.get("video")).rpartition(".step")
             digits = number.removesuffix(".mp4")
@@ -201,7 +201,7 @@ class _Journal:
                 yield int(digits)
 
     def failed_unit(self, number: int) -> Mapping[str, Any] | None:
-        """Return which of an evaluation's episodes one is that failed; None else."""
+        """Return the seed and episode of an evaluation's failed episode, or None."""
         for kind, facts in self.evaluation_events:
             if kind == "failed" and facts and facts.get("episode_id") == number:
                 return {name: facts[name] for name in _UNIT}
@@ -319,7 +319,7 @@ def _with_trajectory(
         arrays[f"{name}.states"] = states
     parts = facts.get("action_parts")
     exception = facts.get("exception")
-    # Where no action fits into an array, each of them is in the journal.
+    # If no action fits into an array, all of them are in the journal.
     is_whole = given is not None or len(irregular) == steps
     return dataclasses.replace(
         episode,
@@ -344,7 +344,7 @@ def _with_trajectory(
 
 
 def _is_elsewhere(facts: Mapping[str, Any]) -> bool:
-    """Return whether another MuJoCo, or another machine, is claimed."""
+    """Return whether the facts claim a different MuJoCo version or machine."""
     said = facts.get("versions")
     version = said.get("mujoco") if isinstance(said, Mapping) else None
     return version != versions().get("mujoco") or (
@@ -353,7 +353,7 @@ def _is_elsewhere(facts: Mapping[str, Any]) -> bool:
 
 
 def _steps_taken(reader: TrajectoryReader) -> dict[str, NDArray[Any]]:
-    """Return the parts of `RecordedSteps`; nothing where controls are not recorded."""
+    """Return the parts of `RecordedSteps`; empty if controls are not recorded."""
     kind = reader.kind("state")
     if kind is None or "ctrl" not in (kind.names or ()):
         return {}
@@ -366,9 +366,9 @@ def _steps_taken(reader: TrajectoryReader) -> dict[str, NDArray[Any]]:
 
 
 def _of_evaluation(kind: str, facts: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Return the known facts of an event of an evaluation."""
+    """Return the known facts of an evaluation's event."""
     if not all(type(facts.get(name)) is int for name in _UNIT):
-        raise ValueError(f"{facts!r:.200} names no episode of an evaluation")
+        raise ValueError(f"{facts!r:.200} does not name an evaluation's episode")
     return _known(facts, _UNIT if kind == "begun" else _FAILED)
 
 
@@ -380,7 +380,7 @@ def _selection(video: Any) -> Mapping[str, Any] | None:
 
 
 def _provenance(said: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Return a provenance without keys that no recorder writes."""
+    """Return a provenance without the keys that recorders do not write."""
     known: dict[str, Any] = {}
     for key, value in _known(said, _PROVENANCE).items():
         inner = _PROVENANCE[key]
@@ -390,7 +390,7 @@ def _provenance(said: Mapping[str, Any]) -> Mapping[str, Any]:
 
 
 def _known(said: Mapping[str, Any], keys: Collection[str]) -> dict[str, Any]:
-    """Return what stands under known keys; nothing recreates the others."""
+    """Return the values of known keys; the others cannot be recreated."""
     return {key: value for key, value in said.items() if key in keys}
 
 
@@ -409,14 +409,14 @@ def _options(said: Any) -> dict[str, Any]:
         return {}
     for name, value in said.items():
         if name not in OPTIONS or type(value) not in OPTIONS[name]:
-            raise ValueError(f"the option {name!r:.80} cannot be {value!r:.80}")
+            raise ValueError(f"the option {name!r:.80} must not be {value!r:.80}")
     return dict(said)
 
 
 def _dtypes(said: Any) -> Iterator[tuple[int, str]]:
     for step, name in said or ():
         if name not in _DTYPES:
-            raise ValueError(f"actions cannot be of dtype {name!r:.80}")
+            raise ValueError(f"actions cannot have the dtype {name!r:.80}")
         yield _count(step), name
 
 
@@ -431,7 +431,7 @@ def _text(value: Any) -> str | None:
 
 def _count(value: Any) -> int:
     if type(value) is not int or value < 0:
-        raise ValueError(f"{value!r:.80} is no count")
+        raise ValueError(f"{value!r:.80} is not a valid count")
     return value
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From the inputs of a recording to the monitor that records it again."""
+"""Construction of the monitor that records a run again, from a recording's inputs."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from ..trackers.monitor_csv import MonitorCsvTracker
 from .inputs import RecordingInputs
 from .notes import Notes
 
-# Our own schedules and rules, which are asked again, by their names in a journal.
+# mjrec's own schedules by their names in a journal. They choose episodes again.
 _SCHEDULES = {
     "capped_cubic_video_schedule": "cubic",
     "record_all": "all",
@@ -41,18 +41,19 @@ def monitor_again(
     only_counted: bool,
     notes: Notes,
 ) -> EnvironmentMonitor:
-    """Return a monitor that was asked for what the recording's was asked for.
+    """Return a monitor with the options of the recording's monitor.
 
     Args:
-        recording: its inputs.
-        recreated: its environment.
-        directory: where others of the same run may be already.
+        recording: the recording's inputs.
+        recreated: the recording's environment.
+        directory: the monitor directory, which may already contain other recordings of
+            the same run.
         clock: returns the time, in seconds since the epoch.
-        only_counted: only rewards and ends are asked for.
-        notes: which choices were the author's, and are believed.
+        only_counted: record only rewards and ends.
+        notes: receives the author's choices, which are believed.
 
     Raises:
-        NotRecreated: an option cannot be.
+        NotRecreated: an option is invalid, or the monitor cannot be created.
     """
     given = recording.options
     infix = Infix.parse(recording.infix)
@@ -66,7 +67,7 @@ def monitor_again(
             max_fps=_rate(given.get("max_fps")),
             quality=given.get("quality", "full"),
             render=given.get("render"),
-            # They are drawn when all is played.
+            # Videos are rendered after all recordings have been replayed.
             workers=0,
             trajectory_callable=_trajectories(recording),
             observations=given.get("observations", False),
@@ -97,11 +98,13 @@ def monitor_again(
             env_id=recording.env_id,
         )
     except (Error, TypeError, ValueError) as error:
-        raise NotRecreated(f"it cannot be recorded so: {error!s:.300}") from error
+        raise NotRecreated(
+            f"it cannot be recorded with its options: {error!s:.300}"
+        ) from error
 
 
 def _monitor_class(recreated: Recreated) -> Callable[..., EnvironmentMonitor]:
-    # Each loads its framework, and dm_env may not be there.
+    # Each monitor imports its framework, and dm_env may not be installed.
     if recreated.is_dm_env:
         from ..monitors.dm_env_monitor import DmEnvMonitor
 
@@ -121,7 +124,7 @@ def _schedule(recording: RecordingInputs, notes: Notes) -> Schedule | None:
     notes.add(
         recording.name,
         "schedule",
-        f"the schedule {name!r:.80} is a function of the author's: that it chose these "
+        f"the schedule {name!r:.80} is the author's own function; that it chose these "
         "episodes is believed",
         count=len(recording.episodes),
         unit="episode",
@@ -140,7 +143,7 @@ def _rule(
     notes.add(
         recording.name,
         "rule",
-        f"the rule {name!r:.80} is a function of the author's: that it chose these "
+        f"the rule {name!r:.80} is the author's own function; that it chose these "
         "episodes is believed",
         count=len(recording.episodes),
         unit="episode",
@@ -166,7 +169,7 @@ def _step_trigger(
     notes.add(
         recording.name,
         "schedule",
-        f"{name!r:.80}, which began clips, is a function of the author's: that it "
+        f"{name!r:.80}, which started clips, is the author's own function; that it "
         "chose these steps is believed",
         count=len(recording.clip_starts),
         unit="clip",
@@ -180,7 +183,7 @@ def _trackers(recording: RecordingInputs) -> Sequence[Tracker]:
 
 
 def _named(name: str, function: Callable[[Any], Any]) -> Callable[[Any], Any]:
-    """Return a function that files call by a name."""
+    """Return a function that is recorded in files under a given name."""
 
     def named(what: Any) -> Any:
         return function(what)
@@ -190,7 +193,7 @@ def _named(name: str, function: Callable[[Any], Any]) -> Callable[[Any], Any]:
 
 
 def _rate(text: str | None) -> float | Fraction | None:
-    """Return a rate as it was given, so that it is written the same way."""
+    """Return a rate with its original type, so that it is written the same way."""
     if text is None:
         return None
     is_float = "." in text or "e" in text

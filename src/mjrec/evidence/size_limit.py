@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Archives that may not be larger than allowed: their videos are drawn again smaller.
+"""Size limits for archives: videos are re-rendered smaller until the archive fits.
 
-They are drawn from the recorded states, every frame of them, and get metadata and
-hashes of their own. A video that was encoded is never encoded again: what was drawn
-live, or has no recorded states, stays as it is.
+All their frames are rendered from the recorded states, and the new videos get their own
+metadata and hashes. An encoded video is never re-encoded: videos that were rendered
+live or have no recorded states stay unchanged.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ from ..rendering.render_video import render_video
 from ..rendering.views import Variant, View
 from .bag import STORED
 
-# Of width and height, one after the other until the archive is small enough.
+# Scales of width and height, tried in order until the archive is small enough.
 _SCALES = (Fraction(3, 4), Fraction(1, 2), Fraction(3, 8), Fraction(1, 4))
-# Of the files that an archive that is too large is made of.
+# Maximum number of files listed in an ArchiveTooLarge error.
 _LARGEST = 10
 
 _SIZE = re.compile(r"(\d{1,15}(?:\.\d{1,6})?)\s*(?:([KMGT])(i?))?B?", re.IGNORECASE)
@@ -43,14 +43,14 @@ _UNITS = ("", "K", "M", "G", "T")
 def byte_count(size: int | str) -> int:
     """Return a size in bytes.
 
-    K, M, G and T are powers of 1000, as those who limit uploads count; Ki, Mi, Gi and
-    Ti are powers of 1024.
+    K, M, G and T are powers of 1000, as in most upload limits; Ki, Mi, Gi and Ti are
+    powers of 1024.
 
     >>> byte_count("50M"), byte_count("1.5 KiB"), byte_count(7)
     (50000000, 1536, 7)
 
     Raises:
-        InvalidArgument: it is no size, or less than a byte.
+        InvalidArgument: the size is invalid or below one byte.
     """
     match = _SIZE.fullmatch(size.strip()) if isinstance(size, str) else None
     try:
@@ -59,19 +59,19 @@ def byte_count(size: int | str) -> int:
             base = 1024 if binary else 1000
             count = int(Fraction(number) * base ** _UNITS.index(unit.upper()))
         else:
-            count = 0 if isinstance(size, bool) else operator.index(size)  # type: ignore[arg-type]  # a text is an error
+            count = 0 if isinstance(size, bool) else operator.index(size)  # type: ignore[arg-type]  # a string is an error
     except TypeError:
         count = 0
     if count < 1:
         raise InvalidArgument(
-            "max_size is a number of bytes, or a text such as '50M' (a million each) "
-            f"or '50Mi' (1024 * 1024 each), got {size!r}."
+            "max_size must be a number of bytes, or a string such as '50M' (millions) "
+            f"or '50Mi' (multiples of 1024 * 1024), got {size!r}."
         )
     return count
 
 
 def shown_size(size: int) -> str:
-    """Return a number of bytes as people read it.
+    """Return a number of bytes in human-readable form.
 
     >>> shown_size(52_345_678), shown_size(999)
     ('52.3 MB', '999 bytes')
@@ -84,7 +84,7 @@ def shown_size(size: int) -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class _Redrawable:
-    """A video that can be drawn again: its file, its states and its metadata."""
+    """A video that can be re-rendered: its file, its states and its metadata."""
 
     video: Path
     trajectory: Path
@@ -98,21 +98,21 @@ def archive_within(
     make: Callable[[], Path],
     on_progress: Callable[[Progress], object],
 ) -> Path:
-    """Return an archive of at most `limit` bytes, with smaller videos if need be.
+    """Return an archive of at most `limit` bytes, with smaller videos if necessary.
 
     Args:
-        limit: the most bytes.
-        staged: the recordings that are to be packed.
-        make: packs them, as they then are, and returns the archive.
-        on_progress: told how far the drawing is.
+        limit: maximum size of the archive in bytes.
+        staged: the folder with the recordings to pack.
+        make: packs the recordings in their current state and returns the archive.
+        on_progress: called with the progress of re-rendering.
 
     Raises:
-        ArchiveTooLarge: there can be none.
-        PackError: a video came out with other frames than it was recorded with.
+        ArchiveTooLarge: even the smallest archive is too large.
+        PackError: a re-rendered video has different frames from the recorded one.
     """
 
     def attempt() -> tuple[Path | None, int]:
-        # What will stand in it as it is.
+        # Files that the archive stores uncompressed.
         least = sum(s for name, s in _sizes(staged) if name.endswith(STORED))
         if least > limit:
             return None, least
@@ -128,7 +128,7 @@ def archive_within(
     rest = size - drawn
     with WorkerPool(usable_cpus()) as workers:
         for scale in _SCALES if videos and rest < limit else ():
-            # No video shrinks more than its frames do: there is no use in trying.
+            # Skip this scale: videos do not shrink by more than their frames.
             if rest + drawn * scale**2 > limit and scale is not _SCALES[-1]:
                 continue
             _draw_all(videos, scale, workers=workers, on_progress=on_progress)
@@ -147,16 +147,16 @@ def _sizes(staged: Path) -> list[tuple[str, int]]:
 def _why_too_large(can_draw: bool, rest: int, limit: int) -> str:
     if not can_draw:
         return (
-            "No video in it can be drawn again smaller: there are no recorded states "
-            "of them, and what is encoded is never encoded again."
+            "None of its videos can be re-rendered smaller: they have no recorded "
+            "states, and encoded videos are never re-encoded."
         )
     if rest >= limit:
-        return f"All that could not be made smaller has {rest} bytes already."
-    return "That is with videos of a quarter of width and height."
+        return f"The files that cannot be made smaller already have {rest} bytes."
+    return "This is with videos at a quarter of their width and height."
 
 
 def _redrawable(staged: Path) -> list[_Redrawable]:
-    """Return the videos that can be drawn again from recorded states."""
+    """Return the videos that can be re-rendered from recorded states."""
     found = []
     manifests = [path for path in sorted(staged.iterdir()) if is_manifest(path.name)]
     for video, metadata in (
@@ -165,7 +165,7 @@ def _redrawable(staged: Path) -> list[_Redrawable]:
         with unreadable(staged / metadata):
             said = dict(read_object(staged / metadata))
         infix, number = Infix.parse(infix_of(video) or ""), episode_of(video)
-        # The states of a clip are gone when its video is there.
+        # The states of a clip are deleted once its video exists.
         if said.get("recording") == "deferred" and "first_step" not in said:
             assert infix is not None
             assert number is not None
@@ -184,7 +184,7 @@ def _draw_all(
     workers: WorkerPool,
     on_progress: Callable[[Progress], object],
 ) -> None:
-    """Put smaller videos in the place of these, with all that is said about them."""
+    """Replace videos and their metadata with smaller ones."""
     frames = sum(int(each.said["frame_count"]) for each in videos)
     now = Progress(videos=len(videos), frames=frames)
 
@@ -220,14 +220,14 @@ def _draw(
     for key in ("frame_count", "frame_steps", "fps"):
         if drawn.get(key) != said.get(key):
             raise PackError(
-                f"{video.name} came out otherwise when it was drawn smaller: its "
+                f"{video.name} changed when it was re-rendered smaller: its "
                 f"{key} was {said.get(key)!r:.100} and is {drawn.get(key)!r:.100}. "
                 "Allow a larger archive."
             )
     metadata = {
         **said,
         **drawn,
-        # Of a further camera the drawing does not know what it is called.
+        # The renderer does not know the name of a further camera.
         "camera": said.get("camera"),
         "packed_smaller": {"from": [said["height"], said["width"]]},
     }
@@ -239,7 +239,7 @@ def _view(said: dict[str, Any], scale: Fraction) -> View:
     if said.get("tiled"):
         height, width = height // int(said["rows"]), width // int(said["columns"])
     return View(
-        # The first camera, and all of them side by side, are drawn as recorded.
+        # The first camera and tiled videos are rendered with the recorded cameras.
         camera=said.get("camera") if "first_video" in said else None,
         height=_even(height * scale),
         width=_even(width * scale),

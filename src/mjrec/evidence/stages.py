@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The three processes of a verification, one after the other, each in a sandbox.
+"""The three processes of a verification, run one after another, each in a sandbox.
 
-- `open` sees what was given: it brings it in, checks the bag, and reads the inputs.
-- `make` sees the inputs and nothing else, and makes the run again.
+- `open` sees the given archive: it unpacks it, checks the bag, and reads the inputs.
+- `make` sees only the inputs, and recreates the run.
 - `compare` sees the two runs.
 
-What one says to `verify`, which has started it: `count` (of how much is done),
-`finding`, `excuses`, `facts`, and at the end `done`, or `failure` with the reason;
-`refused` where what was given is nothing that can be verified, `error` where this
-machine has too little room.
+Each sends messages to `verify`, which started it: `count` (progress), `phase`,
+`inputs`, `finding`, `excuses`, `facts`, and at the end `done`, or `failure` with the
+reason. `refused` means that the given path cannot be verified, `error` that this
+machine does not have enough space.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ _Say = Callable[..., None]
 
 
 class _Counter:
-    """Says how much is done, not too often."""
+    """Reports progress at a limited rate."""
 
     def __init__(self, say: _Say) -> None:
         self._say = say
@@ -51,7 +51,7 @@ class _Counter:
 
 
 def main() -> int:
-    """Do what `verify` asks for."""
+    """Run the stage that `verify` requests, and return the exit status."""
     request, say = enter()
     stage = {"open": _open, "make": _make, "compare": _compare}[request["stage"]]
     try:
@@ -63,7 +63,7 @@ def main() -> int:
         say(error=str(error))
         return 1
     except MemoryError:
-        say(failure="it needs more memory than it may use")
+        say(failure="it needs more memory than the limit")
         return 1
     except Exception as error:
         text = str(error) or type(error).__name__
@@ -73,7 +73,7 @@ def main() -> int:
     return 0
 
 
-# Each imports its own part: making needs MuJoCo and environments, reading h5py.
+# Each stage imports its own part: `make` needs MuJoCo and environments, `open` h5py.
 
 
 def _open(request: Mapping[str, Any], say: _Say) -> None:
@@ -148,7 +148,7 @@ def _make(request: Mapping[str, Any], say: _Say) -> None:
                     on_steps=count_steps,
                 )
             except NotRecreated as error:
-                # What was recorded before that proves nothing.
+                # A part of a recording proves nothing.
                 for path in iter_monitor_files(played, hidden=True):
                     if infix_of(path.name) == recording.infix:
                         path.unlink()

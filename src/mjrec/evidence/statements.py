@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What an author states of a packed run: its title, its authors, its licence."""
+"""An author's statements about a packed run: its title, authors and licence."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ _LONGEST = 1000
 
 @dataclass(frozen=True, kw_only=True)
 class Author:
-    """One of the authors.
+    """An author.
 
     Attributes:
-        given: the given names, as far as the name tells.
-        family: the family name, or the only one.
-        orcid: the URL of the ORCID, where it is known.
-        email: where it is known.
+        given: the given names; empty if there is only one name.
+        family: the family name, or the only name.
+        orcid: the URL of the ORCID, or None if unknown.
+        email: the email address, or None if unknown.
     """
 
     given: str
@@ -35,7 +35,7 @@ class Author:
 
     @property
     def name(self) -> str:
-        """The whole name."""
+        """The full name."""
         return f"{self.given} {self.family}".strip()
 
 
@@ -45,8 +45,8 @@ class License:
 
     Attributes:
         name: its SPDX identifier, or its URL.
-        url: where it can be read.
-        spdx: its SPDX identifier, where it has one.
+        url: the URL of its text.
+        spdx: its SPDX identifier, or None.
     """
 
     name: str
@@ -56,12 +56,12 @@ class License:
 
 @dataclass(frozen=True, kw_only=True)
 class Statements:
-    """What is stated of a run.
+    """Checked statements about a run.
 
     Attributes:
-        title: of the run; None where it is to be called by what was recorded.
-        authors: in their order.
-        license: None where none was stated.
+        title: the run's title; None to generate one from the recorded environments.
+        authors: the authors, in order.
+        license: the licence, or None if none was stated.
     """
 
     title: str | None = None
@@ -72,14 +72,16 @@ class Statements:
 def state(
     *, title: str | None, authors: Iterable[str] | None, license: str | None
 ) -> Statements:
-    """Return what is stated, checked.
+    """Check and parse the statements about a run.
 
     Raises:
-        InvalidArgument: a title, an author or a licence that cannot be.
+        InvalidArgument: the title, an author or the licence is invalid.
+        MissingDependency: a licence is given as an SPDX identifier, but a recent
+            `packaging` is not installed.
     """
     if isinstance(authors, str):
         raise InvalidArgument(
-            f"authors is a list of texts, one for each author, got {authors!r}."
+            f"authors must be a list of strings, one for each author, got {authors!r}."
         )
     return Statements(
         title=None if title is None else _line("title", title),
@@ -92,10 +94,11 @@ def _author(text: object) -> Author:
     match = _AUTHOR.fullmatch(_line("An author", text))
     if match is None or not _is_orcid(match["orcid"]):
         raise InvalidArgument(
-            'An author is "Name", "Name <address>" or "Name <ORCID>", such as '
+            'An author must be "Name", "Name <address>" or "Name <ORCID>", such as '
             f'"Ada Lovelace <0000-0002-1825-0097>", got {text!r}.'
         )
-    # "Family, Given" says which is which; else the last word is the family name.
+    # In "Family, Given" the comma separates them; otherwise the last word is the family
+    # name.
     family, comma, given = match["name"].partition(",")
     if not comma:
         given, _, family = match["name"].rpartition(" ")
@@ -120,10 +123,10 @@ def _license(text: object) -> License:
     if _URL.fullmatch(line):
         return License(name=line, url=line)
     spdx = _spdx_identifier(line)
-    # No expression of several, and none that only its author knows.
+    # Expressions with several licences and LicenseRefs, which are private, are invalid.
     if not spdx or " " in spdx or spdx.startswith("LicenseRef-"):
         raise InvalidArgument(
-            "license is the identifier of one licence in the list of SPDX "
+            "license must be the identifier of one licence in the SPDX list "
             '(https://spdx.org/licenses), such as "CC-BY-4.0", or the URL of its text, '
             f"got {text!r}."
         )
@@ -131,8 +134,8 @@ def _license(text: object) -> License:
 
 
 def _spdx_identifier(text: str) -> str:
-    """Return a licence as SPDX writes it; "" where it does not know it."""
-    # Not at the top: only the extra `evidence` asks for a `packaging` that has it.
+    """Return a licence's SPDX spelling, or "" if it is not in the SPDX list."""
+    # Imported here: only the extra `evidence` requires a `packaging` that has it.
     try:
         from packaging import licenses
     except ImportError as error:
@@ -151,7 +154,7 @@ def _line(what: str, text: object) -> str:
     line = text.strip() if isinstance(text, str) else ""
     if not line or not line.isprintable() or len(line) > _LONGEST:
         raise InvalidArgument(
-            f"{what} must be one line of text, of at most {_LONGEST} characters, got "
+            f"{what} must be one line of text with at most {_LONGEST} characters, got "
             f"{str(text)[:80]!r}."
         )
     return line

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A verification in few words: a verdict, what it rests on, a line for each topic.
+"""Summary of a verification: verdict, excuses, and one line for each topic.
 
-The screen and the page show the same words.
+The terminal and the HTML report show the same text.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from .findings import (
 
 _MOST_ITEMS: Final = 3
 _LONGEST_INPUT: Final = 100
-# The worst first: it is what a line says.
+# Worst first, because a line shows the worst outcome.
 _ORDER: Final = (
     Outcome.DIFFERENT,
     Outcome.BELIEVED,
@@ -35,9 +35,9 @@ _ORDER: Final = (
     Outcome.RECREATED,
 )
 _NOT_LOOKED_AT: Final = "not looked at"
-# At the level of files.
+# The outcome at the level "files".
 _UNCHANGED: Final = "unchanged"
-# What counts best for people, where a topic is counted in several ways.
+# The unit to show for a topic that is counted in several units.
 _UNITS: Final = {
     Topic.REWARDS: "episode",
     Topic.SELECTION: "recording",
@@ -47,12 +47,12 @@ _UNITS: Final = {
 
 @dataclass(frozen=True)
 class Line:
-    """What a topic comes to.
+    """The result for one topic.
 
     Attributes:
-        topic: its name.
-        outcome: the worst of its findings; "not looked at" without one.
-        text: how many were recreated, and what else is to be said.
+        topic: the topic.
+        outcome: the worst outcome of its findings; "not looked at" if it has none.
+        text: the number of recreated items, and any remarks.
     """
 
     topic: Topic
@@ -75,31 +75,31 @@ def headline(verification: Verification) -> str:
     count = sum(finding.count for finding in verification.failures)
     if count or any(excuse.refuted for excuse in verification.excuses):
         differ = f"{counted(count, 'place')} differ{'s' if count == 1 else ''}"
-        return f"{name}: it is not what its inputs give; {differ}."
+        return f"{name}: it does not match what its inputs produce; {differ}."
     return f"{name}: nothing could be recreated, so nothing is proved."
 
 
 def remarks(verification: Verification) -> list[str]:
-    """Return what stands beside the verdict: gaps, episodes that are the same."""
+    """Return the remarks shown next to the verdict: gaps, identical episodes."""
     return [_said(each) for each in verification.findings if each.is_headline]
 
 
 def failures(verification: Verification) -> list[str]:
-    """Return what contradicts the archive."""
+    """Return the findings that contradict the archive."""
     return [_said(finding) for finding in verification.failures]
 
 
 def excuses(verification: Verification) -> list[str]:
-    """Return the excuses, each with its cost; those that cost nothing in one line."""
+    """Return the excuses with their costs; those without a cost share one line."""
     known = verification.excuses
     needed = [each for each in known if each.is_needed or each.refuted]
     others = dict.fromkeys(_claim(each) for each in known if each not in needed)
-    idle = [f"claimed, and nothing rests on it: {'; '.join(others)}"] if others else []
+    idle = [f"claimed, but not needed: {'; '.join(others)}"] if others else []
     return [*(_excuse(each, verification) for each in needed), *idle]
 
 
 def lines(verification: Verification) -> list[Line]:
-    """Return a line for each topic, in their order."""
+    """Return a line for each topic, in the topics' order."""
     found: dict[Topic, list[Finding]] = {topic: [] for topic in Topic}
     for finding in verification.findings:
         if not finding.is_headline:
@@ -118,11 +118,11 @@ def inputs(verification: Verification) -> list[str]:
 
 
 def sampled(verification: Verification) -> str | None:
-    """Return how many frames were drawn, and what chose them; None where all were."""
+    """Return the size and seed of the sample of frames; None if all were rendered."""
     count, seed = (verification.facts.get(key) for key in ("sample", "seed"))
     if count is None:
         return None
-    return f"{count} frames of each video were drawn, chosen by --seed {seed}"
+    return f"{count} frames of each video were rendered, chosen by --seed {seed}"
 
 
 def _line(topic: Topic, found: list[Finding]) -> tuple[str, str]:
@@ -147,7 +147,7 @@ def _counts(topic: Topic, found: Iterable[Finding]) -> str:
     if (unit := _UNITS.get(topic)) in counts:
         counts = Counter({str(unit): counts[str(unit)]})
     if len(counts) > 1:
-        # Single values of files say little beside them.
+        # Counts of single values in files add little to the other units.
         del counts["value"]
     return ", ".join(counted(count, unit) for unit, count in counts.items())
 
@@ -161,7 +161,7 @@ def _beliefs(found: list[Finding]) -> Iterator[str]:
 def _notes(found: list[Finding]) -> Iterator[str]:
     for each in found:
         if each.outcome is Outcome.NOTED and each.excuse is None:
-            # Of several alike the sum says how many.
+            # The count of several findings that were merged.
             many = f" ({counted(each.count, each.unit)})" if each.count > 1 else ""
             yield f"{each.reason}{many}"
 
@@ -173,7 +173,7 @@ def _said(finding: Finding) -> str:
 
 def _excuse(excuse: Excuse, verification: Verification) -> str:
     if excuse.refuted:
-        return f"{_claim(excuse)}: refuted, what it claims would show"
+        return f"{_claim(excuse)}: refuted, because its effects would be visible"
     found = [
         each
         for each in verification.findings
@@ -190,7 +190,7 @@ def _excuse(excuse: Excuse, verification: Verification) -> str:
         for key, count in counts.items()
         for unit, outcome in (key,)
     ]
-    # Of a recording that it reaches it need not name the files.
+    # If recordings are named, their files need not be.
     items = tuple(i for i in excuse.items if not i.startswith(FILE_PREFIX))
     of = f" of {_some(items or excuse.items)}" if excuse.items else ""
     allowed = ", allowed" if excuse.allowed else ""
@@ -201,7 +201,7 @@ def _excuse(excuse: Excuse, verification: Verification) -> str:
 def _claim(excuse: Excuse) -> str:
     here = f" (here {excuse.here})" if excuse.here else ""
     if excuse.kind is ExcuseKind.CODE and excuse.claimed:
-        # It is a sentence.
+        # The claim is a sentence.
         return f"{excuse.name} ({excuse.claimed})"
     return f"{excuse.name} {excuse.claimed}{here}".strip()
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Findings that say the same of several items, as one with their count."""
+"""Merging of findings with the same result for several items into one with a count."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _MOST_FAILURES: Final = 100
 
 
 class Sums:
-    """Counts findings that say the same of several items."""
+    """Counts findings with the same result for several items."""
 
     def __init__(self) -> None:
         self._sums: dict[tuple[Any, ...], Finding] = {}
@@ -23,7 +23,7 @@ class Sums:
         self._failures: Counter[Topic] = Counter()
 
     def same(self, found: Same) -> None:
-        """Count what is equal."""
+        """Count items that are equal."""
         self._add(
             Finding(
                 topic=found.topic,
@@ -36,14 +36,14 @@ class Sums:
         )
 
     def add(self, finding: Finding) -> None:
-        """Count a finding with those for the same excuse; the worst speaks for all."""
+        """Merge a finding with those for the same excuse, and keep the worst."""
         alike = (
             finding.reason if finding.outcome is not Outcome.WITHIN_TOLERANCE else ""
         )
         self._add(finding, reason=alike)
 
     def fail(self, finding: Finding) -> bool:
-        """Count what differs; return whether to list it by itself."""
+        """Count a difference, and return whether to list it separately."""
         self._failures[finding.topic] += 1
         return self._failures[finding.topic] <= _MOST_FAILURES
 

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The report of a verification: one HTML file for people, that loads nothing.
+"""The report of a verification: one HTML file that loads nothing.
 
-Whatever is in it may come from a hostile archive. It is shown as text: escaped, cut
-where it is long, and invisible characters (control characters, marks that turn the
-direction of writing) spelled out.
+Its content may come from a hostile archive. It is shown as text: escaped, shortened if
+long, and with invisible characters (control characters, bidirectional marks) spelled
+out.
 """
 
 from __future__ import annotations
@@ -31,21 +31,21 @@ _STYLES: Final = {
     str(Outcome.DIFFERENT): "fail",
 }
 _MEANINGS: Final = {
-    Topic.IDENTITY: "The environment and the model are those that are named.",
-    Topic.BEGINNING: "Seeds and options lead to the state that an episode begins from.",
+    Topic.IDENTITY: "The environment and the model match their names.",
+    Topic.BEGINNING: "Seeds and options lead to each episode's first state.",
     Topic.PHYSICS: "Actions lead from each state to the next.",
-    Topic.REWARDS: "Actions give the rewards and ends, and these the statistics.",
+    Topic.REWARDS: "Actions produce the rewards and ends, and these the statistics.",
     Topic.SELECTION: "The stated rule chooses the episodes that have a video.",
-    Topic.VIDEOS: "A video is of the size, speed, length and camera that it says.",
-    Topic.PICTURES: "The states give the frames of the videos.",
-    Topic.FILES: "All files are there, unchanged, and no others.",
+    Topic.VIDEOS: "Each video has the size, speed, length and camera that it states.",
+    Topic.PICTURES: "The states produce the frames of the videos.",
+    Topic.FILES: "All files are present and unchanged, with no extra files.",
 }
 # Failures first.
 _ORDER: Final = (
     *(Outcome.DIFFERENT, Outcome.BELIEVED, Outcome.WITHIN_TOLERANCE),
     *(Outcome.NOTED, Outcome.RECREATED),
 )
-# What a browser shows at once, and a person reads.
+# Limits that keep the report readable and fast to load.
 _MOST_LISTED: Final = 200
 _LONGEST_TEXT: Final = 1500
 
@@ -53,11 +53,11 @@ _LONGEST_TEXT: Final = 1500
 def write_verification_report(verification: Verification, path: Path) -> None:
     """Write a verification as one HTML file.
 
-    It needs no network and no scripts, and can be read on a phone, in the dark and on
-    paper. A file of that name is replaced when the new one is whole.
+    It needs neither network nor scripts, and has styles for phones, dark mode and
+    print. An existing file is replaced once the new one is complete.
 
     Raises:
-        MissingDependency: there is no Jinja2.
+        MissingDependency: Jinja2 is not installed.
         FileNotWritten: the file cannot be written.
     """
     template = _template()
@@ -66,7 +66,7 @@ def write_verification_report(verification: Verification, path: Path) -> None:
 
 def _template() -> Any:
     try:
-        # Here, because it is an extra: verifying without a report needs none.
+        # Imported here, because Jinja2 is an extra that only reports need.
         import jinja2
     except ImportError as error:
         raise MissingDependency(
@@ -118,7 +118,7 @@ def _row(finding: Finding) -> dict[str, str]:
 
 
 def _flat(facts: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, str]]:
-    """Yield facts in facts as one list, with names such as `versions: numpy`."""
+    """Yield nested facts as a flat list, with names such as `versions: numpy`."""
     for key, value in facts.items():
         name = f"{above}: {key}" if above else str(key)
         if isinstance(value, Mapping):

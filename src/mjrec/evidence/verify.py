@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Verifying a packed run: recreated from its inputs, and compared."""
+"""Verification of a packed run: it is recreated from its inputs and compared."""
 
 from __future__ import annotations
 
@@ -34,25 +34,25 @@ from .findings import Excuse, Finding, Level, Outcome, Topic, Verification
 from .stages import MODULE
 
 _PACKAGES = ("mjrec", "mujoco", "numpy", "gymnasium", "dm-control", "imageio-ffmpeg")
-# Compiling a model may take 300 of them.
+# Compiling a model may take 300 s.
 _TIMEOUT_S = 900.0
 _SEEDS = 2**32
 _PREFIX = "mjrec-verify-"
-# Held by the process whose folder it is in.
+# A lock held by the process that owns the folder.
 _LOCK = "lock"
-# A lock is a file for a moment before it is held.
+# A lock's file exists for a moment before the lock is held.
 _A_MOMENT_S = 60.0
 
 
 @dataclass(frozen=True, kw_only=True)
 class VerificationProgress:
-    """How far a verification is.
+    """Progress of a verification.
 
     Attributes:
         phase: "reading", "playing", "drawing" or "comparing".
-        done: how much of it.
-        total: of how much; a new phase begins from 0.
-        seconds_left: of this phase, as far as can be told; None else.
+        done: amount of work done in this phase; each phase starts from 0.
+        total: total amount of work in this phase.
+        seconds_left: estimated time left in this phase, or None if unknown.
     """
 
     phase: str
@@ -72,26 +72,26 @@ def verify(
     report: str | os.PathLike[str] | None = None,
     on_progress: Callable[[VerificationProgress], object] | None = None,
 ) -> Verification:
-    """Run a packed run again, and compare the result with the archive.
+    """Recreate a packed run and compare the result with the archive.
 
-    The archive may come from a stranger. Three processes read it, run it and compare,
-    each with limits on memory and time, without network or home directory, and each
-    sees only what it needs: the second gets the inputs only (environment, seeds,
-    actions, options). No code that the archive names is run, except environments in
-    `trust`.
+    The archive may come from a stranger. Three processes read it, recreate the run and
+    compare the two. Each has limits on memory and time, no network and no home
+    directory, and sees only what it needs: the second gets only the inputs
+    (environment, seeds, actions, options). No code that the archive names is run,
+    except environments in `trust`.
 
     Args:
-        path: an archive of `mjrec pack`, an unpacked one, or a monitor directory
-            or a folder of several (for which missing files cannot be found).
-        level: where to stop: `"files"` (the bag holds what it lists), `"stats"`
+        path: an archive from `mjrec pack`, an unpacked one, a monitor directory, or a
+            folder of several. In directories, missing files cannot be detected.
+        level: where to stop: `"files"` (the bag contains what it lists), `"stats"`
             (rewards, ends, statistics and selection of episodes), `"physics"` (also all
             states) or `"pixels"` (also all frames and files).
-        sample: how many frames of each video to check. None is all.
-        seed: for the choice of these frames. None is random.
-        trust: ids of environments that may be made although they are in no trusted
-            registry. This runs code that you have installed.
+        sample: number of frames of each video to check. None means all.
+        seed: seed for choosing these frames. None means random.
+        trust: ids of environments that may be created although they are not in a
+            trusted registry. This runs code that you have installed.
         allow: excuses to accept, by name and value: `"gl=NVIDIA H100"`.
-        report: path of an HTML page to write.
+        report: path of an HTML report to write.
         on_progress: called with the progress.
 
     Returns:
@@ -100,11 +100,11 @@ def verify(
 
     Raises:
         UnreadableArchive: the file is missing, damaged or hostile.
-        InvalidArgument: `level` is unknown, `sample` is below 1, or `allow` names no
-            excuse.
+        InvalidArgument: `level` is unknown, `sample` is below 1, or `allow` contains
+            an unknown excuse.
         MissingDependency: a report needs the extra `evidence`.
         DirectoryNotWritable: the report cannot be written.
-        Error: there is not enough room to unpack.
+        Error: there is not enough space to unpack.
     """
     deepest = _level(level)
     asked = {
@@ -119,7 +119,7 @@ def verify(
     write_report = None if page is None else _report_writer(page)
     given = Path(path)
     if not given.exists():
-        raise UnreadableArchive(given, "there is no such file or directory")
+        raise UnreadableArchive(given, "no such file or directory")
     with _working_folder() as folder:
         verifying = _Verifying(given.absolute(), folder, asked, on_progress)
         verifying.run(deepest)
@@ -142,13 +142,13 @@ def verify(
 
 
 class _Verifying:
-    """The three processes, one after the other, and what they say.
+    """The three processes of a verification and their results.
 
     Args:
-        path: what was given.
-        folder: an empty one, for all that they leave.
+        path: the path given to `verify`.
+        folder: an empty folder for the processes' files.
         asked: the level, the sample and so on.
-        on_progress: told how far they are.
+        on_progress: called with the progress.
     """
 
     def __init__(
@@ -164,7 +164,7 @@ class _Verifying:
         self.facts: Mapping[str, Any] = {}
         self._path = path
         self._folder = folder
-        # Each where the process that makes it may write.
+        # Each is in the folder that the process creating it may write to.
         self._given = folder / "open" / "given"
         self._inputs = folder / "open" / "inputs"
         self._made = folder / "make" / "made"
@@ -172,7 +172,7 @@ class _Verifying:
         self._progress = _Progress(on_progress)
 
     def run(self, level: Level) -> None:
-        """Run as many of them as the level takes, until one fails."""
+        """Run the processes that the level needs, until one fails."""
         given, inputs, made = self._given, self._inputs, self._made
         if not self._stage("open", "reading", [self._path]) or level is Level.FILES:
             return
@@ -180,7 +180,7 @@ class _Verifying:
             self._stage("compare", "comparing", [given, made])
 
     def _stage(self, stage: str, phase: str, readable: list[Path]) -> bool:
-        """Run one, which can read no more than that; return whether it ended well."""
+        """Run a process that may read only `readable`; return whether it succeeded."""
         place = self._folder / stage
         place.mkdir()
         request = {
@@ -197,21 +197,21 @@ class _Verifying:
         with Sandbox(MODULE, request, place=place, readable=readable) as sandbox:
             for said in sandbox.answers(_TIMEOUT_S):
                 if said is None:
-                    failure = f"nothing was heard of it for {_TIMEOUT_S:g} seconds"
+                    failure = f"it sent nothing for {_TIMEOUT_S:g} seconds"
                     break
                 self._take(said)
                 if "done" in said:
                     return True
                 failure = said.get("failure", failure)
             failure = failure or f"its process {sandbox.last_words()}"
-        # The reader knows nothing of the folder that they worked in.
+        # The temporary folder means nothing to the reader.
         failure = failure.replace(f"{self._folder}{os.sep}", "")
         self.findings.append(
             Finding(
                 topic=Topic.FILES,
                 item="",
                 outcome=Outcome.DIFFERENT,
-                reason=f"{phase} ended with a failure: {failure}",
+                reason=f"{phase} failed: {failure}",
                 unit="verification",
                 is_headline=True,
             )
@@ -219,7 +219,7 @@ class _Verifying:
         return False
 
     def _take(self, said: Mapping[str, Any]) -> None:
-        """Take in what a process says."""
+        """Handle a message from a process."""
         match said:
             case {"refused": reason}:
                 raise UnreadableArchive(self._path, reason)
@@ -240,10 +240,10 @@ class _Verifying:
 
 
 class _Progress:
-    """Tells of progress, with the time left.
+    """Reports progress with an estimate of the time left.
 
     Args:
-        told: called with each.
+        told: called with each report.
     """
 
     def __init__(self, told: Callable[[VerificationProgress], object] | None) -> None:
@@ -257,7 +257,7 @@ class _Progress:
         self._told(VerificationProgress(phase=phase, done=0, total=1))
 
     def count(self, done: int, total: int) -> None:
-        """Say how much of it is done."""
+        """Report the amount of work done in this phase."""
         passed = time.monotonic() - self._began
         left = passed * (total - done) / done if done > 0 else None
         self._told(
@@ -280,16 +280,16 @@ def _sample(sample: int | None) -> int | None:
         return None
     if isinstance(sample, bool) or operator.index(sample) < 1:
         raise InvalidArgument(
-            f"sample is how many frames of each video are drawn, 1 or more, got "
-            f"{sample!r}. Leave it out to draw all of them."
+            "sample must be the number of frames to check in each video, 1 or more, "
+            f"got {sample!r}. Leave it out to check all of them."
         )
     return operator.index(sample)
 
 
 def _report_writer(page: Path) -> Callable[..., object]:
     if not page.parent.is_dir():
-        raise DirectoryNotWritable(page.parent, "there is no such directory")
-    # Only here: the report's templates are an extra.
+        raise DirectoryNotWritable(page.parent, "no such directory")
+    # Imported here, because reports need an extra.
     module = importlib.import_module(".verification_report", __package__)
     writer: Callable[..., object] = module.write_verification_report
     return writer
@@ -305,12 +305,11 @@ def _versions() -> Iterator[tuple[str, str]]:
 def _working_folder() -> Iterator[Path]:
     """Yield a new folder, and remove it at the end.
 
-    What verifications of the same user have left that were killed is removed first.
+    First, the folders of the same user's killed verifications are removed.
     """
     parent = Path(tempfile.gettempdir())
     for folder in parent.glob(f"{_PREFIX}*"):
-        # One that goes away meanwhile, or that cannot be looked at, is no reason to
-        # stop.
+        # Ignore folders that disappear meanwhile or cannot be read.
         with contextlib.suppress(OSError):
             if _is_abandoned(folder):
                 shutil.rmtree(folder, ignore_errors=True)
@@ -319,7 +318,7 @@ def _working_folder() -> Iterator[Path]:
     ) as name:
         folder = Path(name)
         lock = None
-        # There are file systems without locks.
+        # Some file systems have no locks.
         with contextlib.suppress(OSError):
             lock = Lock(folder / _LOCK, "", mode=0o600)
         try:
@@ -333,6 +332,6 @@ def _is_abandoned(folder: Path) -> bool:
     facts = folder.lstat()
     if not stat.S_ISDIR(facts.st_mode) or facts.st_uid != os.getuid():
         return False
-    # Where there is none, nothing says that its process has ended.
+    # Without a lock file (OSError), it is unknown whether the process has ended.
     age = time.time() - (folder / _LOCK).lstat().st_mtime
     return age > _A_MOMENT_S and not is_locked(folder / _LOCK)

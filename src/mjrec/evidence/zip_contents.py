@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a zip file says it holds, looked at before anything of it is unpacked.
+"""Checks of a zip file's stated content before anything is unpacked.
 
-Only plain archives are taken: files and folders below one folder, one behind the other
-from the first byte to the table of contents, which ends the file. Whatever is more
-(a comment, bytes before, between or behind, two entries over the same bytes) some
-programs see and others do not, so that two readers would check two different things.
+Only plain archives are accepted: files and folders below one folder, one after another
+from the first byte to the table of contents, which ends the file. Some programs see
+anything more (a comment, bytes before, between or after entries, two entries over the
+same bytes) and others do not, so that two readers would check different things.
 """
 
 from __future__ import annotations
@@ -23,37 +23,37 @@ from .portable_names import check_distinct, portable_parts
 
 _LONGEST_TABLE = 1 << 26
 
-# `end of central directory`, its form for large files, and what says where that is.
+# `end of central directory`, its zip64 form, and the locator of that form.
 _END = struct.Struct("<4s4H2LH")
 _END_64 = struct.Struct("<4sQ2H2L4Q")
 _LOCATOR_64 = struct.Struct("<4sLQL")
 _LOCAL = struct.Struct("<4s5H3L2H")
 _FULL_16, _FULL_32 = 0xFFFF, 0xFFFF_FFFF
 
-# With bit 3 of the flags: what follows the data, in its four forms.
+# If bit 3 of the flags is set, a descriptor of one of four sizes follows the data.
 _DESCRIPTOR = 0x0008
 _DESCRIPTOR_SIZES = (12, 16, 20, 24)
 # Encrypted, patched, strongly encrypted, with a masked table.
 _UNREADABLE = 0x0001 | 0x0020 | 0x0040 | 0x2000
 
-# Of what may follow a name: sizes beyond 4 GiB, times and owners. Other fields give an
-# entry another name, which some programs read and others do not.
+# The extra fields that are accepted: sizes beyond 4 GiB, times and owners. Others can
+# give an entry a second name, which some programs read and others do not.
 _KNOWN_EXTRAS = (0x0001, 0x000A, 0x5455, 0x5855, 0x7855, 0x7875)
 
-# Text packs tenfold, deflate at most a thousandfold.
+# Text compresses about tenfold, deflate reaches a thousandfold at most.
 _ALWAYS_FINE = 1 << 26
 _MOST_EXPANSION = 100
 
 
 @dataclass(frozen=True)
 class ZipContents:
-    """What is to be unpacked.
+    """The checked content of a zip file.
 
     Attributes:
-        top: the one folder that everything is in.
-        files: in the order in which they lie in the archive.
-        folders: the names of folders that have entries of their own.
-        size: of all files together, in bytes, as the archive states it.
+        top: the one folder that contains everything.
+        files: the files, in the order of their positions in the archive.
+        folders: the names of the folders that have their own entries.
+        size: stated total size of all files, in bytes.
     """
 
     top: str
@@ -63,41 +63,42 @@ class ZipContents:
 
 
 def check_table(path: Path) -> None:
-    """Check the end of a zip file, by which its table of contents is found.
+    """Check the end of a zip file, which locates its table of contents.
 
-    To be called before anything reads the table: its length is bounded here.
+    Call this before anything reads the table, because it limits the table's length.
 
     Raises:
-        OSError: it cannot be read.
-        ValueError: it is no zip file, or no plain one.
+        OSError: the file cannot be read.
+        ValueError: the file is not a zip file, or not a plain one.
     """
     with open_regular(path) as file:
         size = file.seek(0, 2)
         table_size, table_offset, entries, end = _table_of(file, size)
     if entries > MOST_ENTRIES or table_size > _LONGEST_TABLE:
         raise ValueError(
-            f"it says that it holds {entries} files, and {MOST_ENTRIES} would be many"
+            f"it claims to contain {entries} files, more than the limit of "
+            f"{MOST_ENTRIES}"
         )
     if table_offset + table_size != end:
         raise ValueError(
-            "it holds something before its first file, or behind its table of contents"
+            "it has extra bytes before its first file or after its table of contents"
         )
 
 
 def zip_contents(archive: zipfile.ZipFile) -> ZipContents:
-    """Return what is in an archive, checked.
+    """Check the content of an archive and return it.
 
     Raises:
-        ValueError: it is no plain archive, or a bomb.
-        OSError: it cannot be read.
+        ValueError: the archive is not a plain one, or is a zip bomb.
+        OSError: the archive cannot be read.
     """
     infos = check_entries(archive)
     files = tuple(info for info in infos if not info.is_dir())
     tops = {portable_parts(info.filename.rstrip("/"))[0] for info in infos}
     if len(tops) != 1 or any("/" not in info.filename for info in files):
         raise ValueError(
-            "what is in it is not in one folder: a packed run has a single folder at "
-            f"the top, and this has {len(tops)}"
+            "its content is not in one folder: a packed run has a single folder at the "
+            f"top, but this has {len(tops)}"
         )
     return ZipContents(
         top=tops.pop(),
@@ -108,17 +109,17 @@ def zip_contents(archive: zipfile.ZipFile) -> ZipContents:
 
 
 def check_entries(archive: zipfile.ZipFile) -> Sequence[zipfile.ZipInfo]:
-    """Return the entries of an archive, in which all programs see the same.
+    """Return the entries of an archive after checking that all programs agree on them.
 
     Raises:
-        ValueError: it is no plain archive.
-        OSError: it cannot be read.
+        ValueError: the archive is not a plain one.
+        OSError: the archive cannot be read.
     """
     infos = archive.infolist()
     for info in infos:
         _check_entry(info)
     _check_places(archive, infos)
-    # On some systems two of them may be one; folders may be said twice.
+    # Two names may be one file on some systems; a folder may be listed twice.
     check_distinct(info.filename for info in infos if not info.is_dir())
     return infos
 
@@ -126,17 +127,17 @@ def check_entries(archive: zipfile.ZipFile) -> Sequence[zipfile.ZipInfo]:
 def _table_of(file: BinaryIO, size: int) -> tuple[int, int, int, int]:
     """Return the table's size and offset, its entries, and where it must end."""
     if size < _END.size:
-        raise ValueError("it is no zip file")
+        raise ValueError("it is not a zip file")
     file.seek(size - _END.size)
     mark, disk, first_disk, _, entries, table_size, offset, comment = _END.unpack(
         file.read(_END.size)
     )
     if mark != b"PK\x05\x06":
         raise ValueError(
-            "it is no zip file, or has a comment or something else at its end"
+            "it is not a zip file, or has a comment or extra bytes at its end"
         )
     if comment or disk or first_disk:
-        raise ValueError("it has a comment, or is a part of several")
+        raise ValueError("it has a comment, or is one part of a split archive")
     end = size - _END.size
     if _FULL_16 not in (entries,) and _FULL_32 not in (table_size, offset):
         return table_size, offset, entries, end
@@ -169,13 +170,13 @@ def _check_entry(info: zipfile.ZipInfo) -> None:
     kind = stat.S_IFMT(info.external_attr >> 16)
     fitting = stat.S_IFDIR if info.is_dir() else stat.S_IFREG
     if kind not in (0, fitting):
-        raise ValueError(f"{name!r} is neither a file nor a folder, but a link or such")
+        raise ValueError(f"{name!r} is neither a file nor a folder (a link, perhaps)")
     if info.flag_bits & _UNREADABLE:
         raise ValueError(f"{name!r} is encrypted")
     if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-        raise ValueError(f"{name!r} is packed in a way that not everybody can unpack")
+        raise ValueError(f"{name!r} uses an unsupported compression method")
     if info.is_dir() and info.file_size:
-        raise ValueError(f"{name!r} is a folder, and has content")
+        raise ValueError(f"{name!r} is a folder, but has content")
     if info.compress_type == zipfile.ZIP_STORED and (
         info.compress_size != info.file_size
     ):
@@ -190,13 +191,13 @@ def _check_extra(name: str, extra: bytes) -> None:
         kind, size = struct.unpack("<2H", extra[:4].ljust(4, b"\0"))
         if kind not in _KNOWN_EXTRAS or len(extra) < 4 + size:
             raise ValueError(
-                f"{name!r} has a field {kind:#06x} that not all programs read"
+                f"{name!r} has an extra field {kind:#06x} that not all programs read"
             )
         extra = extra[4 + size :]
 
 
 def _check_places(archive: zipfile.ZipFile, infos: Sequence[zipfile.ZipInfo]) -> None:
-    """Check that the entries lie one behind the other, and nothing else there."""
+    """Check that the entries follow one another with nothing between them."""
     end, may_have_descriptor = 0, False
     for info in sorted(infos, key=lambda info: info.header_offset):
         _check_gap(info.header_offset - end, may_have_descriptor, info.filename)
@@ -208,24 +209,26 @@ def _check_places(archive: zipfile.ZipFile, infos: Sequence[zipfile.ZipInfo]) ->
 def _check_gap(gap: int, may_have_descriptor: bool, before: str) -> None:
     allowed = _DESCRIPTOR_SIZES if may_have_descriptor else (0,)
     if gap not in allowed:
-        what = "overlaps what is before it" if gap < 0 else "has hidden bytes before it"
+        what = "overlaps the entry before it" if gap < 0 else "follows hidden bytes"
         raise ValueError(f"{before!r} {what}")
 
 
 def _end_of(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> int:
-    """Return where an entry's data ends, by the header that stands before it."""
+    """Return the offset of the end of an entry's data, from the header before it."""
     assert archive.fp is not None
     archive.fp.seek(info.header_offset)
     header = archive.fp.read(_LOCAL.size)
     if len(header) < _LOCAL.size or header[:4] != b"PK\x03\x04":
-        raise ValueError(f"{info.filename!r} is not where it is said to be")
+        raise ValueError(f"{info.filename!r} is not at its stated place")
     fields = _LOCAL.unpack(header)
     name = archive.fp.read(fields[-2])
     encoding = "utf-8" if fields[2] & 0x0800 else "cp437"
     if fields[2:4] != (info.flag_bits, info.compress_type) or (
         name.decode(encoding, errors="replace") != info.orig_filename
     ):
-        raise ValueError(f"{info.filename!r} is called so in one of two places only")
+        raise ValueError(
+            f"{info.filename!r} has a header that contradicts the table of contents"
+        )
     name_size, extra_size = int(fields[-2]), int(fields[-1])
     _check_extra(info.filename, archive.fp.read(extra_size))
     begin = info.header_offset + _LOCAL.size + name_size + extra_size
@@ -236,7 +239,5 @@ def _checked_size(files: Sequence[zipfile.ZipInfo]) -> int:
     size = sum(info.file_size for info in files)
     packed = sum(info.compress_size for info in files)
     if size > max(_ALWAYS_FINE, _MOST_EXPANSION * packed):
-        raise ValueError(
-            f"its {packed} bytes would become {size}, which is made to fill a disk"
-        )
+        raise ValueError(f"its {packed} bytes would expand to {size}, as in a zip bomb")
     return size
