@@ -102,6 +102,13 @@ def test_an_evaluation_is_shown_as_one(tmp_path: Path) -> None:
     assert (listed["count"], motion["steps"]) == (2, 2)
 
 
+def test_a_view_that_never_served_can_be_closed(tmp_path: Path) -> None:
+    """Nothing waits for it, however often."""
+    with LiveView(tmp_path) as opened:
+        opened.close()
+    opened.close()
+
+
 def test_nothing_is_served_without_the_token(view: LiveView) -> None:
     """A page without the token, or of another name, is refused; nothing can be sent."""
     address = f"http://{urlsplit(view.url).netloc}"

@@ -83,23 +83,27 @@ class LiveView:
                 "any free port."
             ) from error
         self._server.daemon_threads = True
+        self._has_served = False
         at = f"http://{_ADDRESS}:{self._server.server_port}"
         self.url = f"{at}/?token={self._token}"
 
     def serve(self) -> None:
         """Answer requests until `close` is called or Ctrl-C is pressed."""
+        self._has_served = True
         self._server.serve_forever(poll_interval=0.1)
 
     def close(self) -> None:
         """Stop answering requests. Idempotent."""
-        self._server.shutdown()
+        if self._has_served:
+            # Otherwise it would wait forever for the end of `serve`.
+            self._server.shutdown()
         self._server.server_close()
 
     def __enter__(self) -> LiveView:
         return self
 
     def __exit__(self, *error: object) -> None:
-        self._server.server_close()
+        self.close()
 
     def _handler(self) -> type[BaseHTTPRequestHandler]:
         token, answers = self._token, self._answers
