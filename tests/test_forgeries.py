@@ -988,7 +988,7 @@ FORGERIES = (
     # Identity.
     Forgery("arguments hidden", hide_arguments, of=noiseless, quick=True),
     Forgery("another environment named", call_it_another_environment),
-    Forgery("another name", call_it_by_another_name, "is called", quick=True),
+    Forgery("another name", call_it_by_another_name, "its name is", quick=True),
     Forgery("called one's own environment", call_it_ones_own),
     Forgery("called gym's", pretend_to_be_gym),
     Forgery("another model's sources", swap_the_model, of=honest.mjcf),
