@@ -112,7 +112,7 @@ def test_a_live_video_that_is_gone_is_missed(
     gone = the(tmp_path / "runs", "*.mp4")
     gone.unlink()
     message = refusal(mjrec.PackError, tmp_path / "runs", place)
-    assert f"names {gone.name}, which is not" in message
+    assert f"names {gone.name}, which is missing" in message
 
 
 def test_statistics_that_are_gone_are_to_be_recovered(

@@ -53,7 +53,7 @@ def test_it_is_packed_and_verified_as_one(evaluation, tmp_path):
 
 def test_episodes_of_several_directories_are_not_chosen_from(evaluation, tmp_path):
     """Each directory counts its own; and each has names of its own."""
-    with pytest.raises(InvalidArgument, match="holds 4 monitor directories"):
+    with pytest.raises(InvalidArgument, match="contains 4 monitor directories"):
         mjrec.pack(evaluation, tmp_path / "e.zip", episodes=[0])
     folders = sorted(evaluation.glob("*/seed-000"))
     for number in range(2):

@@ -963,7 +963,7 @@ FORGERIES = (
     *(
         Forgery(what, both(refilm(f"h264_metadata={metadata}"), claim_ffmpeg), line)
         for what, metadata, line in (
-            ("false colours", "matrix_coefficients=0", "tags of colours"),
+            ("false colours", "matrix_coefficients=0", "colour tags"),
             ("a message", f"sei_user_data={'ab' * 16}+Success", "frames and messages"),
             ("videos turned in the stream", FLIP, "frame"),
         )

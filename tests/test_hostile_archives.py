@@ -171,7 +171,7 @@ HARMS: list[tuple[Make, str]] = [
         (partial(damage, change), reason)
         for change, reason in [
             (partial(stating, 5), "CRC"),
-            (partial(stating, 5000), "another size"),
+            (partial(stating, 5000), "the declared size"),
             (encrypted, "encrypted"),
             (one_bit, "CRC"),
             # What some programs see and others do not.
@@ -240,7 +240,7 @@ def test_archive_that_does_not_fit_on_the_disk_is_an_error(
     write(path, (GOOD, bytes(1000)))
     usage = type("Usage", (), {"free": 999})
     monkeypatch.setattr("shutil.disk_usage", lambda _: usage)
-    with pytest.raises(mjrec.Error, match=r"takes 1000 bytes, and 999 are free"):
+    with pytest.raises(mjrec.Error, match=r"takes 1000 bytes, but only 999 are free"):
         bring_in(path, tmp_path / "given")
     assert not (tmp_path / "given").exists()
 

@@ -1,24 +1,25 @@
 # SPDX-License-Identifier: Apache-2.0
 """Recordings without the names of the people and machines that made them.
 
-Of a staged monitor directory, whose files are copies or links:
+In a staged monitor directory, whose files are copies or links:
 
-- the texts in JSON (manifests, metadata, statistics, journals, text recordings), in
-  trajectories' facts and in Stable-Baselines3's CSV have placeholders: `<home>`,
+- strings in JSON (manifests, metadata, statistics, journals, text recordings), in
+  trajectories' facts and in Stable-Baselines3's CSV get placeholders: `<home>`,
   `<path>`, `<user>`, `<host>`;
-- of the provenance of a recording, the command line keeps only names of files, the
-  code neither its commit nor where it is, and variables no directories;
-- of the device that drew a video its number is left, and where UUIDs of GPUs stood is
-  `<gpu>`: each names a single card;
-- names of files, where a uid, a camera or a prefix has the identity in it, have `user`
-  or `host` instead, and what refers to them says the same;
-- sources of models have no comments, and their images no texts (`anonymous_models`);
-- a compiled model that has the identity in it, which only its author could have
-  loaded, is removed.
+- a recording's provenance keeps only the file names of its command line, loses the
+  code's commit and location, and has no directories in its variables;
+- the device that rendered a video keeps only its index, and UUIDs of GPUs become
+  `<gpu>`, because each identifies a single card;
+- file names that contain the identity in a uid, a camera or a prefix get `user` or
+  `host` instead, and references to them are changed to match;
+- sources of models lose their comments, and their images the metadata
+  (`anonymous_models`);
+- a compiled model that contains the identity is removed. Only its author could have
+  loaded it.
 
-What is matched how, `identity_matching` says. Times stay, and so do all numbers, the
-process id in a default uid among them. What else has the identity in it (a body of a
-model, say) stays, and `identity_traces` finds it.
+`identity_matching` defines the matching. Times and numbers stay, including the process
+id in a default uid. Any other trace of the identity stays too, for example in a body's
+name; `identity_traces` finds it.
 """
 
 from __future__ import annotations
@@ -47,31 +48,31 @@ logger = logging.getLogger(__name__)
 _JSON = re.compile(r".*\.json~*")
 _MODEL = f"{FILE_PREFIX}.model."
 
-# Where programs are is the same for everybody.
+# System directories are the same on every machine.
 _SHARED = r"(?!(?:usr|bin|sbin|lib|lib64|opt|etc|proc|sys|dev)(?:/|$))"
 _DIRECTORY = re.compile(rf"(?<![\w./])/{_SHARED}[^\s\"':,;<>=]+")
-# What is a path for sure: `dm_control/cheetah-run` is none.
+# Only what is certainly a path: `dm_control/cheetah-run` is not.
 _PATH_OF_FILE = re.compile(
     r"(?<![\w.-])(?:[/~]|\.\.?/)[^\s\"':,;<>=]*|[^\s\"':,;<>=]*/[^\s\"':,;<>=/]*\.\w+"
 )
-# Of a card, or of a part of one; `CUDA_VISIBLE_DEVICES` takes a beginning too.
+# UUIDs of GPUs and MIG slices. `CUDA_VISIBLE_DEVICES` also accepts prefixes of them.
 _GPU = re.compile(r"(?<![\w-])(?:GPU|MIG)-[0-9a-fA-F][0-9a-fA-F/-]*")
-# Search engines find a commit.
+# A commit can be found with a search engine.
 _CODE = {"remote": None, "root": "<path>", "commit": "<commit>"}
 
 
 def make_anonymous(recordings: Path, *, identity: Identity) -> None:
-    """Take an identity out of a monitor directory that is made of copies or links.
+    """Remove an identity from a monitor directory that is made of copies or links.
 
     Nothing is written in place: a file that is a hard link to an original is replaced
-    by another one. After an error the directory is of no use.
+    by a new file. After an error the directory is unusable.
 
     Args:
         recordings: the directory.
-        identity: what must not be named.
+        identity: the identity to remove.
 
     Raises:
-        UnreadableFile: a file is damaged, so that nothing says what is in it.
+        UnreadableFile: a file is damaged, so its contents are unknown.
         InvalidArgument: two files would have the same name.
         FileNotWritten: the disk is full.
     """
@@ -82,8 +83,8 @@ def make_anonymous(recordings: Path, *, identity: Identity) -> None:
     name, count = Counter(names.values()).most_common(1)[0]
     if count > 1:
         raise InvalidArgument(
-            f"Without the names of persons and machines in them, two files would be "
-            f"called {name!r}. Record with other uids, or name the cameras otherwise."
+            f"Without the names of people and machines, two files would both be "
+            f"named {name!r}. Record with different uids or camera names."
         )
     for path, new in names.items():
         _make_file_anonymous(path, texts, matcher)
@@ -92,11 +93,11 @@ def make_anonymous(recordings: Path, *, identity: Identity) -> None:
 
 
 class _Texts:
-    """Replaces texts, and the names of files in them as those files are renamed.
+    """Anonymizes strings, including the names of renamed files in them.
 
     Args:
-        matcher: finds what is to be replaced.
-        names: of all files.
+        matcher: finds the identity.
+        names: the names of all files.
     """
 
     def __init__(self, matcher: IdentityMatcher, names: list[str]) -> None:
@@ -111,14 +112,14 @@ class _Texts:
         return self._matcher.replaced_in_name(self._with_new_infixes(name))
 
     def text(self, text: str) -> str:
-        """Return a text without the identity."""
+        """Return a string without the identity."""
         is_of_monitor = text.startswith(f"{FILE_PREFIX}.")
         if is_second_name(text) or (is_of_monitor and not re.search(r"[/\s]", text)):
             return self.name(text)
         return self._matcher.replaced(self._with_new_infixes(text))
 
     def value(self, value: Any) -> Any:
-        """Return a value of JSON without the identity."""
+        """Return a JSON value without the identity."""
         match value:
             case str():
                 return self.text(value)
@@ -133,7 +134,7 @@ class _Texts:
                 return value
 
     def json(self, data: bytes) -> bytes:
-        """Return JSON without the identity; the same bytes where it has none."""
+        """Return JSON without the identity; the same bytes if nothing changes."""
         value = loads(data)
         new = self.value(value)
         return data if new == value else dumps(new).encode()
@@ -156,7 +157,7 @@ def _make_file_anonymous(path: Path, texts: _Texts, matcher: IdentityMatcher) ->
     elif name.startswith(_MODEL) and name.endswith(".zip"):
         _rewrite(path, lambda data: anonymous_sources(data, matcher))
     elif name.startswith(_MODEL) and matcher.found_in_bytes(compiled_model(path)):
-        logger.info("%s is left out: it names who compiled it.", name)
+        logger.info("Leaving out %s: it names who compiled it.", name)
         path.unlink()
 
 
@@ -183,8 +184,8 @@ def _json_lines(data: bytes, texts: _Texts) -> Iterator[bytes]:
         try:
             yield texts.json(text) + line[len(text) :]
         except ValueError:
-            # A torn one, which readers leave out, says nothing of the run.
-            logger.info("A line of a journal that is no JSON is left out.")
+            # A torn line: readers skip it too.
+            logger.info("Leaving out a journal line that is not valid JSON.")
 
 
 def _csv_lines(data: bytes, texts: _Texts) -> Iterator[bytes]:
@@ -196,7 +197,7 @@ def _csv_lines(data: bytes, texts: _Texts) -> Iterator[bytes]:
 
 
 def _general(key: str, value: Any) -> Any:
-    """Return what may be said under a key of JSON in any recording."""
+    """Return the part of a JSON key's value that identifies nobody."""
     if key == "provenance" and isinstance(value, dict):
         return {k: _general_provenance(k, item) for k, item in value.items()}
     if key == "gl_device" and isinstance(value, dict):
@@ -235,7 +236,7 @@ def _without_directories(argument: Any) -> Any:
 
 
 def _renamed_infixes(matcher: IdentityMatcher, names: list[str]) -> Mapping[str, str]:
-    """Return the new infixes of monitors that must not have their old ones."""
+    """Return the new infixes of monitors whose old ones contain the identity."""
     old = sorted({infix for name in names if (infix := infix_of(name)) is not None})
     taken = {infix for infix in old if matcher.replaced_in_name(infix) == infix}
     new: dict[str, str] = {}

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Models without what their authors say of themselves beside them.
+"""Models without the remarks of their authors.
 
-Comments in MJCF and texts in PNG images are removed; no element or attribute changes,
-so that the model compiles to the same. What it calls its bodies and files stays: a
-model without that is another model.
+Comments in MJCF and metadata in PNG images are removed. No element or attribute
+changes, so the model compiles to the same result. Names of bodies and files stay:
+changing them would change the model.
 """
 
 from __future__ import annotations
@@ -21,36 +21,36 @@ from xml.etree import ElementTree
 from ..formats.json_fields import unreadable
 from .identity_matching import IdentityMatcher
 
-# What begins like a comment inside CDATA is none.
+# Inside CDATA, `<!--` does not begin a comment.
 _BESIDE_THE_MODEL = re.compile(
     r"(?P<cdata><!\[CDATA\[.*?\]\]>)|<!--(?P<comment>.*?)-->", re.DOTALL
 )
-# The licence of a model asks that this is passed on.
+# Licences require that these comments be kept.
 _LICENCE = re.compile(r"copyright|licen[cs]e|\(c\)|©", re.IGNORECASE)
 _MAIL = re.compile(r"@[\w-]+\.\w")
 
 _PNG = b"\x89PNG\r\n\x1a\n"
-# What a viewer shows beside an image: texts, a time, what a camera noted.
+# Text, modification time and EXIF.
 _PNG_METADATA = (b"tEXt", b"zTXt", b"iTXt", b"tIME", b"eXIf")
 
 _DAMAGE = (zipfile.BadZipFile, zlib.error, struct.error, EOFError, RuntimeError)
 
 
 def anonymous_sources(content: bytes, matcher: IdentityMatcher) -> bytes:
-    """Return the zip of what a model was made from, without its authors' remarks.
+    """Return the zip file of a model's sources, without its authors' remarks.
 
-    Comments that speak of a licence stay, unless the identity or an address of mail is
-    in them.
+    Comments that mention a licence stay, unless they contain the identity or an email
+    address.
 
     Args:
-        content: of the zip.
-        matcher: of the identity.
+        content: the bytes of the zip file.
+        matcher: finds the identity.
 
     Returns:
-        The same bytes where nothing is to be removed.
+        The same bytes if there is nothing to remove.
 
     Raises:
-        ValueError: it is damaged.
+        ValueError: the zip file or a file in it is damaged.
     """
     image = io.BytesIO()
     is_same = True
@@ -70,10 +70,10 @@ def anonymous_sources(content: bytes, matcher: IdentityMatcher) -> bytes:
 
 
 def compiled_model(path: Path) -> bytes:
-    """Return what is in a packed compiled model.
+    """Return the uncompressed bytes of a gzipped compiled model.
 
     Raises:
-        UnreadableFile: it is damaged.
+        UnreadableFile: the file is damaged.
     """
     with unreadable(path):
         try:
@@ -85,7 +85,7 @@ def compiled_model(path: Path) -> bytes:
 def _file(content: bytes, matcher: IdentityMatcher) -> bytes:
     if content.startswith(_PNG):
         return b"".join(_png_parts(content))
-    # MuJoCo takes any name for MJCF.
+    # MJCF files may have any name.
     if content.lstrip(b"\xef\xbb\xbf \t\r\n").startswith(b"<"):
         return _xml(content, matcher)
     return content
@@ -104,16 +104,16 @@ def _xml(content: bytes, matcher: IdentityMatcher) -> bytes:
     text = content.decode("utf-8")
     new = _BESIDE_THE_MODEL.sub(kept, text)
     if _elements(new) != _elements(text):
-        raise ValueError("the comments in its XML cannot be told from the model")
+        raise ValueError("removing the comments of its XML would change the model")
     return new.encode()
 
 
 def _elements(text: str) -> str:
-    """Return the XML as a form in which only what is no comment counts."""
+    """Return the canonical form of XML, which leaves out comments."""
     try:
         return ElementTree.canonicalize(text.removeprefix("\ufeff"), strip_text=True)
     except ElementTree.ParseError as error:
-        raise ValueError(f"it is no XML: {error}") from error
+        raise ValueError(f"it is not valid XML: {error}") from error
 
 
 def _png_parts(content: bytes) -> Iterator[bytes]:

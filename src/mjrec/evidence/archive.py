@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Opening what is to be verified: a packed run, its unpacked folder, or recordings.
+"""Opening the input of a verification: a packed run, its folder, or recordings.
 
-What is given may be anybody's; this is done in a sandbox. Everything is brought into
-one folder of the sandbox's own, as a packed run has it, and only regular files are.
+The input is untrusted, so this runs in a sandbox. Everything is brought into a folder
+inside the sandbox, laid out like a packed run; only regular files are accepted.
 """
 
 from __future__ import annotations
@@ -32,11 +32,11 @@ from .layout import PAYLOAD, RECORDINGS
 from .portable_names import check_distinct, portable_parts
 from .zip_contents import ZipContents, check_table, zip_contents
 
-# What makes a folder a bag.
+# A folder that contains this file is a bag.
 BAG_DECLARATION = "bagit.txt"
 
 _CHUNK = 1 << 20
-# What else is on a disk that is nearly full must go on.
+# Bytes to leave free on the disk for other programs.
 _ROOM = 1 << 26
 
 # zipfile raises RuntimeError for an encrypted file, NotImplementedError for methods and
@@ -48,7 +48,7 @@ _NOT_READ = (
 
 
 class Kind(enum.StrEnum):
-    """What was given to be verified."""
+    """The kind of input to verify."""
 
     ZIP = "packed run"
     BAG = "unpacked run"
@@ -56,19 +56,19 @@ class Kind(enum.StrEnum):
 
 
 def bring_in(path: Path, into: Path) -> Mapping[str, Any]:
-    """Bring what is to be verified into a folder, as a packed run has it.
+    """Bring the input of a verification into a folder, laid out like a packed run.
 
     Args:
-        path: a zip file; a folder with a bag in it, or one folder with a bag in it; or
-            a monitor directory, or a folder of some.
-        into: a folder that is not there yet.
+        path: a zip file; a bag, or a folder whose only entry is a bag; or a monitor
+            directory, or a folder of monitor directories.
+        into: a folder that does not exist yet.
 
     Returns:
-        `kind`; of a zip file its `sha256` and `bytes`.
+        `kind`; for a zip file also its `sha256` and `bytes`.
 
     Raises:
-        UnreadableArchive: it is none of these, or damaged, or made to do harm.
-        FileNotWritten: there is too little room.
+        UnreadableArchive: the input is none of these, is damaged or is malicious.
+        FileNotWritten: there is too little disk space.
     """
     try:
         if path.is_dir():
@@ -89,8 +89,8 @@ def digest_of(path: Path, algorithm: str) -> str:
     """Return the digest of a regular file, in hexadecimal digits.
 
     Raises:
-        OSError: it cannot be read.
-        ValueError: it is no regular file.
+        OSError: the file cannot be read.
+        ValueError: the path is not a regular file.
     """
     digest = hashlib.new(algorithm)
     with open_regular(path) as file:
@@ -114,14 +114,14 @@ def _of_folder(path: Path, into: Path) -> Mapping[str, Any]:
     recordings: dict[str, Path] = {}
     for place in recording_directories(path):
         for file in iter_monitor_files(place):
-            # Models are called by their content: another monitor may have the same.
+            # Models are named by their content, so two monitors may share one.
             if recordings.setdefault(file.name, file) != file and infix_of(file.name):
                 raise UnreadableArchive(path, f"{file.name} is in two of its folders")
     if not recordings:
         raise UnreadableArchive(
             path,
             "it is neither a packed run (a zip file, or a folder with bagit.txt) nor a "
-            "monitor directory: nothing is recorded in it",
+            "monitor directory: it contains no recordings",
         )
     _copy_files(recordings, into / PAYLOAD / RECORDINGS, given=path)
     _unbundle(into / PAYLOAD / RECORDINGS)
@@ -131,11 +131,11 @@ def _of_folder(path: Path, into: Path) -> Mapping[str, Any]:
 def _bag_in(path: Path) -> Path | None:
     if (path / BAG_DECLARATION).exists():
         return path
-    # As `unzip` leaves it.
+    # The result of `unzip`.
     inside = [entry for entry in path.iterdir() if not entry.name.startswith(".")]
     if len(inside) == 1 and (inside[0] / BAG_DECLARATION).exists():
         if inside[0].is_symlink():
-            raise UnreadableArchive(path, "the folder that it holds is a link")
+            raise UnreadableArchive(path, "the only folder in it is a link")
         return inside[0]
     return None
 
@@ -152,7 +152,7 @@ def _files_below(folder: Path) -> Iterator[Path]:
 
 
 def _unbundle(recordings: Path) -> None:
-    """Give each trajectory a file of its own, as a packed run has it."""
+    """Give each trajectory its own file, as in a packed run."""
     for bundle in [p for p in iter_monitor_files(recordings) if is_bundle(p.name)]:
         for path in trajectories_in(bundle):
             with open_hdf5(path) as reader:
@@ -176,16 +176,16 @@ def _check_recordings(bag: Path, given: Path) -> None:
     if not (bag / PAYLOAD / RECORDINGS).is_dir():
         raise UnreadableArchive(
             given,
-            f"it has no folder {PAYLOAD}/{RECORDINGS}: it is not what `mjrec pack` "
-            "makes",
+            f"it has no folder {PAYLOAD}/{RECORDINGS}, so it does not come from "
+            "`mjrec pack`",
         )
 
 
 def _unpack(path: Path, into: Path) -> None:
-    """Unpack a zip file's one folder.
+    """Unpack a zip file's only folder.
 
-    Everything is streamed to the disk, and counted while it is: an archive that holds
-    more than it says is refused at the first byte too many.
+    Files are streamed to the disk and counted on the way: an archive that contains more
+    than it declares is refused at the first extra byte.
     """
     check_table(path)
     with open_regular(path) as file, zipfile.ZipFile(file) as archive:
@@ -199,7 +199,7 @@ def _unpack(path: Path, into: Path) -> None:
 
 
 def _check_folders(folder: Path) -> None:
-    """Check that no folder is empty: no list of a bag would name it."""
+    """Check that no folder is empty: the manifests of a bag list only files."""
     for path in folder.rglob("*"):
         if path.is_dir() and not any(path.iterdir()):
             raise ValueError(f"{path.name[:200]!r} is an empty folder")
@@ -210,8 +210,8 @@ def _check_room(size: int, into: Path, path: Path) -> None:
     if size + _ROOM > free:
         raise FileNotWritten(
             into.parent,
-            f"unpacking {path} takes {size} bytes, and {free} are free",
-            then="choose another disk with the variable TMPDIR",
+            f"unpacking {path} takes {size} bytes, but only {free} are free",
+            then="or set TMPDIR to a directory on another disk",
         )
 
 
@@ -243,4 +243,4 @@ def _copy(source: IO[bytes], output: IO[bytes], target: Path, size: int) -> None
         except OSError as error:
             raise FileNotWritten(target, error.strerror) from error
     if left:
-        raise ValueError(f"{target.name!r} has another size than it is said to have")
+        raise ValueError(f"{target.name!r} does not have the declared size")

@@ -1,16 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A folder as a BagIt bag (RFC 8493), made and checked; and as a zip file.
+"""BagIt bags (RFC 8493): writing and checking them, and packing a folder as a zip file.
 
-The files of the bag are written here, because `bagit.make_bag` writes version 0.97, in
-the directory's own order, and changes the working directory of the whole process. The
-`bagit` package, which knows nothing of this one, then validates the bag.
+The bag's files are written here because `bagit.make_bag` writes version 0.97, in
+directory order, and changes the working directory of the whole process. The independent
+`bagit` package then validates the bag.
 
-Of the zip file, times, modes, owners, order and machine are left out, so that it has
-always the same bytes. What is compressed already is stored; the rest is deflated, which
-the same zlib does alike.
+The zip file is reproducible byte for byte: its order, times, modes and system are
+fixed, and owners are left out. Files that are compressed already are stored; the others
+are deflated, with the same result for the same version of zlib.
 
-A bag is read strictly: what is not said in its manifests is not there, and what is
-there is said.
+Bags are checked strictly: every file must be listed in a manifest, and every listed
+file must exist.
 """
 
 from __future__ import annotations
@@ -33,16 +33,16 @@ from .findings import Finding, Outcome, Topic
 from .layout import FORMAT_KEY, FORMAT_VERSION, PAYLOAD
 from .portable_names import check_distinct, portable_parts
 
-# The endings of files in which nothing is left to be compressed.
+# Extensions of files that are compressed already.
 STORED = (".mp4", ".avi", ".h5", ".gz", ".zip")
-# What a full disk calls for.
+# Advice for a full disk.
 TRY_AGAIN = "then pack again"
 
 _ALGORITHM = "sha512"
 _LEVEL = 6
 _UNIX = 3
 _MODE = (stat.S_IFREG | 0o644) << 16
-# The first moment that a zip file can name.
+# The earliest time that a zip file can store.
 _TIME = (1980, 1, 1, 0, 0, 0)
 _BLOCK = 1 << 20
 
@@ -62,10 +62,10 @@ _OnProgress = Callable[[int, int], object]
 
 
 def check_bagit() -> None:
-    """Check that the `bagit` package is there.
+    """Check that the `bagit` package is installed.
 
     Raises:
-        MissingDependency: it is not.
+        MissingDependency: `bagit` is not installed.
     """
     if importlib.util.find_spec("bagit") is None:
         raise MissingDependency(
@@ -74,17 +74,17 @@ def check_bagit() -> None:
 
 
 def bag_tags(folder: Path, *, date: str, title: str) -> dict[str, str]:
-    """Return the texts that describe a bag, by the names of their files.
+    """Return the contents of a bag's tag files, by file name.
 
     Args:
-        folder: the bag's, whose payload is in `data` already.
-        date: of the run.
-        title: likewise.
+        folder: the bag's folder, with its payload already in `data`.
+        date: the run's date.
+        title: the run's title.
     """
     payload = _files(folder / PAYLOAD)
     size = sum(path.stat().st_size for path in payload)
-    # Since 1.0 a percent sign in a name is written as %25, which the `bagit` package
-    # and `sha512sum --check` do not know. Names of cameras may have one.
+    # Version 1.0 writes a percent sign in a name as %25, which the `bagit` package and
+    # `sha512sum --check` do not decode. Names of cameras may contain one.
     version = "0.97" if any("%" in path.name for path in payload) else "1.0"
     declared = {"BagIt-Version": version, "Tag-File-Character-Encoding": "UTF-8"}
     info = {
@@ -98,15 +98,15 @@ def bag_tags(folder: Path, *, date: str, title: str) -> dict[str, str]:
 
 
 def make_bag(folder: Path, *, date: str, title: str) -> None:
-    """Make a bag of a folder, whose payload is in `data` already.
+    """Turn a folder into a bag.
 
     Args:
-        folder: the bag's.
-        date: of the run.
-        title: likewise.
+        folder: the bag's folder, with its payload already in `data`.
+        date: the run's date.
+        title: the run's title.
 
     Raises:
-        PackError: the `bagit` package does not take the bag for a valid one.
+        PackError: the `bagit` package finds the bag invalid.
     """
     for name, text in bag_tags(folder, date=date, title=title).items():
         (folder / name).write_text(text, encoding="utf-8", newline="\n")
@@ -118,15 +118,15 @@ def make_bag(folder: Path, *, date: str, title: str) -> None:
         bagit.Bag(str(folder)).validate()
     except bagit.BagError as error:
         raise PackError(
-            f"The bag that was made is not valid: {error}. A file has been changed "
-            "while it was packed, or this is a mistake in mjrec."
+            f"The new bag is invalid: {error}. A file changed while it was being "
+            "packed, or this is a bug in mjrec."
         ) from error
 
 
 def write_zip(folder: Path, path: Path) -> None:
-    """Write all files of a folder, which becomes the archive's only top folder.
+    """Write a folder as a zip file, with that folder as its only top-level entry.
 
-    The file is on the disk when this returns.
+    The file has been synced to disk when this returns.
 
     Raises:
         FileNotWritten: the disk is full.
@@ -144,11 +144,11 @@ def write_zip(folder: Path, path: Path) -> None:
 
 
 def check_bag(bag: Path, on_progress: _OnProgress) -> Iterator[Finding]:
-    """Yield what is found about a bag as a whole.
+    """Yield the findings about a bag as a whole.
 
     Args:
-        bag: its folder.
-        on_progress: told how many bytes are checked, and of how many.
+        bag: the bag's folder.
+        on_progress: called with the number of bytes checked so far and in total.
     """
     objections = list(_objections(bag, on_progress))
     for name, reason in objections[:_MOST_FAILURES]:
@@ -160,25 +160,25 @@ def check_bag(bag: Path, on_progress: _OnProgress) -> Iterator[Finding]:
             topic=Topic.FILES,
             item="",
             outcome=Outcome.DIFFERENT,
-            reason="further files that are missing, changed or too many",
+            reason="more files that are missing, changed or not listed",
             count=len(objections) - _MOST_FAILURES,
         )
 
 
 def unchanged(bag: Path) -> Finding:
-    """Return that a bag to which nothing is to be objected is what it says."""
+    """Return the finding for a bag without objections."""
     return Finding(
         topic=Topic.FILES,
         item="",
         outcome=Outcome.NOTED,
-        reason="they are those that the bag lists, and have the SHA-512 that it says",
+        reason="the files and their SHA-512 are those that the bag lists",
         count=sum(path.is_file() for path in bag.rglob("*")),
     )
 
 
 def _files(folder: Path) -> list[Path]:
     found = (path for path in folder.rglob("*") if path.is_file())
-    # By the names as they are in the archive, whatever the system's own order.
+    # Sorted by their names in the archive: the system's order varies.
     return sorted(found, key=lambda path: path.relative_to(folder).as_posix())
 
 
@@ -202,7 +202,7 @@ def _add(archive: zipfile.ZipFile, source: Path, name: str) -> None:
     info.file_size = source.stat().st_size
     stored = source.name.endswith(STORED)
     info.compress_type = zipfile.ZIP_STORED if stored else zipfile.ZIP_DEFLATED
-    # Public only from Python 3.13 on, as `compress_level`; `open` reads it in all.
+    # Public only since Python 3.13, as `compress_level`; `open` reads it in all.
     info._compresslevel = None if stored else _LEVEL  # type: ignore[attr-defined]  # see above
     with source.open("rb") as file, archive.open(info, "w") as entry:
         shutil.copyfileobj(file, entry, _BLOCK)
@@ -211,9 +211,9 @@ def _add(archive: zipfile.ZipFile, source: Path, name: str) -> None:
 def _objections(bag: Path, on_progress: _OnProgress) -> Iterator[tuple[str, str]]:
     try:
         if not _DECLARATION.fullmatch(_text_of(bag / BAG_DECLARATION)):
-            yield BAG_DECLARATION, "it is not that of a bag of BagIt 1.0 or 0.97"
+            yield BAG_DECLARATION, "it does not declare BagIt 1.0 or 0.97"
         yield from ((_INFO, reason) for reason in _objections_to_info(bag))
-        said = {
+        listed = {
             **_said_in(bag, _MANIFESTS[0], is_payload=True),
             **_said_in(bag, _MANIFESTS[1], is_payload=False),
         }
@@ -222,19 +222,19 @@ def _objections(bag: Path, on_progress: _OnProgress) -> Iterator[tuple[str, str]
         return
     paths = [path for path in bag.rglob("*") if not path.is_dir()]
     there = {path.relative_to(bag).as_posix(): path.stat().st_size for path in paths}
-    for name in sorted(said.keys() - there.keys()):
+    for name in sorted(listed.keys() - there.keys()):
         yield name, "it is missing"
     known = {BAG_DECLARATION, _INFO, *_MANIFESTS}
-    for name in sorted(said.keys() - known):
+    for name in sorted(listed.keys() - known):
         if not name.startswith(f"{PAYLOAD}/"):
-            yield name, "no packed run has such a file beside its data"
+            yield name, "packed runs have no such file outside data/"
     # No manifest can hold its own digest.
-    for name in sorted(there.keys() - said.keys() - {_MANIFESTS[1]}):
-        yield name, "nothing says that it belongs there"
+    for name in sorted(there.keys() - listed.keys() - {_MANIFESTS[1]}):
+        yield name, "no manifest lists it"
     total, done = sum(there.values()), 0
-    for name in sorted(said.keys() & there.keys()):
-        if digest_of(bag / name, "sha512") != said[name]:
-            yield name, "it was changed: its SHA-512 is another one"
+    for name in sorted(listed.keys() & there.keys()):
+        if digest_of(bag / name, "sha512") != listed[name]:
+            yield name, "it was changed: its SHA-512 differs from the listed one"
         done += there[name]
         on_progress(done, total)
 
@@ -247,24 +247,24 @@ def _objections_to_info(bag: Path) -> Iterator[str]:
     versions = [value for key, value in fields if key == FORMAT_KEY]
     if versions != [str(FORMAT_VERSION)]:
         yield (
-            f"it says {FORMAT_KEY} {', '.join(versions)[:80] or '(nothing)'}, and this "
-            f"mjrec knows version {FORMAT_VERSION}: it was packed by another one"
+            f"its {FORMAT_KEY} is {', '.join(versions)[:80] or '(missing)'}, but this "
+            f"version of mjrec reads {FORMAT_VERSION}"
         )
 
 
 def _said_in(bag: Path, manifest: str, *, is_payload: bool) -> dict[str, str]:
-    """Return the digests that a manifest says, by the names of the files."""
-    said: dict[str, str] = {}
+    """Return the digests that a manifest lists, by file name."""
+    listed: dict[str, str] = {}
     for number, line in enumerate(_text_of(bag / manifest).splitlines(), 1):
         match = _LINE.fullmatch(line)
         if match is None:
-            raise ValueError(f"{manifest}, line {number}: no SHA-512 and a name")
+            raise ValueError(f"{manifest}, line {number}: not a SHA-512 and a name")
         name = _ENCODED.sub(lambda found: chr(int(found[1], 16)), match["name"])
-        if (portable_parts(name)[0] == PAYLOAD) is not is_payload or name in said:
+        if (portable_parts(name)[0] == PAYLOAD) is not is_payload or name in listed:
             raise ValueError(f"{manifest}, line {number}: {name[:200]!r} is misplaced")
-        said[name] = match["digest"].lower()
-    check_distinct(said)
-    return said
+        listed[name] = match["digest"].lower()
+    check_distinct(listed)
+    return listed
 
 
 def _text_of(path: Path) -> str:

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What an archive claims of its versions and hardware, where the reader's are others.
+"""Claims of an archive: versions and hardware that differ from the reader's.
 
-Both runs were recorded by the same code: so each says of itself what it was made with,
-and where these differ is where a claim is.
+The same code recorded both runs, so each states its own versions and hardware. Each
+difference between the two is a claim.
 """
 
 from __future__ import annotations
@@ -29,16 +29,16 @@ from .layout import ENVIRONMENT, RECORDINGS
 
 _LONGEST_LINE: Final = 1 << 24
 _COMPILING: Final = ("mujoco", "machine")
-# What may be claimed as a version: no sentence.
+# A version may not be a sentence.
 VERSION: Final = re.compile(r"[\w.+-]{1,40}", re.ASCII)
-# A key of another name is no claim of a version: some excuses have other names.
+# Other keys are not claims of versions: some excuses have other names.
 _PACKAGES: Final = frozenset(("python", *PACKAGES, "bagit", "zlib"))
 _RECORDING: Final = "recording "
 _GL: Final = ("gl_vendor", "gl_renderer", "gl_version")
 
 
 def claimed_excuses(given: Path, made: Path) -> list[Excuse]:
-    """Return the excuses that two runs claim; below both lie the recordings."""
+    """Return the excuses that follow from two runs' folders (their `data/`)."""
     found: list[Excuse] = []
     recordings = given / RECORDINGS
     # All trajectories of a recording come from one machine.
@@ -55,19 +55,19 @@ def claimed_excuses(given: Path, made: Path) -> list[Excuse]:
         try:
             found += _claims(path, other, f"{_RECORDING}{infix}")
         except (Error, OSError, ValueError):
-            # Whatever cannot be read is found when it is compared.
+            # The comparison reports unreadable files.
             continue
     with contextlib.suppress(OSError, ValueError):
         found += _versions(
             read_object(given / ENVIRONMENT)["packed_with"], packed_with()
         )
-    # Several excuses reach one recording, which may have thousands of trajectories.
+    # Several excuses share a recording, which may have thousands of trajectories.
     models_of = functools.cache(functools.partial(_models, recordings))
     return [_with_models(excuse, models_of) for excuse in found]
 
 
 def _with_models(excuse: Excuse, models_of: Callable[[str], Iterable[str]]) -> Excuse:
-    """Return an excuse that reaches the compiled models of its recordings, too."""
+    """Return an excuse extended to the compiled models of its recordings."""
     if excuse.name not in _COMPILING:
         return excuse
     models: dict[str, None] = {}
@@ -97,16 +97,16 @@ def _claims(given: Path, made: Path, recording: str) -> Iterator[Excuse]:
         with open_trajectory(given) as a, open_trajectory(made) as b:
             yield from _machine(a.facts, b.facts, recording)
     elif name.endswith(".meta.json"):
-        said, here = read_object(given), read_object(made)
+        claimed, here = read_object(given), read_object(made)
         video = name.removesuffix(".meta.json")
         items = [f"{video}{end}" for end in (".mp4", ".meta.json", ".framehash")]
         yield from _versions(
-            said.get("rendered_with"), here.get("rendered_with"), *items
+            claimed.get("rendered_with"), here.get("rendered_with"), *items
         )
-        yield from _machine(said, here, *items)
-        yield from _claim("gl", _joined(said), _joined(here), *items)
-        if said.get("ffmpeg_sha256") != here.get("ffmpeg_sha256"):
-            yield excuse_of("ffmpeg", _encoder(said), _encoder(here), *items)
+        yield from _machine(claimed, here, *items)
+        yield from _claim("gl", _joined(claimed), _joined(here), *items)
+        if claimed.get("ffmpeg_sha256") != here.get("ffmpeg_sha256"):
+            yield excuse_of("ffmpeg", _encoder(claimed), _encoder(here), *items)
 
 
 def _versions(given: Any, made: Any, *items: str) -> Iterator[Excuse]:
@@ -124,7 +124,7 @@ def _machine(
     values = []
     for facts in (given, made):
         machine = _mapping(facts.get("machine"))
-        # Of the flags of a CPU the beginning tells them apart.
+        # The beginning is enough to distinguish the flags of CPUs.
         values.append(" ".join(str(v)[:16] for v in machine.values()).strip())
     yield from _claim("machine", *values, *items)
 

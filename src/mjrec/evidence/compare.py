@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Two packed runs, item by item: an archive's, and the same run recreated.
+"""Item-by-item comparison of a packed run with the same run recreated.
 
-Equal bytes need no second look; else one comparator for each kind of file says where
-the two differ, and an excuse may allow it. A file that only one of the two has is a
-difference. Memory does not grow with the number of episodes, time does in proportion.
+Files with equal bytes need no further check. Otherwise a comparator for each kind of
+file finds the differences, and an excuse may allow them. A file that only one run has
+is a difference. Memory is independent of the number of episodes; time is proportional.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ from .layout import PAYLOAD, RECORDINGS, SAMPLED
 from .notes import REWARDS_FILE, read_notes
 from .sums import Sums
 
-# What stands in the middle or at the end of a file's name, and what kind it is then.
+# Kinds of files, by the ends of their names.
 _KINDS: Final[Mapping[str, str]] = {
     ".mjb.gz": "model",
     ".zip": "sources",
@@ -65,11 +65,11 @@ _KINDS: Final[Mapping[str, str]] = {
     ".monitor.csv": "results",
     ".json": "text",
 }
-# What a run has that was made without drawing.
+# Kinds of files in a run that was recreated without rendering.
 _UNDRAWN: Final = ("journal", "statistics", "manifest", "trajectory")
-# In a manifest, what drawing changes.
+# Keys of a manifest that rendering changes.
 _DRAWN_KEYS: Final = frozenset(("videos", "pending", "broken"))
-# Before the metadata, which has the hash of what was decoded.
+# Compared first. Metadata comes after videos: it has the hash of the decoded frames.
 _ORDER: Final = ("sources", "model", "journal", "video")
 _TOPICS: Final = {
     "model": Topic.IDENTITY,
@@ -86,25 +86,26 @@ _TOPICS: Final = {
 _OF_MANIFEST: Final = (Topic.SELECTION, Topic.IDENTITY)
 _NOT_MADE: Final = "nothing recreated this file"
 _NO_DIFFERENCES: Final = (Aspect.CLAIM, Aspect.STATEMENT)
-# Excuses of what was not played.
+# Excuses for recordings that were not replayed.
 _UNPLAYED: Final = ("environment", "wrappers", "actions not kept")
 _Found: TypeAlias = Iterator[Same | Difference]
 
 
 class Comparison:
-    """The comparison of two packed runs; iterate over it, once.
+    """The comparison of two packed runs. Iterate over it once.
 
     Args:
-        given: the archive's: the folder that holds `data/`.
-        made: the run that was recreated, likewise; `maker.json` there says what could
-            not be.
-        level: how deep. Below PIXELS, `made` was not drawn.
-        sampled: some frames were drawn, and lie in `made`.
-        allow: excuses that the reader takes, "NAME=VALUE" each.
-        on_progress: called with the bytes that are compared, and all that there are.
+        given: the archive's folder, which contains `data/`.
+        made: the recreated run's folder, which contains `data/` and `maker.json`, the
+            list of items that could not be recreated.
+        level: the depth of the comparison. Below PIXELS, `made` was not rendered.
+        sampled: whether `made` contains a sample of rendered frames.
+        allow: excuses that the reader accepts, as "NAME=VALUE".
+        on_progress: called with the number of bytes compared so far and in total.
 
     Attributes:
-        excuses: after the last finding, those that were used or are refuted.
+        excuses: the excuses that were used or refuted, once the last finding has been
+            yielded.
     """
 
     def __init__(
@@ -129,7 +130,7 @@ class Comparison:
         self.excuses: tuple[Excuse, ...] = ()
 
     def __iter__(self) -> Iterator[Finding]:
-        """Yield what differs as it is found; then what is equal, in sums."""
+        """Yield differences as they are found, then the totals of equal items."""
         noted = [believed(note) for note in self._notes]
         claims = claimed_excuses(self._given, self._made)
         excuses = applicable(merged([*claims, *(excuse for excuse, _ in noted)]))
@@ -179,7 +180,7 @@ class Comparison:
             yield from self._not_compared()
 
     def _names(self, folder: Path) -> dict[str, int]:
-        """Return the files that are compared, and their sizes."""
+        """Return the sizes of the files to compare, by name."""
         found = {
             path.relative_to(folder).as_posix(): path.lstat().st_size
             for path in (folder / RECORDINGS).rglob("*")
@@ -199,14 +200,14 @@ class Comparison:
         if is_given and is_made:
             return
         if model in self._renamed or model in self._renamed.values():
-            # The sources are the same; they are in the name of what is made of them.
+            # The sources are the same; the name has the hash of the compiled model.
             if is_given and kind == "model":
                 yield recompiled(file)
             return
         if is_made and self._level is not Level.PIXELS and kind == "trajectory":
             with open_hdf5(self._made / file) as reader:
                 if reader.facts.get("kept") is False:
-                    # It is removed once its video is drawn.
+                    # It would be removed once its video is rendered.
                     return
         if is_given and kind in ("model", "sources") and self._is_unplayed(model):
             yield _believed(
@@ -220,7 +221,7 @@ class Comparison:
         yield Difference(
             topic=_TOPICS.get(kind, Topic.FILES),
             file=file,
-            # A compiled model that is not there is none that was compiled elsewhere.
+            # A missing compiled model is not excused as compiled elsewhere.
             aspect=Aspect.MODEL if kind == "model" and is_given else Aspect.EXACT,
             how=_NOT_MADE if is_given else "no such file, but one was recreated",
         )
@@ -301,7 +302,7 @@ class Comparison:
         compared = compare_objects(given, made, file, rules)
         found = [each for each in compared if isinstance(each, Difference)]
         if self._level is not Level.PIXELS:
-            # What was not drawn has other lists of videos, and no more.
+            # Without rendering, only the lists of videos differ.
             found = [each for each in found if each.aspect is not Aspect.STORED]
             numbers = [_with_video(read_object(path)) for path in (given, made)]
             if numbers[0] != numbers[1]:
@@ -332,7 +333,7 @@ class Comparison:
         )
 
     def _compare_rewards(self) -> _Found:
-        """Compare what was recreated instead of trajectories."""
+        """Compare the rewards that were recreated instead of trajectories."""
         path = self._made.parent / REWARDS_FILE
         if not path.exists():
             return
@@ -353,7 +354,7 @@ class Comparison:
                     yield _damaged(file, error)
 
     def _not_compared(self) -> Iterator[Same | Difference | Finding]:
-        """Yield what this level leaves out; of sampled videos, what was drawn."""
+        """Yield what this level skips, and compare the sampled frames."""
         videos = sorted((self._given / RECORDINGS).glob("*.mp4"))
         frames = drawn = 0
         for path in videos:
@@ -371,10 +372,10 @@ class Comparison:
             undone = "videos were not recreated"
             yield _believed(Topic.VIDEOS, undone, len(videos), "video")
         if frames > drawn:
-            reason = "frames were not drawn again"
+            reason = "frames were not rerendered"
             if drawn:
                 missed = f"{1 - drawn / frames:.0%}"
-                reason += f"; a single changed one is missed with a chance of {missed}"
+                reason += f"; the chance of missing a single changed one is {missed}"
             yield _believed(Topic.PICTURES, reason, frames - drawn, "frame")
         if self._level is Level.STATS:
             undone = "states were not compared (--level stats)"
@@ -391,7 +392,7 @@ def _order(file: str) -> tuple[int, str]:
 
 
 def _kind(file: str) -> str:
-    """Return what kind of file it is; "" of those that are no recordings."""
+    """Return the kind of a file; "" if it is not a recording."""
     if not file.startswith(f"{RECORDINGS}/openaigym."):
         return ""
     return next((kind for end, kind in _KINDS.items() if file.endswith(end)), "")
@@ -402,7 +403,7 @@ def _is_equal(one: Path, other: Path) -> bool:
 
 
 def _damaged(file: str, error: Error) -> Difference:
-    # Without the path, which is that of a temporary folder.
+    # Without the path, which is in a temporary folder.
     reason = error.reason if isinstance(error, UnreadableFile) else str(error)
     topic = _TOPICS.get(_kind(file), Topic.FILES)
     return Difference(topic=topic, file=file, how=f"it cannot be read: {reason}")
@@ -418,8 +419,8 @@ def _other_code() -> Finding:
         topic=Topic.PHYSICS,
         item="",
         outcome=Outcome.NOTED,
-        reason="it claims the versions and the machine that are here, so other code or "
-        "other numbers were at work",
+        reason="it claims the same versions and machine as here, so the code or the "
+        "numbers must have been different",
         unit="verification",
         is_headline=True,
     )
@@ -430,7 +431,7 @@ def _video_of(file: str) -> str:
 
 
 def _with_video(manifest: Mapping[str, Any]) -> set[int]:
-    """Return the episodes that have a video, or wait for one."""
+    """Return the episodes that have a video or a pending one."""
     details = manifest.get("mjrec") or {}
     names = [video for video, _ in manifest.get("videos", ())]
     names += details.get("broken", ())

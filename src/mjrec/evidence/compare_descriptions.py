@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What describes a packed run: written again from the archive's own recordings.
+"""Comparison of a packed run's descriptions with ones regenerated from its recordings.
 
-These are compared by themselves. README, citation, table, crate and the like say of
-them what their manifests, metadata and trajectories say, and not a word more.
+The recordings are compared separately. README, citation, table and crate must follow
+from the archive's manifests, metadata and trajectories alone.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ _LONGEST_FILE: Final = 1 << 28
 
 
 def compare_descriptions(bag: Path) -> Iterator[Same | Difference]:
-    """Yield how the descriptions of a bag compare with those written again."""
+    """Compare the descriptions of a bag with regenerated ones."""
     try:
         texts = written_again(bag)
     except Error as error:
         reason = error.reason if isinstance(error, UnreadableFile) else str(error)
-        yield _difference(ENVIRONMENT, f"nothing can be written again of it: {reason}")
+        yield _difference(ENVIRONMENT, f"descriptions cannot be regenerated: {reason}")
         return
     payload = bag / PAYLOAD
     there = {path.name: path for path in payload.iterdir() if path.name != RECORDINGS}
@@ -48,25 +48,25 @@ def compare_descriptions(bag: Path) -> Iterator[Same | Difference]:
 
 
 def written_again(bag: Path) -> dict[str, str]:
-    """Return the texts of a bag's descriptions, by their names, of its recordings.
+    """Return a bag's descriptions, regenerated from its recordings, by file name.
 
     Raises:
-        Error: a file is damaged, or says what cannot be.
+        Error: a file is damaged or has invalid contents.
     """
     path, recordings = bag / PAYLOAD / ENVIRONMENT, bag / PAYLOAD / RECORDINGS
     with unreadable(path):
-        said = read_object(path).get("packed_with")
-        if not isinstance(said, dict):
-            raise ValueError("it does not say what it was packed with")
-        options = packing_options(said.get("options") or {})
+        recorded = read_object(path).get("packed_with")
+        if not isinstance(recorded, dict):
+            raise ValueError("it lacks the versions that packed it")
+        options = packing_options(recorded.get("options") or {})
     run = read_run(recordings, options=options)
-    texts = descriptions(run, recordings, packed_with=_claimed(said))
+    texts = descriptions(run, recordings, packed_with=_claimed(recorded))
     return {**texts, **bag_tags(bag, date=run.date, title=run.title)}
 
 
-def _claimed(said: dict[str, Any]) -> dict[str, str]:
-    """Return the versions that packed it, as claimed."""
-    claimed = {name: str(said.get(name)) for name in packed_with()}
+def _claimed(recorded: dict[str, Any]) -> dict[str, str]:
+    """Return the claimed versions of the packages that packed the run."""
+    claimed = {name: str(recorded.get(name)) for name in packed_with()}
     return {n: v for n, v in claimed.items() if VERSION.fullmatch(v)}
 
 
@@ -84,11 +84,11 @@ def _compare(name: str, path: Path, text: str) -> Same | Difference:
             return _difference(name, only_in(True, one), where=f"line {number}")
         case None, (_, other):
             return _difference(name, only_in(False, other))
-    return _difference(name, "its lines are other spaces, or in another order")
+    return _difference(name, "its spaces, or the order of its lines, differ")
 
 
 def _first_more(lines: list[str], others: list[str]) -> tuple[int, str] | None:
-    """Return the first line, with its number, that the others have less often."""
+    """Return the first line, with its number, that occurs less often in the others."""
     more = Counter(lines) - Counter(others)
     found = (
         (number, line)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Two files of JSON, value by value: journal, statistics, manifest, metadata.
+"""Comparison of JSON files, value by value: journal, statistics, manifest, metadata.
 
-Each key that may be other than recreated stands in a table here, with what it tells
-about and how it may differ. Any other key has to be equal, and to be there.
+A table lists each key that may differ from the recreated one, with its topic and how it
+may differ. Every other key must exist and be equal.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ ABSENT: Final = object()
 
 
 class Rule(NamedTuple):
-    """What a key tells about, how it may differ, and of a CLAIM whose it is."""
+    """A key's topic, how it may differ, and for a CLAIM the name of the excuse."""
 
     topic: Topic
     aspect: Aspect = Aspect.EXACT
@@ -36,8 +36,8 @@ class Rule(NamedTuple):
 
 
 _OF_FILES: Final = Rule(Topic.FILES)
-# Whether a value that is other than recreated is right for the archive's own file:
-# its hash, its size. Called with the file's name and the value, ABSENT for none.
+# Whether a value that differs from the recreated one is right for the archive's own
+# file, such as its hash. Called with the file's name and the value, or ABSENT.
 Own: TypeAlias = Callable[[str, Any], bool]
 
 
@@ -46,15 +46,15 @@ class Rules:
     """How the values of a file are compared.
 
     Attributes:
-        keys: by the outermost key that stands here; what is below it has the same.
-        usual: of all other keys.
-        own: by key, of values that follow from a file of the archive itself, or that
-            nothing can recreate.
-        claims: keys whose values are versions by the names of packages.
-        left_out: keys that are not looked at.
-        renamed: names in the archive, and those of the same files recreated: a
+        keys: rules by key. A key's rule also applies to everything below it.
+        usual: the rule for all other keys.
+        own: checks by key, for values that follow from a file of the archive itself or
+            that cannot be recreated.
+        claims: keys whose values are versions by package name.
+        left_out: keys to ignore.
+        renamed: names in the archive, mapped to those of the recreated files: a
             compiled model has its hash in its name.
-        is_packed: packing took the lines about rows out of journals.
+        is_packed: whether packing removed the lines about rows from journals.
     """
 
     keys: Mapping[str, Rule] = field(default_factory=dict)
@@ -66,7 +66,7 @@ class Rules:
     is_packed: bool = False
 
     def translated(self, text: bytes) -> bytes:
-        """Return a text of the archive with the names that were recreated."""
+        """Return bytes of the archive with the names of the recreated files."""
         for name, again in self.renamed.items():
             text = text.replace(name.encode(), again.encode())
         return text
@@ -83,7 +83,7 @@ _GL: Final = Rule(Topic.PICTURES, Aspect.CLAIM, "gl")
 _FFMPEG: Final = Rule(Topic.VIDEOS, Aspect.CLAIM, "ffmpeg")
 _MODEL: Final = Rule(Topic.IDENTITY, Aspect.MODEL)
 
-# Of all files: a key means the same wherever it stands.
+# For all files: a key means the same everywhere.
 KEYS: Final[Mapping[str, Rule]] = {
     **dict.fromkeys(("reward", "episode_rewards", "reward_before"), _REWARD),
     **dict.fromkeys(("length", "episode_lengths", "terminated", "truncated"), _END),
@@ -104,9 +104,9 @@ KEYS: Final[Mapping[str, Rule]] = {
     "machine": Rule(Topic.PHYSICS, Aspect.CLAIM, "machine"),
     "model": _MODEL,
 }
-# The program's name and version; what it was told is no claim.
+# The program's name and version. Its other arguments are not claims.
 _ENCODER: Final = ("encoder_version.version", "encoder_version.cmdline[0]")
-# Of several devices alike, the one that drew. EGL numbers them, others do not.
+# The one of several similar devices that rendered. EGL numbers them; other APIs do not.
 _DEVICE: Final = {
     "file": re.compile(r"/dev/[\w/-]{1,80}", re.ASCII),
     "uuid": re.compile(r"GPU-[0-9a-f-]{36}", re.ASCII),
@@ -114,7 +114,7 @@ _DEVICE: Final = {
 
 
 def is_gl_device(value: Any) -> bool:
-    """Return whether a value is a `gl_device`, or none: a statement without words."""
+    """Return whether a value is ABSENT or a valid `gl_device`, free of other text."""
     if value is ABSENT:
         return True
     if not isinstance(value, dict) or type(value.get("index")) is not int:
@@ -129,17 +129,17 @@ def is_gl_device(value: Any) -> bool:
 def compare_objects(
     given: Path, made: Path, file: str, rules: Rules
 ) -> Iterator[Same | Difference]:
-    """Yield how two files differ, each a JSON object.
+    """Yield the differences between two files that each contain a JSON object.
 
     Raises:
-        UnreadableFile: one is damaged.
+        UnreadableFile: a file is damaged.
     """
     one = _translated_object(given, rules)
     yield from _or_bytes(json_differences(one, read_object(made), file, rules), file)
 
 
 def _translated_object(given: Path, rules: Rules) -> Mapping[str, Any]:
-    """Return an object of the archive, with the names that were recreated."""
+    """Return a JSON object of the archive with the names of the recreated files."""
     with unreadable(given):
         return json_object(rules.translated(read_regular(given, limit=_LONGEST_FILE)))
 
@@ -147,10 +147,10 @@ def _translated_object(given: Path, rules: Rules) -> Mapping[str, Any]:
 def compare_journals(
     given: Path, made: Path, file: str, rules: Rules
 ) -> Iterator[Same | Difference]:
-    """Yield how two journals differ, line by line, and how many episodes are equal.
+    """Compare two journals line by line; yield differences and equal episodes.
 
     Raises:
-        UnreadableFile: one is damaged.
+        UnreadableFile: a journal is damaged.
     """
     with unreadable(given), open_regular(given) as one, open_regular(made) as other:
         given_lines = _lines(one) if rules.is_packed else _without_rows(one)
@@ -168,7 +168,7 @@ def compare_journals(
 
 
 def same_journal(path: Path, file: str) -> Iterator[Same]:
-    """Yield the episodes of a journal that is equal to the other, byte for byte."""
+    """Yield the episodes of a journal whose bytes equal the other's."""
     with unreadable(path), open_regular(path) as journal:
         for line in _lines(journal):
             if begin := _EPISODE.match(line):
@@ -207,16 +207,16 @@ def json_differences(
     episode: int | None = None,
     rule: Rule | None = None,
 ) -> Iterator[Difference]:
-    """Yield where two values of JSON differ.
+    """Yield the differences between two JSON values.
 
     Args:
-        given: the archive's.
-        made: the recreated one.
-        file: where both stand.
-        rules: how they are compared.
-        where: their place in it.
-        episode: the number of the episode that they are of.
-        rule: of all that is in them; None before a key that has one.
+        given: the archive's value.
+        made: the recreated value.
+        file: the name of the file that contains them.
+        rules: the rules of the comparison.
+        where: the values' path in the file.
+        episode: the number of the episode that they belong to.
+        rule: the rule for everything in the values. None if no outer key has one.
     """
     if given is made or (type(given) is type(made) and given == made):
         return
@@ -259,7 +259,7 @@ def _rule(key: str, where: str, rules: Rules, outer: Rule | None) -> Rule | None
     if outer is not None:
         return Rule(outer.topic, Aspect.CLAIM, key)
     if key in rules.claims:
-        # The names of what has a version come next.
+        # The keys below it are the packages' names.
         return Rule(Topic.IDENTITY, Aspect.CLAIM, "*")
     return rules.keys.get(key)
 
@@ -280,8 +280,8 @@ def _leaf(
         aspect is Aspect.CLAIM and rule.claim != "machine"
     )
     if (is_gone and not may_be_gone) or (aspect is Aspect.DERIVED and size is None):
-        # No version makes a number of what is none, nor leaves a key out. But a
-        # package may be missing here, or OpenGL's names.
+        # No version turns a non-number into a number, or omits a key. But a package or
+        # OpenGL's names may be missing here.
         aspect = Aspect.EXACT
     return Difference(
         topic=rule.topic,
@@ -297,7 +297,7 @@ def _leaf(
 
 
 def _or_bytes(found: Any, file: str) -> Iterator[Same | Difference]:
-    """Yield differences; without one, that the same is written otherwise."""
+    """Yield differences; if there are none, one in how the values are written."""
     is_any = False
     for difference in found:
         is_any = True
@@ -307,7 +307,7 @@ def _or_bytes(found: Any, file: str) -> Iterator[Same | Difference]:
             topic=Topic.FILES,
             file=file,
             aspect=Aspect.STORED,
-            how="the same values, written otherwise",
+            how="the same values, written differently",
         )
 
 

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Two models: what they were made from, and what MuJoCo compiled of that.
+"""Comparison of two models: their sources and the compiled models.
 
-Sources have to be equal, but for the name of their main file. What is compiled of them
-has its hash in its name, and is another one where another MuJoCo has compiled it.
+Sources must be equal, except for the name of their main file. A compiled model has its
+hash in its name, and depends on the version of MuJoCo that compiled it.
 """
 
 from __future__ import annotations
@@ -25,27 +25,27 @@ from .findings import Topic
 from .zip_contents import check_entries, check_table
 
 _MODEL: Final = re.compile(r"openaigym\.model\.[0-9a-f]{16}")
-# Four numbers; the last is the version. A model of 1 GiB is beyond any.
+# Four numbers, the last of which is the version. No real model reaches 1 GiB.
 _MODEL_HEAD: Final = 16
 _LARGEST_MODEL: Final = 1 << 30
 _SOURCES: Final = "*.model.*.zip"
-# In the zip file of its sources.
+# In the zip file of the sources.
 _CONTENTS: Final = "contents.json"
 
 
 def model_name(file: str) -> str:
-    """Return the name of a model without what it is followed by; "" of other files."""
+    """Return a model's name without its extensions; "" for other files."""
     found = _MODEL.match(file.rpartition("/")[2])
     return found[0] if found else ""
 
 
 def renamed_models(given: Path, made: Path) -> dict[str, str]:
-    """Return the models that have another name when recreated, of the same sources."""
+    """Return the recreated names of models with the same sources but a new name."""
     sources: list[dict[str, str]] = []
     for folder in (given, made):
         names: dict[str, str] = {}
         for path in folder.rglob(_SOURCES):
-            # What is damaged is found when it is compared.
+            # The comparison reports damaged files.
             with contextlib.suppress(UnreadableFile):
                 names[_sources(path)] = model_name(path.name)
         sources.append(names)
@@ -57,19 +57,19 @@ def renamed_models(given: Path, made: Path) -> dict[str, str]:
 
 
 def compare_sources(given: Path, made: Path, file: str) -> Iterator[Same | Difference]:
-    """Yield how the sources of two models differ that are not the same bytes."""
+    """Yield the difference between two models' sources whose bytes differ."""
     is_equal = _sources(given) == _sources(made)
     yield Difference(
         topic=Topic.IDENTITY,
         file=file,
-        # The name of the main file is a statement.
+        # Only the name of the main file differs.
         aspect=Aspect.STATEMENT if is_equal else Aspect.EXACT,
-        how="its sources are not those of the model that was recreated",
+        how="its sources differ from those of the recreated model",
     )
 
 
 def compare_models(given: Path, made: Path, file: str) -> Iterator[Same | Difference]:
-    """Yield how two compiled models differ that are not the same bytes."""
+    """Compare two compiled models whose bytes differ."""
     contents = []
     for path in (given, made):
         try:
@@ -78,7 +78,7 @@ def compare_models(given: Path, made: Path, file: str) -> Iterator[Same | Differ
         except (OSError, EOFError, zlib.error) as error:
             raise UnreadableFile(path, error) from error
     if contents[0][:_MODEL_HEAD] == contents[1][:_MODEL_HEAD]:
-        # The head has the version of MuJoCo that wrote it.
+        # The header has the version of MuJoCo that wrote the model.
         yield Same(topic=Topic.IDENTITY, file=file, unit="compiled model")
     if contents[0] != contents[1]:
         yield recompiled(file)
@@ -87,25 +87,25 @@ def compare_models(given: Path, made: Path, file: str) -> Iterator[Same | Differ
             topic=Topic.FILES,
             file=file,
             aspect=Aspect.STORED,
-            how="the same model, compressed otherwise",
+            how="the same model, compressed differently",
         )
 
 
 def recompiled(file: str) -> Difference:
-    """Return that a model was compiled otherwise."""
+    """Return the difference for a model that was compiled differently."""
     return Difference(
         topic=Topic.IDENTITY,
         file=file,
         aspect=Aspect.MODEL,
         unit="compiled model",
-        how="it was compiled otherwise",
+        how="it was compiled differently",
     )
 
 
 def _sources(path: Path) -> str:
-    """Return the hash of a model's sources, whatever their main file is called.
+    """Return the hash of a model's sources, ignoring the name of their main file.
 
-    Some environments write it under a name that is random.
+    Some environments give that file a random name.
     """
     digest = hashlib.sha256()
     try:
@@ -113,15 +113,15 @@ def _sources(path: Path) -> str:
         with zipfile.ZipFile(path) as sources:
             check_entries(sources)
             if sum(each.file_size for each in sources.infolist()) > _LARGEST_MODEL:
-                raise ValueError("its sources are larger than any")
+                raise ValueError("its sources are too large")
             contents = json_object(sources.read(_CONTENTS))
             main = f"source/{contents.get('main')}"
             digest.update(json_text.dumps({**contents, "main": ""}).encode())
             names = [name for name in sources.namelist() if name != _CONTENTS]
             for name in [main, *sorted(set(names) - {main})]:
                 content = sources.read(name)
-                said = "" if name == main else name
-                digest.update(f"{said!r}: {len(content)}\n".encode())
+                shown = "" if name == main else name
+                digest.update(f"{shown!r}: {len(content)}\n".encode())
                 digest.update(content)
     except (KeyError, OSError, ValueError, zipfile.BadZipFile, zlib.error) as error:
         raise UnreadableFile(path, error) from error

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Two trajectories, dataset by dataset and attribute by attribute.
+"""Comparison of two trajectories, dataset by dataset and attribute by attribute.
 
-Rows are read in blocks, so that memory does not grow with an episode.
+Rows are read in blocks, so memory does not grow with an episode's length.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _BLOCK_BYTES: Final = 1 << 22
 # `model_changes/<n>/<field>`.
 _DEEPEST: Final = 3
 
-# What the datasets tell about, and how their numbers may differ.
+# The datasets' topics, and how their numbers may differ.
 _DATASETS: Final = {
     "states": (Topic.PHYSICS, Aspect.STATE),
     "snapshots": (Topic.PICTURES, Aspect.STATE),
@@ -41,27 +41,27 @@ _DATASETS: Final = {
 }
 _UNITS: Final = {"snapshots": "snapshot", "model_changes": "change"}
 _FACTS: Final = "facts"
-# It follows from the facts; reading a trajectory checks it.
+# Derived from the facts; reading a trajectory checks it.
 _CHECKSUM: Final = "crc32"
 
 
 def compare_trajectories(
     given: Path, made: Path, file: str, rules: Rules
 ) -> Iterator[Same | Difference]:
-    """Yield how two trajectories compare.
+    """Compare two trajectories; yield differences and equal items.
 
     Args:
-        given: the archive's.
-        made: the recreated one.
+        given: the archive's trajectory.
+        made: the recreated trajectory.
         file: the name of both, below `data/`.
-        rules: of their facts.
+        rules: the rules for comparing their facts.
 
     Raises:
-        UnreadableFile: one is damaged.
+        UnreadableFile: a trajectory is damaged.
     """
     differs = False
     try:
-        # Whatever is no trajectory ends here.
+        # Raises for anything that is not a trajectory.
         open_hdf5(given).close()
         with h5py.File(given, "r") as one, h5py.File(made, "r") as other:
             for found in _compare_groups(one, other, file, rules):
@@ -74,12 +74,12 @@ def compare_trajectories(
             topic=Topic.FILES,
             file=file,
             aspect=Aspect.STORED,
-            how="the same contents, stored otherwise",
+            how="the same contents, stored differently",
         )
 
 
 def same_trajectory(path: Path, file: str) -> Iterator[Same]:
-    """Yield what a trajectory holds that is equal, byte for byte, to the other."""
+    """Yield the equal items of a trajectory whose bytes equal the other's."""
     with h5py.File(path, "r") as trajectory:
         for name in ("rewards", "states"):
             yield from _same(name, trajectory.get(name), file)
@@ -88,10 +88,10 @@ def same_trajectory(path: Path, file: str) -> Iterator[Same]:
 def compare_rewards(
     given: Path, made: NDArray[np.float64], file: str
 ) -> Iterator[Same | Difference]:
-    """Yield how the rewards of a trajectory compare with the recreated ones.
+    """Compare the rewards of a trajectory with the recreated ones.
 
     Raises:
-        UnreadableFile: it is damaged.
+        UnreadableFile: the trajectory is damaged.
     """
     with open_hdf5(given) as reader:
         rewards = reader.rewards
@@ -113,13 +113,13 @@ def _compare_groups(
     named = [_objects(each) for each in (one, other)]
     before = [f"{each.userblock_size} bytes" for each in (one, other)]
     if before[0] != before[1]:
-        yield _difference(Topic.FILES, file, "what is before it", *before)
+        yield _difference(Topic.FILES, file, "the bytes before the HDF5 data", *before)
     yield from _compare_attributes(one, other, file, rules)
     for name in sorted(named[0] | named[1]):
         dataset = name.partition("/")[0]
         topic, _ = _DATASETS.get(dataset, (Topic.FILES, Aspect.EXACT))
         if name not in named[0] or name not in named[1]:
-            where = [f"{name} is there" if name in each else "none" for each in named]
+            where = ["it" if name in each else "none" for each in named]
             yield _difference(topic, file, name, *where)
             continue
         a, b = one[name], other[name]
@@ -131,7 +131,7 @@ def _compare_groups(
 
 
 def _objects(file: h5py.File) -> set[str]:
-    """Return the paths of all that is in a file, each a hard link of its own."""
+    """Return the paths of all objects in a file, which must all be hard links."""
     found: set[str] = set()
     open_groups = [""]
     while open_groups:
@@ -140,7 +140,7 @@ def _objects(file: h5py.File) -> set[str]:
         for name in group:
             inner = f"{path}/{name}" if path else name
             if not isinstance(group.get(name, getlink=True), h5py.HardLink):
-                raise ValueError(f"its {inner} leads elsewhere")
+                raise ValueError(f"its {inner} is a soft or external link")
             found.add(inner)
             if group.get(name, getclass=True) is h5py.Group:
                 if inner.count("/") >= _DEEPEST:
@@ -172,7 +172,7 @@ def _compare_attributes(
 def _raw_attribute(owner: Any, key: str) -> tuple[Any, ...]:
     identifier = owner.attrs.get_id(key)
     if identifier.dtype.kind not in "Siuf":
-        raise ValueError(f"its attribute {key!r} is of another type")
+        raise ValueError(f"its attribute {key!r} has the wrong type")
     value = np.asarray(owner.attrs[key])
     return identifier.dtype.str, value.shape, value.tobytes()
 
@@ -182,11 +182,11 @@ def _compare_datasets(
 ) -> Iterator[Same | Difference]:
     topic, aspect = _DATASETS.get(name.partition("/")[0], (Topic.FILES, Aspect.EXACT))
     if a.is_virtual or a.external:
-        raise ValueError(f"its {name} is stored outside it")
+        raise ValueError(f"its {name} is stored in another file")
     kinds = [f"{each.dtype} of {each.shape}" for each in (a, b)]
     if kinds[0] != kinds[1]:
         other = _difference(topic, file, name, *kinds)
-        # A wrapper may observe in another shape.
+        # A wrapper may change the shape of observations.
         yield replace(other, aspect=aspect) if aspect is Aspect.OBSERVED else other
         return
     found = _Rows(name, topic, aspect, file)
@@ -205,7 +205,7 @@ def _compare_datasets(
 def _same(
     name: str, item: Any, file: str, differing: _Rows | None = None
 ) -> Iterator[Same]:
-    """Yield what a dataset proves, so far as it is equal."""
+    """Yield the items that the equal rows of a dataset prove."""
     if not isinstance(item, h5py.Dataset):
         return
     is_equal = differing is None or not differing.any
@@ -220,14 +220,15 @@ def _same(
 
 
 class _Rows:
-    """The rows of a dataset that differ: how many, and by how much at most.
+    """The number of rows of a dataset that differ, and the largest difference.
 
-    Those of one aspect count together; the first state, which is a beginning, apart.
+    Rows are counted by aspect. The first state is counted separately: it is the
+    episode's beginning.
 
     Args:
-        name: of the dataset.
-        topic: what it tells about.
-        aspect: of its numbers.
+        name: the dataset's name.
+        topic: the dataset's topic.
+        aspect: the aspect of its numbers.
         file: the trajectory's name, below `data/`.
     """
 
@@ -238,16 +239,16 @@ class _Rows:
 
     @property
     def any(self) -> bool:
-        """Whether any differ."""
+        """Whether any rows differ."""
         return bool(self._worst)
 
     @property
     def is_first_other(self) -> bool:
-        """Whether a beginning differs."""
+        """Whether the episode's beginning differs."""
         return any(topic is Topic.BEGINNING for topic, _ in self._worst)
 
     def add(self, start: int, a: NDArray[Any], b: NDArray[Any]) -> None:
-        """Look at a block of rows that differs; its first row is number `start`."""
+        """Add a block of rows that differ, the first of which has the index `start`."""
         is_beginning = start == 0 and self._name in ("states", "observations")
         differing: dict[tuple[Topic, Aspect], NDArray[np.bool_]] = {}
         for member in a.dtype.names or ("",):
@@ -300,7 +301,7 @@ class _Rows:
         )
 
     def differences(self) -> Iterator[Difference]:
-        """Yield the worst of each kind, with the number of rows that it stands for."""
+        """Yield the worst difference of each kind, with its number of rows."""
         for key, worst in self._worst.items():
             yield replace(worst, count=self._counts[key])
 
@@ -312,7 +313,7 @@ def _table(values: NDArray[Any]) -> NDArray[Any]:
 
 
 def _errors(left: NDArray[Any], right: NDArray[Any]) -> NDArray[np.float64]:
-    """Return `abs(x - y) / (1 + abs(x))`; infinite for what is no matter of degree."""
+    """Return `abs(x - y) / (1 + abs(x))`; infinite if not finite or not floats."""
     if left.dtype.kind != "f":
         return np.full(left.shape, np.inf)
     with np.errstate(all="ignore"):

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Two videos: the boxes of the file, its times and shape, and each frame.
+"""Comparison of two videos: the mp4 boxes, the times, the shape, and each frame.
 
-The same frames, settings and ffmpeg make the same bytes. Where the bytes differ, all
-that a player goes by has to be equal all the same, and each frame is decoded.
+The same frames, settings and ffmpeg produce the same bytes. If the bytes differ,
+everything that affects players must still be equal, and each frame is decoded and
+compared.
 """
 
 from __future__ import annotations
@@ -34,11 +35,11 @@ from .frame_similarity import (
 )
 from .mp4_boxes import Box, read_boxes, shown_times
 
-# What another encoder, or other frames, change in a file that shows the same.
+# Boxes that a different encoder, or different frames, may change.
 _ENCODED: Final = frozenset(
     ("mdat", "avcC", "btrt", "stsz", "stsc", "stco", "co64", "stss", "ctts", "elst")
 )
-# Only where frames are stored in another order than shown, or are no key frames.
+# Present only if frames are stored out of order or are not all key frames.
 _OPTIONAL: Final = frozenset(("ctts", "stss"))
 _LONGEST_HASHES: Final = 1 << 28
 _LONGEST_LINE: Final = 1 << 20
@@ -52,34 +53,34 @@ def compare_videos(
     file: str,
     on_decoded: Callable[[str], object] = lambda _: None,
 ) -> Iterator[Same | Difference]:
-    """Yield how two videos differ that are not the same bytes.
+    """Compare two videos whose bytes differ.
 
     Args:
-        given: the archive's.
-        made: the recreated one.
+        given: the archive's video.
+        made: the recreated video.
         file: the name of both, below `data/`.
-        on_decoded: called with the sha256 of all planes of the archive's.
+        on_decoded: called with the SHA-256 of all planes of the archive's video.
 
     Raises:
-        UnreadableFile, EncoderError: one is damaged.
+        UnreadableFile, EncoderError: a video is damaged.
     """
     boxes, again = read_boxes(given), read_boxes(made)
     found = list(_compare_boxes(boxes, again, file))
     with unreadable(given):
         times = [shown_times(each) for each in (boxes, again)]
     if times[0] != times[1]:
-        said = [
+        shown = [
             each if isinstance(each, str) else f"{each[0]} frames of {each[1]} s"
             for each in times
         ]
-        found.append(_differs(file, "times", *said))
+        found.append(_differs(file, "times", *shown))
     yield from found
     yield Difference(
         topic=Topic.FILES,
         file=file,
         unit="encoding",
         aspect=Aspect.ENCODED,
-        how="it was encoded otherwise",
+        how="it was encoded differently",
     )
     frames = [
         *_compare_frames(given, made, file, on_decoded),
@@ -115,7 +116,7 @@ def _compare_frames(
             return
         for number, (a, b) in enumerate(itertools.zip_longest(one, other)):
             if a is None or b is None:
-                which = ["no frame" if each is None else "one" for each in (a, b)]
+                which = ["no frame" if each is None else "a frame" for each in (a, b)]
                 yield _differs(file, f"frame {number}", *which)
                 return
             for plane in a:
@@ -126,9 +127,9 @@ def _compare_frames(
 
 
 def _compare_streams(given: Path, file: str) -> Iterator[Difference]:
-    """Yield what players go by beside the frames: what colours mean, and captions."""
+    """Yield differences outside the frames: colour tags and captions."""
     if not has_usual_colours(given):
-        yield _differs(file, "tags of colours", "others", "BT.709")
+        yield _differs(file, "colour tags", "other tags", "BT.709")
     if has_messages(given):
         yield _differs(file, "the stream", "frames and messages", "frames")
 
@@ -136,22 +137,22 @@ def _compare_streams(given: Path, file: str) -> Iterator[Difference]:
 def compare_sampled(
     video: Path, hashes: Path, drawn: Path, file: str
 ) -> Iterator[Same | Difference]:
-    """Yield how some drawn frames compare with a video and the hashes of its frames.
+    """Compare some rerendered frames with a video and the hashes of its frames.
 
     Args:
-        video: the archive's.
-        hashes: the `.framehash` file beside it.
-        drawn: the folder of `<number>.png`.
+        video: the archive's video.
+        hashes: its `.framehash` file.
+        drawn: the folder with the rendered frames, `<number>.png`.
         file: the video's name, below `data/`.
 
     Raises:
-        UnreadableFile, EncoderError: one is damaged.
+        UnreadableFile, EncoderError: the video or the file of hashes is damaged.
     """
     with unreadable(hashes):
         lines = read_regular(hashes, limit=_LONGEST_HASHES).splitlines()
     recorded = [line.rpartition(b", ")[2] for line in lines if line[:1].isdigit()]
     wanted = {int(path.stem): path for path in drawn.glob("*.png")}
-    # The encoder loses something of every frame; these limits hold for any machine.
+    # The encoder is lossy. Its limits apply on any machine.
     worst, shipped, equal = Worst(file), Worst(file), 0
     with DecodedVideo(video) as decoded:
         for number, planes in enumerate(decoded):
@@ -170,7 +171,7 @@ def compare_sampled(
             equal += is_equal
             (shipped if is_equal else worst).add(number, planes, expected)
     if wanted:
-        yield _differs(file, f"frame {min(wanted)}", "no such frame", "one")
+        yield _differs(file, f"frame {min(wanted)}", "no such frame", "a frame")
     if shipped.strain > 1:
         for difference in shipped.differences():
             yield replace(difference, topic=Topic.VIDEOS, aspect=Aspect.EXACT)
@@ -182,7 +183,7 @@ def compare_sampled(
 def compare_frame_hashes(
     given: Path, made: Path, file: str
 ) -> Iterator[Same | Difference]:
-    """Yield how the hashes of two videos' frames differ, and how many are equal."""
+    """Compare two videos' frame hashes; yield differences and equal frames."""
     differing, first, total = 0, "", -1
     with unreadable(given), open_regular(made) as other:
         total = sum(1 for line in other if _HASH_BEGINS.match(line))
@@ -201,7 +202,7 @@ def compare_frame_hashes(
             unit="frame hash",
             aspect=Aspect.HASH,
             where=f"frame {first}",
-            how="its hash is another",
+            how="its hash differs",
         )
     if total > differing:
         count = total - differing
@@ -209,7 +210,7 @@ def compare_frame_hashes(
 
 
 class Worst:
-    """Compares pairs of frames, and says how far the worst are apart."""
+    """Compares pairs of frames and keeps the largest differences."""
 
     def __init__(self, file: str) -> None:
         self._file = file
@@ -218,7 +219,7 @@ class Worst:
         self.strain = 0.0
 
     def add(self, number: int, one: Planes, other: Planes) -> None:
-        """Compare a frame with the other one."""
+        """Compare two frames."""
         pairs = zip(one, other, strict=True)
         if all(np.array_equal(a, b) for a, b in pairs):
             return
@@ -234,7 +235,7 @@ class Worst:
             self.strain, self._worst = strain, number
 
     def differences(self) -> Iterator[Difference]:
-        """Yield what all of them come to; nothing where all are equal."""
+        """Yield one difference for all frames; nothing if all are equal."""
         if not self._differing:
             return
         plain, lit = self._plain, self._lit

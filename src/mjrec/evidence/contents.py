@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What of monitor directories is packed: all that their manifests vouch for.
+"""The files of monitor directories to pack: those that their manifests vouch for.
 
-Of each monitor: the manifest and what it names (statistics, finished videos, those
-that broke), the journal, the frame hashes, the trajectories, and the models of these.
-Locks, unfinished files, unreadable logs, second names of videos, and videos
-that were rendered again another way are left out: no manifest knows them.
+For each monitor, these are the manifest and the files that it names (statistics,
+finished and broken videos), the journal, the frame hashes, the trajectories and their
+models. Locks, unfinished files, unreadable logs, second names of videos, and videos
+that were rerendered differently are left out: no manifest names them.
 
-Where episodes are chosen, the trajectories of all others are packed without states and
-snapshots: actions, rewards and seeds of every episode stay, so that anyone can make all
-of them again.
+If episodes are chosen, the trajectories of all others are packed without states and
+snapshots. Actions, rewards and seeds of every episode stay, so all of them can be
+recreated.
 """
 
 from __future__ import annotations
@@ -51,13 +51,13 @@ from ..results import iter_episodes
 from ..results.monitor_files import monitors_of
 from .layout import PACKED_EPISODES
 
-_RENDER = "To render what is pending: mjrec render {}"
+_RENDER = "Render the pending videos with: mjrec render {}"
 _STRAY = (
-    "There is no manifest of their monitor, which would say what they are. Put it "
-    "back, or move them away."
+    "The manifest of their monitor is missing. Put it back, or move these files to "
+    "another directory."
 )
 _RECOVER = (
-    "Their process was killed, or results are missing; to put that in order: mjrec "
+    "Their process was killed, or results are missing. Recover them with: mjrec "
     "recover {}"
 )
 _OF_BROKEN_VIDEO = (".mp4", ".avi", ".json", ".framehash")
@@ -65,16 +65,18 @@ _OF_BROKEN_VIDEO = (".mp4", ".avi", ".json", ".framehash")
 
 @dataclass(kw_only=True)
 class Contents:
-    """What is packed.
+    """The contents of a packed run.
 
     Attributes:
-        directory: as it was given.
-        packed_episodes: the numbers of the chosen episodes; None where all are packed.
-        files: those that are packed as they are, by name.
-        manifests: by name, those that are packed with other content.
-        bundled: trajectories that get a file of their own, by the name of that.
-        without_states: trajectories that are packed without states and snapshots.
-        provenance: what the manifests say of where their recordings were made.
+        directory: the directory, as given.
+        packed_episodes: the numbers of the chosen episodes. None if all are packed.
+        files: files that are packed unchanged, by name.
+        manifests: manifests that are packed with changed contents, by name.
+        bundled: trajectories that are extracted from bundles, by the name of their new
+            file.
+        without_states: trajectories that are packed without states and snapshots, by
+            name.
+        provenance: the provenance in each manifest.
     """
 
     directory: Path
@@ -86,11 +88,11 @@ class Contents:
     provenance: list[Mapping[str, Any]] = field(default_factory=list)
 
     def is_chosen(self, name: str) -> bool:
-        """Return whether a file is of an episode that was chosen."""
+        """Return whether a file belongs to a chosen episode."""
         return self.packed_episodes is None or episode_of(name) in self.packed_episodes
 
     def add(self, path: Path, *, of: str | None = None) -> None:
-        """Add a file, which the one called `of` names."""
+        """Add a file, which the file named `of` refers to."""
         _check_name(path)
         try:
             with unreadable(path):
@@ -99,34 +101,36 @@ class Contents:
             if of is None or path.exists():
                 raise
             raise PackError(
-                f"{of} names {path.name}, which is not in {self.directory}. Put it "
-                "back; a run that lacks what it names would not be verified."
+                f"{of} names {path.name}, which is missing from {self.directory}. Put "
+                "it back: a run with missing files cannot be verified."
             ) from None
 
 
 def look_for_contents(directory: Path, episodes: Iterable[int] | None) -> Contents:
-    """Return what of a monitor directory is to be packed.
+    """Return the files of a monitor directory to pack.
 
     Args:
-        directory: the monitor directory, or one that holds some, as an evaluation's.
-        episodes: those whose videos and states are packed; all, if None.
+        directory: the monitor directory, or one that contains several, such as an
+            evaluation's.
+        episodes: the numbers of the episodes whose videos and states are packed. All if
+            None.
 
     Raises:
-        InvalidArgument: it is no monitor directory, an episode is no number, or those
-            of several directories are chosen from.
-        UnknownName: there is no such episode.
-        DirectoryInUse: a monitor is open, or a process renders.
+        InvalidArgument: `directory` contains no recordings, `episodes` is not a list of
+            numbers, or `episodes` is given for several monitor directories.
+        UnknownName: an episode does not exist.
+        DirectoryInUse: a monitor is open, or another process is rendering.
         UnfinishedRecordings: videos are pending, or a monitor was killed.
-        PackError: a file that is to be packed is gone, or has a name that archives
-            cannot hold everywhere.
-        UnreadableFile: a file is damaged, or a link that leads out of the directory.
+        PackError: a file is missing, two directories have files of the same names, or a
+            file's name is not portable.
+        UnreadableFile: a file is damaged, or is a link that leads out of the directory.
     """
     places = recording_directories(directory)
     for place in places:
         _check_is_idle(place)
     if not any(map(any, map(iter_monitor_files, places))):
         raise InvalidArgument(
-            f"{directory} holds no recordings that could be packed. "
+            f"{directory} contains no recordings to pack. "
             f"{where_recordings_are(directory)}"
         )
     for place in places:
@@ -135,8 +139,8 @@ def look_for_contents(directory: Path, episodes: Iterable[int] | None) -> Conten
     if episodes is not None:
         if len(places) > 1:
             raise InvalidArgument(
-                f"{directory} holds {len(places)} monitor directories, and episodes "
-                "are counted in each. Pack the one whose episodes you choose."
+                f"{directory} contains {len(places)} monitor directories, each with its "
+                "own episode numbers. To choose episodes, pack a single one."
             )
         chosen = _chosen(places[0], episodes)
     contents = Contents(directory=directory, packed_episodes=chosen)
@@ -147,7 +151,7 @@ def look_for_contents(directory: Path, episodes: Iterable[int] | None) -> Conten
 
 
 def _add_all(contents: Contents, place: Path, infixes: dict[str, Path]) -> None:
-    """Add the monitors of a directory, whose infixes none before them may have."""
+    """Add a directory's monitors, whose infixes must differ from all earlier ones."""
     of_infix: dict[str, list[Path]] = {}
     for path in iter_monitor_files(place):
         of_infix.setdefault(infix_of(path.name) or "", []).append(path)
@@ -157,7 +161,7 @@ def _add_all(contents: Contents, place: Path, infixes: dict[str, Path]) -> None:
         if (other := infixes.setdefault(monitor.infix, place)) != place:
             raise PackError(
                 f"{other} and {place} have files of the same names, with "
-                f"{monitor.infix} in them. Pack each of them by itself."
+                f"{monitor.infix} in them. Pack each directory separately."
             )
         _add_monitor(contents, monitor.manifest, of_infix[monitor.infix])
 
@@ -170,13 +174,13 @@ def _check_is_idle(directory: Path) -> None:
             raise DirectoryNotWritable(directory, error.strerror) from error
         if is_held:
             what = (
-                "a monitor that is still open writes there"
+                "an open monitor is writing there"
                 if path.name == f".{FILE_PREFIX}.{infix_of(path.name)}.lock"
-                else "another process renders there"
+                else "another process is rendering there"
             )
             raise DirectoryInUse(
-                f"Cannot pack {directory}: {what} (it holds {path.name}). Close the "
-                "monitor, or wait for the rendering, and pack then."
+                f"Cannot pack {directory}: {what} (it holds the lock {path.name}). "
+                "Close the monitor or wait for the rendering, then pack again."
             )
 
 
@@ -202,7 +206,7 @@ def _check_all_is_done(directory: Path) -> None:
 
 
 def _chosen(directory: Path, episodes: Iterable[int]) -> tuple[int, ...]:
-    """Return the numbers of the chosen episodes, sorted, each once."""
+    """Return the numbers of the chosen episodes, sorted and without duplicates."""
     given = list(episodes)
     try:
         numbers = [operator.index(n) for n in given if not isinstance(n, bool)]
@@ -210,7 +214,7 @@ def _chosen(directory: Path, episodes: Iterable[int]) -> tuple[int, ...]:
         numbers = []
     if not numbers or len(numbers) < len(given):
         raise InvalidArgument(
-            f"episodes is a list of the numbers of episodes, got {given!r}."
+            f"episodes must be a list of episode numbers, got {given!r}."
         )
     known = {episode.episode_id for episode in iter_episodes(directory)}
     named = (*iter_monitor_files(directory), *finished_trajectories(directory))
@@ -261,8 +265,8 @@ def _add_manifest(contents: Contents, path: Path, manifest: Manifest) -> None:
         return
     if details is None:
         raise InvalidArgument(
-            f"{path.name} is gym's own, whose videos do not say which episode they "
-            "show: its episodes cannot be chosen from. Pack all of them."
+            f"{path.name} is gym's own manifest, whose videos do not state their "
+            "episodes, so none can be chosen. Pack all episodes."
         )
     _check_name(path)
     details = {**details, PACKED_EPISODES: list(contents.packed_episodes)}
@@ -286,19 +290,19 @@ def _add_trajectory(contents: Contents, path: Path) -> None:
     with open_for_rendering(path) as reader:
         model = reader.facts.get("model") or {}
     for name in filter(None, (model.get("mjb"), model.get("xml"))):
-        # What it was made from may not be known, and a compiled one may be gone.
+        # Sources may not be recorded, and a compiled model may have been removed.
         if path.with_name(name).exists():
             contents.add(path.with_name(name))
 
 
 def _broken_of(manifest: Manifest) -> Iterator[str]:
-    """Yield the names of the metadata of videos that ended early, checked."""
+    """Yield the checked names of the metadata of broken videos."""
     for name in (manifest.mjrec or {}).get("broken") or ():
         yield base_name(name)
 
 
 def _check_name(path: Path) -> None:
-    """Check that a name means the same file wherever it is unpacked."""
+    """Check that a file name is valid on all systems."""
     try:
         path.name.encode()
         is_portable = path.name.isprintable() and "\\" not in path.name
@@ -306,6 +310,6 @@ def _check_name(path: Path) -> None:
         is_portable = False
     if not is_portable:
         raise PackError(
-            f"{path.name!r} cannot be packed: on some systems that is no name of a "
-            "file. Record with another uid."
+            f"{path.name!r} cannot be packed: it is not a valid file name on some "
+            "systems. Record with a different uid."
         )

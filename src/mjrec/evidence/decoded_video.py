@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The frames of a shipped video, decoded one after the other.
+"""Decoding of an archive's video, frame by frame.
 
-ffmpeg reads the file as nothing but an mp4 with H.264 in it, whatever it says of
-itself, and opens no other file for it. What it gives tells its own size, so that a file
-of another size is not taken for one of the recorded size.
+ffmpeg reads the file only as an mp4 with H.264, whatever the file declares, and opens
+no other file for it. The decoded stream states its own size, so that a video of a
+different size is not mistaken for one of the recorded size.
 """
 
 from __future__ import annotations
@@ -27,15 +27,15 @@ from .frame_similarity import Planes
 
 _BEGINNING: Final = ("-hide_banner", "-loglevel", "error", "-nostdin", "-xerror")
 _INPUT: Final = ("-threads", "2", "-protocol_whitelist", "file", "-f", "mp4")
-# The tags of colours that mjrec writes; and all but frames, among which are no
-# parameters of decoding: these stand in the file's head, for all players alike.
+# The colour tags that mjrec writes. The second filter keeps everything but frames;
+# decoding parameters are in the file's header, not among the frames.
 _TAGS: Final = (
     "h264_metadata=video_full_range_flag=0:colour_primaries=1:"
     "transfer_characteristics=1:matrix_coefficients=1"
 )
 _BESIDE_FRAMES: Final = "filter_units=remove_types=1|5|9"
 _MOST_BESIDE: Final = 1 << 20
-# A message by x264, which says how it encodes.
+# The message in which x264 lists its settings.
 _MESSAGE: Final = b"\0\0\0\1\x06\x05"
 _BY_X264: Final = bytes.fromhex("dc45e9bde6d948b7962cd820d923eeef")
 _READ_SIZE: Final = 1 << 20
@@ -45,10 +45,10 @@ _FRAME: Final = b"FRAME\n"
 
 
 def has_usual_colours(path: Path) -> bool:
-    """Return whether the tags of a video let players show its colours as they are.
+    """Return whether a video has mjrec's colour tags.
 
     Raises:
-        EncoderError: it cannot be read.
+        EncoderError: the video cannot be read.
     """
     hashes = [
         _stream(path, filters, "-f", "hash", "-hash", "sha256")
@@ -58,19 +58,21 @@ def has_usual_colours(path: Path) -> bool:
 
 
 def has_messages(path: Path) -> bool:
-    """Return whether anything but frames is in a video's stream, such as captions.
+    """Return whether a video's stream contains messages, such as captions.
+
+    x264's own message does not count.
 
     Raises:
-        EncoderError: it cannot be read.
+        EncoderError: the video cannot be read.
     """
     beside = _stream(path, _BESIDE_FRAMES, "-f", "data", "-fs", str(_MOST_BESIDE))
     return bool(beside) and not _is_by_x264(beside)
 
 
 def _is_by_x264(units: bytes) -> bool:
-    """Return whether units of a stream are one message of the encoder's, and no more.
+    """Return whether units of a stream are exactly one message of the encoder.
 
-    Its size is a sum of bytes, of which the last is not 255.
+    The message's size is encoded as a sum of bytes, the last of which is not 255.
     """
     sizes = units.removeprefix(_MESSAGE)
     full = len(sizes) - len(sizes.lstrip(b"\xff"))
@@ -84,7 +86,7 @@ def _is_by_x264(units: bytes) -> bool:
 
 
 def _stream(path: Path, filters: str, *output: str) -> bytes:
-    """Return what filters of its bits make of a video's stream; nothing is decoded."""
+    """Return a video's stream after bitstream filters, without decoding it."""
     arguments = [
         *_BEGINNING,
         *_INPUT,
@@ -95,19 +97,20 @@ def _stream(path: Path, filters: str, *output: str) -> bytes:
 
 
 class DecodedVideo:
-    """A video that is being decoded; used in a `with` block.
+    """A video that is being decoded. Use it in a `with` block.
 
     Args:
-        path: of the mp4.
+        path: the mp4 file.
 
     Attributes:
-        height: of its frames, in pixels.
-        width: likewise.
-        header: what ffmpeg says of the stream: size, rate, shape of a pixel, format.
+        height: height of the frames in pixels.
+        width: width of the frames in pixels.
+        header: ffmpeg's header of the stream: size, rate, pixel aspect ratio, format.
 
     Raises:
-        UnreadableFile: it is no regular file.
-        EncoderError: it cannot be decoded.
+        UnreadableFile: the path is not a regular file, or the video has no frames or an
+            odd height or width.
+        EncoderError: the video cannot be decoded.
         Error: ffmpeg cannot be started.
     """
 
@@ -138,7 +141,7 @@ class DecodedVideo:
         """Yield the planes of each frame, to the end of the file.
 
         Raises:
-            EncoderError: it cannot be decoded to its end.
+            EncoderError: the video cannot be decoded to its end.
         """
         size = self.height * self.width
         while self._take(len(_FRAME)) == _FRAME:
@@ -155,7 +158,7 @@ class DecodedVideo:
         self._process.wait()
 
     def close(self) -> None:
-        """End ffmpeg, whatever it is at. Idempotent."""
+        """Stop ffmpeg. Idempotent."""
         self._process.kill()
         self._process.release()
 
@@ -170,20 +173,20 @@ class DecodedVideo:
             block = self._process.read(_LONGEST_HEADER)
             if not block:
                 self._process.wait()
-                raise UnreadableFile(path, "there is no frame in it")
+                raise UnreadableFile(path, "it contains no frames")
             self._rest += block
         line, _, self._rest = self._rest.partition(b"\n")
         match = _HEADER.fullmatch(line)
         if match is None:
-            raise UnreadableFile(path, f"ffmpeg says {line!r:.80} of it")
+            raise UnreadableFile(path, f"ffmpeg describes it as {line!r:.80}")
         width, height = map(int, match.groups())
         if height % 2 or width % 2:
-            raise UnreadableFile(path, f"its frames are {width}x{height}")
+            raise UnreadableFile(path, f"its frame size is odd: {width}x{height}")
         self.height, self.width = height, width
         self.header = line.decode("ascii", "backslashreplace")
 
     def _take(self, size: int) -> bytes:
-        """Return this many bytes; fewer at the end."""
+        """Read exactly `size` bytes; fewer at the end."""
         parts, missing = [self._rest[:size]], size - len(self._rest[:size])
         self._rest = self._rest[size:]
         while missing:

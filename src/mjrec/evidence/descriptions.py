@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What says what is in a packed run: table, JSON, README, citation and crate.
+"""Descriptions of a packed run: table, JSON, README, citation and crate.
 
-The crate is an RO-Crate 1.1 with the profile Process Run Crate 0.5, which is made for
-it: one `CreateAction` for each monitor, whose instrument is what recorded, whose
-objects are the environment, the models and the policy, and whose results are its files.
+The crate is an RO-Crate 1.1 with the profile Process Run Crate 0.5. Each monitor is a
+`CreateAction`: its instruments are the recording software, its objects the environment,
+the models and the policy, and its results the monitor's files.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ from .layout import (
 from .packed_run import PackedRun, Session
 from .statements import Author
 
-# Of the table of videos; the statistics have them all.
+# Maximum number of rows in the table of videos. The statistics list all videos.
 _MOST_VIDEOS = 200
 _FORMATS = {
     ".json": "application/json",
@@ -76,14 +76,14 @@ _HOMES = {
 def descriptions(
     run: PackedRun, recordings: Path, *, packed_with: Mapping[str, str]
 ) -> dict[str, str]:
-    """Return the texts of all of them, by the names of their files.
+    """Return the contents of all descriptions, by file name.
 
-    They depend on the recordings and on what is given here, and on nothing else.
+    They depend only on the recordings and the arguments.
 
     Args:
-        run: what there is to say.
-        recordings: the folder of what was recorded, as it is packed.
-        packed_with: the versions of what packs it.
+        run: the packed run to describe.
+        recordings: the folder of the packed recordings.
+        packed_with: the versions of the packages that pack it.
 
     Raises:
         UnreadableFile: a file is damaged.
@@ -101,12 +101,12 @@ def descriptions(
 
 
 def packed_with() -> dict[str, str]:
-    """Return the versions of what packs here."""
+    """Return the versions of the packages that pack a run here."""
     return {
         "mjrec": importlib.metadata.version("mjrec"),
         "bagit": importlib.metadata.version("bagit"),
         "python": platform.python_version(),
-        # What deflates, to the very byte.
+        # Determines the bytes of compressed files.
         "zlib": zlib.ZLIB_RUNTIME_VERSION,
     }
 
@@ -114,9 +114,8 @@ def packed_with() -> dict[str, str]:
 def _statistics(recordings: Path) -> str:
     """Return the table of the episodes, in the order of `iter_episodes`.
 
-    Its columns are `layout.STATISTICS_COLUMNS`. Numbers are written so that reading
-    them gives the same bits; what is not known is empty; truth is `true` or `false`; a
-    seed is JSON.
+    The columns are `layout.STATISTICS_COLUMNS`. Numbers round-trip exactly, unknown
+    values are empty, booleans are `true` or `false`, and seeds are JSON.
     """
     file = io.StringIO(newline="")
     writer = csv.writer(file, lineterminator="\n")
@@ -132,9 +131,9 @@ def _environment(run: PackedRun, packed_with: Mapping[str, str]) -> dict[str, An
 
     Returns:
         `recordings`: for each monitor, by its infix, `env_id`, `versions`,
-        `provenance` (null where the recording says nothing of them), and `frames`
-        and `encoders`, each different one that made a video of it. `packed_with`: the
-        versions of what has made this archive, and the options of packing.
+        `provenance` (null if not recorded), and `pictures` and `encoders`, the distinct
+        renderers and encoders of its videos. `packed_with`: the versions of the
+        packages that packed the archive, and the options of packing.
     """
     return {
         "recordings": {session.infix: _made_with(session) for session in run.sessions},
@@ -158,7 +157,7 @@ def _made_with(session: Session) -> dict[str, Any]:
         "versions": dict(session.versions),
         "provenance": session.provenance or None,
         "pictures": session.different(*frames),
-        # Which also differ by their command lines.
+        # Encoders that differ only in their command lines are the same here.
         "encoders": [one for n, one in enumerate(encoders) if one not in encoders[:n]],
     }
 
@@ -193,8 +192,8 @@ def _cell(value: object) -> str:
 def _rendered(
     name: str, run: PackedRun, *, finalize: Callable[[Any], str], **facts: Any
 ) -> str:
-    """Return what a template makes of a run; each value passes through `finalize`."""
-    # Of the extra `evidence`, so it is not imported with this module.
+    """Render a template for a run; `finalize` formats each value."""
+    # Part of the extra `evidence`, so it is not imported with this module.
     try:
         import jinja2
     except ImportError as error:
@@ -203,7 +202,7 @@ def _rendered(
         ) from error
     templates = jinja2.Environment(
         loader=jinja2.PackageLoader("mjrec.evidence"),
-        # What recordings say of their provenance may lack anything.
+        # Any part of the provenance may be missing.
         undefined=jinja2.ChainableUndefined,
         finalize=finalize,
         trim_blocks=True,
@@ -226,13 +225,13 @@ def _rendered(
 
 
 class _Verbatim(str):
-    """A text that is not escaped."""
+    """A string that is not escaped."""
 
     __slots__ = ()
 
 
 def _markdown(value: object) -> str:
-    """Return a text of a stranger, such that it is text and no more."""
+    """Return an untrusted string, escaped so that Markdown shows it as plain text."""
     if isinstance(value, _Verbatim):
         return value
     line = " ".join(str(value).split())
@@ -242,8 +241,8 @@ def _markdown(value: object) -> str:
 
 
 def _json(value: object) -> str:
-    # A JSON string is a double-quoted YAML scalar too, as long as nothing is escaped as
-    # a pair of surrogates.
+    # A JSON string is also a double-quoted YAML scalar, unless characters are escaped
+    # as surrogate pairs.
     return json.dumps(value, ensure_ascii=False)
 
 
@@ -252,11 +251,11 @@ def _json_text(content: Any) -> str:
 
 
 def _crate_facts(recordings: Path, texts: Mapping[str, str]) -> dict[str, Any]:
-    """Return what the template needs besides the run.
+    """Return the template's variables other than the run.
 
     Args:
-        recordings: the folder of what was recorded.
-        texts: the other descriptions, by the names of their files.
+        recordings: the folder of the recordings.
+        texts: the other descriptions, by file name.
     """
     files = sorted(recordings.iterdir())
     return {
@@ -271,7 +270,7 @@ def _crate_facts(recordings: Path, texts: Mapping[str, str]) -> dict[str, Any]:
 
 
 def _crate_filters() -> Mapping[str, Callable[..., Any]]:
-    """Return the filters of the template."""
+    """Return the template's filters."""
     return {
         "release": _release,
         "author_id": _author_id,
@@ -285,7 +284,7 @@ def _crate_filters() -> Mapping[str, Callable[..., Any]]:
 
 
 def _finished_crate(text: str) -> dict[str, Any]:
-    """Return what the template made: each entity once, without unknown facts."""
+    """Return the crate with each entity once, and without unknown values."""
     crate: dict[str, Any] = json.loads(text)
     graph: dict[str, Any] = {}
     for entity in crate["@graph"]:
@@ -305,7 +304,7 @@ def _file(name: str, entity_id: str, size: int) -> dict[str, Any]:
 
 
 def _instruments(session: Session) -> list[str]:
-    # Who recorded, first; recordings of gym have nothing of ours.
+    # mjrec comes first. Recordings by gym have no versions.
     versions = sorted(session.versions.items(), key=lambda item: item[0] != "mjrec")
     return [_release(*each) for each in versions or [("gym", "")]]
 
@@ -343,12 +342,12 @@ def _author_id(author: Author) -> str:
 
 
 def _action_id(session: Session) -> str:
-    told = (session.infix, session.env_id, str(session.tally.start), *session.files)
-    return f"urn:uuid:{_uuid('recording', *told)}"
+    facts = (session.infix, session.env_id, str(session.tally.start), *session.files)
+    return f"urn:uuid:{_uuid('recording', *facts)}"
 
 
 def _uuid(*texts: str) -> uuid.UUID:
-    """Return what is always the same for the same texts."""
+    """Return a UUID that is determined by the strings."""
     return uuid.uuid5(uuid.NAMESPACE_URL, "\0".join(["mjrec", *texts]))
 
 
@@ -357,6 +356,6 @@ def _quoted(text: str) -> str:
 
 
 def _references(ids: Iterable[str]) -> Any:
-    """Return what leads to entities; to one alone without a list, as JSON-LD has it."""
+    """Return references to entities: a list, a single one without it, or None."""
     references = [{"@id": one} for one in ids]
     return references[0] if len(references) == 1 else references or None

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What comparators say: items that are equal, and places that differ.
+"""Results of comparators: items that are equal, and places that differ.
 
-A comparator looks at one file of two packed runs. It judges nothing: whether an excuse
-allows a difference is decided elsewhere, by the aspect of it.
+A comparator compares one file of two packed runs. It does not judge: `excuses` decides
+by a difference's aspect whether an excuse allows it.
 """
 
 from __future__ import annotations
@@ -25,20 +25,20 @@ class Aspect(enum.Enum):
     """How an item differs, which decides what may excuse it.
 
     Attributes:
-        EXACT: it must be equal; no version or machine changes it.
+        EXACT: values that must be equal; no version or machine changes them.
         STATE: numbers of the simulation.
-        DERIVED: numbers that the environment computes of states.
-        OBSERVED: what the environment's or a wrapper's code gives besides rewards and
-            ends: observations, success.
-        SOLVER: what only the solver uses to begin from: the warm start.
+        DERIVED: numbers that the environment computes from states.
+        OBSERVED: other outputs of the environment or a wrapper than rewards and ends:
+            observations, success.
+        SOLVER: the warm start, which only the solver uses.
         MODEL: the compiled model.
-        PICTURE: a frame's pixels, as the file shows them.
-        HASH: a frame's hash, that follows from its pixels.
-        ENCODED: bytes of the encoder that show nothing by themselves.
-        STORED: all contents are equal, the bytes that store them are not.
+        PICTURE: a frame's pixels, as decoded from the file.
+        HASH: a frame's hash, which follows from its pixels.
+        ENCODED: bytes of the encoder that show nothing on their own.
+        STORED: the contents are equal, but not the bytes that store them.
         CLAIM: a version, or a name of hardware.
-        STATEMENT: what nothing can make again; or what follows from a file of the
-            archive itself, and is right for that. Nothing is to be said of it.
+        STATEMENT: a value that cannot be recreated, or that follows from a file of the
+            archive itself and is right for that file. It is not reported.
     """
 
     EXACT = "exact"
@@ -57,14 +57,16 @@ class Aspect(enum.Enum):
 
 @dataclass(frozen=True, kw_only=True)
 class Place:
-    """Where an item is.
+    """The location of an item.
 
     Attributes:
-        topic: what it tells about.
-        file: its name below `data/`.
-        count: how many `unit` it stands for.
-        unit: "episode", "step", "frame", "video", "file".
-        episode: the number of the episode that it is of; None where the file says it.
+        topic: the item's topic.
+        file: the file's name below `data/`.
+        count: number of units.
+        unit: the unit that is counted, such as "episode", "step", "frame", "video" or
+            "file".
+        episode: the number of the item's episode. None if the file's name states it, or
+            if the item belongs to no episode.
     """
 
     topic: Topic
@@ -75,7 +77,7 @@ class Place:
 
     @property
     def scopes(self) -> tuple[str, ...]:
-        """What an excuse may name to reach it: episode, recording, file."""
+        """The names by which an excuse can reach it: episode, recording, file."""
         name = self.file.rpartition("/")[2]
         infix = infix_of(name)
         if infix is None:
@@ -88,7 +90,7 @@ class Place:
 
     @property
     def item(self) -> str:
-        """What a finding calls it: the episode, else the file."""
+        """The name for findings: the episode if there is one, otherwise the file."""
         first = self.scopes[0]
         return first if first.startswith("episode ") else self.file
 
@@ -100,16 +102,16 @@ class Same(Place):
 
 @dataclass(frozen=True, kw_only=True)
 class Difference(Place):
-    """One place, or several alike, where the two differ.
+    """One place, or several similar ones, where the two runs differ.
 
     Attributes:
-        aspect: how.
-        where: "states[12].qpos", "frame 13", "mjrec.schedule".
-        how: a clause, as of `unlike`, short and printable.
-        size: of numbers the largest `abs(x - y) / (1 + abs(x))`; None where it is no
-            matter of degree.
-        claim: of a CLAIM, whose: "mujoco", "gl", "ffmpeg", "machine".
-        figures: more numbers by name: of PICTURE `psnr`, `ssim` and `block`.
+        aspect: how the item differs.
+        where: the place in the file: "states[12].qpos", "frame 13", "mjrec.schedule".
+        how: the difference as a short, printable clause (see `unlike`).
+        size: the largest `abs(x - y) / (1 + abs(x))` for numbers. None if the
+            difference has no size.
+        claim: the name of the excuse for a CLAIM: "mujoco", "gl", "ffmpeg", "machine".
+        figures: more numbers by name, such as `psnr`, `ssim` and `block` for PICTURE.
     """
 
     aspect: Aspect = Aspect.EXACT
@@ -126,12 +128,12 @@ class Difference(Place):
 
 
 def unlike(given: Any, made: Any) -> str:
-    """Return how two values differ, as a clause."""
+    """Return the difference between two values as a clause."""
     return f"the archive has {short(given)}, the recreated run has {short(made)}"
 
 
 def only_in(is_given: bool, value: Any) -> str:
-    """Return that only one of the two has a value, as a clause."""
+    """Return a clause that only one of the two runs has a value."""
     who = "the archive" if is_given else "the recreated run"
     return f"only {who} has it: {short(value)}"
 
@@ -142,7 +144,7 @@ def relative_error(given: float, made: float) -> float:
 
 
 def short(value: Any) -> str:
-    """Return a value as one short line of text."""
+    """Return a value as one short, printable line."""
     text = value if isinstance(value, str) else repr(value)
     text = text if text.isprintable() else ascii(text)[1:-1]
     return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 4]} ..."

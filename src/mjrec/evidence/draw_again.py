@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Drawing the videos of a run that was recreated: all of them, or some frames."""
+"""Rendering the videos of a recreated run: all of them, or a sample of frames."""
 
 from __future__ import annotations
 
@@ -27,35 +27,35 @@ _OnProgress = Callable[[int, int], object]
 
 
 def draw_all(directory: Path, on_progress: _OnProgress) -> None:
-    """Draw and encode all pending videos of a directory.
+    """Render and encode all pending videos of a directory.
 
     Raises:
-        Error: one could not be.
+        Error: a video could not be rendered.
     """
     rendered = render_videos(
         directory,
         on_progress=lambda now: on_progress(now.frames_done, now.frames or 0),
     )
     for name, reason in rendered.failures.items():
-        raise Error(f"The video {name} could not be drawn: {reason}")
+        raise Error(f"The video {name} could not be rendered: {reason}")
 
 
 def draw_sample(
     directory: Path, into: Path, *, count: int, seed: int, on_progress: _OnProgress
 ) -> None:
-    """Draw some frames of each pending video, as images by their numbers.
+    """Render a sample of the frames of each pending video, as images.
 
-    Of clips, of frames with text on them and of tiled videos none is drawn.
+    Clips, annotated videos and tiled videos are skipped.
 
     Args:
-        directory: the recordings.
-        into: a new folder; `<video>/<number>.png` in it are the frames.
-        count: how many of each video.
-        seed: of the choice.
-        on_progress: told how many frames are drawn, and of how many.
+        directory: the directory of the recordings.
+        into: a new folder, which gets the frames as `<video>/<number>.png`.
+        count: maximum number of frames per video.
+        seed: the seed of the random choice of frames.
+        on_progress: called with the number of frames rendered so far and in total.
 
     Raises:
-        Error: one could not be drawn.
+        Error: a frame could not be rendered.
     """
     chosen = np.random.default_rng(seed)
     videos = list(_pending(directory))
@@ -73,11 +73,13 @@ def draw_sample(
                     done += 1
                     on_progress(done, count * len(videos))
             except Error as error:
-                raise Error(f"The video {name} could not be drawn: {error}") from error
+                raise Error(
+                    f"The video {name} could not be rendered: {error}"
+                ) from error
 
 
 def _pending(directory: Path) -> Iterator[tuple[str, Path, int, Any]]:
-    """Yield names of videos, what each is drawn from, how many frames, its camera."""
+    """Yield the name, trajectory, number of frames and camera of each pending video."""
     for path in iter_monitor_files(directory):
         if not is_manifest(path.name):
             continue

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The choice among the episodes of an evaluation, recreated.
+"""Recreation of the choice among the episodes of an evaluation.
 
-An evaluation chooses videos among the episodes of all recordings of an environment.
-Where all of these are in the archive, its rule is asked again. Where some are missing,
-or the evaluation was extended, the choice is believed.
+An evaluation chooses videos among the episodes of all recordings of an environment. If
+the archive contains all of these, the rule is applied again. If some are missing, or
+the evaluation was extended, the choice is believed.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from .notes import Notes
 
 
 class _Ended(NamedTuple):
-    """An episode of an evaluation that is over."""
+    """A finished episode of an evaluation."""
 
     key: RecordingKey
     reward: float | None
@@ -32,24 +32,25 @@ class _Ended(NamedTuple):
     success: bool | None
 
 
-# Those that were chosen among so many episodes.
+# The chosen episodes with their roles, by the number of episodes to choose from.
 _Choices = dict[int, dict[RecordingKey, list[str]]]
 
 
 def choose_for_evaluations(
     recordings: Iterable[RecordingInputs], directory: Path, notes: Notes
 ) -> None:
-    """Choose the videos of evaluations, and write it down where they were played.
+    """Choose the videos of evaluations, and store the choice with their recordings.
 
     Args:
         recordings: the inputs of all recordings.
-        directory: where they were played; their monitors are closed.
-        notes: which choices are believed.
+        directory: the directory of the recreated recordings. Their monitors must be
+            closed.
+        notes: receives the choices that are believed.
     """
     groups: dict[str, list[RecordingInputs]] = {}
     for each in recordings:
         if (directory / journal_name(each.infix)).exists() and each.is_evaluation:
-            # Arguments may differ: some tasks are drawn from the seed.
+            # Arguments may differ: some tasks are sampled from the seed.
             groups.setdefault(each.env_id, []).append(each)
     for group in groups.values():
         rules = {str(keep.get("rule")) for e in group for keep in e.evaluation_keeps}
@@ -70,8 +71,8 @@ def _choose(
         notes.add(
             group[0].name,
             "rule",
-            f"its videos were chosen among {among} episodes of an evaluation, and here "
-            f"are {here}: that the rule {rule!r:.80} chose them is believed",
+            f"its videos were chosen among {among} episodes of an evaluation, but the "
+            f"archive has {here}: the choice by the rule {rule!r:.80} is believed",
             count=sum(map(len, choices.values())),
             unit="video",
         )
@@ -83,7 +84,7 @@ def _choose(
 
 
 def _stated(group: Iterable[RecordingInputs]) -> _Choices:
-    """Return what the archive says of the choice."""
+    """Return the choices that the archive states."""
     found: _Choices = {}
     for recording in group:
         infix = Infix.parse(recording.infix)
@@ -92,7 +93,7 @@ def _stated(group: Iterable[RecordingInputs]) -> _Choices:
         for keep in recording.evaluation_keeps:
             numbers = {*keep["chosen"]} - known
             chosen = found.setdefault(_count(keep), {})
-            # What they were called is overwritten where they were chosen again.
+            # A later choice overwrites the roles of an earlier one.
             chosen |= {RecordingKey(infix, number): [] for number in numbers}
             known |= numbers
         for episode in recording.episodes:
@@ -106,7 +107,7 @@ def _stated(group: Iterable[RecordingInputs]) -> _Choices:
 def _made_again(
     group: Iterable[RecordingInputs], rule: str, directory: Path
 ) -> _Choices:
-    """Return what the rule chooses among the episodes that were played."""
+    """Return the rule's choice among the replayed episodes."""
     ended: dict[tuple[Any, Any], _Ended | None] = {}
     for recording in group:
         infix = Infix.parse(recording.infix)

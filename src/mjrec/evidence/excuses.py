@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Excuses: claims that allow a stated difference, each of them tried.
+"""Excuses: claims that allow certain differences, and tests of these claims.
 
-The exact comparison comes first, always. An excuse reaches what its rule below names,
-in the recordings, episodes or files that it is claimed of: it widens a finite
-tolerance, or excludes an item, which is then believed. Where the claimed difference
-ought to show and nothing differs, the claim is refuted.
+The exact comparison always comes first. An excuse applies to the recordings, episodes
+or files that it is claimed for, as its rule below defines: it widens a finite
+tolerance, or excludes an item, which is then believed. If the claimed difference should
+be visible but nothing differs, the claim is refuted.
 """
 
 from __future__ import annotations
@@ -34,11 +34,11 @@ _Allowed: TypeAlias = Mapping[Aspect, float | Limits]
 # Between MuJoCo 3.17 and 4.0, and with and without the CPU's FMA, a step of a model
 # whose bodies touch as spheres, capsules and planes differs by 2e-12. Contacts that are
 # found by iterating (boxes, meshes, height fields) jump: by 2e-7 without FMA, by 2.5e-3
-# between major versions. Velocities are differences divided by a time, and rewards are
-# made of them.
+# between major versions. Velocities are differences divided by a time, and rewards
+# depend on them.
 _NEAR: Final[_Allowed] = {Aspect.STATE: 1e-6, Aspect.DERIVED: 1e-4}
 _OTHER_MAJOR: Final[_Allowed] = {Aspect.STATE: 1e-2, Aspect.DERIVED: 1e-2}
-# Sums in another order.
+# Sums in a different order.
 _ROUNDED: Final[_Allowed] = {Aspect.STATE: 1e-9, Aspect.DERIVED: 1e-6}
 _REDRAWN: Final[_Allowed] = {Aspect.HASH: math.inf, Aspect.ENCODED: math.inf}
 _RESTORED: Final[_Allowed] = {Aspect.STORED: math.inf}
@@ -48,15 +48,15 @@ _ALIKE: Final[_Allowed] = {**_REDRAWN, **_RESTORED, Aspect.PICTURE: OTHER_ENCODE
 
 @dataclass(frozen=True, kw_only=True)
 class _Rule:
-    """What an excuse does.
+    """The effects of an excuse.
 
     Attributes:
-        kind: which of the three.
-        costs: what it takes away, a clause.
-        allows: by aspect, up to which size.
-        excludes: topics that are believed, whatever differs in them.
-        fed: topics that were fed to the maker: equal they prove nothing, and there is
-            no reason for a difference.
+        kind: the kind of the excuse.
+        costs: what the excuse weakens, as a clause.
+        allows: the largest allowed differences, by aspect.
+        excludes: topics in which every difference is believed.
+        fed: topics whose values were copied from the archive into the recreated run.
+            Equality proves nothing there, and a difference is not excused.
     """
 
     kind: ExcuseKind
@@ -70,13 +70,13 @@ _STEPS: Final = "steps and rewards are compared within a tolerance"
 _BY_NAME: Final[Mapping[str, _Rule]] = {
     "mujoco": _Rule(
         kind=ExcuseKind.VERSION,
-        costs=f"{_STEPS}, compiled models are believed",
+        costs=f"{_STEPS}, and compiled models are believed",
         allows={**_ALIKE, **_RECOMPILED, **_NEAR},
     ),
-    # Its quaternions are other by up to 0.1 in Gymnasium's Ant.
+    # Quaternions differ by up to 0.1 in Gymnasium's Ant.
     "rk4": _Rule(
         kind=ExcuseKind.VERSION,
-        costs="turns of free bodies are compared within a wide tolerance",
+        costs="rotations of free bodies are compared within a wide tolerance",
         allows={Aspect.STATE: 0.25, Aspect.DERIVED: 0.25},
     ),
     "machine": _Rule(
@@ -86,12 +86,12 @@ _BY_NAME: Final[Mapping[str, _Rule]] = {
     ),
     "gl": _Rule(
         kind=ExcuseKind.HARDWARE,
-        costs="frames are alike within a tolerance, their hashes are believed",
+        costs="frames are compared within a tolerance, and their hashes are believed",
         allows={**_ALIKE, Aspect.PICTURE: OTHER_RENDERER},
     ),
     "ffmpeg": _Rule(
         kind=ExcuseKind.VERSION,
-        costs="frames in the files are alike within a tolerance",
+        costs="frames in the files are compared within a tolerance",
         # Frames are hashed before they are encoded.
         allows={a: limit for a, limit in _ALIKE.items() if a is not Aspect.HASH},
     ),
@@ -115,7 +115,7 @@ _BY_NAME: Final[Mapping[str, _Rule]] = {
     ),
     "wrappers": _Rule(
         kind=ExcuseKind.CODE,
-        costs="what it made of actions, rewards and ends is believed",
+        costs="its changes to actions, rewards and ends are believed",
         allows={Aspect.OBSERVED: math.inf},
         fed=(Topic.REWARDS,),
     ),
@@ -123,7 +123,7 @@ _BY_NAME: Final[Mapping[str, _Rule]] = {
         ("schedule", "rule", "step_trigger"),
         _Rule(
             kind=ExcuseKind.CODE,
-            costs="which episodes it chose is believed",
+            costs="its choice of episodes is believed",
             fed=(Topic.SELECTION,),
         ),
     ),
@@ -134,25 +134,27 @@ _BY_NAME: Final[Mapping[str, _Rule]] = {
     ),
     "unseeded beginning": _Rule(
         kind=ExcuseKind.EVENT,
-        costs="the state that it begins from is believed",
+        costs="its initial state is believed",
         fed=(Topic.BEGINNING,),
     ),
     **dict.fromkeys(
         ("kill", "early reset", "exception", "fault"),
         _Rule(
             kind=ExcuseKind.EVENT,
-            costs="where it ends is believed",
+            costs="its end is believed",
             fed=(Topic.REWARDS,),
         ),
     ),
 }
-# Claims of what makes the numbers of a step.
+# Claims that can change the numbers of a step.
 NUMERIC: Final = (
     *("mujoco", "machine", "numpy", "gymnasium", "gymnasium-robotics", "dm-control"),
     "environment",
 )
 _ANY_VERSION: Final = _Rule(
-    kind=ExcuseKind.VERSION, costs="nothing but its own version", allows=_RESTORED
+    kind=ExcuseKind.VERSION,
+    costs="only the version itself is believed",
+    allows=_RESTORED,
 )
 _DESCRIPTIONS: Final = ("README.md", "CITATION.cff", "ro-crate-metadata.json")
 _OUTCOMES: Final = {
@@ -163,27 +165,27 @@ _OUTCOMES: Final = {
     Aspect.DERIVED: Outcome.WITHIN_TOLERANCE,
     Aspect.PICTURE: Outcome.WITHIN_TOLERANCE,
 }
-# Why no tolerance says anything of it.
+# Why items are believed that have no tolerance.
 _BELIEVED: Final = {
-    Aspect.SOLVER: "from there the solver begins, and comes to the same end",
+    Aspect.SOLVER: "it only starts the solver, which reaches the same result",
     Aspect.MODEL: "it was compiled elsewhere",
-    Aspect.HASH: "they were drawn elsewhere",
+    Aspect.HASH: "they were rendered elsewhere",
 }
-# How many of the frames may be equal bit for bit: of another rasteriser, next to none;
-# of the same one on another CPU, those in which nothing was rounded otherwise.
+# The largest share of frames that may be bitwise equal: with another rasterizer, few;
+# with the same one on another CPU, those that rounding did not change.
 _MOST_EQUAL_FRAMES: Final = {"gl": 0.5, "machine": 0.8}
 _ELSEWHERE: Final = (ExcuseKind.VERSION, ExcuseKind.HARDWARE)
 _FAMILIES: Final = ("llvmpipe", "softpipe", "nvidia", "amd", "radeon", "intel", "apple")
 
 
 def excuse_of(name: str, claimed: str, here: str = "", *items: str) -> Excuse:
-    """Return the excuse of a name.
+    """Return the excuse with a name.
 
     Args:
-        name: of the rule; of a package where there is none.
+        name: the name of a rule, or of a package without its own rule.
         claimed: the archive's value.
-        here: the reader's.
-        items: what it is claimed of; nothing is the whole archive.
+        here: the reader's value.
+        items: the items that it is claimed for. The whole archive if empty.
     """
     rule = _BY_NAME.get(name, _ANY_VERSION)
     return Excuse(
@@ -197,7 +199,7 @@ def excuse_of(name: str, claimed: str, here: str = "", *items: str) -> Excuse:
 
 
 def merged(excuses: Iterable[Excuse]) -> tuple[Excuse, ...]:
-    """Return excuses of one name and value as one, of all their items."""
+    """Merge excuses with the same name and values into one for all their items."""
     found: dict[tuple[str, str, str], Excuse] = {}
     items: dict[tuple[str, str, str], dict[str, None]] = {}
     of_all = set()
@@ -214,7 +216,7 @@ def merged(excuses: Iterable[Excuse]) -> tuple[Excuse, ...]:
 
 
 def applicable(excuses: Iterable[Excuse]) -> tuple[Excuse, ...]:
-    """Return excuses without those that only another major MuJoCo gives reason to."""
+    """Return excuses without those that require a different major MuJoCo."""
     known = tuple(excuses)
     others = {
         item
@@ -226,21 +228,22 @@ def applicable(excuses: Iterable[Excuse]) -> tuple[Excuse, ...]:
 
 
 def with_allowed(excuses: Iterable[Excuse], allow: Iterable[str]) -> tuple[Excuse, ...]:
-    """Return excuses, those marked that the reader takes.
+    """Return excuses, with those that the reader accepts marked as allowed.
 
     Args:
-        excuses: that were claimed.
-        allow: "NAME=VALUE" each; the value is a part of what is claimed, or "any".
+        excuses: the claimed excuses.
+        allow: the accepted excuses as "NAME=VALUE". The value is a part of the claimed
+            value, or "any".
 
     Raises:
-        InvalidArgument: one has no value.
+        InvalidArgument: an item of `allow` lacks a name or a value.
     """
     taken = []
     for text in allow:
         name, _, value = text.partition("=")
         if not name.strip() or not value.strip():
             raise InvalidArgument(
-                f"allow takes the name of an excuse and its value, as in "
+                f"allow takes an excuse's name and value, for example "
                 f'"gl=NVIDIA H100", got {text!r}.'
             )
         taken.append((name.strip(), value.strip().lower()))
@@ -258,22 +261,22 @@ def with_allowed(excuses: Iterable[Excuse], allow: Iterable[str]) -> tuple[Excus
 
 
 class Trial:
-    """Tries excuses against all that is equal and all that differs.
+    """Tests excuses against all equal and all different items.
 
     Args:
-        excuses: that are claimed.
+        excuses: the claimed excuses.
     """
 
     def __init__(self, excuses: Sequence[Excuse]) -> None:
         self._excuses = excuses
         self._scopes = [frozenset(excuse.items) for excuse in excuses]
         self._used: Counter[int] = Counter()
-        # By what is counted.
+        # By excuse and unit.
         self._equal: Counter[tuple[int, str]] = Counter()
         self._other: Counter[tuple[int, str]] = Counter()
 
     def same(self, place: Same) -> bool:
-        """Note what is equal; return whether that is no proof: it was fed in."""
+        """Count an equal item; return True if it was fed in, so equality is no proof."""
         is_fed = False
         for index in self._reaching(place):
             self._equal[index, place.unit] += place.count
@@ -281,7 +284,7 @@ class Trial:
         return is_fed
 
     def judge(self, found: Difference) -> Finding | None:
-        """Return what a difference comes to; None where nothing is to be said of it."""
+        """Return the finding for a difference; None if it need not be reported."""
         if found.aspect is Aspect.STATEMENT:
             return None
         for index in self._reaching(found):
@@ -296,13 +299,13 @@ class Trial:
         return _finding(found, Outcome.DIFFERENT, None)
 
     def use(self, name: str) -> None:
-        """Note that something was believed for the excuse of a name."""
+        """Mark the excuses with a name as used."""
         for index, excuse in enumerate(self._excuses):
             self._used[index] += excuse.name == name
 
     @property
     def excuses(self) -> tuple[Excuse, ...]:
-        """The excuses, those of versions and hardware also where nothing needs them."""
+        """The used and refuted excuses, and all those of versions and hardware."""
         tried = (
             dataclasses.replace(
                 excuse,
@@ -318,7 +321,7 @@ class Trial:
         )
 
     def refutations(self) -> Iterator[Finding]:
-        """Yield what contradicts a claim."""
+        """Yield a finding for each refuted claim."""
         for index, excuse in enumerate(self._excuses):
             reason = self._refutation(index)
             if reason is not None:
@@ -326,8 +329,8 @@ class Trial:
                     topic=Topic.IDENTITY,
                     item=", ".join(excuse.items[:3]),
                     outcome=Outcome.DIFFERENT,
-                    reason=f"{excuse.name} is claimed to be {excuse.claimed}, here it "
-                    f"is {excuse.here}: {reason}",
+                    reason=f"{excuse.name} is claimed to be {excuse.claimed} and is "
+                    f"{excuse.here} here, but {reason}",
                     unit="claim",
                 )
 
@@ -338,18 +341,18 @@ class Trial:
                 yield index
 
     def _refutation(self, index: int) -> str | None:
-        """Return why the claimed difference is none; None where it may be one."""
+        """Return why a claimed difference is refuted; None if it is not."""
         excuse, equal = self._excuses[index], self._equal
         frames, videos = equal[index, "frame"], equal[index, "encoding"]
         if excuse.name == "mujoco" and equal[index, "compiled model"]:
             return "the compiled model was written by the same version"
         if excuse.name == "ffmpeg" and videos and self._other[index, "encoding"]:
-            return f"{videos} videos are equal byte for byte, others are not"
+            return f"{videos} videos are equal byte for byte and others are not"
         others = self._other[index, "frame hash"]
         if excuse.name == "gl" and _family(excuse.claimed) == _family(excuse.here):
             return None
         if excuse.name == "machine" and not others:
-            # It need not show: no step of the half cheetah depends on the CPU.
+            # It may be invisible: no step of the half cheetah depends on the CPU.
             return None
         most = _MOST_EQUAL_FRAMES.get(excuse.name)
         if frames and most is not None and frames >= most * (frames + others):
@@ -358,15 +361,15 @@ class Trial:
 
 
 def believed(note: Note) -> tuple[Excuse, Finding | None]:
-    """Return what a note of the maker is: an excuse, and what is believed for it.
+    """Return a maker's note as an excuse, and a finding for what is believed.
 
-    The finding is None where nothing is believed unless something differs.
+    The finding is None if the excuse matters only for differences.
     """
     name, item, reason = note.excuse, note.item, note.reason
     rule = _BY_NAME.get(name)
-    # Of code the reason says whose.
-    is_told = rule is not None and rule.kind is not ExcuseKind.EVENT
-    excuse = excuse_of(name, reason if is_told else "", "", item)
+    # For code, the reason names it.
+    is_stated = rule is not None and rule.kind is not ExcuseKind.EVENT
+    excuse = excuse_of(name, reason if is_stated else "", "", item)
     if rule is not None and not rule.fed:
         return excuse, None
     if rule is None:
@@ -384,7 +387,7 @@ def believed(note: Note) -> tuple[Excuse, Finding | None]:
 
 
 def _outcome(excuse: Excuse, found: Difference) -> Outcome | None:
-    """Return what an excuse makes of a difference; None where it does not allow it."""
+    """Return a difference's outcome under an excuse; None if it is not allowed."""
     rule = _rule(excuse)
     if found.topic in rule.excludes:
         return Outcome.BELIEVED
@@ -451,6 +454,6 @@ def _major(version: str) -> str:
 
 
 def _family(renderer: str) -> str:
-    """Return who makes a renderer, as far as that is known; else all of its name."""
+    """Return the vendor of a renderer if known, otherwise the whole name."""
     name = renderer.lower()
     return next((family for family in _FAMILIES if family in name), name)
