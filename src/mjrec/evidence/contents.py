@@ -139,8 +139,8 @@ def look_for_contents(directory: Path, episodes: Iterable[int] | None) -> Conten
     if episodes is not None:
         if len(places) > 1:
             raise InvalidArgument(
-                f"{directory} contains {len(places)} monitor directories, each with its "
-                "own episode numbers. To choose episodes, pack a single one."
+                f"{directory} contains {len(places)} monitor directories, each with "
+                "its own episode numbers. To choose episodes, pack a single one."
             )
         chosen = _chosen(places[0], episodes)
     contents = Contents(directory=directory, packed_episodes=chosen)

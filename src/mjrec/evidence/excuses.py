@@ -276,7 +276,7 @@ class Trial:
         self._other: Counter[tuple[int, str]] = Counter()
 
     def same(self, place: Same) -> bool:
-        """Count an equal item; return True if it was fed in, so equality is no proof."""
+        """Count an equal item; return True if it was fed in and so proves nothing."""
         is_fed = False
         for index in self._reaching(place):
             self._equal[index, place.unit] += place.count
