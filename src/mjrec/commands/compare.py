@@ -83,7 +83,7 @@ def compare(
         if len(a) != 2:
             raise InvalidArgument(
                 "Give two evaluations (mjrec compare A B) or two sets (mjrec compare "
-                f"A... --against B...), got {len(a)} without --against."
+                f"A... --against B...); got {len(a)} without --against."
             )
         a, against = a[:1], a[1:]
     if (no_worse_than is None) != (margin is None):

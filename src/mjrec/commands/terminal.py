@@ -79,7 +79,8 @@ def print_rows(
     Args:
         names: the column names.
         rows: the cells of each row, which may contain untrusted text.
-        left: the columns of text, aligned left; the others hold numbers.
+        left: names of the text columns, which are left-aligned; the others hold
+            numbers.
 
     Returns:
         Whether there was at least one row.

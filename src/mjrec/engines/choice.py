@@ -61,13 +61,14 @@ def engine_from(
     Args:
         name: `"local"`, `"ray"`, `"slurm"`, or `"dask:ADDRESS"` with the address of a
             Dask scheduler.
-        workers: maximum number of workers; None is the engine's default.
-        address: address of a Ray cluster, `"auto"` for the one that runs on this
-            machine; None is the one that `RAY_ADDRESS` names, otherwise one that is
-            started for the run.
+        workers: maximum number of workers; None uses the engine's default.
+        address: address of a Ray cluster, or `"auto"` for the one running on this
+            machine. If None, the cluster named by `RAY_ADDRESS` is used; if that is
+            unset, one is started for the run.
         gpus: number of GPUs for each worker, which may be a fraction.
         require_gpu: whether a worker that renders in software is an error.
-        options: options of a single engine, as strings: parameters of `SlurmEngine`.
+        options: engine-specific options, as strings. Only `SlurmEngine` has any: its
+            parameters.
 
     Raises:
         UnknownName: the engine or an option does not exist.

@@ -58,7 +58,7 @@ class Estimate:
     Attributes:
         value: the figure.
         interval: the figure's interval; None if there is no interval.
-        interval_method: method of the interval; None if there is no interval.
+        interval_method: how the interval was computed; None if there is no interval.
     """
 
     value: float

@@ -119,9 +119,9 @@ OTHER_RENDERER: Final = Limits(psnr=28.0, ssim=0.88, block=44.0, shadow=0.04)
 
 
 def planes_of(frame: Frame) -> Planes:
-    """Return the planes of a rendered frame, its sides padded to even lengths.
+    """Return the planes of a rendered frame, padded to an even width and height.
 
-    They equal those that the encoder is given to within one level.
+    They match the planes passed to the encoder to within one level.
     """
     rgb = pad_to_even(frame).astype(np.float32) / 255
     luma = rgb @ _LUMA

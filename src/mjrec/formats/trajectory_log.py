@@ -58,7 +58,7 @@ def open_recording(path: Path) -> TrajectoryReader:
     """
     recording = find_recording(path)
     if recording is None:
-        raise UnreadableFile(path, "neither the file nor a log of it exists")
+        raise UnreadableFile(path, "neither the file nor its log exists")
     with unreadable(recording.log), contextlib.ExitStack() as opened:
         rows = opened.enter_context(
             contextlib.closing(RowLogReader(recording.log, recording.dtype.itemsize))

@@ -221,10 +221,11 @@ def _device(gpu: str, environ: Mapping[str, str]) -> tuple[EglDevice | None, Pro
 def _tries(
     device: EglDevice, gpu: str, alone: Probe, environ: Mapping[str, str]
 ) -> Iterator[tuple[int, Probe]]:
-    """Yield numbers that may select a device in mujoco, likely ones first, with probes.
+    """Yield candidate numbers for a device in mujoco, the likeliest first.
 
-    For mujoco 3, the number is the index in EGL's list. For mujoco 4, it is an index in
-    `CUDA_VISIBLE_DEVICES`, CUDA's number, or the index in mujoco's own list.
+    Each comes with its probe. For mujoco 3, the number is the index in EGL's list. For
+    mujoco 4, it is an index into `CUDA_VISIBLE_DEVICES`, the CUDA device number, or an
+    index into mujoco's own list.
     """
     if environ.get(CUDA_VISIBLE_DEVICES) == gpu:
         yield 0, alone

@@ -181,7 +181,7 @@ class Background:
     def waiting_at_the_end(
         self, on_progress: Callable[[Progress], object]
     ) -> Iterator[None]:
-        """Make `wait` return at once inside the block, and wait for all at its end.
+        """Make `wait` return at once inside the block, and wait when the block ends.
 
         All monitors can then submit their recordings before the first wait.
         """

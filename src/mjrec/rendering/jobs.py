@@ -74,8 +74,8 @@ class RecordingKey:
     def video_name(self) -> str:
         """The base name of an episode's video.
 
-        A clip's video cannot be named from the key: only its rows say in which episode
-        it began.
+        The name of a clip's video cannot be derived from the key: only its rows record
+        the episode in which the clip began.
         """
         return f"{video_prefix(self.infix, self.number)}.mp4"
 

@@ -342,7 +342,9 @@ class _StoredModel:
 
 
 class _Frames:
-    """A source of snapshots of one simulation in one view. Checks that they suffice.
+    """A source of snapshots of one simulation in one view.
+
+    It checks that the snapshots are enough to redraw the frames.
 
     If each frame influences the next one, it also keeps track of this influence: an
     infinite plane is drawn around the camera of the previous frame, and a camera that

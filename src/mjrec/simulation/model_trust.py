@@ -103,7 +103,8 @@ def is_stored(digest: object) -> bool:
     """Return whether this user has stored a model.
 
     Args:
-        digest: the sha256 of the compiled model, from a file; any value is accepted.
+        digest: the SHA-256 of the compiled model, as read from a file. Any value is
+            accepted; a malformed one counts as not stored.
     """
     if not isinstance(digest, str) or not _DIGEST.fullmatch(digest):
         return False

@@ -319,7 +319,7 @@ class SceneRenderer:
         mujoco.mjv_updateCamera(self._model, data, camera, self._scene)
 
     def render(self, data: mujoco.MjData) -> Frame:
-        """Return the frame of `data`, a new `(height, width, 3) uint8` array.
+        """Render `data`, and return the frame as a `(height, width, 3) uint8` array.
 
         The first row is at the top.
 

@@ -186,7 +186,7 @@ class Trajectory:
 
     @functools.cached_property
     def snapshots(self) -> dict[str, NDArray[Any]]:
-        """The arrays that frames are drawn from, by MuJoCo's names, `(F, *shape)`.
+        """The arrays that frames are drawn from, keyed by MuJoCo name: `(F, *shape)`.
 
         Raises:
             UnreadableFile: the file has been removed or is damaged.
