@@ -208,7 +208,7 @@ def test_nothing_to_finish_is_one_clear_error(path: Path) -> None:
     [log], [journal] = log_paths(path.parent), path.parent.glob("*.jsonl")
     journal.write_bytes(b"something else\n")
     for _ in range(2):
-        with pytest.raises(UnreadableFile, match="nor a log of it"):
+        with pytest.raises(UnreadableFile, match="nor its log"):
             finish_trajectory(path)
     assert log.exists()
 
