@@ -202,7 +202,7 @@ def test_what_is_finished_meanwhile_is_read(
 
 def test_nothing_to_finish_is_one_clear_error(path: Path) -> None:
     """Neither log nor file; or a log that cannot be read, which stays."""
-    with pytest.raises(UnreadableFile, match=r"\.h5: neither the file nor a log"):
+    with pytest.raises(UnreadableFile, match=r"\.h5: neither the file nor its log"):
         finish_trajectory(path)
     record(path)
     [log], [journal] = log_paths(path.parent), path.parent.glob("*.jsonl")
