@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import contextlib
 import filecmp
+import functools
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Final, TypeAlias
@@ -226,16 +227,24 @@ class Comparison:
             how=_NOT_MADE if is_given else "no such file, but one was recreated",
         )
 
-    def _is_unplayed(self, model: str | None) -> bool:
+    def _is_unplayed(self, model: str) -> bool:
         """Return whether a model belongs only to recordings that were not recreated."""
-        unplayed = {n.item for n in self._notes if n.excuse == "environment"}
-        played: set[str | None] = set()
-        for path in (self._given / RECORDINGS).glob("*.h5") if unplayed else ():
-            if f"recording {infix_of(path.name)}" not in unplayed:
+        return bool(self._unplayed) and model not in self._played_models
+
+    @functools.cached_property
+    def _unplayed(self) -> set[str]:
+        return {n.item for n in self._notes if n.excuse == "environment"}
+
+    @functools.cached_property
+    def _played_models(self) -> set[str]:
+        """The models of recreated recordings; all trajectories are opened for them."""
+        played: set[str] = set()
+        for path in (self._given / RECORDINGS).glob("*.h5"):
+            if f"recording {infix_of(path.name)}" not in self._unplayed:
                 with contextlib.suppress(Error), open_hdf5(path) as reader:
                     names = reader.facts.get("model") or {}
                     played |= {model_name(str(names.get(k))) for k in ("mjb", "xml")}
-        return bool(unplayed) and model not in played
+        return played
 
     def _compare_file(self, file: str) -> Iterator[Same | Difference | Finding]:
         given, made, kind = self._given / file, self._made / file, _kind(file)

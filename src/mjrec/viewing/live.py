@@ -187,12 +187,12 @@ class _Answers:
             return answer(asked)
 
     def _page(self, asked: dict[str, str]) -> tuple[str, str]:
-        paths = recorded_episodes(self._directory)
-        path = self._path(asked["episode"]) if "episode" in asked else None
+        known = {self._name(path): path for path in recorded_episodes(self._directory)}
+        path = known[asked["episode"]] if "episode" in asked else None
         try:
-            if not paths:
+            if not known:
                 raise InvalidArgument("No episode has been recorded yet.")
-            path = path or paths[-1]
+            path = path or [*known.values()][-1]
             trajectory, stage = self._load(path)
         except Error as error:
             # An episode that has just begun has no state yet.
