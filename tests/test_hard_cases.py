@@ -14,6 +14,7 @@ import subprocess
 import sys
 
 import gymnasium
+import mujoco
 import numpy as np
 import pytest
 from compiled_tasks import growing
@@ -129,6 +130,29 @@ def test_a_task_that_compiles_its_model_at_each_reset(options, tmp_path):
         tmp_path,
         **{**options, **whole, "env_id": "dm_control/growing", **SIZE},
     )
+
+
+@pytest.mark.dm_control
+@pytest.mark.parametrize("is_older", [False, True])
+def test_another_renderer_is_closed_between_live_frames(is_older, tmp_path):
+    """It frees objects in the current context, and leaves none current or dm_control's.
+
+    dm_control notices neither. Its own drawing afterwards works as well.
+    """
+    model = mujoco.MjModel.from_xml_string("<mujoco/>")
+    options = {"video_callable": lambda _: True, "render": "live", **SIZE}
+    drawn = []
+    for way in ("alone", "beside"):
+        with mjrec.Monitor(growing(), tmp_path / way, **options) as env:
+            other = mujoco.Renderer(model, 8, 8) if is_older else None
+            timestep = env.reset()
+            while not timestep.last():
+                if way == "beside":
+                    (other or mujoco.Renderer(model, 8, 8)).close()
+                timestep = env.step(np.zeros(env.action_spec().shape))
+            drawn.append(env.physics.render(**SIZE).tobytes())
+    assert hashes(tmp_path / "beside") == hashes(tmp_path / "alone")
+    assert drawn[0] == drawn[1]
 
 
 def test_an_environment_that_moves_things_while_it_draws(tmp_path):

@@ -3,12 +3,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from operator import attrgetter
 from typing import Any
 
 import numpy as np
+from dm_control._render import base
 from dm_control.mujoco import wrapper
 
 from ..frames import check_size
@@ -20,7 +22,11 @@ from ..simulation.cameras import (
     resolve_camera,
 )
 from ..simulation.capture import Capture
-from ..simulation.gl_context import current_gl_facts
+from ..simulation.gl_context import (
+    collection_paused,
+    context_kept,
+    current_gl_facts,
+)
 from ..simulation.model_sources import AuthoredModel
 from ..simulation.view import (
     SceneView,
@@ -170,9 +176,11 @@ class PhysicsFrames:
 
     def render(self) -> Any:
         """Return the current frame, `(height, width, 3) uint8`."""
-        return self._env.physics.render(
-            height=self._height, width=self._width, camera_id=self._camera
-        )
+        physics = self._env.physics
+        with _own_context(physics):
+            return physics.render(
+                height=self._height, width=self._width, camera_id=self._camera
+            )
 
     def facts(self) -> dict[str, Any]:
         """Return the facts about the frames for a video's metadata."""
@@ -182,9 +190,29 @@ class PhysicsFrames:
             "quality": "full",
             "camera": camera_label(raw_model(physics.model), self._camera),
         }
-        with physics.contexts.gl.make_current() as context:
+        with _own_context(physics) as context:
             facts.update(context.call(current_gl_facts))
         return facts
+
+
+@contextlib.contextmanager
+def _own_context(physics: Any) -> Iterator[Any]:
+    """Make the context that dm_control draws with current, and yield its executor.
+
+    dm_control remembers which context it made current last, and would draw in none if
+    another library had changed that. Nor must its context stay current: a
+    `mujoco.Renderer` that is closed or collected frees in the current context the
+    objects that have the numbers of its own. In both cases, `physics.render()` would
+    return whatever was in memory.
+    """
+    with context_kept(or_none=True), collection_paused():
+        gl = physics.contexts.gl
+        with gl.make_current() as context:
+            context.call(gl._platform_make_current)
+            yield context
+        # dm_control makes it current again when it draws next.
+        base._CURRENT_THREAD_FOR_CONTEXT.pop(id(gl), None)
+        base._CURRENT_CONTEXT_FOR_THREAD.pop(gl.thread, None)
 
 
 class _PhysicsScene:

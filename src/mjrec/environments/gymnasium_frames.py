@@ -149,9 +149,9 @@ def _own_context(env: gymnasium.Env[Any, Any]) -> Iterator[None]:
 @contextlib.contextmanager
 def _current(viewer: Any) -> Iterator[None]:
     """Make a viewer's context current, if there is a viewer; restore it afterwards."""
-    from ..simulation.gl_context import context_kept
+    from ..simulation.gl_context import collection_paused, context_kept
 
-    with context_kept():
+    with context_kept(), collection_paused():
         if viewer is not None:
             viewer.make_context_current()
         yield

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import gc
 import importlib
 import os
 import sys
@@ -132,20 +133,44 @@ def current_gl_facts() -> dict[str, Any]:
 
 
 @contextlib.contextmanager
-def context_kept() -> Iterator[None]:
+def context_kept(*, or_none: bool = False) -> Iterator[None]:
     """Restore the context that was current before the block.
 
     This works only with EGL. The other backends cannot make another library's context
-    current. With them, or if no context was current, the block's context stays current.
+    current: with them, the block's context stays current.
+
+    Args:
+        or_none: whether no context is current afterwards if none was before; otherwise
+            the block's stays current.
     """
     before = _current_in_egl()
     try:
         yield
     finally:
+        if before is None and or_none and (current := _current_in_egl()):
+            egl = sys.modules["OpenGL.EGL"]
+            none = (egl.EGL_NO_SURFACE, egl.EGL_NO_SURFACE, egl.EGL_NO_CONTEXT)
+            before = (current[0], *none)
         if before is not None:
             # The block may have freed that context.
             with contextlib.suppress(sys.modules["OpenGL.error"].Error):
                 sys.modules["OpenGL.EGL"].eglMakeCurrent(*before)
+
+
+@contextlib.contextmanager
+def collection_paused() -> Iterator[None]:
+    """Pause the garbage collector in the block.
+
+    mujoco's renderers free what they drew with when they are collected, in whichever
+    context is current. A frame drawn there then contains whatever was in memory.
+    """
+    was_enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if was_enabled:
+            gc.enable()
 
 
 def refuse_fork_of_gl() -> None:
