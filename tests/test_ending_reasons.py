@@ -205,7 +205,10 @@ def test_a_signal_whose_exception_is_lost_comes_again(tmp_path):
 
 
 @pytest.mark.usefixtures("default_signals")
-def test_the_end_of_an_episode_that_is_interrupted(tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    "moment", ["states.StateRecorder.end", "recorder.Recorder._finished_episode"]
+)
+def test_the_end_of_an_episode_that_is_interrupted(moment, tmp_path, monkeypatch):
     """Ctrl-C while that is written down: recovery makes it, and the next, complete."""
     env = gymnasium.make("InvertedPendulum-v5", max_episode_steps=3)
     monitor = Monitor(env, tmp_path, lambda _: True, workers=0)
@@ -213,7 +216,7 @@ def test_the_end_of_an_episode_that_is_interrupted(tmp_path, monkeypatch):
     steps(monitor, 2)
     with monkeypatch.context() as patch:
         patch.setattr(
-            "mjrec.recorder.states.StateRecorder.end",
+            f"mjrec.recorder.{moment}",
             lambda *_: signal.raise_signal(signal.SIGINT),
         )
         with pytest.raises(KeyboardInterrupt):

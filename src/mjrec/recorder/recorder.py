@@ -486,11 +486,26 @@ class Recorder:
         Args:
             reason: the reason to give if no exception was raised.
         """
-        if self._recording is not None and not self._recording.is_over:
-            failures = _Failures()
-            facts = {"complete": False, **(self._ending or {"reason": reason})}
-            self._end_episode(facts, None, failures)
-            failures.raise_first()
+        recording = self._recording
+        if recording is None or recording.is_over:
+            return
+        if self.stats_recorder.done:
+            # A signal arrived between its last step and its end. Its rows say that it
+            # is complete, and recovery ends it.
+            recording.is_over = True
+            self._leave_recording(recording)
+            return
+        failures = _Failures()
+        facts = {"complete": False, **(self._ending or {"reason": reason})}
+        self._end_episode(facts, None, failures)
+        failures.raise_first()
+
+    def _leave_recording(self, recording: EpisodeRecording) -> None:
+        """Leave the running episode as SIGKILL would."""
+        recording.leave()
+        # The span may now reach to the log's last row, so the next episode needs a
+        # new log.
+        self.run.logs.release()
 
     def _end_episode(
         self,
@@ -543,10 +558,7 @@ class Recorder:
                 with failures, self._tolerating_lost():
                     kept.settle()
         except BaseException:
-            recording.leave()
-            # The span may now reach to the log's last row, so the next episode needs a
-            # new log.
-            self.run.logs.release()
+            self._leave_recording(recording)
             raise
         if episode is not None:
             has_video = recording.video.enabled and standing is not Standing.DROPPED
