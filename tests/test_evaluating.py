@@ -307,7 +307,7 @@ def test_without_opengl_videos_stay_pending(tmp_path, monkeypatch, caplog):
     evaluation = run(tmp_path / "e", keep="best")
     assert evaluation.videos == []
     (path,) = evaluation.pending
-    assert "No video can be drawn here" in caplog.messages[0]
+    assert "Videos cannot be drawn on this machine" in caplog.messages[0]
     assert f"mjrec render {path.parent}" in caplog.text
     columns = read_results(tmp_path / "e").by_task[PENDULUM]
     assert [*columns.videos.values()] == [path.name]

@@ -138,7 +138,7 @@ def test_results_without_timing_are_read(tmp_path):
 
 def test_an_unfinished_evaluation_is_told_from_none(tmp_path):
     """The way on is to resume it; where there is none, it says so."""
-    with pytest.raises(UnreadableFile, match="the directory has no evaluation"):
+    with pytest.raises(UnreadableFile, match="the directory contains no evaluation"):
         read_results(tmp_path)
     assert not is_evaluation(tmp_path)
     (tmp_path / "evaluation.json").write_text("{}")

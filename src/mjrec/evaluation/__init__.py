@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Evaluating policies on episodes of many tasks, with statistics."""
+"""Evaluation of policies on many tasks, with statistics."""

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The finished episodes of a chunk, read from the journals in its directory.
 
-An episode of an evaluation has up to three lines in a journal. `begun` is written
-before its reset. Its end is either the journal's usual line, with `evaluation`, or a
-line `failed`::
+An episode of an evaluation has up to three lines in a journal. The line `begun` is
+written before the reset. The line for the end of the episode is either the journal's
+usual line, with an additional field `evaluation`, or a line `failed`::
 
     {"begun": {"seed": 7, "episode": 0}}
     {"episode_id": 0, "length": 200, ..., "evaluation": {"seed": 7, "episode": 0,
@@ -11,9 +11,9 @@ line `failed`::
     {"failed": {"seed": 7, "episode": 1, "episode_id": 1, "failure": "...",
      "length": 12, "start_time": 1790000000.0, "seconds": 0.2}}
 
-A monitor that closes notes that in its journal, and a process that is stopped from
-outside adds `{"begun": null}`. If a `begun` is followed by none of these, the process
-crashed or was killed in that episode.
+A monitor records in its journal that it was closed, and a process that is stopped from
+outside appends `{"begun": null}`. If none of these lines follows a `begun`, the process
+crashed or was killed during that episode.
 """
 
 from __future__ import annotations
@@ -39,10 +39,10 @@ class ChunkResults:
     """The finished episodes of a chunk.
 
     Attributes:
-        results: results of the episodes that ended, keyed by seed and number.
-        deaths: number of processes that died in an episode without a result, keyed by
-            seed and number.
-        is_drawn_live: whether videos were drawn while episodes ran.
+        results: results of the finished episodes, keyed by seed and episode number.
+        deaths: number of processes that died while running each unfinished episode,
+            keyed by seed and episode number.
+        is_drawn_live: whether videos were drawn while the episodes ran.
     """
 
     results: dict[Unit, EpisodeResult] = field(default_factory=dict)
@@ -51,7 +51,7 @@ class ChunkResults:
 
     @property
     def size(self) -> int:
-        """Amount of work done, including episodes in which a process died."""
+        """A measure of progress: finished episodes plus process deaths."""
         return len(self.results) + self.deaths.total()
 
 
@@ -59,7 +59,7 @@ def read_chunk(folder: Path, task: str) -> ChunkResults:
     """Read the finished episodes of a chunk.
 
     Args:
-        folder: the chunk's monitor directory, which may be missing.
+        folder: the chunk's monitor directory, which does not have to exist.
         task: the environment's name.
 
     Raises:
@@ -76,7 +76,7 @@ def read_chunk(folder: Path, task: str) -> ChunkResults:
 def recorded_results(directory: Path) -> Iterator[tuple[Path, EpisodeResult]]:
     """Yield the finished episodes of an evaluation, with their monitor directories.
 
-    They come in the plan's order, even if the evaluation is not finished.
+    The episodes are in the plan's order, even if the evaluation is unfinished.
 
     Raises:
         UnreadableFile: the plan or a journal cannot be read.

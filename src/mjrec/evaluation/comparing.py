@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Comparing evaluations: how much better B is than A.
+"""Comparison of two evaluations, or sets of evaluations, A and B.
 
 All figures compare B with A: differences are B - A, and the probability of improvement
-is the probability that B has a higher return than A. If each side is one evaluation,
-the figures are computed from its episodes and only hold for these two policies. If a
-side has several evaluations, one per training, the figures are computed from the
-evaluations' means and hold for the two methods: see `docs/reference/statistics.md`.
+is the probability that B has a higher return than A. If each side is a single
+evaluation, the figures are computed from its episodes and apply only to these two
+policies. If a side has several evaluations, one per training run, the figures are
+computed from the mean returns of the evaluations and apply to the two methods. See
+`docs/reference/statistics.md`.
 """
 
 from __future__ import annotations
@@ -33,30 +34,30 @@ TASK_FIGURES: Final = (
     *("mean A", "mean B", "difference", "paired difference"),
     *(IMPROVEMENT, "p-value"),
 )
-"""Names of a task's figures, in the order of tables."""
+"""Names of the figures for one task, in the order in which tables list them."""
 OVERALL_FIGURES: Final = (IMPROVEMENT, "IQM A", "IQM B", "IQM difference")
-"""Names of the figures across all tasks, in the order of tables."""
+"""Names of the figures for all tasks together, in the order used in tables."""
 
 _MOST_TOLD: Final = 10
 
 
 @dataclass(frozen=True, kw_only=True)
 class TaskComparison:
-    """The comparison of A and B on one task. Tuples hold the values of A and B.
+    """The comparison of A and B on one task. Tuples contain the values for A and B.
 
     Attributes:
         task: the task's name.
-        episodes: number of completed episodes, which the figures are computed from.
+        episodes: number of completed episodes. The figures are computed from these.
         failed: number of failed episodes.
-        not_finite: number of completed episodes whose return is NaN or infinite. If
-            there are any, there are no figures.
+        not_finite: number of completed episodes whose return is NaN or infinite. If a
+            side has such episodes, no figures are computed.
         figures: the available figures, keyed by their names in `TASK_FIGURES`. The
-            means are of returns, or, with several evaluations, of their mean returns.
-            The paired difference uses episodes that began in the same state. The
-            p-value is from the two-sided Mann-Whitney test, adjusted (Holm) for the
-            number of tasks.
-        pairs: number of pairs of episodes in the paired difference.
-        unknown: why there are no figures; None if there are figures.
+            means are averages over episodes or, if a side has several evaluations, over
+            the mean returns of the evaluations. The paired difference uses episodes
+            that began in the same state. The p-value is from the two-sided Mann-Whitney
+            test and is adjusted for the number of tasks by Holm's method.
+        pairs: number of episode pairs that the paired difference is computed from.
+        unknown: the reason why there are no figures; None if there are figures.
     """
 
     task: str
@@ -70,25 +71,26 @@ class TaskComparison:
 
 @dataclass(frozen=True, kw_only=True)
 class Comparison:
-    """The comparison of B with A. Two-element tuples hold the values of A and B.
+    """The comparison of B with A.
 
     Attributes:
-        a: directories of A.
-        b: directories of B.
-        unit: the unit of resampling: `"episodes"` with one evaluation on each side,
+        a: evaluation directories of A.
+        b: evaluation directories of B.
+        unit: the unit of resampling: `"episodes"` if each side has one evaluation,
             otherwise `"evaluations"`.
-        policies: the policies.
+        policies: the policies of A and B.
         cautions: reasons not to trust the figures, such as different conditions or
             failed episodes.
         remarks: other differences, which do not affect the figures.
-        left_out: tasks of one side that are not in all evaluations of the other.
-        tasks: the common tasks, in the order of A.
+        left_out: for A and B, the tasks that the other side does not have in all of its
+            evaluations.
+        tasks: the comparison on each common task, in A's order.
         figures: the available figures, keyed by their names in `OVERALL_FIGURES`: the
             probability of improvement, averaged over tasks, and the interquartile means
             of scores.
-        scored: tasks that the scores are computed from: those with the same scale in
-            all evaluations.
-        bootstrap: settings of the confidence intervals.
+        scored: tasks that contribute to the scores, because all evaluations use the
+            same scale for them.
+        bootstrap: settings for the confidence intervals.
     """
 
     a: tuple[Path, ...]
@@ -112,22 +114,24 @@ def compare(
     resamples: int = 10_000,
     seed: int = 0,
 ) -> Comparison:
-    """Compare two evaluations, or two sets of them: how much better is B than A?
+    """Compare two evaluations, or two sets of evaluations.
 
-    With one evaluation on each side, episodes are resampled, and the figures hold for
-    these two policies. With several evaluations (trainings of one method with different
-    seeds), each evaluation is represented by its mean return, and the means are
-    resampled task by task.
+    The figures show how much better B is than A. If each side has one evaluation,
+    episodes are resampled, and the figures apply to these two policies. If a side has
+    several evaluations (training runs of one method with different seeds), each
+    evaluation is represented by its mean return, and the means are resampled for each
+    task separately.
 
     Args:
-        a: the evaluation directory of A, or several.
-        b: the evaluation directory of B, or several.
+        a: the evaluation directory of A, or several directories.
+        b: the evaluation directory of B, or several directories.
         confidence: confidence level of the intervals.
         resamples: number of bootstrap resamples.
-        seed: seed of the bootstrap.
+        seed: seed for the bootstrap.
 
     Raises:
-        UnreadableFile: a directory has no finished evaluation, or it is damaged.
+        UnreadableFile: a directory contains no finished evaluation, or the evaluation
+            is damaged.
         InvalidArgument: the evaluations have no task in common, a side has no
             directory, or a directory is given twice.
     """
@@ -193,11 +197,12 @@ def compare(
 
 
 def holm_adjusted(p_values: Mapping[str, float]) -> dict[str, float]:
-    """Return p-values adjusted for their number by Holm's method.
+    """Adjust p-values for multiple comparisons by Holm's method.
 
-    The k-th smallest of m p-values (from 0) is multiplied by m - k and capped at 1. It
-    is at least as large as the adjusted value before it. If all values below 0.05 are
-    called different, any of these claims is wrong in at most 5 of 100 comparisons.
+    The k-th smallest of m p-values (counted from 0) is multiplied by m - k and capped
+    at 1. If the result is smaller than the adjusted value before it, that value is used
+    instead. If every adjusted value below 0.05 is reported as a difference, then at
+    most 5 in 100 comparisons contain a false report.
     """
     adjusted: dict[str, float] = {}
     largest = 0.0
@@ -208,11 +213,11 @@ def holm_adjusted(p_values: Mapping[str, float]) -> dict[str, float]:
 
 
 class _Side:
-    """The evaluations of one side of a comparison.
+    """The evaluations on one side of a comparison.
 
     Args:
         name: `"A"` or `"B"`.
-        directories: one directory, or several.
+        directories: one directory or several.
     """
 
     def __init__(self, name: str, directories: Directories) -> None:
@@ -225,7 +230,7 @@ class _Side:
                 f"Side {name} has no evaluation. Give at least one directory."
             )
         if len({path.resolve() for path in self.directories}) < len(self.directories):
-            raise InvalidArgument(f"An evaluation is given twice: {self.told}.")
+            raise InvalidArgument(f"An evaluation was given twice: {self.told}.")
         self.results = [read_results(path) for path in self.directories]
 
     @property
@@ -244,7 +249,7 @@ class _Side:
         return [each.plan.policy for each in self.results]
 
     def without(self, tasks: Sequence[str]) -> tuple[str, ...]:
-        """Return all tasks except the given ones."""
+        """Return the tasks of this side except the given ones."""
         return tuple(task for task in self.tasks if task not in tasks)
 
     def returns(self, task: str) -> list[FloatArray]:
@@ -253,18 +258,18 @@ class _Side:
         return [each.rows["total_reward"][~each.failed] for each in columns]
 
     def sample(self, task: str, is_single: bool) -> FloatArray:
-        """Return the sample for the figures: returns, or each evaluation's mean."""
+        """Return the returns if `is_single`, or else the mean of each evaluation."""
         returns = self.returns(task)
         return returns[0] if is_single else np.array([r.mean() for r in returns])
 
     def counts(self, task: str) -> tuple[int, int, int]:
-        """Return the numbers of completed, failed and non-finite episodes."""
+        """Return the number of completed episodes, failed episodes and bad returns."""
         failed = sum(len(each.by_task[task].failures) for each in self.results)
         returns = np.concatenate(self.returns(task))
         return len(returns), failed, _not_finite(returns)
 
     def unknown(self, task: str) -> str | None:
-        """Return why there are no figures for a task; None if there are figures."""
+        """Return the reason why a task has no figures, or None if it has figures."""
         for path, returns in zip(self.directories, self.returns(task), strict=True):
             name = self.name if len(self.results) == 1 else path
             if not len(returns):
@@ -312,7 +317,7 @@ def _overall_figures(
 
 
 def _paired_differences(task: str, a: Evaluation, b: Evaluation) -> FloatArray:
-    """Return the differences B - A of episodes that began in the same state."""
+    """Return B - A for each pair of episodes that began in the same state."""
     if not (
         a.plan.protocol == b.plan.protocol == SEEDED
         and a.plan.env_kwargs == b.plan.env_kwargs
@@ -329,7 +334,7 @@ def _by_unit(columns: TaskResults) -> dict[tuple[int, int], float]:
 
 
 def _scales(results: Sequence[Evaluation]) -> dict[str, tuple[float, float]]:
-    """Return the score ranges of the tasks on which all evaluations agree."""
+    """Return the score ranges, by task, on which all evaluations agree."""
     said: dict[str, set[tuple[float, float] | None]] = {}
     for each in results:
         for summary in each.summaries:
@@ -347,7 +352,7 @@ def _cautions(a: _Side, b: _Side, tasks: Sequence[TaskComparison]) -> Iterator[s
         if len(side.results) == 1 < len(other.results):
             yield (
                 f"{side.name} is a single evaluation, so the variation between "
-                "trainings is unknown and there are no intervals"
+                "training runs is unknown and there are no intervals"
             )
     for name, of_a, of_b in _different(a, b, _conditions):
         yield (
@@ -361,18 +366,18 @@ def _cautions(a: _Side, b: _Side, tasks: Sequence[TaskComparison]) -> Iterator[s
             if failed:
                 yield (
                     f"{task.task}: {failed} of {failed + completed} episodes of "
-                    f"{name} failed; the figures leave them out"
+                    f"{name} failed; the figures do not include them"
                 )
 
 
 def _conditions(results: Evaluation) -> Mapping[str, object]:
-    """Return the conditions that change the returns of the same policy."""
+    """Return the conditions that affect the returns of a policy."""
     plan = results.plan
     return {"max_steps": plan.max_steps, "env_kwargs": plan.env_kwargs}
 
 
 def _choices(results: Evaluation) -> Mapping[str, object]:
-    """Return the choice of episodes, and the versions that ran them."""
+    """Return the options that select episodes, and the versions of packages."""
     plan = results.plan
     return {
         "protocol": plan.protocol,
@@ -385,7 +390,7 @@ def _choices(results: Evaluation) -> Mapping[str, object]:
 def _different(
     a: _Side, b: _Side, facts: Callable[[Evaluation], Mapping[str, object]]
 ) -> Iterator[tuple[str, str, str]]:
-    """Yield each fact that differs between evaluations, with both sides' values."""
+    """Yield each fact that differs between evaluations, and the values in A and B."""
     said = [[facts(each) for each in side.results] for side in (a, b)]
     for name in dict.fromkeys(name for side in said for fact in side for name in fact):
         of_a, of_b = ([fact.get(name, "none") for fact in side] for side in said)

@@ -14,25 +14,28 @@ class EpisodeResult:
     Attributes:
         task: the environment's name.
         seed: the run's seed.
-        episode: the episode's number in the run of this task and seed, from 0.
+        episode: the episode's number within its run, counted from 0. A run consists of
+            the episodes of one task and seed.
         total_reward: the return; None if the episode failed.
-        length: number of steps; for a failed episode, the steps before the failure.
-        terminated: whether the task ended the episode; None if it failed.
-        truncated: whether a limit outside the task ended the episode; None if it
-            failed.
-        success: whether the environment reports a success; None if it does not report
-            that.
-        failure: why the episode could not be completed, in one line; None if it was
-            completed.
-        warnings: number of MuJoCo's warnings by kind, for kinds that occurred. Kinds
-            are the names in `mujoco.mjtWarning` without `mjWARN_`.
-        monitor: infix of its monitor's files; None if it failed before there was a
-            monitor.
-        episode_id: the episode's number in that monitor; None if it failed before the
-            monitor began it.
-        start_time: wall clock when the episode began, in seconds since the epoch; None
-            if unknown.
-        seconds: duration in seconds; None if unknown.
+        length: number of steps; if the episode failed, the number of steps before the
+            failure.
+        terminated: whether the task ended the episode; None if the episode failed.
+        truncated: whether a limit outside the task ended the episode; None if the
+            episode failed.
+        success: whether the environment reported a success; None if it reported neither
+            success nor failure.
+        failure: the reason why the episode could not be completed, as a single line;
+            None if it was completed.
+        warnings: number of MuJoCo warnings, keyed by kind. The kinds are the names in
+            `mujoco.mjtWarning` without `mjWARN_`, and only those that occurred are
+            included.
+        monitor: infix in the file names of the monitor that recorded the episode; None
+            if the episode failed before a monitor was created.
+        episode_id: the episode's number in its monitor; None if the episode failed
+            before the monitor began to record it.
+        start_time: when the episode began, in seconds since the Unix epoch; None if
+            unknown.
+        seconds: wall-clock duration in seconds; None if unknown.
     """
 
     task: str
@@ -52,10 +55,10 @@ class EpisodeResult:
 
     @property
     def reward(self) -> float | None:
-        """The return, under the name that keep rules use."""
+        """The return, under the name that the keep rules expect."""
         return self.total_reward
 
     @property
     def unit(self) -> tuple[int, int]:
-        """Seed and number, which identify the episode within its task."""
+        """The seed and episode number, which identify the episode within its task."""
         return self.seed, self.episode

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Evaluating a policy: `evaluate` distributes the work and writes the results.
+"""`evaluate`, which distributes an evaluation to workers and writes the results.
 
-Workers record the episodes, chunk by chunk. This process simulates nothing and needs no
-OpenGL until videos are drawn. It may be killed at any time: resuming the evaluation
-repeats nothing that is finished.
+Workers record the episodes, one chunk at a time. The calling process does not simulate
+anything, and it needs OpenGL only to draw the videos at the end. It can be killed at
+any time: a resumed evaluation does not repeat finished work.
 """
 
 from __future__ import annotations
@@ -79,8 +79,9 @@ logger = logging.getLogger(__name__)
 _WORKER = "mjrec.evaluation.worker:EvaluationWorker"
 _LOCK_NAME = ".mjrec.evaluation.lock"
 
-# The number of threads that a library uses depends on the machine and would change the
-# order of sums, and so their values. The worker processes keep all CPUs busy anyway.
+# By default the number of a library's threads depends on the machine. It would change
+# the order in which numbers are added, and therefore the results. The worker processes
+# keep all CPUs busy anyway.
 _ONE_THREAD_EACH = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 _GL = "MUJOCO_GL"
@@ -123,20 +124,20 @@ def evaluate(
     on_progress: _Tell | None = None,
     engine: Executor | str | None = None,
 ) -> Evaluation:
-    """Run episodes of each task and seed, and write their results.
+    """Run episodes for each task and seed, and write the results.
 
-    Every episode keeps its trajectory, so it can be rendered later. An episode fails if
-    the policy or the environment raises, or if an action is NaN or has the wrong shape;
-    the other episodes continue. If a worker dies in an episode, the episode is retried,
-    and fails after three deaths.
+    The trajectory of every episode is kept, so any episode can be rendered later. An
+    episode fails if the policy or the environment raises an exception, or if an action
+    is NaN or has the wrong shape. The other episodes still run. If a worker dies during
+    an episode, the episode is retried. It fails after three deaths.
 
-    A worker creates the environment and policy once per task and resets them for each
-    episode. There are two exceptions: an environment that draws its model from the seed
-    (dm_control's `lqr`) is created once per seed, and an environment whose frames are
-    drawn live once per episode.
+    A worker creates the environment and the policy once per task and resets them for
+    each episode. There are two exceptions. An environment that draws its model from the
+    seed (dm_control's `lqr`) is created once per seed, and an environment whose frames
+    are drawn live is created once per episode.
 
-    Ctrl-C and other exceptions end the workers. Finished episodes are kept, and the
-    same call with `resume=True` continues.
+    Ctrl-C and other exceptions stop the workers. Finished episodes are kept, and the
+    same call with `resume=True` continues the evaluation.
 
     Args:
         tasks: environments as in `mjrec record`, sets (`dm_control:benchmarking`,
@@ -146,57 +147,58 @@ def evaluate(
             `module:name()`); or a function of the observation, an object with
             `predict`, or a class that is built with each environment. Objects are
             pickled and sent to each worker.
-        directory: the evaluation's directory; it must be empty or new, unless `resume`
+        directory: the evaluation's directory. It must be new or empty, unless `resume`
             or `force` is given.
         episodes: number of episodes per task and seed. Defaults to 10.
         seeds: the seeds.
         num_seeds: number of seeds, counted from 0, instead of `seeds`. Defaults to 5.
         workers: number of worker processes, which also render. Defaults to one per
-            usable CPU. Results do not depend on it. If `engine` is a name, the number
-            of the engine's workers.
+            usable CPU. If `engine` is a name, this is the number of the engine's
+            workers. The results do not depend on the number.
         keep: rule that chooses the episodes of each task that get a video: `best[:N]`,
             `median`, `worst[:N]` and `failures[:N]`, joined by commas; or `cubic`,
             `all` or `none`. Defaults to `"best,median,worst"`.
         protocol: `"seeded"` (the default): episode i of seed s starts from
-            `SeedSequence([s, i])`. `"suite"`: each task and seed has one random stream,
-            seeded with s.
-        resume: continue the evaluation in the directory and repeat nothing that is
-            finished. Arguments that are None keep their earlier values. You may add
+            `SeedSequence([s, i])`. `"suite"`: the episodes of a task and a seed s share
+            one random stream, which is seeded with s.
+        resume: continue the evaluation in the directory without repeating finished
+            episodes. Arguments that are None keep their earlier values. You may add
             tasks, seeds and (except with `"suite"`) episodes. Everything else must be
             the same, including the policy's code and weights.
         force: delete the evaluation in the directory first.
         max_steps: truncate episodes after this many steps. None for the environment's
-            limit, or 1000.
+            limit, or for 1000 steps if it has no limit.
         episode_timeout: maximum duration of an episode in seconds. An episode that
             takes longer fails, and its worker is ended.
-        camera: the videos' camera. None for the model's tracking camera, if it has one.
-        height: height of the videos in pixels. None for the environment's own.
-        width: width of the videos in pixels. None for the environment's own.
-        max_fps: maximum frames per second of simulated time. None for a frame at every
-            step.
+        camera: the camera for the videos. None for the model's tracking camera, if
+            there is one.
+        height: height of the videos in pixels. None for the environment's default.
+        width: width of the videos in pixels. None for the environment's default.
+        max_fps: maximum number of frames per second of simulated time. None for one
+            frame per step.
         quality: `"full"` (the default) or `"draft"`.
-        env_kwargs: arguments for each environment.
-        policy_kwargs: arguments for the policy.
-        score_ranges: the returns that count as scores 0 and 1 across tasks, by task.
-            dm_control tasks have default ranges.
+        env_kwargs: keyword arguments for each environment.
+        policy_kwargs: keyword arguments for the policy.
+        score_ranges: for each task, the returns that correspond to scores of 0 and 1.
+            Scores make tasks comparable. dm_control tasks have default ranges.
         confidence: confidence level of the intervals.
-        on_progress: called several times a second with the progress.
-        engine: where to run, instead of in child processes: an executor, or `"local"`,
-            `"ray"` or `"slurm"`. Its workers also render. All of them must see the
-            directory under the same path. Results do not depend on it.
+        on_progress: called with the progress several times a second.
+        engine: an executor to use instead of child processes, or `"local"`, `"ray"` or
+            `"slurm"`. Its workers also render. All of them must see the directory under
+            the same path. The results do not depend on the engine.
 
     Returns:
-        The results, which are also in the directory: `results.json`, `results.csv`,
-        `timing.csv`.
+        The results, which are also written to `results.json`, `results.csv` and
+        `timing.csv` in the directory.
 
     Raises:
         MissingDependency: a task's framework, or the engine's package, is not
             installed.
         DifferentEvaluation: `resume` was given with different options.
-        DirectoryInUse: another evaluation is writing to the directory.
+        DirectoryInUse: another evaluation is using the directory.
         PolicyError: the policy cannot be built or sent to other processes.
-        Error: an argument, a task or the policy is invalid. All of these errors are
-            raised before any episode runs.
+        Error: an argument, a task or the policy is invalid. All of the errors above
+            are raised before any episode runs.
     """
     how = Bootstrap(confidence=confidence)
     given = given_engine(engine, workers)
@@ -241,7 +243,7 @@ def evaluate(
         executor = given or local
         is_here = isinstance(executor, LocalEngine)
         work = _work(plan, sent, place, chooses_gl=given is not None)
-        # Quick checks run locally, so that they need not wait in a cluster's queue.
+        # Quick checks run locally, so that they do not wait in a cluster's queue.
         with Run(executor if is_here else local, work) as home:
             load_scipy()
             needed = min(local.workers, len(plan.tasks) * len(plan.chunks))
@@ -252,7 +254,7 @@ def evaluate(
                 _clear(place)
             write_plan(place, plan)
             chunks = chunks_in(place, plan)
-            # The slowest tasks come first, so that all workers end at about the same
+            # The slowest tasks come first, so that all workers finish at about the same
             # time.
             chunks.sort(key=lambda each: -velocities.get(each.task.name, 0))
             if is_here:
@@ -262,7 +264,7 @@ def evaluate(
                 progress = run_chunks(run, chunks, tell)
         results = results_of(plan, chunks)
         choice = choose_videos(plan, chunks, results)
-        # Written before the videos are drawn, because drawing takes long.
+        # Written before the videos are drawn, because drawing takes a long time.
         _write(place, plan, results, choice, ranges, how)
         videos, pending = draw_videos(
             choice,
@@ -276,11 +278,11 @@ def evaluate(
 
 
 def _begun(directory: Path, *, resume: bool, force: bool) -> EvaluationPlan | None:
-    """Return the plan of the evaluation to resume; None if a new one begins.
+    """Return the plan of the evaluation to resume, or None to begin a new evaluation.
 
     Raises:
-        InvalidArgument: the directory has an evaluation, but neither `resume` nor
-            `force` was given; or it has files that are not an evaluation.
+        InvalidArgument: the directory contains an evaluation, but neither `resume` nor
+            `force` was given; or it contains files that do not belong to an evaluation.
     """
     there = (directory / PLAN_NAME).exists()
     if there and resume and not force:
@@ -293,22 +295,22 @@ def _begun(directory: Path, *, resume: bool, force: bool) -> EvaluationPlan | No
         )
     if there:
         raise InvalidArgument(
-            f"{directory} already has an evaluation. To continue it, or to add seeds "
-            "or episodes, use resume=True (--resume). To delete it, use force=True "
-            "(--force). For a new evaluation, use a different directory."
+            f"{directory} already contains an evaluation. To continue it, or to add "
+            "seeds or episodes, use resume=True (--resume). To delete it, use "
+            "force=True (--force). For a new evaluation, use a different directory."
         )
     names = {*names_in(directory)} - {_LOCK_NAME, WORK_FOLDER}
     if names:
         raise InvalidArgument(
-            f"{directory} has files that are not an evaluation ({min(names)} "
-            f"{'and others' if len(names) > 1 else 'only'}). An evaluation needs an "
-            "empty or new directory."
+            f"{directory} contains files that do not belong to an evaluation "
+            f"({min(names)}{' and others' if len(names) > 1 else ''}). An evaluation "
+            "needs a new or empty directory."
         )
     return None
 
 
 def _options(begun: EvaluationPlan | None, **given: Any) -> dict[str, Any]:
-    """Return the options, with defaults or earlier values for those that are None."""
+    """Replace options that are None by their earlier values or their defaults."""
     if begun is None:
         return {
             name: _DEFAULTS.get(name) if value is None else value
@@ -325,8 +327,8 @@ def _options(begun: EvaluationPlan | None, **given: Any) -> dict[str, Any]:
 def _policy_as_begun(begun: EvaluationPlan) -> str:
     if begun.is_object:
         raise PolicyError(
-            f"The policy of this evaluation is an object, {begun.policy}. To continue, "
-            "pass it again (policy=...)."
+            f"The policy of this evaluation is an object ({begun.policy}). To continue "
+            "the evaluation, pass the object again (policy=...)."
         )
     return begun.policy
 
@@ -357,8 +359,8 @@ def _environ_of_workers(plan: EvaluationPlan, *, is_elsewhere: bool) -> dict[str
             **environ_for_drawing(),
         }
     if not keep_rule(plan.keep).keeps_none:
-        # Checked now instead of after hours. A task that is drawn live needs the
-        # backend in its worker.
+        # Checked now, so that a problem does not show up hours later. A task that is
+        # drawn live needs the backend in its worker.
         try:
             wanted[_GL] = choose().backend
         except GLError as error:
@@ -374,10 +376,10 @@ def _make(directory: Path) -> None:
 
 
 def _clear(directory: Path) -> None:
-    """Delete the evaluation in a directory, if any, and nothing else.
+    """Delete the evaluation in a directory, if there is one, and nothing else.
 
     Raises:
-        DirectoryInUse: one of its monitors is open.
+        DirectoryInUse: a monitor of the evaluation is still open.
     """
     if not (directory / PLAN_NAME).exists():
         return
@@ -395,12 +397,12 @@ def _clear(directory: Path) -> None:
 
 @contextlib.contextmanager
 def _held(directory: Path) -> Iterator[None]:
-    """Keep other evaluations out of the directory."""
+    """Lock the directory against other evaluations."""
     lock = try_lock(directory / _LOCK_NAME)
     if lock is None:
         raise DirectoryInUse(
-            f"Another evaluation is writing to {directory}. Wait until it has "
-            "finished, or use a different directory."
+            f"Another evaluation is using {directory}. Wait until it has finished, or "
+            "use a different directory."
         )
     with lock:
         yield
@@ -437,14 +439,14 @@ def _write(
         across=summarize_across(returns, scales, bootstrap=bootstrap),
         bootstrap=bootstrap,
         selection=choice.selection,
-        # SciPy computes the statistics.
+        # SciPy is included because it computes the statistics.
         versions=versions("scipy"),
         files=_Files(directory, plan, choice),
     )
 
 
 class _Files:
-    """A lookup of the files of an episode."""
+    """A function that looks up the files of an episode."""
 
     def __init__(self, directory: Path, plan: EvaluationPlan, choice: Choice) -> None:
         self._directory = directory
@@ -454,7 +456,7 @@ class _Files:
             for task, chosen in choice.selection.items()
         }
         self._folders = {task.name: task.folder for task in plan.tasks}
-        # Cached file names of the previous episode's folder.
+        # The file names in the previous episode's folder are cached.
         self._folder = ""
         self._names: set[str] = set()
 

@@ -1,18 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-"""An evaluation's results, and the files in its directory that hold them.
+"""The results of an evaluation, and the files that store them.
 
 ::
 
     directory/
-    ├── evaluation.json     the plan, written before anything is run
-    ├── results.json        plan, choice of videos, summaries, versions; written last
+    ├── evaluation.json     the plan, written before anything runs
+    ├── results.json        plan, chosen videos, summaries, versions; written last
     ├── results.csv         one row per episode
-    ├── timing.csv          wall times and files of the same episodes
+    ├── timing.csv          wall-clock times and files of the same episodes
     └── <task>/<chunk>/     monitor directories, a few per task
 
 `results.json` and `results.csv` depend only on the plan and on the installed packages.
-They are byte-identical for any number of workers, and no matter how often the
-evaluation was killed and resumed. `result_tables` describes the tables.
+They are byte-identical for any number of workers, no matter how often the evaluation
+was killed and resumed. `result_tables` describes the tables.
 """
 
 from __future__ import annotations
@@ -66,10 +66,10 @@ class ChosenEpisode:
     """An episode that was chosen to get a video.
 
     Attributes:
-        seed: the seed of its run.
+        seed: the seed of the episode's run.
         episode: the episode's number in the run.
-        role: why it was chosen: `"best"`, `"median"`, `"worst"`, `"failure"`, `"cubic"`
-            or `"all"`.
+        role: the part of the keep rule that chose the episode: `"best"`, `"median"`,
+            `"worst"`, `"failure"`, `"cubic"` or `"all"`.
     """
 
     seed: int
@@ -85,14 +85,16 @@ class Evaluation:
         directory: the evaluation's directory.
         plan: the plan of the evaluation.
         summaries: summaries of the tasks, in the plan's order.
-        across: the summary of all tasks that have a scale; None if there is none.
-        bootstrap: settings of the confidence intervals.
+        across: the summary of all tasks that have a scale; None if it was not computed.
+        bootstrap: settings for the confidence intervals.
         selection: the episodes that were chosen to get a video, by task.
-        versions: versions of the packages that ran, by package.
+        versions: versions of the packages that were used, by package.
         by_task: the episodes of each task, in the plan's order.
-        videos: the existing videos; only known after a run, otherwise empty.
-        pending: reasons why chosen videos are missing, keyed by their future paths;
-            only known after a run, otherwise empty.
+        videos: paths of the finished videos. Only set by a run; empty if the results
+            were read from files.
+        pending: reasons why chosen videos are missing, keyed by the paths that the
+            videos will get. Only set by a run; empty if the results were read from
+            files.
     """
 
     directory: Path
@@ -117,7 +119,7 @@ class Evaluation:
         return list(self)
 
     def _repr_html_(self) -> str:
-        """Show the evaluation in a notebook: a row per task, and the chosen videos."""
+        """Return HTML for notebooks, with a row per task and the finished videos."""
         facts = {"episodes": len(self.results), "directory": self.directory}
         level = f"{100 * self.bootstrap.confidence:g} %"
         columns = ("task", "episodes", "mean", level, "IQM", "success", "failed")
@@ -155,9 +157,9 @@ class Evaluation:
         return self.directory / name
 
     def file_of(self, result: EpisodeResult) -> Path | None:
-        """Return an episode's video, or its trajectory if there is no video.
+        """Return the path of an episode's video, or of its trajectory without a video.
 
-        Return None if both are missing.
+        Return None if both files are missing.
         """
         infix = Infix.parse(result.monitor or "")
         if infix is None or result.episode_id is None:
@@ -172,7 +174,7 @@ class Evaluation:
 
 
 def is_evaluation(directory: Path) -> bool:
-    """Return whether a directory has an evaluation, finished or not."""
+    """Return whether a directory contains an evaluation, finished or not."""
     return any((directory / name).is_file() for name in (PLAN_NAME, RESULTS_NAME))
 
 
@@ -188,28 +190,29 @@ def write_results(
     versions: Mapping[str, str],
     files: Callable[[EpisodeResult], EpisodeFiles] = lambda _: EpisodeFiles(),
 ) -> None:
-    """Write the results of an evaluation, `results.json` last.
+    """Write the results of an evaluation. `results.json` is written last.
 
-    An old `results.json` is removed first, so that the tables and summaries of
-    different plans are never found together.
+    An old `results.json` is removed first, so that the directory never contains the
+    tables of one plan together with the summaries of another.
 
     Args:
         directory: the evaluation's directory.
         plan: the plan of the evaluation.
-        results: the results of all episodes of the plan, in its order.
+        results: the results of all episodes in the plan, in the plan's order.
         summaries: summaries of the tasks, in the plan's order.
-        across: the summary of all tasks.
-        bootstrap: settings of the confidence intervals.
+        across: the summary of all tasks that have a scale, if any.
+        bootstrap: settings for the confidence intervals.
         selection: see `Evaluation`.
         versions: see `Evaluation`.
-        files: returns the files of an episode.
+        files: a function that returns the files of an episode.
 
     Raises:
-        FileNotWritten: the disk is full, or the directory is gone or read-only.
+        FileNotWritten: the disk is full, or the directory is missing or read-only.
     """
     value = {
         "format_version": FORMAT_VERSION,
-        # Chunks depend on when episodes were added, which does not change results.
+        # Chunks are left out because they depend on when episodes were added, and that
+        # must not change the results.
         "plan": to_json(replace(plan, chunks=())),
         "selection": {
             "rule": plan.keep,
@@ -234,17 +237,17 @@ def write_results(
 def read_results(directory: Path, *, needs_timing: bool = False) -> Evaluation:
     """Read the results in an evaluation's directory.
 
-    The files are untrusted: sizes, numbers, names and their order are checked, and no
-    file outside the directory is opened.
+    The files are untrusted: their sizes, numbers, names and row order are checked, and
+    no file outside the directory is opened.
 
     Args:
         directory: the evaluation's directory.
-        needs_timing: whether `timing.csv` must exist. Otherwise times and files are
-            unknown if it is missing.
+        needs_timing: whether `timing.csv` must exist. If it is missing and not needed,
+            times and files are unknown.
 
     Raises:
-        UnreadableFile: the directory has no evaluation, the evaluation is not finished,
-            or a file is damaged or missing.
+        UnreadableFile: the directory contains no evaluation, the evaluation is not
+            finished, or a file is damaged or missing.
     """
     read = read_summaries(directory)
     table, timing = directory / _TABLE_NAME, directory / _TIMING_NAME
@@ -253,7 +256,7 @@ def read_results(directory: Path, *, needs_timing: bool = False) -> Evaluation:
 
 
 def read_summaries(directory: Path) -> Evaluation:
-    """Read the results without episodes, from `results.json` alone.
+    """Read the results from `results.json` alone, without the episodes.
 
     Raises:
         UnreadableFile: the file is missing or damaged.
@@ -266,7 +269,7 @@ def read_summaries(directory: Path) -> Evaluation:
         version = field(value, "format_version", integer)
         if version != FORMAT_VERSION:
             raise ValueError(
-                f"its format is version {version}, but this mjrec reads version "
+                f"it has format version {version}, but this mjrec reads version "
                 f"{FORMAT_VERSION}"
             )
         plan = field(value, "plan", _plan)
@@ -307,7 +310,7 @@ def _why_missing(directory: Path) -> str:
             "the evaluation is not finished; to continue it, run the same command with "
             "--resume"
         )
-    return "the directory has no evaluation"
+    return "the directory contains no evaluation"
 
 
 def _plan(value: Any) -> EvaluationPlan:

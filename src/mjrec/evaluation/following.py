@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Distributing an evaluation to workers and following it until all episodes are over.
+"""Distribution of an evaluation to workers, from its start to the drawn videos.
 
-Results are read from the chunks' journals, never from the workers' return values.
+The results of episodes are read from the chunks' journals, never from the return values
+of workers.
 """
 
 from __future__ import annotations
@@ -33,7 +34,8 @@ from .plan import Chunk, EvaluatedTask, EvaluationPlan
 
 logger = logging.getLogger(__name__)
 
-# Seconds between progress reports, and the maximum share of time spent on counting.
+# The number of seconds between progress reports, and the maximum share of the time that
+# is spent on counting finished episodes.
 _SECONDS_BETWEEN_REPORTS = 0.25
 _MOST_OF_TIME = 0.05
 
@@ -43,16 +45,16 @@ class EvaluationProgress:
     """The progress of an evaluation.
 
     Attributes:
-        done: number of finished episodes, including failed ones and those that were
-            already finished when the evaluation was resumed.
+        done: number of finished episodes, including failed episodes and episodes that
+            were finished before the evaluation was resumed.
         failed: number of failed episodes.
-        total: number of all episodes.
+        total: total number of episodes.
         videos_done: number of finished videos.
-        videos: number of all videos, as far as known.
-        frames_done: number of frames drawn for these videos; 0 if the workers of an
-            engine draw them.
-        frames: number of all frames of these videos; 0 if the workers of an engine draw
-            them.
+        videos: total number of videos that are known so far.
+        frames_done: number of frames drawn so far; 0 if an engine's workers draw the
+            videos.
+        frames: total number of frames in the videos; 0 if an engine's workers draw the
+            videos.
     """
 
     done: int = 0
@@ -69,17 +71,17 @@ _Tell = Callable[[EvaluationProgress], object]
 
 @dataclass
 class ChunkRun:
-    """A chunk of a task while it runs.
+    """The current state of a chunk of a task.
 
     Attributes:
         task: the task.
         chunk: the chunk.
-        folder: its monitor directory.
-        known: its finished episodes.
-        rounds: number of times that it was submitted.
-        size: amount of work that was done when it was last submitted.
-        reason: why some of its episodes have no result.
-        is_over: whether no more results will come.
+        folder: the chunk's monitor directory.
+        known: the chunk's finished episodes, as last read.
+        rounds: number of times that the chunk was submitted.
+        size: value of `ChunkResults.size` when the chunk was last submitted.
+        reason: the reason to give for episodes that have no result.
+        is_over: whether the chunk will not produce any more results.
     """
 
     task: EvaluatedTask
@@ -93,7 +95,7 @@ class ChunkRun:
 
     @property
     def is_complete(self) -> bool:
-        """Whether all of its episodes have a result."""
+        """Whether all episodes of the chunk have a result."""
         return all(unit in self.known.results for unit in self.chunk)
 
 
@@ -103,9 +105,9 @@ class Choice:
 
     Attributes:
         selection: the chosen episodes of each task.
-        videos: pairs of a chunk's monitor directory and a recording in it, without
-            duplicates.
-        impossible: reasons why videos cannot be drawn, keyed by their paths.
+        videos: the recordings to draw, without duplicates. Each is a pair of a chunk's
+            monitor directory and the key of a recording in that directory.
+        impossible: reasons why videos cannot be drawn, keyed by the videos' paths.
     """
 
     selection: Mapping[str, Sequence[ChosenEpisode]]
@@ -116,21 +118,23 @@ class Choice:
 def check_tasks(
     run: Run, plan: EvaluationPlan, *, workers: int = 1
 ) -> tuple[EvaluationPlan, Mapping[str, int]]:
-    """Have workers create the environment and policy of each new task, without a step.
+    """Check that workers can create the environment and policy of each new task.
+
+    The environments are not stepped.
 
     Args:
         run: the workers.
         plan: the plan of the evaluation.
-        workers: number of workers to start if there are new tasks. All of them will
-            have to create a task anyway, so they do it in parallel.
+        workers: number of workers to start if there are new tasks. Each worker has to
+            create an environment sooner or later, so they all do it now, in parallel.
 
     Returns:
-        The plan with the tasks' step limits, and a rough measure of the cost of a step
-        for each new task.
+        The plan with the tasks' step limits, and for each new task a rough measure of
+        the cost of a step.
 
     Raises:
-        Error: an environment or policy could not be created; this is the original
-            error, such as an `UnknownName`.
+        Error: an environment or policy could not be created. This is the original error
+            from the worker, such as an `UnknownName`.
     """
     unknown = {task.name: task for task in plan.tasks if task.step_limit is None}
     if unknown:
@@ -139,12 +143,12 @@ def check_tasks(
             run.submit(f"{number}", kind="check", task=name)
     velocities: dict[str, int] = {}
     for outcome in run.results():
-        # Without a timeout there is always an outcome.
+        # `outcome` is only None after a timeout, and none is set here.
         assert outcome is not None
         said = outcome.value or {}
         name = [*unknown][int(outcome.key) % len(unknown)]
         if outcome.failure is not None:
-            # Our own errors come back as "error", so the worker must have died.
+            # The worker must have died, because mjrec's errors are returned as "error".
             raise EnvironmentNotMade(name, outcome.failure)
         if "error" in said:
             raise unpacked(said["error"])
@@ -166,12 +170,12 @@ def chunks_in(directory: Path, plan: EvaluationPlan) -> list[ChunkRun]:
 
 
 def run_chunks(run: Run, chunks: Sequence[ChunkRun], tell: _Tell) -> EvaluationProgress:
-    """Run the missing episodes of chunks, and return the final progress.
+    """Run the missing episodes of all chunks, and return the final progress.
 
     Args:
         run: the workers.
-        chunks: the chunks, in the order in which to submit them.
-        tell: called with the progress.
+        chunks: the chunks, in the order of submission.
+        tell: a function that is called with the progress.
 
     Raises:
         Error: workers cannot be started, or a journal is damaged.
@@ -187,18 +191,18 @@ def run_chunks(run: Run, chunks: Sequence[ChunkRun], tell: _Tell) -> EvaluationP
         if outcome is not None:
             each = by_key.pop(outcome.key)
             each.known = read_chunk(each.folder, each.task.name)
-            # Models stored by this process's workers are trusted as this user's own.
+            # Models that this process's own workers stored can be trusted.
             note_models((outcome.value or {}).get("models", ()))
             if not each.is_complete and each.known.size > each.size:
-                # Progress was made, so try again: an episode that kills its process
-                # then fails on its own.
+                # There was progress, so the chunk is submitted again. An episode that
+                # repeatedly kills its process eventually counts as failed.
                 by_key[_submit(run, each)] = each
                 continue
             each.is_over = True
             if not each.is_complete:
                 said = outcome.failure or (
-                    f"A worker has finished {each.folder}, but its recordings are "
-                    "missing. All machines must see the directory under the same path."
+                    f"A worker finished {each.folder}, but the recordings are missing "
+                    "there. All machines must see the directory under the same path."
                 )
                 logger.warning("%s", said)
                 each.reason = said.partition(" Its last output")[0]
@@ -239,7 +243,7 @@ def results_of(plan: EvaluationPlan, chunks: Iterable[ChunkRun]) -> list[Episode
 def choose_videos(
     plan: EvaluationPlan, chunks: Sequence[ChunkRun], results: Iterable[EpisodeResult]
 ) -> Choice:
-    """Choose the episodes that get a video, and write the choice to their folders."""
+    """Choose the episodes that get a video, and write the choice to the folders."""
     selection: dict[str, list[ChosenEpisode]] = {}
     videos: list[tuple[Path, RecordingKey]] = []
     impossible: dict[Path, str] = {}
@@ -248,7 +252,7 @@ def choose_videos(
         by_task[result.task].append(result)
     for task, own in by_task.items():
         chosen: dict[str, dict[RecordingKey, list[ChosenEpisode]]] = {}
-        # Ties must depend on nothing but the recorded episodes.
+        # The order in which ties are broken must depend only on the episodes.
         own.sort(key=lambda each: each.unit)
         begun = [each if each.episode_id is not None else None for each in own]
         kept = keep_rule(plan.keep).choose(begun)
@@ -270,12 +274,12 @@ def choose_videos(
                     each.folder, roles, rule=plan.keep, finished=len(own)
                 )
             except Error as error:
-                logger.warning("%s: no videos can be chosen: %s", each.folder, error)
+                logger.warning("%s: videos could not be chosen: %s", each.folder, error)
                 keys = {*mine}
                 impossible |= {each.folder / k.video_name: str(error) for k in keys}
             videos += [(each.folder, key) for key in mine if key in keys]
             drawable |= {e for key in mine if key in keys for e in mine[key]}
-        # In the rule's order.
+        # The episodes keep the order in which the rule returned them.
         selection[task] = [
             episode
             for result, role in kept
@@ -298,14 +302,14 @@ def draw_videos(
     Args:
         choice: the chosen episodes.
         directory: the evaluation's directory.
-        engine: the engine whose workers draw; None for child processes.
+        engine: the engine whose workers draw; None to draw in child processes.
         workers: number of child processes.
-        progress: the progress of the episodes.
-        tell: called with the progress.
+        progress: the progress of the episodes, which is included in each report.
+        tell: a function that is called with the progress.
 
     Returns:
-        The existing videos, and the reasons why others are missing, keyed by their
-        paths.
+        The paths of the finished videos, and a mapping from the paths of the missing
+        videos to the reasons why they are missing.
     """
     jobs = [VideoJob.finishing(folder, key) for folder, key in choice.videos]
     why = dict(choice.impossible)
@@ -341,7 +345,7 @@ def draw_videos(
             videos.append(path)
         else:
             text = why.get(path, "Its frames were not recorded.")
-            pending[path] = f"{text} To try again: mjrec render {folder}"
+            pending[path] = f"{text} To try again, run: mjrec render {folder}"
     for reason in dict.fromkeys(pending.values()):
         names = [str(path) for path in pending if pending[path] == reason]
         logger.warning("%s: %s", ", ".join(names), reason)

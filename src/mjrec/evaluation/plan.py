@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The plan of an evaluation, its chunks, and its file `evaluation.json`.
+"""The plan of an evaluation, the plan's chunks, and its file, `evaluation.json`.
 
-The file is written before anything is run.
+The file is written before any episode runs.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ from ..json_text import dumps
 FORMAT_VERSION = 1
 PLAN_NAME = "evaluation.json"
 
-# Logged with the reason if no video can be drawn.
+# The warning to log, with the reason, if videos cannot be drawn.
 NO_GL = (
-    "No video can be drawn here, so chosen videos will stay pending "
-    "(--keep none chooses none): %s"
+    "Videos cannot be drawn on this machine, so the chosen videos will stay pending "
+    "(use --keep none to choose no videos): %s"
 )
 
 Protocol: TypeAlias = Literal["seeded", "suite"]
@@ -34,9 +34,9 @@ SEEDED: Protocol = "seeded"
 SUITE: Protocol = "suite"
 
 Unit: TypeAlias = tuple[int, int]
-"""Seed and number, which identify an episode within its task."""
+"""The seed and episode number, which identify an episode within its task."""
 
-# Fields that may differ when an evaluation is resumed.
+# Fields that may have changed when an evaluation is resumed.
 _MAY_DIFFER = ("tasks", "chunks", "episode_timeout")
 
 _Positive: TypeAlias = Annotated[int, positive]
@@ -44,11 +44,11 @@ _Positive: TypeAlias = Annotated[int, positive]
 
 @dataclass(frozen=True)
 class EvaluatedTask:
-    """An environment that a policy is evaluated in.
+    """An environment in which the policy is evaluated.
 
     Attributes:
-        name: the environment's name, as in `environments.names.parse_environment_name`.
-        folder: base name of its folder in the evaluation's directory.
+        name: the environment's name; see `environments.names.parse_environment_name`.
+        folder: base name of the task's folder in the evaluation's directory.
         step_limit: maximum number of steps per episode; None until the environment has
             been created.
     """
@@ -60,13 +60,13 @@ class EvaluatedTask:
 
 @dataclass(frozen=True)
 class Chunk:
-    """Episodes that one job runs and records into a separate monitor directory.
+    """Episodes of a task that one job runs and records in one monitor directory.
 
     Attributes:
-        folder: base name of the monitor directory, in the folder of each task.
+        folder: base name of the monitor directory in the folder of each task.
         seeds: seeds of the episodes, in ascending order.
-        first: number of each seed's first episode.
-        stop: number after each seed's last episode.
+        first: number of the first episode of each seed.
+        stop: number after the last episode of each seed.
     """
 
     folder: Annotated[str, base_name]
@@ -88,34 +88,35 @@ class Chunk:
 class EvaluationPlan:
     """The checked plan of an evaluation, stored in `evaluation.json`.
 
-    When it is read back, only types and ranges are checked, not whether its tasks and
-    rules exist.
+    When the file is read, types and ranges are checked, but not whether the tasks and
+    the rule exist.
 
     Attributes:
         tasks: the tasks, in the order of the results.
         policy: a string as in `mjrec record`, or the name of an object that is sent
             separately (see `is_object`).
         is_object: whether the policy is an object.
-        policy_kwargs: further arguments for the policy.
-        policy_digests: SHA-256 of the policy's parts, keyed by a description of the
-            part.
+        policy_kwargs: keyword arguments for the policy.
+        policy_digests: SHA-256 of each part of the policy, keyed by a description of
+            the part.
         seeds: the seeds, in the order of the results.
         episodes: number of episodes per task and seed.
         protocol: `"seeded"`: episode i of seed s starts from `SeedSequence([s, i])`.
-            `"suite"`: the environment has one random stream per task and seed.
-        chunks: the chunks in which the episodes of each task run.
+            `"suite"`: the episodes of a task and seed share one random stream.
+        chunks: the chunks into which the episodes of each task are divided.
         keep: rule that chooses the episodes that get a video; see
             `recorder.keep_rules`.
         max_steps: number of steps after which an episode is truncated; None for the
-            environment's own limit, or 1000 if it has no limit.
+            environment's own limit, or for 1000 steps if it has no limit.
         episode_timeout: seconds after which an episode fails; None for no timeout.
-        camera: the videos' camera; None for the model's tracking camera, if it has one.
-        height: height of the videos; None for the environment's own.
-        width: width of the videos; None for the environment's own.
-        max_fps: maximum frames per second of simulated time; None for a frame at every
-            step.
+        camera: the camera for the videos; None for the model's tracking camera, if
+            there is one.
+        height: height of the videos; None for the environment's default.
+        width: width of the videos; None for the environment's default.
+        max_fps: maximum number of frames per second of simulated time; None for one
+            frame per step.
         quality: `"full"` or `"draft"`.
-        env_kwargs: further arguments for each environment.
+        env_kwargs: keyword arguments for each environment.
     """
 
     tasks: tuple[EvaluatedTask, ...]
@@ -138,7 +139,7 @@ class EvaluationPlan:
     env_kwargs: Mapping[str, Any] = field(default_factory=dict)
 
     def chunk_of(self, unit: Unit) -> Chunk | None:
-        """Return the chunk that contains an episode; None if there is none."""
+        """Return the chunk that contains an episode, or None if no chunk does."""
         seed, number = unit
         chunks = self._chunks_by_seed.get(seed, ())
         return next((each for each in chunks if each.first <= number < each.stop), None)
@@ -162,7 +163,7 @@ def write_plan(directory: Path, plan: EvaluationPlan) -> None:
     """Write the plan to an evaluation's directory.
 
     Raises:
-        FileNotWritten: the disk is full, or the directory is gone or read-only.
+        FileNotWritten: the disk is full, or the directory is missing or read-only.
     """
     value = {"format_version": FORMAT_VERSION, "plan": to_json(plan)}
     write_text(directory / PLAN_NAME, dumps(value, indent=2) + "\n")
@@ -172,7 +173,7 @@ def read_plan(directory: Path) -> EvaluationPlan:
     """Read the plan of the evaluation in a directory.
 
     Raises:
-        UnreadableFile: the plan is missing, damaged, or in a different format version.
+        UnreadableFile: the plan is missing, damaged or in a different format version.
     """
     path = directory / PLAN_NAME
     with unreadable(path):
@@ -181,7 +182,7 @@ def read_plan(directory: Path) -> EvaluationPlan:
         if version != FORMAT_VERSION:
             raise UnreadableFile(
                 path,
-                f"its format is version {version}, but this mjrec reads version "
+                f"it has format version {version}, but this mjrec reads version "
                 f"{FORMAT_VERSION}",
             )
         return json_fields.field(
@@ -192,15 +193,20 @@ def read_plan(directory: Path) -> EvaluationPlan:
 def check_continues(
     directory: Path, begun: EvaluationPlan, asked: EvaluationPlan
 ) -> None:
-    """Check that a requested plan can continue one that was begun.
+    """Check that a new plan can continue an evaluation that was begun.
 
-    Different tasks, more seeds and more episodes are allowed, except that the protocol
-    `"suite"` does not allow more episodes, because their number belongs to the unit of
-    work. Any other difference would change results or videos. Episodes cannot be left
-    out, because their returns may already be known.
+    The new plan may have different tasks, additional seeds and more episodes. With the
+    protocol `"suite"`, it must not have more episodes, because the number of episodes
+    is part of the unit of work. Any other difference would change results or videos.
+    Episodes must not be dropped, because their returns may already be known.
+
+    Args:
+        directory: the evaluation's directory, for the error message.
+        begun: the plan of the existing evaluation.
+        asked: the new plan.
 
     Raises:
-        DifferentEvaluation: the requested plan cannot continue the begun one.
+        DifferentEvaluation: the new plan cannot continue the evaluation.
     """
     was, now = to_json(begun), to_json(asked)
     for plan in (was, now):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Building an evaluation's plan, checked without creating an environment."""
+"""Creating and checking the plan of an evaluation, without any environment."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ _MOST_UNITS = 4_000_000
 _OUTSIDE = re.compile(r"[^A-Za-z0-9._-]")
 _LONGEST_FOLDER = 100
 
-# A chunk costs about a tenth of a second and six files. This many processes can work on
-# one task, and larger chunks would save little.
+# A chunk costs about a tenth of a second and six files. With this number of chunks, as
+# many processes can work on one task. Larger chunks would save little.
 _USUAL_CHUNKS = 8
 _MOST_EPISODES_OF_CHUNK = 25
 
@@ -47,17 +47,19 @@ def plan_from(
     begun: EvaluationPlan | None = None,
     **options: Any,
 ) -> EvaluationPlan:
-    """Return the plan of an evaluation; `mjrec.evaluate` describes the options.
+    """Return the checked plan of an evaluation.
+
+    `mjrec.evaluate` describes the options.
 
     Args:
-        tasks: see `evaluate`; if empty, the tasks of `begun`.
+        tasks: see `evaluate`. If empty, the tasks of `begun` are used.
         sent: the policy.
-        seeds: see `evaluate`; if `seeds` and `num_seeds` are both None, the seeds of
-            `begun`.
+        seeds: see `evaluate`. If `seeds` and `num_seeds` are both None, the seeds of
+            `begun` are used.
         num_seeds: see `evaluate`.
-        begun: the plan to continue; its folders and chunks are kept.
-        **options: all other fields of the plan, except those that follow from the
-            policy, the tasks and the seeds.
+        begun: the plan to continue, if any. Its folders and chunks are kept.
+        **options: all fields of the plan that do not follow from the policy, the tasks
+            and the seeds.
 
     Raises:
         UnknownName, InvalidArgument: an argument is invalid.
@@ -80,7 +82,7 @@ def plan_from(
         options["max_fps"] = float(options["max_fps"])
     if (timeout := options["episode_timeout"]) is not None and not 0 < timeout < 1e9:
         raise InvalidArgument(
-            "episode_timeout must be a positive number of seconds below 1e9, got "
+            "episode_timeout must be a positive number of seconds below 1e9, but it is "
             f"{timeout!r}."
         )
     check_quality(options["quality"])
@@ -91,9 +93,9 @@ def plan_from(
     units = len(names) * len(checked_seeds) * options["episodes"]
     if units > _MOST_UNITS:
         raise InvalidArgument(
-            f"{len(names)} tasks, {len(checked_seeds)} seeds and "
-            f"{options['episodes']} episodes are {units} episodes, but an evaluation "
-            f"can have at most {_MOST_UNITS}."
+            f"{len(names)} tasks with {len(checked_seeds)} seeds and "
+            f"{options['episodes']} episodes per seed make {units} episodes, but an "
+            f"evaluation can have at most {_MOST_UNITS}."
         )
     plan = EvaluationPlan(
         tasks=_with_folders(names, known),
@@ -108,10 +110,11 @@ def plan_from(
 
 
 def chunks_of(plan: EvaluationPlan, known: Sequence[Chunk]) -> tuple[Chunk, ...]:
-    """Return the chunks of a plan: the known ones, and new ones for other episodes.
+    """Return the chunks of a plan.
 
-    A chunk has one seed or consecutive seeds. With the protocol `"seeded"`, where
-    episodes are independent, a seed with many episodes is split into several chunks.
+    The known chunks are kept, and new chunks are added for all other episodes. A chunk
+    has one seed or several consecutive seeds. With the protocol `"seeded"`, episodes
+    are independent, so a seed with many episodes is split into several chunks.
     """
     stops = {seed: chunk.stop for chunk in known for seed in chunk.seeds}
     left: dict[int, list[int]] = {}
@@ -137,11 +140,12 @@ def chunks_of(plan: EvaluationPlan, known: Sequence[Chunk]) -> tuple[Chunk, ...]
 def check_score_ranges(
     score_ranges: Mapping[str, tuple[float, float]] | None, tasks: Iterable[str]
 ) -> dict[str, tuple[float, float]]:
-    """Return the checked score ranges, by task.
+    """Check score ranges and return them, keyed by task.
 
     Raises:
-        UnknownName: a range is for a task that is not evaluated.
-        InvalidArgument: a range is not two finite numbers, the lower one first.
+        UnknownName: a range is given for a task that is not evaluated.
+        InvalidArgument: a range does not consist of two finite numbers in ascending
+            order.
     """
     names = list(tasks)
     checked = {}
@@ -159,7 +163,7 @@ def _chunk_name(seeds: Sequence[int], first: int, stop: int, episodes: int) -> s
 
 
 def _range(what: str, first: int, last: int) -> str:
-    """Return a name such as `seed-003`, or `seeds-000-011` for several."""
+    """Return a name such as `seed-003` for one number, or `seeds-000-011`."""
     if first == last:
         return f"{what}-{first:03d}"
     return f"{what}s-{first:03d}-{last:03d}"
@@ -172,8 +176,8 @@ def _score_range(task: str, given: Any) -> tuple[float, float]:
         low = high = np.nan
     if not (np.isfinite([low, high]).all() and low < high):
         raise InvalidArgument(
-            f"The score range of {task} must be the return that counts as 0 and a "
-            f"higher one that counts as 1, such as (0, 1000), got {given!r}."
+            f"The score range of {task} must be the return for a score of 0 and a "
+            f"higher return for a score of 1, such as (0, 1000), but it is {given!r}."
         )
     return low, high
 
@@ -184,8 +188,8 @@ def _seeds(seeds: Iterable[int] | None, num_seeds: int | None) -> tuple[int, ...
         return tuple(range(_positive("num_seeds", number)))
     if num_seeds is not None:
         raise InvalidArgument(
-            f"seeds={seeds!r} lists the seeds, and num_seeds={num_seeds!r} counts them "
-            "from 0. Give only one of them."
+            f"seeds={seeds!r} and num_seeds={num_seeds!r} were both given. Give only "
+            "one of them: seeds lists the seeds, and num_seeds counts them from 0."
         )
     if isinstance(seeds, int | np.integer):
         seeds = [int(seeds)]
@@ -194,7 +198,7 @@ def _seeds(seeds: Iterable[int] | None, num_seeds: int | None) -> tuple[int, ...
         episode_seeds(seed, 0)
     if not given or len(set(given)) < len(given):
         raise InvalidArgument(
-            f"seeds must not be empty or contain duplicates, got {list(given)}."
+            f"seeds must not be empty or contain duplicates, but it is {list(given)}."
         )
     return tuple(map(int, given))
 
@@ -202,21 +206,23 @@ def _seeds(seeds: Iterable[int] | None, num_seeds: int | None) -> tuple[int, ...
 def _positive(name: str, value: object) -> int:
     whole = isinstance(value, int | np.integer) and not isinstance(value, bool)
     if not whole or value < 1:  # type: ignore[operator]  # it is a number
-        raise InvalidArgument(f"{name} must be a positive whole number, got {value!r}.")
+        raise InvalidArgument(
+            f"{name} must be a positive whole number, but it is {value!r}."
+        )
     return int(value)  # type: ignore[call-overload, no-any-return]  # it is a number
 
 
 def _json_of(what: str, given: Mapping[str, Any]) -> dict[str, Any]:
-    """Convert arguments to JSON and back, which is how they reach a worker."""
+    """Convert arguments to JSON and back, as happens on their way to a worker."""
     kwargs = {}
     for name, value in given.items():
         try:
             kwargs[name] = loads(json.dumps(value, allow_nan=False))
         except (TypeError, ValueError, RecursionError) as error:
             raise InvalidArgument(
-                f"{what} must be JSON (strings, numbers, lists and objects), because "
-                f"they are sent to other processes and stored in a file, but {name!r} "
-                f"is {value!r}: {error}."
+                f"{what} must contain only JSON values (strings, numbers, lists and "
+                "objects), because they are sent to other processes and stored in a "
+                f"file. {name!r} is {value!r}, which is not such a value: {error}."
             ) from error
     return kwargs
 
@@ -234,10 +240,10 @@ def _with_folders(
 
 def _folder(name: str, taken: set[str]) -> str:
     parsed = parse_environment_name(name)
-    # The location of a file must not appear in the results.
+    # The results must not reveal where a file was stored.
     text = parsed.path.name if isinstance(parsed, MjcfName) else name
     base = _OUTSIDE.sub(_encoded, text.replace("/", "-"))[:_LONGEST_FOLDER]
-    # Neither a hidden folder nor a relative path such as `..`.
+    # Avoids hidden folders and relative paths such as `..`.
     base = f"-{base}" if base.startswith(".") else base
     folder, number = base, 1
     while folder in taken:

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Policies in the form that is sent to workers: a name, or a pickled object.
+"""Policies in a form that can be sent to workers: a name or a pickled object.
 
-Each part of a policy has a digest: the source of its module, the files that its
-arguments name, and an object's pickled content. The digests prevent results of
-different policies from being mixed.
+A digest is stored for each part of a policy: the source file of its module, each file
+named in its arguments, and the pickled content of an object. The digests prevent a
+resumed evaluation from mixing the results of different policies.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ from ..errors import PolicyError
 
 @dataclass(frozen=True)
 class SentPolicy:
-    """A policy that can be sent.
+    """A policy that can be sent to workers.
 
     Attributes:
-        name: the given string, or the object's qualified name.
-        payload: the pickled object; None for a string.
-        digests: SHA-256 of its parts, keyed by a description of the part.
+        name: the policy as given if it is a string, otherwise its qualified name.
+        payload: the pickled object; None if the policy is a string.
+        digests: SHA-256 of each part of the policy, keyed by a description of the part.
     """
 
     name: str
@@ -38,20 +38,20 @@ class SentPolicy:
 
     @property
     def is_object(self) -> bool:
-        """Whether the policy is an object."""
+        """Whether the policy is an object instead of a string."""
         return self.payload is not None
 
 
 def sent_policy(policy: Any, kwargs: Mapping[str, Any]) -> SentPolicy:
-    """Return a policy in the form that is sent to workers.
+    """Convert a policy to a form that can be sent to workers.
 
     Args:
-        policy: a string as in `mjrec record`; or a function, an object with `predict`,
-            or a class that is built with each environment.
-        kwargs: further arguments for the policy.
+        policy: a string as in `mjrec record`, a function, an object with `predict`, or
+            a class that is built with each environment.
+        kwargs: keyword arguments for the policy.
 
     Raises:
-        PolicyError: `policy` is not a valid policy, or cannot be pickled.
+        PolicyError: `policy` is not a valid policy or cannot be pickled.
     """
     arguments = {
         f"the file of its argument {name}": digest
@@ -62,9 +62,9 @@ def sent_policy(policy: Any, kwargs: Mapping[str, Any]) -> SentPolicy:
         return SentPolicy(policy, None, {**_digests_of_text(policy), **arguments})
     if not (callable(policy) or callable(getattr(policy, "predict", None))):
         raise PolicyError(
-            f"The policy {policy!r:.200} is not callable and has no predict(). Give "
-            "such an object, a class that is built with the environment, or a string: "
-            "random, zero, module:name or module:name()."
+            f"The policy {policy!r:.200} is not callable and has no predict() method. "
+            "Give a function, an object with predict(), a class that is built with the "
+            "environment, or a string: random, zero, module:name or module:name()."
         )
     named = policy if hasattr(policy, "__qualname__") else type(policy)
     module = inspect.getmodule(named)
@@ -79,7 +79,7 @@ def sent_policy(policy: Any, kwargs: Mapping[str, Any]) -> SentPolicy:
 
 
 def _digests_of_text(policy: str) -> dict[str, str]:
-    """Return the digest of the file that a string names, or of its module's source."""
+    """Return the digest of the policy file or of the module's source file."""
     module, colon, _ = policy.partition(":")
     if not colon:
         digest = _file_digest(Path(policy))
@@ -91,7 +91,7 @@ def _digests_of_text(policy: str) -> dict[str, str]:
                 found = importlib.util.find_spec(module)
             source = None if found is None else found.origin
     except Exception:
-        # The workers import it and report what is wrong with it.
+        # The workers will import the module and report the error.
         return {}
     digest = None if source is None else _file_digest(Path(source))
     return {} if digest is None else {"its code": digest}
@@ -105,18 +105,19 @@ def _file_digest(path: Path) -> str | None:
 
 
 def _pickled(policy: Any, name: str) -> bytes:
-    # Imported here because only running needs it; it is a dependency of gymnasium. The
-    # pickle goes through our own pipe to our own processes.
+    # Imported here because only an evaluation with an object needs cloudpickle, which
+    # is a dependency of gymnasium. The pickle is sent through our own pipe to our own
+    # processes.
     import cloudpickle  # type: ignore[import-untyped]  # it has no types
 
     try:
         payload: bytes = cloudpickle.dumps(policy)
     except Exception as error:
         raise PolicyError(
-            f"The policy {name} cannot be sent to the processes that run it: "
-            f"{type(error).__name__}: {error}. Give its name instead, "
-            "policy='module:name'. Each process then imports it, and builds a class "
-            "with its environment."
+            f"The policy {name} cannot be sent to the worker processes: "
+            f"{type(error).__name__}: {error}. Pass its name instead "
+            "(policy='module:name'). Each process then imports the policy or, if it is "
+            "a class, builds it with the environment."
         ) from error
     return payload
 
@@ -124,7 +125,7 @@ def _pickled(policy: Any, name: str) -> bytes:
 def _digest_of_pickle(payload: bytes) -> str:
     from cloudpickle import cloudpickle
 
-    # Classes that are pickled by value get a random name in each process.
+    # A class that is pickled by value gets a different random name in each process.
     names = getattr(cloudpickle, "_DYNAMIC_CLASS_TRACKER_BY_CLASS", {})
     for name in names.values():
         payload = payload.replace(name.encode(), b"0" * len(name))

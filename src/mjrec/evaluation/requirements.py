@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Requirements on comparisons, such as `probability of improvement > 0.75`."""
+"""Requirements that a comparison must meet, such as `IQM difference low > 0`."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ class Requirement:
     """A requirement on a figure of a comparison.
 
     Attributes:
-        text: the requirement as given.
-        task: the task; None for all tasks together, or, for figures that only exist per
-            task, for each of them.
+        text: the requirement as the user wrote it.
+        task: name of the task. None means all tasks together if there is such a figure,
+            and otherwise each task separately.
         figure: the figure's name.
-        end: `"low"` or `"high"` for that end of the figure's interval; None for the
+        end: `"low"` or `"high"` for an end of the figure's interval; None for the
             figure itself.
         sign: the comparison operator.
         number: the number to compare with.
@@ -48,7 +48,7 @@ class Requirement:
     number: float
 
     def shortfalls(self, comparison: Comparison) -> Iterator[str]:
-        """Yield a message for each figure that violates the requirement.
+        """Yield a message for each figure that does not meet the requirement.
 
         Raises:
             UnknownName: the comparison does not include the task.
@@ -86,13 +86,13 @@ def parse_requirement(text: str) -> Requirement:
 
     Raises:
         InvalidArgument: the string does not have this form.
-        UnknownName: the figure does not exist.
+        UnknownName: there is no figure with this name.
     """
     match = _FORM.fullmatch(text.strip())
     if match is None:
         raise InvalidArgument(
-            "A requirement must be FIGURE > NUMBER (or >=, <, <=), such as "
-            f"'probability of improvement > 0.75', got {text!r}."
+            f"{text!r} is not a valid requirement. Write FIGURE > NUMBER (or >=, <, "
+            "<=), such as 'probability of improvement > 0.75'."
         )
     task, figure = match["task"], match["figure"]
     figures = TASK_FIGURES if task else {*TASK_FIGURES, *OVERALL_FIGURES}
