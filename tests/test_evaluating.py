@@ -644,7 +644,7 @@ def test_what_cannot_be_drawn_has_results_without_videos(tmp_path, caplog):
     # Nor is any announced.
     assert len(evaluation.selection["CartPole-v1"]) == is_drawn
     assert len(read_results(tmp_path / "e").by_task["CartPole-v1"].videos) == is_drawn
-    said = [r.message for r in caplog.records if "no videos, only results" in r.message]
+    said = [r.message for r in caplog.records if "will have no videos" in r.message]
     assert len(said) == (not is_drawn)
 
 

@@ -84,7 +84,7 @@ def test_an_unknown_set_lists_the_sets(text):
 
 def test_a_pattern_that_matches_nothing_says_where_it_looked():
     """And names what is like it."""
-    with pytest.raises(UnknownName, match=r"The search covers .*dm_control:all"):
+    with pytest.raises(UnknownName, match=r"Patterns are matched .*dm_control:all"):
         tasks_from(["HalfChetah-v*"])
 
 

@@ -1,21 +1,22 @@
 # SPDX-License-Identifier: Apache-2.0
 """`results.csv` and `timing.csv`: one row per episode, in the plan's order.
 
-`results.csv` depends only on the plan: it is byte-identical for any number of workers,
-and no matter how often the evaluation was killed and resumed::
+`results.csv` depends only on the plan and the installed packages. It is byte-identical
+for any number of workers, no matter how often the evaluation was killed and resumed::
 
     task,seed,episode,return,length,terminated,truncated,success,failure
 
-Truth values are `true`, `false`, or empty if unknown. Numbers are written with Python's
-`repr`, so they are read back exactly. A failure is a single line.
+Truth values are `true`, `false` or, if unknown, empty. Numbers are written with
+Python's `repr`, so reading them returns exactly the same values. A failure is a single
+line.
 
-`timing.csv` holds what differs between runs: wall times, and the files of an episode.
-Its rows are for the same episodes, in the same order::
+`timing.csv` contains the facts that differ between runs: wall-clock times and the files
+of each episode. It has one row for each row of `results.csv`, in the same order::
 
     task,seed,episode,start,seconds,folder,monitor,episode_id,trajectory,video
 
-The files are untrusted: all values that are used are checked, lines are shorter than
-`_LONGEST_LINE`, and rows are read into columns, never into objects.
+The files are untrusted: all values that are used are checked, lines must be shorter
+than `_LONGEST_LINE`, and rows are read into arrays, never into one object per row.
 """
 
 from __future__ import annotations
@@ -48,8 +49,8 @@ _TIMING: Final = (
     *("episode_id", "trajectory", "video"),
 )
 
-# Room for a name, a few numbers and one line of an error. The csv module's own limit
-# for a single field is twice as much.
+# Enough for a name, a few numbers and one line of an error. The csv module's own limit
+# for a single field is twice as large.
 _LONGEST_LINE: Final = 1 << 16
 _LONGEST_FAILURE: Final = 2000
 _MOST_ROWS: Final = 4_000_000
@@ -71,10 +72,11 @@ class EpisodeFiles:
     """The files of an episode.
 
     Attributes:
-        folder: the monitor directory, relative to the evaluation's directory; None if
-            the episode has no files.
-        trajectory: base name of the trajectory; None if there is no trajectory.
-        video: base name of the video, finished or pending; None if there is no video.
+        folder: path of the monitor directory, relative to the evaluation's directory;
+            None if the episode has no files.
+        trajectory: base name of the trajectory; None if the episode has no trajectory.
+        video: base name of the finished or pending video; None if the episode gets no
+            video.
     """
 
     folder: str | None = None
@@ -82,7 +84,7 @@ class EpisodeFiles:
     video: str | None = None
 
 
-# One episode. -1 and NaN mean unknown.
+# The dtype of one episode. -1 and NaN mean unknown.
 ROW: Final = np.dtype(
     [
         *(("seed", "<i8"), ("episode", "<i8"), ("total_reward", "<f8")),
@@ -97,17 +99,17 @@ ROW: Final = np.dtype(
 class TaskResults:
     """The episodes of one task, in the plan's order: by seed, then by number.
 
-    A million episodes take 70 MB.
+    A million episodes take 70 MB of memory.
 
     Attributes:
         task: the environment's name.
-        rows: `(n,)` of `ROW`, with the fields of `EpisodeResult`. `total_reward` is NaN
-            for a failed episode or a NaN return. Truth values are 1, 0 or -1.
-            `monitor` is an index into `monitors`.
-        failures: the failures of failed episodes, keyed by index.
-        places: the indices of the monitors that recorded the episodes, keyed by monitor
-            directory (relative to the evaluation's directory) and infix.
-        videos: base names of the episodes' videos, keyed by index.
+        rows: array of shape `(n,)` and dtype `ROW`, with the fields of `EpisodeResult`.
+            `total_reward` is NaN if the episode failed or if its return is NaN. Truth
+            values are 1, 0 or -1 (unknown). `monitor` is an index into `monitors`.
+        failures: reasons why episodes failed, keyed by the index of the episode.
+        places: the index of each monitor that recorded episodes, keyed by the monitor
+            directory (relative to the evaluation's directory) and the infix.
+        videos: base names of videos, keyed by the index of the episode.
     """
 
     task: str
@@ -121,7 +123,7 @@ class TaskResults:
 
     @property
     def failed(self) -> NDArray[np.bool_]:
-        """`(n,) bool`, whether each episode failed."""
+        """Whether each episode failed, with shape `(n,)`."""
         failed = np.zeros(len(self), dtype=np.bool_)
         failed[list(self.failures)] = True
         return failed
@@ -132,7 +134,7 @@ class TaskResults:
         return [infix for _, infix in self.places]
 
     def video_path(self, index: int) -> str | None:
-        """Return the path of an episode's video, or None if it has no video.
+        """Return the path of an episode's video, or None if there is no video.
 
         The path is relative to the evaluation's directory.
         """
@@ -142,7 +144,7 @@ class TaskResults:
         return f"{folder}/{self.videos[index]}"
 
     def __iter__(self) -> Iterator[EpisodeResult]:
-        """Yield each episode as a result, without its warnings."""
+        """Yield the result of each episode, without its warnings."""
         monitors = self.monitors
         for index, row in enumerate(self._rows_in_python()):
             failure, monitor = self.failures.get(index), row["monitor"]
@@ -191,7 +193,13 @@ def write_timing_table(
     results: Iterable[EpisodeResult],
     files: Callable[[EpisodeResult], EpisodeFiles],
 ) -> None:
-    """Write `timing.csv`; `files` returns the files of an episode."""
+    """Write `timing.csv`.
+
+    Args:
+        file: the file, opened with `newline=""`.
+        results: all episodes, in the plan's order.
+        files: a function that returns the files of an episode.
+    """
     writer = csv.writer(file, lineterminator="\n")
     writer.writerow(_TIMING)
     for each in results:
@@ -215,9 +223,11 @@ def read_tables(
 
     Args:
         results: the path of `results.csv`.
-        timing: the path of `timing.csv`. If it is missing, times and files are unknown.
-        plan: the plan of the evaluation. The tables must have exactly its episodes.
-        needs_timing: whether `timing.csv` must exist, too.
+        timing: the path of `timing.csv`. If the file is missing, times and files are
+            unknown.
+        plan: the plan of the evaluation. The tables must contain exactly the episodes
+            of the plan.
+        needs_timing: whether `timing.csv` must exist as well.
 
     Raises:
         UnreadableFile: a table is damaged or missing, or belongs to a different plan.
@@ -269,7 +279,7 @@ def _read_timing(of: TaskResults, index: int, values: Sequence[str]) -> None:
     place = folder, monitor
     infix = Infix.parse(monitor)
     if infix is None or not _FOLDER.fullmatch(folder):
-        raise ValueError(f"{folder!r:.80}, {monitor!r:.80} is not a monitor")
+        raise ValueError(f"{monitor!r:.80} in {folder!r:.80} is not a monitor")
     row["monitor"] = of.places.setdefault(place, len(of.places))
     row["episode_id"] = number = _whole(episode_id)
     if video:
@@ -285,31 +295,31 @@ def _read_rows(
     columns: Mapping[str, TaskResults],
     read: Callable[[TaskResults, int, Sequence[str]], None],
 ) -> None:
-    """Read a table, whose rows must match the episodes of `columns` exactly."""
+    """Read a table whose rows must match the episodes of `columns` exactly."""
     with open_regular(path) as binary:
         file = io.TextIOWrapper(binary, encoding="utf-8", newline="")
         reader = csv.reader(_lines(file), strict=True)
         line = 0
         try:
             if tuple(next(reader, ())) != tuple(header):
-                raise ValueError(f"its first line is not {','.join(header)}")
+                raise ValueError(f"the first line is not {','.join(header)}")
             units = ((of, index) for of in columns.values() for index in range(len(of)))
             for line, (of, index) in enumerate(units, start=2):
                 row = next(reader, [])
                 if len(row) != len(header) or reader.line_num != line:
-                    raise ValueError(f"it is not one row of {len(header)} values")
+                    raise ValueError(f"the line is not a row with {len(header)} values")
                 unit = [_encodable(of.task), *map(str, of.rows[index].item()[:2])]
                 if row[:3] != unit:
                     raise ValueError(
-                        f"expected the episode {', '.join(unit)}, found "
+                        f"the episode should be {', '.join(unit)}, but it is "
                         f"{', '.join(row[:3]):.80}"
                     )
                 read(of, index, row[3:])
             if next(reader, None) is not None:
                 line += 1
-                raise ValueError("it has more episodes than the plan")
+                raise ValueError("the table has more episodes than the plan")
         except UnicodeDecodeError as error:
-            raise ValueError(f"it is not UTF-8 text after line {line}") from error
+            raise ValueError(f"the text after line {line} is not UTF-8") from error
         except (csv.Error, ValueError) as error:
             raise ValueError(f"line {line or 1}: {error}") from error
 
@@ -317,7 +327,7 @@ def _read_rows(
 def _lines(file: TextIO) -> Iterator[str]:
     while line := file.readline(_LONGEST_LINE):
         if len(line) == _LONGEST_LINE:
-            raise ValueError("it is too long for a line of a table")
+            raise ValueError("the line is too long")
         yield line
 
 
@@ -334,7 +344,7 @@ def _truth_text(value: bool | None) -> str:
 
 
 def _one_line(text: str) -> str:
-    # A failed episode needs a text here, even if the error has no message.
+    # A failed episode must have text here, even if the error has no message.
     shown = "".join(c if c.isprintable() else " " for c in _encodable(text))
     return " ".join(shown.split())[:_LONGEST_FAILURE] or "unknown"
 

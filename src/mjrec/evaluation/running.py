@@ -1,11 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Running the missing episodes of a chunk.
 
-The environment and the policy are reused across the chunks of a task. They are
-recreated in three cases: after a failed episode, because the environment may be in any
-state; for each seed, if the environment draws its model from the seed when it is
-created (dm_control's `lqr`); and for each episode that is drawn live, because its
-frames depend on earlier ones.
+The environment and the policy are reused for all chunks of a task. They are recreated
+in three cases:
+
+- after a failed episode, because the environment may be in any state;
+- for each seed, if the environment draws its model from the seed when it is created
+  (dm_control's `lqr`);
+- for each episode that is drawn live, because its frames would depend on earlier
+  episodes.
 """
 
 from __future__ import annotations
@@ -66,7 +69,7 @@ class Acting:
 
     Attributes:
         task: the environment's name.
-        seed: the seed that it was created with.
+        seed: the seed that the environment was created with.
         named: the environment.
         policy: the policy.
         is_drawn_live: whether frames are drawn while the environment is stepped.
@@ -84,10 +87,10 @@ class Evaluator:
 
     Args:
         plan: the plan of the evaluation.
-        policy: the pickled policy if it is an object, otherwise None.
+        policy: the pickled policy if the policy is an object, otherwise None.
 
     Attributes:
-        journal: the running episode's journal; None if there is no open monitor.
+        journal: path of the open monitor's journal; None if no monitor is open.
     """
 
     def __init__(self, plan: EvaluationPlan, policy: bytes | None) -> None:
@@ -102,7 +105,7 @@ class Evaluator:
         return not keep_rule(self._plan.keep).keeps_none
 
     def fits(self, task: str, seed: int, *, continues: bool) -> bool:
-        """Return whether the current environment and policy fit an episode.
+        """Return whether the current environment and policy can run an episode.
 
         Args:
             task: the episode's environment name.
@@ -119,7 +122,9 @@ class Evaluator:
         return continues or (is_of_seed and not known.is_drawn_live)
 
     def acting(self, task: str, seed: int, *, continues: bool = False) -> Acting:
-        """Return an environment and its policy, reusing the current ones if they fit.
+        """Return an environment and its policy for an episode.
+
+        The current environment and policy are reused if `fits` allows that.
 
         Raises:
             Error: see `environment_from_name`, `load_policy` and `policy_from`.
@@ -131,7 +136,7 @@ class Evaluator:
         return self._acting
 
     def leave(self) -> None:
-        """Note that the running episode did not cause the end of this process."""
+        """Record that the running episode is not the reason why this process ends."""
         if self.journal is not None:
             with self.journal.open("ab") as file:
                 file.write(b'{"begun": null}\n')
@@ -148,12 +153,12 @@ class Evaluator:
         Args:
             task: the environment's name.
             folder: the chunk's monitor directory. No other process may write to it, and
-                recordings of killed processes must have been recovered.
-            chunk: the episodes.
+                the recordings of killed processes must have been recovered.
+            chunk: the chunk.
 
         Raises:
-            Error: something cannot be created or recorded. Finished episodes are in the
-                journal.
+            Error: the environment or the policy cannot be created, or an episode cannot
+                be recorded. The journal contains the episodes that were finished.
         """
         try:
             _ChunkRun(self, self._plan, task, folder, chunk).run()
@@ -184,7 +189,7 @@ class Evaluator:
             raise
         can_be_drawn = self.draws and named.not_drawn is None
         if self.draws and not can_be_drawn:
-            logger.warning("%s: no videos, only results. %s", task, named.not_drawn)
+            logger.warning("%s will have no videos. %s", task, named.not_drawn)
         return Acting(task, seed, named, policy, can_be_drawn and choice.mode == LIVE)
 
     def _make_policy(self, environment: Any) -> Policy:
@@ -193,18 +198,18 @@ class Evaluator:
             return load_policy(name, environment, self._plan.policy_kwargs)
         try:
             with working_directory_importable():
-                # Safe to unpickle: it comes through our own pipe from the parent.
+                # The pickle is safe, because the parent sent it through our own pipe.
                 chosen = pickle.loads(self._policy)
         except Exception as error:
             raise PolicyError(
                 f"The policy {name} could not be recreated in a worker process: "
-                f"{_in_one_line(error)}. Give its name instead, policy='module:name'."
+                f"{_in_one_line(error)}. Pass its name instead (policy='module:name')."
             ) from error
         return policy_from(chosen, name, environment, self._plan.policy_kwargs)
 
 
 class _ChunkRun:
-    """The run of one chunk, with the monitor around its environment."""
+    """A run of one chunk, with the monitor that wraps the environment."""
 
     def __init__(
         self,
@@ -242,11 +247,11 @@ class _ChunkRun:
                     self._run(unit, _begin_episode)
 
     def _run_stream(self, seed: int, missing: set[int]) -> None:
-        """Run the missing episodes of a seed's random stream.
+        """Run the missing episodes of a seed that share a random stream.
 
-        Each episode begins where the previous one ended, so finished episodes before
-        the missing ones are run again without being recorded. After a failed episode a
-        new stream begins.
+        The stream continues from one episode to the next. Finished episodes that come
+        before a missing one therefore run again, but without being recorded. After a
+        failed episode a new stream begins.
         """
         stream: int | None = seed
         for number in range(self._chunk.first, max(missing) + 1):
@@ -265,13 +270,13 @@ class _ChunkRun:
             stream = None if is_complete else following.environment
 
     def _run(self, unit: Unit, begin: _Begin, *, continues: bool = False) -> bool:
-        """Run an episode, and return whether it was completed.
+        """Run an episode and return whether it was completed.
 
         Raises:
             Error: the episode could not be recorded.
         """
         monitor = self._monitored(unit, continues=continues)
-        # Frames must not depend on earlier episodes, because chunks may differ.
+        # Frames must not depend on earlier episodes, which differ from chunk to chunk.
         monitor.forget_frames()
         episode_id, start = monitor.episode_id, time.time()
         seed, number = unit
@@ -282,7 +287,7 @@ class _ChunkRun:
         def failed(why: str) -> dict[str, Any]:
             facts = _failed(unit, why, start_time=start, seconds=time.time() - start)
             if monitor.episode_id > episode_id:
-                # Otherwise the monitor was never notified of the episode.
+                # Otherwise the monitor does not know the episode.
                 length = monitor.stats_recorder.steps or 0
                 facts.update(episode_id=episode_id, length=length)
             return facts
@@ -293,10 +298,10 @@ class _ChunkRun:
         try:
             with time_limit(limit, journal, f"{dumps({'failed': too_long})}\n"):
                 self._play_recorded(acting, monitor, unit, begin)
-        # A policy, or an environment's library, may call sys.exit().
+        # A policy or an environment's library may call sys.exit().
         except (Exception, SystemExit) as error:
-            # Our own errors concern the recording, such as a full disk, unless they are
-            # about an invalid action or reward.
+            # Our own errors are about the recording, such as a full disk, unless they
+            # are about an invalid action or reward.
             if isinstance(error, Error) and not isinstance(error, _OF_EPISODES):
                 raise
             logger.warning("An episode failed with this error:", exc_info=True)
@@ -327,7 +332,7 @@ class _ChunkRun:
         _play(acting, monitor, episode_seeds(*unit), begin_counting)
 
     def _monitored(self, unit: Unit, *, continues: bool = False) -> _Monitor:
-        """Return a monitor for an episode, reusing the current one if it fits."""
+        """Return a monitor for an episode, which may be the current monitor."""
         self._renew_unless_it_fits(unit[0], continues=continues)
         if self._monitor is None:
             acting = self._evaluator.acting(self._task, unit[0], continues=continues)
@@ -335,8 +340,8 @@ class _ChunkRun:
             monitor = Monitor(
                 named.environment,
                 self._folder,
-                # Episodes that cannot be drawn later are all drawn live; videos that
-                # are not chosen are removed afterwards.
+                # If episodes cannot be drawn later, all of them are drawn live, and the
+                # videos that are not chosen are deleted afterwards.
                 record_all if acting.is_drawn_live else False,
                 resume=True,
                 uid=_uid(self._folder),
@@ -363,7 +368,7 @@ class _ChunkRun:
             self._renew()
 
     def _renew(self) -> None:
-        """Close monitor and environment, so that the next episode gets new ones."""
+        """Close the monitor and the environment, so that both are created anew."""
         self._monitor = self._evaluator.journal = None
         self._open.close()
         self._evaluator.close()
@@ -376,12 +381,15 @@ def _begin_episode(named: NamedEnvironment, env: Any, seeds: EpisodeSeeds) -> An
 def _begin_in_stream(
     stream: int | None, named: NamedEnvironment, env: Any, seeds: EpisodeSeeds
 ) -> Any:
-    """Begin an episode; `stream` seeds a new stream, None continues the last one."""
+    """Begin an episode in a new random stream, or in the current one.
+
+    `stream` is the seed of the new stream. If it is None, the current stream continues.
+    """
     return named.begin(env, seeds, stream)
 
 
 def _play(acting: Acting, env: Any, seeds: EpisodeSeeds, begin: _Begin) -> None:
-    """Run an episode in an environment, or in the monitor around it."""
+    """Run an episode in an environment or in the monitor that wraps it."""
     named, policy = acting.named, acting.policy
     with working_directory_importable():
         seed_global_generators(seeds.policy)
@@ -396,16 +404,16 @@ def _warnings(environment: Any) -> dict[str, int]:
     simulation = simulation_below(environment)
     if simulation is None:
         return {}
-    # Imported here because it loads MuJoCo, which not every task needs.
+    # Imported here because it loads MuJoCo, which some tasks do not need.
     from ..simulation.warnings import warning_counts
 
     return warning_counts(simulation)
 
 
 def _uid(folder: Path) -> str:
-    """Return the part of file names that identifies a chunk.
+    """Return a string that identifies a chunk in file names.
 
-    It is unique, so that the files of a whole evaluation can share one directory.
+    It is unique, so the files of a whole evaluation can be moved to one directory.
     """
     room = _LONGEST_UID - len(folder.name) - 1
     task = _OUTSIDE_UID.sub("_", folder.parent.name)[:room].lstrip(".")
@@ -427,7 +435,7 @@ def _failed(unit: Unit, why: str, **facts: Any) -> dict[str, Any]:
 
 def _in_one_line(error: BaseException) -> str:
     text = " ".join(str(error).split())
-    # Our own messages are complete; other errors are unclear without the class name.
+    # Our own messages are complete. Other messages are unclear without the class name.
     if isinstance(error, Error):
         return text
     return f"{type(error).__name__}: {text}" if text else type(error).__name__

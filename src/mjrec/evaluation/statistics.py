@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Figures of returns and scores, with confidence intervals.
+"""Statistical figures for returns and scores, with confidence intervals.
 
-Every figure is defined once, as a function of samples along their last axis, so that
-SciPy's bootstrap can evaluate thousands of resamples at once.
-`docs/reference/statistics.md` has the formulas and their sources. The tests compare the
-figures with rliable and with values computed by hand.
+Every figure is defined once, as a function that reduces the last axis of its samples.
+SciPy's bootstrap can therefore evaluate thousands of resamples at once.
+`docs/reference/statistics.md` lists the formulas and their sources. The tests compare
+the figures with rliable and with values computed by hand.
 
-All numbers must be finite: `summaries` and `comparing` handle NaN and infinity.
+All numbers must be finite. `summaries` and `comparing` handle NaN and infinity.
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ PERCENTILE_BOOTSTRAP: Final = "percentile bootstrap"
 LARGE_SAMPLE: Final = "large-sample normal interval"
 
 MOST_RESAMPLED: Final = 3000
-"""Maximum number of values, over all samples, for which figures are bootstrapped."""
+"""Maximum total number of values in the samples for which the bootstrap is used."""
 
 _MOST_RESAMPLES: Final = 1_000_000
 
-# Number of values in a block of resamples: 2 MB, which fit into a CPU's cache.
+# Number of values in a block of resamples. They take 2 MB, which fits in a CPU cache.
 _BLOCK: Final = 1 << 18
 
 
@@ -57,8 +57,8 @@ class Estimate:
 
     Attributes:
         value: the figure.
-        interval: the figure's interval; None if there is no interval.
-        interval_method: how the interval was computed; None if there is no interval.
+        interval: the confidence interval, or None if it cannot be computed.
+        interval_method: name of the method for the interval; None without an interval.
     """
 
     value: float
@@ -72,7 +72,7 @@ class Bootstrap:
 
     Attributes:
         resamples: number of resamples.
-        seed: seed of the random generator.
+        seed: seed for the random number generator.
         confidence: confidence level.
 
     Raises:
@@ -86,30 +86,31 @@ class Bootstrap:
     def __post_init__(self) -> None:
         if not 1 <= self.resamples <= _MOST_RESAMPLES:
             raise InvalidArgument(
-                f"resamples must be from 1 to {_MOST_RESAMPLES} (10000 is usual), got "
-                f"{self.resamples}."
+                f"resamples must be from 1 to {_MOST_RESAMPLES} (10000 is usual), but "
+                f"it is {self.resamples}."
             )
         if not 0 < self.confidence < 1:
             raise InvalidArgument(
-                "confidence must be between 0 and 1 (0.95 is usual), got "
+                "confidence must be between 0 and 1 (0.95 is usual), but it is "
                 f"{self.confidence}."
             )
         if not 0 <= self.seed < 2**64:
             raise InvalidArgument(
-                f"seed must be a whole number from 0 to 2^64 - 1, got {self.seed}."
+                "seed must be a whole number from 0 to 2^64 - 1, but it is "
+                f"{self.seed}."
             )
 
 
 @dataclass(frozen=True)
 class Figure:
-    """A figure of one or more samples.
+    """A figure that is computed from one or more samples.
 
     Attributes:
-        samples: the samples, which are resampled independently of each other, along
-            their last axis.
-        of: returns the figure of samples: `(...)`, or `(k, ...)` for a figure of k
-            numbers.
-        error: returns the standard error of the figure, for large samples.
+        samples: the samples. Each is resampled independently along its last axis.
+        of: function that computes the figure from samples. It returns an array of shape
+            `(...)`, or of shape `(k, ...)` if the figure consists of k numbers.
+        error: function that returns the standard error of the figure, which is valid
+            for large samples.
     """
 
     samples: tuple[npt.NDArray[Any], ...]
@@ -123,14 +124,14 @@ class Figure:
 
     @property
     def value(self) -> float:
-        """The figure as a number, if it is a single number."""
+        """The figure as a number, if it consists of a single number."""
         return float(self.values)
 
     @property
     def interval_method(self) -> str | None:
-        """The method of intervals; None if a sample has only one value.
+        """Name of the method for intervals; None if a sample has only one value.
 
-        An interval of zero width would suggest certainty.
+        In that case the interval would have zero width and suggest certainty.
         """
         sizes = [len(sample) for sample in self.samples]
         if min(sizes) < 2:
@@ -138,7 +139,7 @@ class Figure:
         return PERCENTILE_BOOTSTRAP if sum(sizes) <= MOST_RESAMPLED else LARGE_SAMPLE
 
     def ends(self, how: Bootstrap) -> tuple[FloatArray, FloatArray] | None:
-        """Return the lower and upper ends of the intervals; None without intervals."""
+        """Return the lower and upper ends of the intervals, or None without them."""
         if self.interval_method is None:
             return None
         if self.interval_method == LARGE_SAMPLE:
@@ -157,16 +158,16 @@ class Figure:
         return found.confidence_interval.low, found.confidence_interval.high
 
     def interval(self, how: Bootstrap) -> Interval | None:
-        """Return the interval, if the figure is a single number."""
+        """Return the interval of a figure that consists of a single number."""
         ends = self.ends(how)
         return None if ends is None else Interval(*map(float, ends))
 
     def estimate(self, how: Bootstrap) -> Estimate:
-        """Return the figure with its interval, if it is a single number."""
+        """Return a figure that consists of a single number, with its interval."""
         return Estimate(self.value, self.interval(how), self.interval_method)
 
     def __sub__(self, other: Figure) -> Figure:
-        """Return the difference of two figures of independent samples."""
+        """Return the difference between two figures with independent samples."""
         split = len(self.samples)
         return Figure(
             self.samples + other.samples,
@@ -176,9 +177,9 @@ class Figure:
 
 
 def average(figures: Iterable[Figure]) -> Figure:
-    """Return the mean of figures of independent samples, such as tasks.
+    """Return the mean of several figures, which all have the same weight.
 
-    All figures have the same weight.
+    The samples of the figures must be independent, such as those of different tasks.
     """
     parts = list(figures)
 
@@ -207,8 +208,8 @@ def mean(sample: FloatArray) -> Figure:
 def interquartile_mean(samples: Iterable[FloatArray]) -> Figure:
     """Return the mean of the middle half of all samples pooled together.
 
-    floor(n / 4) of all n values are cut off at each end. Larger samples have a larger
-    weight.
+    Of all n values, the floor(n / 4) smallest and the floor(n / 4) largest are left
+    out. Larger samples have more weight.
     """
     strata = tuple(np.sort(sample) for sample in samples)
 
@@ -242,7 +243,7 @@ def performance_profile(scores: Iterable[FloatArray], thresholds: FloatArray) ->
         scores: the scores of each task.
         thresholds: the thresholds, in ascending order.
     """
-    # All that matters about a score is the number of thresholds below it.
+    # Only the number of thresholds below a score matters.
     return average(
         _shares_above(np.searchsorted(thresholds, values), len(thresholds))
         for values in scores
@@ -269,14 +270,14 @@ def _shares_above(places: npt.NDArray[np.int64], count: int) -> Figure:
 def improvement(x: FloatArray, y: FloatArray) -> Figure:
     """Return the probability that a value of `x` is greater than a value of `y`.
 
-    It is #{(i, j) : x_i > y_j} / (n_x n_y), where ties count half: the Mann-Whitney
-    statistic U of `x`, divided by the number of pairs.
+    This is #{(i, j) : x_i > y_j} / (n_x n_y), where each tie counts as one half. It
+    equals the Mann-Whitney statistic U of `x` divided by the number of pairs.
     """
 
     def of(samples: Sequence[FloatArray]) -> FloatArray:
         size, others = (each.shape[-1] for each in samples)
         ranks = _stats().rankdata(np.concatenate(samples, axis=-1), axis=-1)
-        # Ranks are multiples of 1/2, so the result is exactly 1/2 where it should be.
+        # Ranks are multiples of 1/2, so a result of 1/2 has no rounding error.
         above = ranks[..., :size].sum(axis=-1) - size * (size + 1) / 2
         return np.asarray(above / (size * others))
 
@@ -289,14 +290,14 @@ def improvement(x: FloatArray, y: FloatArray) -> Figure:
 
 
 def _placements(x: FloatArray, y: FloatArray) -> FloatArray:
-    """Return the share of `y` below each value of `x`; ties count half."""
+    """Return the share of `y` below each value of `x`. Ties count as one half."""
     y = np.sort(y)
     below, up_to = (np.searchsorted(y, x, side=side) for side in ("left", "right"))
     return np.asarray((below + up_to) / (2 * len(y)))
 
 
 def wilson_interval(successes: int, n: int, confidence: float) -> Interval:
-    """Return Wilson's score interval of a share, without continuity correction."""
+    """Return Wilson's score interval for a share, without continuity correction."""
     found = _stats().binomtest(successes, n).proportion_ci(confidence, method="wilson")
     return Interval(float(found.low), float(found.high))
 
@@ -304,7 +305,7 @@ def wilson_interval(successes: int, n: int, confidence: float) -> Interval:
 def two_sided_p_value(x: FloatArray, y: FloatArray) -> float:
     """Return the p-value of the two-sided Mann-Whitney test.
 
-    It is exact for small samples without ties.
+    The p-value is exact for small samples without ties.
     """
     if np.ptp(np.concatenate([x, y])) == 0:
         # SciPy would divide zero by zero.
@@ -313,17 +314,17 @@ def two_sided_p_value(x: FloatArray, y: FloatArray) -> float:
 
 
 def load_scipy() -> None:
-    """Load SciPy on a thread, because it takes a second, while workers are busy."""
+    """Start a thread that loads SciPy, which takes a second, while workers run."""
 
     def load() -> None:
-        # If SciPy is missing, the code that needs it reports that.
+        # If SciPy is missing, the code that uses it will report that.
         with contextlib.suppress(ImportError):
             _stats()
 
-    # Not a daemon: the interpreter must not exit while C++ modules are loading.
+    # Not a daemon thread, because the interpreter must not exit while C++ modules load.
     threading.Thread(target=load, name="mjrec-scipy").start()
 
 
 def _stats() -> Any:
-    # Imported here because it takes longer to import than everything else.
+    # Imported here because SciPy takes longer to import than everything else.
     return importlib.import_module("scipy.stats")

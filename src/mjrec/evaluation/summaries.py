@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Summaries of the episodes of one task, and of several tasks.
+"""Summaries of a single task and of all tasks together.
 
-Failed episodes have no return: they are counted, but not included in the figures.
-Claims about a task are only sound if `failed` and `not_finite` are 0.
+Failed episodes have no return. They are counted but not included in the figures, so
+claims about a task are sound only if `failed` and `not_finite` are 0.
 """
 
 from __future__ import annotations
@@ -33,11 +33,12 @@ class TaskSummary:
 
     Attributes:
         task: the task's name.
-        runs: number of seeds (in a monitor directory: monitors) with episodes.
-        episodes: number of completed episodes, which the figures are computed from.
+        runs: number of seeds with episodes, or of monitors if a monitor directory is
+            summarized.
+        episodes: number of completed episodes. The figures are computed from these.
         failed: number of failed episodes.
         mean: mean return.
-        std: standard deviation of the returns, with n - 1.
+        std: sample standard deviation of the returns, with the divisor n - 1.
         median: median return.
         iqm: interquartile mean of the returns.
         minimum: lowest return.
@@ -47,17 +48,18 @@ class TaskSummary:
         mean_length: mean length of the episodes, in steps.
         terminated: number of episodes that the task ended.
         truncated: number of episodes that a limit outside the task ended.
-        success_known: number of episodes known to be a success or not. If the task
-            reports success at all, failed episodes are included as not successful.
-        success_rate: share of successes among those.
-        success_interval: Wilson's interval of the success rate.
-        warnings: number of MuJoCo's warnings, by kind.
-        score_range: the returns that count as scores 0 and 1; None if the task has no
-            scale.
-        not_finite: number of NaN or infinite returns. If there are any, there are no
-            figures of the returns: including such returns would make the figures
-            meaningless, and leaving them out would make them misleading.
-        interval_method: method of the intervals of mean and interquartile mean.
+        success_known: number of episodes for which success or its absence is known. If
+            the task reports success at all, failed episodes count as unsuccessful.
+        success_rate: share of successful episodes among the `success_known` episodes.
+        success_interval: Wilson's interval for the success rate.
+        warnings: number of MuJoCo warnings, by kind.
+        score_range: the returns that correspond to scores of 0 and 1; None if the task
+            has no scale.
+        not_finite: number of returns that are NaN or infinite. If there are such
+            returns, no figures are computed from the returns: with them the figures
+            would be meaningless, and without them the figures would be misleading.
+        interval_method: name of the method for the intervals of the mean and the
+            interquartile mean.
     """
 
     task: str
@@ -91,9 +93,9 @@ class Profile:
     Attributes:
         thresholds: the thresholds, in ascending order.
         shares: share of scores above each threshold, averaged over tasks.
-        low: lower ends of the pointwise intervals; equal to `shares` if there are no
-            intervals (`AcrossTasks.interval_method` is None).
-        high: upper ends of the pointwise intervals; equal to `shares` if there are no
+        low: lower ends of the pointwise intervals. Equal to `shares` without intervals,
+            that is, if `AcrossTasks.interval_method` is None.
+        high: upper ends of the pointwise intervals. Equal to `shares` without
             intervals.
     """
 
@@ -109,7 +111,7 @@ class AcrossTasks:
 
     Attributes:
         tasks: the tasks with a scale.
-        left_out: the other tasks, each with the reason.
+        left_out: reasons why the other tasks are left out, keyed by task.
         mean: mean of the tasks' mean scores.
         median: median of the tasks' mean scores.
         iqm: interquartile mean of all scores.
@@ -117,8 +119,8 @@ class AcrossTasks:
         optimality_gap: average amount by which scores fall short of 1.
         optimality_gap_interval: confidence interval of the optimality gap.
         profile: performance profile of all scores.
-        interval_method: method of the intervals; None if there are no intervals because
-            a task has only one episode.
+        interval_method: name of the method for the intervals; None if there are no
+            intervals because a task has only one episode.
     """
 
     tasks: tuple[str, ...]
@@ -149,24 +151,24 @@ def summarize_task(
 ) -> TaskSummary:
     """Summarize the episodes of one task.
 
-    The arrays have one element per completed episode, in the same order. The order
-    changes no figure by more than rounding errors. A million episodes take a second.
+    All arrays have one element per completed episode, in the same order. Changing the
+    order affects the figures only by rounding errors. A million episodes take a second.
 
     Args:
         task: the task's name.
         total_rewards: the returns.
-        runs: number of seeds, or monitors, of the episodes.
+        runs: number of seeds or monitors that the episodes come from.
         lengths: lengths in steps; empty if they were not recorded.
         terminated: whether the task ended each episode; empty if not recorded.
         truncated: whether a limit outside the task ended each episode; empty if not
             recorded.
-        success: 1 for success, 0 for none, NaN if the environment does not report it;
+        success: 1 for a success, 0 otherwise, NaN if the environment did not report it;
             empty if not recorded.
         failed: number of episodes that could not be completed.
-        warnings: number of MuJoCo's warnings, by kind, in all episodes, including
-            failed ones.
-        score_range: the returns that count as scores 0 and 1.
-        bootstrap: settings of the confidence intervals; None for `Bootstrap()`.
+        warnings: number of MuJoCo warnings by kind in all episodes, including failed
+            episodes.
+        score_range: the returns that correspond to scores of 0 and 1.
+        bootstrap: settings for the confidence intervals; None for `Bootstrap()`.
     """
     returns = np.asarray(total_rewards, dtype=np.float64)
     how = bootstrap or Bootstrap()
@@ -197,7 +199,7 @@ def summarize_results(
     score_range: tuple[float, float] | None = None,
     bootstrap: Bootstrap | None = None,
 ) -> TaskSummary:
-    """Summarize one task, given the results of all its episodes."""
+    """Summarize one task from the results of all its episodes."""
     completed = [result for result in results if result.failure is None]
     warnings: Counter[str] = Counter()
     for result in results:
@@ -220,14 +222,14 @@ def summarize_results(
 def default_score_range(
     task: str, step_limit: int | None = None
 ) -> tuple[float, float] | None:
-    """Return the returns that count as scores 0 and 1; None if they are unknown.
+    """Return the returns for scores of 0 and 1, or None if the task has no default.
 
-    Tasks of the dm_control suite have 1000 steps with rewards from 0 to 1 (arXiv
-    1801.00690), except `lqr`, whose rewards are unbounded.
+    Tasks in the dm_control suite have 1000 steps with rewards from 0 to 1 (arXiv
+    1801.00690). The exception is `lqr`, whose rewards are unbounded.
 
     Args:
         task: the task's name.
-        step_limit: maximum number of steps per episode, if one was requested.
+        step_limit: maximum number of steps per episode; None for 1000 steps.
     """
     if not task.startswith(_SUITE) or task.startswith(_UNBOUNDED_IN_SUITE):
         return None
@@ -235,7 +237,7 @@ def default_score_range(
 
 
 def scaled(total_rewards: FloatArray, score_range: tuple[float, float]) -> FloatArray:
-    """Scale returns to scores, so that the ends of the range become 0 and 1."""
+    """Convert returns to scores, so that the ends of the range become 0 and 1."""
     low, high = score_range
     return (total_rewards - low) / (high - low)
 
@@ -250,9 +252,9 @@ def summarize_across(
 
     Args:
         total_rewards: returns of the completed episodes, by task.
-        score_ranges: the returns that count as scores 0 and 1, by task; a task that is
-            missing or None has no scale.
-        bootstrap: settings of the confidence intervals; None for `Bootstrap()`.
+        score_ranges: the returns that correspond to scores of 0 and 1, by task. A task
+            has no scale if its range is missing or None.
+        bootstrap: settings for the confidence intervals; None for `Bootstrap()`.
     """
     scores: dict[str, FloatArray] = {}
     left_out: dict[str, str] = {}
@@ -299,7 +301,7 @@ def summarize_across(
 def _figures(returns: FloatArray, how: Bootstrap) -> dict[str, Any]:
     mean = statistics.mean(returns)
     iqm = statistics.interquartile_mean([returns])
-    # The sum of returns near the largest float overflows.
+    # The sum of returns may overflow if they are close to the largest float.
     with np.errstate(over="ignore", invalid="ignore"):
         return {
             "mean": _finite(mean.value),
@@ -319,7 +321,7 @@ def _successes(success: npt.ArrayLike, failed: int, how: Bootstrap) -> dict[str,
     known_successes = known_successes[~np.isnan(known_successes)]
     if not len(known_successes):
         return {}
-    # A failed episode counts as not successful.
+    # A failed episode counts as unsuccessful.
     known = len(known_successes) + failed
     successes = int(np.count_nonzero(known_successes))
     return {

@@ -1,14 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Task names from the user: environments, sets of environments, and patterns.
+"""Task names that users give: environments, sets of environments and patterns.
 
 ======================  ==============================================================
 `HalfCheetah-v5`        an environment as in `mjrec record`: a Gymnasium id,
                         `dm_control/<domain>-<task>`, or the path of an MJCF file;
-                        an id without a version means the newest
-`dm_control:all`        a set, see `TASK_SETS`
+                        an id without a version means the newest version
+`dm_control:all`        a set; see `TASK_SETS`
 `dm_control/walker-*`   a pattern with `*`, `?` and `[...]`, matched against the tasks
                         of the dm_control suite and the ids in Gymnasium's registry; a
-                        pattern without versions (`Half*`) means the newest of each
+                        pattern without a version (`Half*`) matches only the newest
+                        version of each environment
 `module:Fetch*-v4`      a pattern matched against the ids that this module registers
 ======================  ==============================================================
 """
@@ -45,13 +46,13 @@ _WILD = re.compile(r"[*?\[]")
 
 
 def tasks_from(texts: Sequence[str]) -> tuple[str, ...]:
-    """Return the environments that `texts` name, in order and without duplicates.
+    """Return the environments that the strings name, in order, without duplicates.
 
     Raises:
         UnknownName: a set or file does not exist, or nothing matches a pattern.
         InvalidArgument: `texts` is empty, or a name is invalid.
-        MissingDependency, EnvironmentNotMade: a set's framework is not installed, or
-            cannot be imported.
+        MissingDependency: the framework of a set is not installed.
+        EnvironmentNotMade: the framework of a set cannot be imported.
     """
     if isinstance(texts, str):
         texts = [texts]
@@ -72,26 +73,26 @@ def _named(text: str) -> Sequence[str]:
             "set of tasks",
             text,
             TASK_SETS,
-            hint="A task of the suite is named dm_control/<domain>-<task>.",
+            hint="Tasks in the suite are named dm_control/<domain>-<task>.",
         )
-    # A file may have brackets in its name.
+    # The name of a file may contain brackets.
     if _WILD.search(text) and not Path(text).expanduser().is_file():
         return _matching(text)
     name = parse_environment_name(text)
     if not isinstance(name, GymnasiumName) or version_of(text) >= 0:
         return [text]
     module, colon, env_id = text.rpartition(":")
-    # If the id is unknown, creating the environment will list the known ones.
+    # If the id is unknown, the error from creating the environment lists known ids.
     newest = newest_versions(gymnasium_ids(module)).get(env_id, env_id)
     return [f"{module}{colon}{newest}"]
 
 
 def _is_set(text: str) -> bool:
-    """Return whether the name can only mean a set."""
+    """Return whether a name cannot be anything but a set."""
     framework, colon, name = text.partition(":")
     if not colon or _WILD.search(name):
         return False
-    # `gymnasium:Ant-v5` is not a set: it names an environment and the module that
+    # `gymnasium:Ant-v5` is not a set. It names an environment and the module that
     # registers it.
     return framework == "dm_control" or (
         framework == "gymnasium" and version_of(name) < 0
@@ -103,15 +104,15 @@ def _matching(pattern: str) -> Sequence[str]:
     known = list(_candidates(module, wanted))
     newest = newest_versions(known)
     matching = [newest[name] for name in newest if fnmatch.fnmatchcase(name, wanted)]
-    # Otherwise the pattern must include versions.
+    # If nothing matches without versions, the pattern must include versions.
     matching = matching or [n for n in known if fnmatch.fnmatchcase(n, wanted)]
     if not matching:
         raise UnknownName(
             "task that matches",
             pattern,
             known,
-            hint="The search covers the tasks of the dm_control suite, if it is "
-            "installed, and the ids in Gymnasium's registry. Sets are "
+            hint="Patterns are matched against the tasks of the dm_control suite, if "
+            "it is installed, and the ids in Gymnasium's registry. The sets are "
             f"{', '.join(TASK_SETS)}.",
         )
     return [f"{module}{colon}{name}" for name in matching]

@@ -1,20 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
 """The worker process of an evaluation.
 
-Settings: `{"directory": DIR, "plan": <the plan as JSON, without its chunks>}`. If the
-policy is an object, `"payload"` is the file with the pickled policy. With
-`"chooses_gl": true` the worker chooses an OpenGL backend that works on its machine, if
-episodes get videos.
+The settings are `{"directory": DIR, "plan": <the plan as JSON, without its chunks>}`.
+If the policy is an object, `"payload"` is the path of the file with the pickled policy.
+If `"chooses_gl"` is true and episodes get videos, the worker chooses an OpenGL backend
+that works on its machine.
 
-Jobs, by their `kind`; repeating a job is harmless:
+There are two kinds of jobs. It is safe to repeat a job.
 
-`check`  `{"task"}`: creates the environment and the policy, without taking a step.
-         Returns `{"step_limit", "velocities"}`, where `velocities` is the number of
-         degrees of freedom (0 without MuJoCo). If creation fails, returns `{"error":
-         ...}`, packed by `messages.carried`, so that the caller can raise the same
-         error and no traceback is logged.
-`run`    `{"task", "folder", "chunk"}`: runs the missing episodes of a chunk. Returns
-         `{"models": [SHA-256 of each compiled model that it has stored, ...]}`.
+`check`  Creates the environment and the policy without taking a step. The arguments are
+         `{"task"}`. Returns `{"step_limit", "velocities"}`, where `velocities` is the
+         number of degrees of freedom (0 without MuJoCo). If creation fails, returns
+         `{"error": ...}` instead, packed by `messages.carried`. The caller can then
+         raise the same error, and no traceback is logged.
+`run`    Runs the missing episodes of a chunk. The arguments are `{"task", "folder",
+         "chunk"}`. Returns `{"models": [...]}` with the SHA-256 of each compiled model
+         that the worker has stored.
 """
 
 from __future__ import annotations
@@ -42,10 +43,10 @@ _LOCK = ".mjrec.chunk.lock"
 
 
 class EvaluationWorker:
-    """Runs an evaluation's jobs; a handler for `engines.jobs`.
+    """A handler for `engines.jobs` that runs an evaluation's jobs.
 
     Args:
-        settings: see the module docstring.
+        settings: the settings, which the module docstring describes.
     """
 
     def __init__(self, settings: Mapping[str, Any]) -> None:
@@ -55,8 +56,8 @@ class EvaluationWorker:
         self._evaluator = Evaluator(
             self._plan, None if policy is None else Path(policy).read_bytes()
         )
-        # If dm_control finds no other backend it tries GLFW, which warns about the
-        # missing display on a headless machine. If that matters, drawing reports it.
+        # If dm_control finds no other backend, it tries GLFW, which warns on a headless
+        # machine that there is no display. If that matters, drawing will report it.
         warnings.filterwarnings("ignore", message=r"\(65550\) b'X11")
         if settings.get("chooses_gl") and self._evaluator.draws:
             try:
@@ -72,14 +73,14 @@ class EvaluationWorker:
         """Run a job.
 
         Raises:
-            Error: the job failed. A check returns its error instead.
+            Error: the job failed. A check returns the error instead of raising it.
         """
         if arguments["kind"] == "check":
             return self._check(arguments["task"])
         return self._run(arguments)
 
     def leave(self) -> None:
-        """Note in the journal that the running episode did not end this process."""
+        """Record that the running episode is not the reason why this process ends."""
         self._evaluator.leave()
 
     def close(self) -> None:
@@ -103,7 +104,7 @@ class EvaluationWorker:
             folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise DirectoryNotWritable(folder, error.strerror) from error
-        # A worker of an earlier run whose driver was killed may still be at work.
+        # If an earlier evaluation was killed, its workers may still be running.
         with wait_for_lock(folder / _LOCK), noting_models() as models:
             recover(folder, bundle=True)
             chunk = from_json(Chunk, arguments["chunk"])
