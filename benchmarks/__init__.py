@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Measurements of what recording costs: `python -m benchmarks`."""
+"""Benchmarks that measure the cost of recording: `python -m benchmarks`."""

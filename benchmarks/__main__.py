@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What recording costs, beside what was promised: `python -m benchmarks`.
+"""Measure the cost of recording and compare it with the promised limits.
 
-Each measurement runs its variants in turns, every one in a process of its own, and the
-table has the medians of the rounds. Half of the samples lie within the range beside a
-number. The machine should have nothing else to do.
+Run `python -m benchmarks`. Each measurement runs its variants alternately, each in a
+separate process, and the table shows the medians over the rounds. The range next to a
+number contains half of the samples. The machine should be idle otherwise.
 """
 
 from __future__ import annotations
@@ -27,26 +27,27 @@ from .machine import Machine, examine
 from .results import Result
 from .tables import table_of
 
-# Modules of this package, imported after the choice of OpenGL: some import mujoco.
+# Modules of this package. They are imported after OpenGL has been chosen, because some
+# of them import mujoco.
 MEASUREMENTS = (
     *("stepping", "time_to_video", "memory", "rendering", "disk", "encoding"),
     *("verifying", "evaluating", "reporting", "scaling", "engines"),
 )
 
 
-# Those that can also be measured part by part.
+# Measurements that have a variant with the time of each phase.
 _PHASES = {"time_to_video": "video_phases"}
 
 
 @dataclass(frozen=True)
 class Report:
-    """What a run of the benchmarks found.
+    """The results of a benchmark run.
 
     Attributes:
-        machine: that they ran on.
-        quick: whether they ran shortly.
-        results: by the names of the measurements.
-        seconds: that each took.
+        machine: the machine that the benchmarks ran on.
+        quick: whether the benchmarks ran with `--quick`.
+        results: the results, keyed by the name of the measurement.
+        seconds: duration of each measurement, keyed by its name.
     """
 
     machine: Machine
@@ -55,7 +56,7 @@ class Report:
     seconds: Mapping[str, float]
 
     def as_json(self) -> dict[str, Any]:
-        """Return everything in what JSON can hold."""
+        """Return the report as values that JSON can represent."""
         return {
             "machine": asdict(self.machine),
             "quick": self.quick,
@@ -68,7 +69,7 @@ class Report:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Measure what was asked for; return 1 where a promise is not kept."""
+    """Run the requested measurements, and return 1 if a limit is exceeded."""
     options = _parser().parse_args(arguments)
     console, waiting = Console(), Console(stderr=True)
     machine = examine(mjrec.use_gl())
@@ -87,7 +88,7 @@ def main(arguments: list[str] | None = None) -> int:
         console.print()
         console.print(table_of(module.TITLE, results[name]))
         if options.json:
-            # After each, so that an interrupted run has given something.
+            # Written after each measurement, so that an interrupted run leaves results.
             report = Report(machine, options.quick, results, seconds)
             options.json.write_text(json.dumps(report.as_json(), indent=2) + "\n")
     broken = [r for each in results.values() for r in each if r.is_kept is False]
@@ -114,17 +115,17 @@ def _parser() -> argparse.ArgumentParser:
         nargs="+",
         choices=MEASUREMENTS,
         metavar="NAME",
-        help=f"some of {', '.join(MEASUREMENTS)}; all without it",
+        help=f"run only some of {', '.join(MEASUREMENTS)}",
     )
     parser.add_argument(
         "--quick",
         action="store_true",
-        help="fewer rounds and steps: minutes, and numbers to be taken with care",
+        help="use fewer rounds and steps: takes minutes, but is less accurate",
     )
     parser.add_argument(
         "--phases",
         action="store_true",
-        help="the parts of time_to_video, in its place",
+        help="measure the phases of time_to_video instead of its total time",
     )
     parser.add_argument(
         "--json", type=Path, metavar="FILE", help="write every sample to this file"

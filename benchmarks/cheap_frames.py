@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What all but drawing costs: `python -m benchmarks.cheap_frames`.
+"""The cost of everything except drawing: `python -m benchmarks.cheap_frames`.
 
-A thousand steps of HalfCheetah-v5, from `make` to the closed mp4, with frames that cost
-next to nothing: 64x64, without shadows and multisampling. Each run is a process of its
-own, and the variants take turns. With `MUJOCO_GL` unset mjrec chooses the backend. The
-CPU seconds are those of all processes of a run, with their imports: on a machine with
-other work they are what can be compared.
+Each run takes a thousand steps in HalfCheetah-v5, from `make` to the closed mp4, with
+frames that cost next to nothing (64x64, without shadows and multisampling). It runs in
+a separate process, and the variants alternate. If `MUJOCO_GL` is unset, mjrec chooses
+the backend. The CPU seconds include all processes of a run and their imports. On a busy
+machine, compare the CPU seconds, not the elapsed time.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ VARIANTS = {
 
 
 def record(how: str) -> float:
-    """Record one episode; return the seconds from `make` to the closed video."""
+    """Record one episode and return the seconds from `make` to the closed video."""
     assets = Path(environments.__file__).parent / "assets"
     xml = (assets / "half_cheetah.xml").read_text()
     with tempfile.TemporaryDirectory() as directory:
@@ -65,13 +65,13 @@ def record(how: str) -> float:
             env.step(env.action_space.sample())
         env.close()
         seconds = time.perf_counter() - began
-        assert len(list(videos.glob("*.mp4"))) == 1, "there is no video"
+        assert len(list(videos.glob("*.mp4"))) == 1, "the video is missing"
     return seconds
 
 
 def seconds_of(how: str, backend: str | None) -> tuple[float, float]:
-    """Return what `record` returns, in a process of its own, and its CPU seconds."""
-    # Modules are compiled once, as usual.
+    """Call `record` in a new process, and return its result and the CPU seconds."""
+    # Python may write bytecode files, as it usually does.
     left_out = ("MUJOCO_GL", "PYTHONDONTWRITEBYTECODE")
     environ = {k: v for k, v in os.environ.items() if k not in left_out}
     if backend is not None:
@@ -84,7 +84,8 @@ def seconds_of(how: str, backend: str | None) -> tuple[float, float]:
         stderr=subprocess.DEVNULL,
         check=True,
     )
-    # What drew was killed when all was done, and counts once it is waited for.
+    # The drawing processes are killed at the end. Their CPU time is only counted after
+    # waiting for them.
     with contextlib.suppress(ChildProcessError):
         while True:
             os.waitpid(-1, 0)
@@ -95,12 +96,12 @@ def seconds_of(how: str, backend: str | None) -> tuple[float, float]:
 
 
 def _adopt_orphans() -> None:
-    """Be the parent of processes whose own has ended."""
+    """Make this process the parent of processes whose own parent has exited."""
     ctypes.CDLL(None).prctl(_PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0)
 
 
 def main() -> None:
-    """Print the medians of each variant, and what they are of RecordVideo's."""
+    """Print the medians of each variant, also as multiples of RecordVideo's."""
     _adopt_orphans()
     found: dict[str, list[tuple[float, float]]] = {name: [] for name in VARIANTS}
     for _ in range(ROUNDS):

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Calling a function in a Python process of its own.
+"""Calling a function in a new Python process.
 
-What a process has imported, allocated and drawn before changes how fast it is and how
-much memory it has; a fresh one has done nothing yet.
+The speed and memory of a process depend on what it has imported, allocated and drawn
+before. A new process has done none of that.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ Answer = TypeVar("Answer")
 
 _ROOT = Path(__file__).parents[1]
 _END_OF_STDERR = 4000
-# Ten thousand frames in software take half an hour on a slow machine.
+# Rendering ten thousand frames in software takes half an hour on a slow machine.
 _TIMEOUT_S = 7200
 
 
 class ChildFailed(RuntimeError):
-    """A measurement did not come to its end."""
+    """A measurement failed."""
 
 
 def call(
@@ -34,16 +34,17 @@ def call(
     environ: dict[str, str] | None = None,
     **arguments: Any,
 ) -> Answer:
-    """Return what `function` returns in a fresh process.
+    """Call a function in a new process and return its result.
 
     Args:
-        function: at the top of a module of this package.
-        environ: environment variables beside those of this process.
-        arguments: of the function; they and the answer are what JSON can hold.
+        function: a module-level function in this package.
+        environ: environment variables to set in addition to those of this process.
+        arguments: keyword arguments for the function. JSON must be able to represent
+            the arguments and the result.
 
     Raises:
-        ChildFailed: it raised, or its process died; the message has the end of what it
-            printed.
+        ChildFailed: the function raised an exception, or its process died. The message
+            contains the end of the process's error output.
     """
     name = f"{function.__module__}:{function.__qualname__}"
     done = subprocess.run(
@@ -66,9 +67,9 @@ def call(
 
 
 def _answer() -> None:
-    """Do what the parent asked for; the answer is all that goes to the real output."""
+    """Call the requested function and write only its result to standard output."""
     output = os.fdopen(os.dup(sys.stdout.fileno()), "w")
-    # Libraries print progress bars.
+    # Libraries may print, for example progress bars, so their output goes to stderr.
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
     module, _, name = sys.argv[1].partition(":")
     function = getattr(importlib.import_module(module), name)

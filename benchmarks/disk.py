@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How many bytes recorded episodes are, and how long their final form takes."""
+"""The size of recorded episodes, and the time to finish their trajectory files."""
 
 from __future__ import annotations
 
@@ -28,17 +28,18 @@ from .setups import (
     suite_environment,
 )
 
-TITLE = "Disk: bytes of an episode, every step captured"
+TITLE = "Disk: size of an episode, with every step captured"
 
 
 @dataclass(frozen=True, kw_only=True)
 class Settings:
-    """How much is measured.
+    """The size of the measurement.
 
     Attributes:
-        environments: their names; those of dm_control as `dm_control/dog-run`.
-        rounds: of all environments; only the time depends on them.
-        steps: the length of the episodes.
+        environments: names of the environments; dm_control's tasks have names such as
+            `dm_control/dog-run`.
+        rounds: number of rounds. Only the times differ from round to round.
+        steps: length of the episodes.
     """
 
     environments: tuple[str, ...] = (
@@ -55,7 +56,7 @@ QUICK = Settings(rounds=1)
 
 
 def measure(settings: Settings, say: Say) -> list[Result]:
-    """Return the lines of each environment."""
+    """Return the result lines for all environments."""
     samples = take_turns(
         {
             name: functools.partial(
@@ -77,11 +78,11 @@ def measure(settings: Settings, say: Say) -> list[Result]:
 
 
 def record_and_finish(name: str, steps: int) -> dict[str, float]:
-    """Record an episode of random actions and give its trajectory the final form.
+    """Record an episode of random actions and finish its trajectory file.
 
     Returns:
-        Bytes of the log, of the finished file and of the model's files, and the
-        seconds that finishing took.
+        The sizes of the log, of the finished file and of the model's files in bytes,
+        and the time to finish the file in seconds.
     """
     with tempfile.TemporaryDirectory() as directory:
         if name.startswith(SUITE):
@@ -96,7 +97,7 @@ def record_and_finish(name: str, steps: int) -> dict[str, float]:
         finished = finish_trajectory(recording.path)
         seconds = time.perf_counter() - start
         sizes["finished"] = finished.stat().st_size
-        # Which waits until the model is stored.
+        # Closing waits until the model is stored.
         env.close()
         for path in sorted(Path(directory).glob("openaigym.model.*")):
             sizes[f"model, {_ending(path.name)}"] = path.stat().st_size
@@ -104,12 +105,12 @@ def record_and_finish(name: str, steps: int) -> dict[str, float]:
 
 
 def _ending(name: str) -> str:
-    """Return what comes behind the hash in a model's name."""
+    """Return the part after the hash in the name of a model file."""
     return "." + name.split(".", 3)[3]
 
 
 def _recorded_gymnasium(env_id: str, steps: int, directory: str) -> Any:
-    """Return a monitor whose episode is over."""
+    """Record an episode and return the monitor, which is still open."""
     make = {**UNENDING.get(env_id, {}), "max_episode_steps": steps}
     env = Setup(
         env_id=env_id, recorder=MONITOR, make=make, options={"workers": 0}
@@ -121,13 +122,13 @@ def _recorded_gymnasium(env_id: str, steps: int, directory: str) -> Any:
 
 
 def _recorded_dm_control(env_id: str, steps: int, directory: str) -> Any:
-    """Return a monitor whose episode is over."""
+    """Record an episode and return the monitor, which is still open."""
     env = suite_environment(env_id)
     monitor = mjrec.Monitor(env, directory, workers=0, env_id=env_id)
     monitor.reset()
     for action in random_actions(env, steps):
         monitor.step(action)
-    # Whether it was over or not.
+    # Ends the episode if it has not ended yet.
     monitor.reset()
     return monitor
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How fast `mjrec.VideoWriter` takes frames, and how long its `close` takes."""
+"""The speed of `mjrec.VideoWriter`, and the time that its `close` takes."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from .children import call
 from .results import Result
 from .rounds import Say, take_turns
 
-TITLE = "Encoding: frames per second that VideoWriter writes, close() included"
+TITLE = "Encoding: frames per second of VideoWriter, including close()"
 
 _VARIANTS: Mapping[str, dict[str, Any]] = {
     "default": {},
@@ -33,11 +33,11 @@ _VARIANTS: Mapping[str, dict[str, Any]] = {
 
 @dataclass(frozen=True, kw_only=True)
 class Settings:
-    """How much is measured.
+    """The size of the measurement.
 
     Attributes:
-        rounds: of all variants.
-        frames: of each variant in a round.
+        rounds: number of rounds.
+        frames: number of frames that each variant writes in a round.
         size: height and width of the frames.
     """
 
@@ -51,7 +51,7 @@ QUICK = Settings(rounds=3, frames=100)
 
 
 def measure(settings: Settings, say: Say) -> list[Result]:
-    """Return a line for each way of encoding."""
+    """Return a result line for each set of encoding options."""
     height, width = settings.size
     samples = take_turns(
         {
@@ -75,16 +75,16 @@ def measure(settings: Settings, say: Say) -> list[Result]:
 def write_video(
     frames: int, height: int, width: int, options: dict[str, Any]
 ) -> dict[str, float]:
-    """Write frames to a file; return how fast that was and what came of it."""
+    """Write frames to a video, and return the speed and the size of the file."""
     gradients = moving_gradients(frames, height, width)
     with tempfile.TemporaryDirectory() as directory:
-        # The first close of a process also reads the whole ffmpeg binary for its hash.
+        # The first close in a process also reads the whole ffmpeg binary to hash it.
         _write(gradients[:2], Path(directory) / "first.mkv", options)
         return _write(gradients, Path(directory) / "second.mkv", options)
 
 
 def moving_gradients(count: int, height: int, width: int) -> Frame:
-    """Return frames that move, with the noise that textures have."""
+    """Return frames with moving gradients and noise that resembles textures."""
     y, x = np.mgrid[0:height, 0:width]
     base = np.stack([x, y, (x + y) // 2], axis=-1) % 256
     noise = np.random.default_rng(0).integers(0, 8, base.shape)
@@ -116,5 +116,5 @@ def _result(subject: str, name: str, samples: list[dict[str, float]]) -> Result:
         variant=name,
         unit="frames/s",
         samples=tuple(sample["rate"] for sample in samples),
-        note=f"close() {closing:.2f} s, {size / 1000:.1f} kB a frame",
+        note=f"close() {closing:.2f} s, {size / 1000:.1f} kB per frame",
     )

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What an engine adds to the work that it hands out."""
+"""The overhead that an engine adds to the jobs that it distributes."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ from .process_memory import peak_memory
 from .results import Result
 from .rounds import Say, take_turns
 
-TITLE = "Engines: jobs in which nothing is done, in processes of this machine"
+TITLE = "Engines: empty jobs in local processes"
 
 
 @dataclass(frozen=True, kw_only=True)
 class Settings:
-    """How much is measured.
+    """The size of the measurement.
 
     Attributes:
-        rounds: of all variants.
-        workers: how many there are, each time more.
-        jobs: that are handed out.
+        rounds: number of rounds.
+        workers: numbers of workers to measure with.
+        jobs: number of jobs to distribute.
     """
 
     rounds: int = 5
@@ -40,7 +40,7 @@ QUICK = Settings(rounds=3, jobs=1000)
 
 
 def measure(settings: Settings, say: Say) -> list[Result]:
-    """Return how soon workers are there, how fast jobs go, and what workers take."""
+    """Return the startup time, the job rate and the memory per worker."""
     samples = take_turns(
         {
             count: functools.partial(call, hand_out, workers=count, jobs=settings.jobs)
@@ -68,14 +68,14 @@ def measure(settings: Settings, say: Say) -> list[Result]:
 
 
 class Idle:
-    """Does nothing, with all loaded that an evaluation's worker loads.
+    """A handler that does nothing, but loads all that an evaluation's worker loads.
 
     Args:
-        settings: none.
+        settings: not used.
     """
 
     def __init__(self, settings: Mapping[str, Any]) -> None:
-        # Here, because whoever hands out the work loads none of it.
+        # Imported here because the process that distributes the jobs needs none of it.
         import gymnasium
 
         import mjrec.evaluation.worker
@@ -84,13 +84,13 @@ class Idle:
         gymnasium.make("InvertedPendulum-v5").reset()
 
     def __call__(self, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
-        """Return how much memory the worker has had."""
+        """Return the worker's peak memory."""
         del arguments
         return {"peak": peak_memory()}
 
 
 def hand_out(workers: int, jobs: int) -> list[float]:
-    """Return seconds to the first outcome, outcomes per second, and MB of a worker."""
+    """Return the seconds to the first result, results per second, and a worker's MB."""
     start = time.perf_counter()
     work = Work(entry=f"{__name__}:{Idle.__name__}")
     with Run(LocalEngine(workers), work) as run:
@@ -100,7 +100,7 @@ def hand_out(workers: int, jobs: int) -> list[float]:
         first = time.perf_counter() - start
         for number in range(jobs):
             run.submit(str(number))
-        # Until all workers are there.
+        # The first half is not timed, so that all workers have started.
         results = run.results()
         for _ in range(jobs // 2):
             next(results)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How much faster two workers evaluate a policy than one, and than bare processes."""
+"""The speed of an evaluation with one worker, two workers, and bare processes."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from .rounds import Say, take_turns
 
 TITLE = "Evaluating: the random policy, without videos"
 
-# Of all sizes, in the order of the alphabet: what takes long does not come first.
+# Tasks of all sizes, in alphabetical order, so that slow tasks do not come first.
 _TASKS = (
     *("acrobot-swingup", "ball_in_cup-catch", "cartpole-swingup", "cheetah-run"),
     *("finger-spin", "hopper-hop", "humanoid-walk", "pendulum-swingup"),
@@ -29,7 +29,7 @@ _TASKS = (
 _PROMISE = at_most(1 / 1.7)
 
 _BARE = "2 bare processes"
-# What evaluates nothing: it steps the environment, with random actions.
+# A script that steps the environment with random actions and evaluates nothing.
 _STEPPING = """
 import sys
 import gymnasium
@@ -46,15 +46,15 @@ for seed in range(int(sys.argv[1])):
 
 @dataclass(frozen=True, kw_only=True)
 class Settings:
-    """How much is measured.
+    """The size of the measurement.
 
     Attributes:
-        rounds: of both variants.
-        tasks: of the suite.
-        episodes: of each task.
-        steps: of each episode; None is all of them.
-        bare: how many episodes of HalfCheetah two workers evaluate, beside two
-            processes that only step it.
+        rounds: number of rounds.
+        tasks: number of tasks from the suite.
+        episodes: number of episodes per task.
+        steps: maximum number of steps per episode; None for no limit.
+        bare: numbers of HalfCheetah episodes that two workers evaluate, to be compared
+            with two processes that only step the environment.
     """
 
     rounds: int = 5
@@ -69,7 +69,7 @@ QUICK = Settings(rounds=3, steps=250, bare=(40,))
 
 
 def measure(settings: Settings, say: Say) -> list[Result]:
-    """Return how long one worker takes, and two, and bare processes."""
+    """Return the times that one worker, two workers and bare processes take."""
     return [
         *_measure_workers(settings, say),
         *(
@@ -110,7 +110,7 @@ def _measure_workers(settings: Settings, say: Say) -> list[Result]:
 def seconds_to_evaluate(
     workers: int, tasks: int, episodes: int, steps: int | None
 ) -> float:
-    """Return how long an evaluation takes, from the call to its results."""
+    """Return the seconds that an evaluation takes, from the call to its results."""
     with tempfile.TemporaryDirectory() as place:
         start = time.perf_counter()
         mjrec.evaluate(
@@ -149,17 +149,17 @@ def _measure_bare(episodes: int, settings: Settings, say: Say) -> list[Result]:
 
 
 def seconds_to_step_bare(episodes: int) -> float:
-    """Return how long two processes take that step half of the episodes each."""
+    """Return the seconds that two processes take to step half of the episodes each."""
     start = time.perf_counter()
     command = [sys.executable, "-c", _STEPPING, str(episodes // 2)]
     processes = [subprocess.Popen(command) for _ in range(2)]
     if any(process.wait() for process in processes):
-        raise RuntimeError("A process that steps has failed.")
+        raise RuntimeError("A process that steps the environment has failed.")
     return time.perf_counter() - start
 
 
 def seconds_to_evaluate_cheetah(episodes: int) -> float:
-    """Return how long two workers take, with all that is written."""
+    """Return the seconds that two workers take, including all files they write."""
     with tempfile.TemporaryDirectory() as place:
         start = time.perf_counter()
         mjrec.evaluate(

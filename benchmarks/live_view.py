@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Steps with a viewer attached, and without: `python -m benchmarks.live_view`.
+"""Step times with and without a viewer: `python -m benchmarks.live_view`.
 
-A monitor records HalfCheetah-v5. In every other round `mjrec view` serves its directory
-in a process of its own, and another asks it for new states and for the list of
-episodes: without a pause, where a page waits four times as long as an answer took.
+A monitor records HalfCheetah-v5. In every other round, a separate `mjrec view` process
+serves the directory, and a client process requests new states and the list of episodes
+without pausing. A real page pauses for four times as long as an answer took.
 """
 
 from __future__ import annotations
@@ -35,9 +35,9 @@ GOAL = 0.95
 
 @contextlib.contextmanager
 def viewer(directory: str, answers: list[int]) -> Iterator[None]:
-    """Serve a directory to something that asks like a page, over a block.
+    """Serve a directory to a client that sends requests, for the duration of a block.
 
-    Adds to `answers` how many pairs of them it got meanwhile.
+    Appends the number of answered pairs of requests to `answers`.
     """
     view = [sys.executable, "-m", "mjrec", "view", directory]
     with subprocess.Popen(view, stdout=subprocess.PIPE, text=True) as server:
@@ -46,7 +46,7 @@ def viewer(directory: str, answers: list[int]) -> Iterator[None]:
         page = [sys.executable, "-m", "benchmarks.live_view", url]
         with subprocess.Popen(page, stdout=subprocess.PIPE, text=True) as asking:
             assert asking.stdout is not None
-            # Its first answer, for which the model is loaded.
+            # Wait for the first answer, because the server loads the model for it.
             asking.stdout.readline()
             yield
             asking.kill()
@@ -55,7 +55,7 @@ def viewer(directory: str, answers: list[int]) -> Iterator[None]:
 
 
 def ask(url: str) -> None:
-    """Ask for the newest states and for the list, again and again, until killed."""
+    """Request the episode list and the newest states repeatedly until killed."""
     address = urlsplit(url)
     token = parse_qs(address.query)["token"][0]
     known: dict[str, int] = {}
@@ -70,7 +70,7 @@ def ask(url: str) -> None:
 
 
 def answer(host: str, page: str, token: str, **options: str) -> dict[str, Any]:
-    """Return what the server says, in JSON."""
+    """Send a request to the server and return the JSON answer."""
     query = urlencode({"token": token, **options})
     with urllib.request.urlopen(f"http://{host}{page}?{query}") as told:
         found: dict[str, Any] = json.loads(told.read())
@@ -78,7 +78,7 @@ def answer(host: str, page: str, token: str, **options: str) -> dict[str, Any]:
 
 
 def main() -> None:
-    """Measure in rounds that take turns, and print the quantiles of all steps."""
+    """Measure in alternating rounds and print the quantiles of all step times."""
     env = gymnasium.make("HalfCheetah-v5")
     actions = random_actions(env, STEPS)
     alone: list[int] = []
@@ -105,7 +105,7 @@ def main() -> None:
         print(f"{quantile:3}% {without:8.1f}us {with_one:8.1f}us", end="   ")
         print(f"{without / with_one:.3f} of the speed (goal {GOAL})")
     ratio = seconds["alone"] / seconds["viewed"]
-    print(f"whole rounds {ratio:.3f} of the speed, with {answers} pairs of answers")
+    print(f"whole rounds {ratio:.3f} of the speed; answered pairs: {answers}")
 
 
 if __name__ == "__main__":

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the measurements were made on."""
+"""A description of the machine that runs the benchmarks."""
 
 from __future__ import annotations
 
@@ -24,20 +24,20 @@ _MEMORY = re.compile(r"^MemTotal:\s*(\d+) kB$", re.MULTILINE)
 
 @dataclass(frozen=True, kw_only=True)
 class Machine:
-    """A machine and what is installed on it.
+    """A machine and the software installed on it.
 
     Attributes:
-        cpu: the processor's name.
-        cpus: how many a process can keep busy.
-        memory: in GB.
-        kernel: of the operating system.
-        gl_backend: that draws.
-        gl_renderer: who draws, in OpenGL's words.
-        gl_version: with the driver's.
-        python: the interpreter's version.
-        ffmpeg: its first line about itself.
-        packages: versions by names.
-        load: processes that wanted to run in the minute before.
+        cpu: name of the processor.
+        cpus: number of CPUs that this process can use.
+        memory: memory in GB.
+        kernel: the operating system and its kernel version.
+        gl_backend: name of the OpenGL backend.
+        gl_renderer: renderer name as reported by OpenGL.
+        gl_version: version as reported by OpenGL, including the driver's version.
+        python: version of the interpreter.
+        ffmpeg: first line of ffmpeg's version output.
+        packages: package versions, keyed by name.
+        load: load average over the last minute before the benchmarks.
     """
 
     cpu: str
@@ -53,7 +53,7 @@ class Machine:
     load: float
 
     def lines(self) -> list[str]:
-        """Return what a reader of the table wants to know, in words."""
+        """Return a description to print above the tables."""
         packages = ", ".join(f"{name} {v}" for name, v in self.packages.items())
         return [
             f"{self.cpu}, {self.cpus} usable CPUs, {self.memory:.0f} GB, {self.kernel}",
@@ -64,7 +64,7 @@ class Machine:
 
 
 def examine(backend: str) -> Machine:
-    """Return what there is, with the renderer of an OpenGL backend."""
+    """Return a description of this machine, using an OpenGL backend to draw."""
     drawn = probe(backend)
     return Machine(
         cpu=_first(_MODEL_NAME, "/proc/cpuinfo") or platform.processor(),

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Directories into which thousands of monitors have recorded, made without recording.
+"""Create directories with the files of thousands of monitors, almost without recording.
 
-One monitor records. Its manifest, with all that it says of the machine, is then written
-again under other infixes, by the writers that monitors use, as are statistics and
-journals. Trajectories are there by their names only: reading results opens none.
+A single monitor records. Its manifest, including the facts about the machine, is then
+written under many other infixes with the same functions that monitors use. Statistics
+and journals are written in the same way. Trajectory files are empty, because nothing
+opens them to read results.
 """
 
 from __future__ import annotations
@@ -45,20 +46,21 @@ _CHUNK = "seed-000"
 _START = 1.79e9
 _SECONDS = 0.5
 _STEPS = 1000
-# As many monitors as one process makes before the next has another number.
+# The number of monitors in one process. The next monitor gets a new process number.
 _OF_ONE_PROCESS = 100
 _FIRST_PROCESS = 4711
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Written:
-    """One monitor among those that are written.
+    """A monitor whose files are written.
 
     Attributes:
-        infix: its own.
-        seed: of its batch.
-        first: number of its first episode, in the evaluation and in the directory.
-        episodes: how many it recorded.
+        infix: the monitor's infix.
+        seed: seed of the monitor's batch.
+        first: number of the monitor's first episode, both in the evaluation and in the
+            directory.
+        episodes: number of episodes that it recorded.
     """
 
     infix: Infix
@@ -68,17 +70,17 @@ class _Written:
 
     @property
     def numbers(self) -> range:
-        """The numbers of its episodes."""
+        """The numbers of the monitor's episodes."""
         return range(self.first, self.first + self.episodes)
 
 
 def write_monitors(folder: Path, *, monitors: int, episodes: int) -> None:
-    """Write what so many closed monitors of an evaluation leave in a task's folder.
+    """Write the files that closed monitors of an evaluation leave in a task's folder.
 
     Args:
-        folder: is made.
-        monitors: how many.
-        episodes: of each.
+        folder: the folder, which is created.
+        monitors: number of monitors.
+        episodes: number of episodes per monitor.
     """
     _write_monitors(folder, monitors, episodes, _recorded_manifest())
 
@@ -86,13 +88,13 @@ def write_monitors(folder: Path, *, monitors: int, episodes: int) -> None:
 def write_evaluation(
     directory: Path, *, tasks: int, monitors: int, episodes: int
 ) -> None:
-    """Write a finished evaluation, all of whose episodes have a trajectory.
+    """Write a finished evaluation in which every episode has a trajectory.
 
     Args:
-        directory: is made.
-        tasks: how many.
-        monitors: of each task.
-        episodes: of each monitor.
+        directory: the directory, which is created.
+        tasks: number of tasks.
+        monitors: number of monitors per task.
+        episodes: number of episodes per monitor.
     """
     planned = [EvaluatedTask(f"{TASK}/{n}", f"task{n}") for n in range(tasks)]
     plan = EvaluationPlan(
@@ -147,7 +149,7 @@ def _trajectory_of(result: EpisodeResult) -> str:
 
 
 def _recorded_manifest() -> Manifest:
-    """Return what a monitor of an evaluation writes about its machine."""
+    """Return the manifest that a monitor of an evaluation writes on this machine."""
     with tempfile.TemporaryDirectory() as place:
         env = gymnasium.make(TASK)
         monitor: Any = mjrec.Monitor(env, place, False, mode="evaluation", workers=0)
@@ -243,5 +245,5 @@ def _result(task: str, written: _Written, number: int) -> EpisodeResult:
 
 
 def _reward(number: int) -> float:
-    # No two alike for long, and no more digits than returns have.
+    # The values rarely repeat and have about as many digits as real returns.
     return number * 7919 % 10_007 / 13

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How much memory recording takes in the process that simulates."""
+"""The memory that recording needs in the simulating process."""
 
 from __future__ import annotations
 
@@ -15,27 +15,27 @@ from .results import Reference, Result, at_most
 from .rounds import Say, take_turns
 from .setups import BARE, MONITOR, RECORD_VIDEO, Setup, has_moviepy, random_actions
 
-TITLE = "Memory: peak of the simulation's process in one episode of HalfCheetah-v5"
+TITLE = "Memory: peak in the simulating process, one episode of HalfCheetah-v5"
 
 _BARE, _PENDING, _DRAWN = "bare", "workers=0", "workers=1"
 _LITTLE = at_most(64)
-# Pages come and go with what the allocator happens to do.
+# The number of pages varies a little with the behavior of the allocator.
 _NO_GROWTH = at_most(4)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Settings:
-    """How much is measured.
+    """The size of the measurement.
 
     Attributes:
-        rounds: of all variants.
-        short: the frames of the shorter episode.
-        long: those of the longer one.
+        rounds: number of rounds.
+        short: number of frames in the shorter episode.
+        long: number of frames in the longer episode.
         size: height and width of the frames.
-        drawn_size: of those that workers draw. What they draw is not in the process
-            that is measured, so it need not be large.
-        recorders: who is measured, the bare environment among them; RecordVideo with
-            the shorter episode only.
+        drawn_size: height and width of the frames that workers draw. These frames can
+            be small, because they are not in the measured process.
+        recorders: the variants to measure, including the bare environment. RecordVideo
+            is measured only with the shorter episode.
     """
 
     rounds: int = 3
@@ -51,7 +51,7 @@ QUICK = Settings(rounds=1, short=100, long=1000)
 
 
 def measure(settings: Settings, say: Say) -> list[Result]:
-    """Return how much more each variant takes, and how that grows with the episode."""
+    """Return the memory of each variant, and its growth with the episode's length."""
     samples = take_turns(
         {
             key: functools.partial(
@@ -88,7 +88,7 @@ def _setups(settings: Settings) -> Iterator[tuple[tuple[str, int], Setup]]:
         setups = {
             _BARE: _setup(BARE, full),
             _PENDING: _setup(MONITOR, full, workers=0),
-            # At the lower quality, or ten thousand take half an hour.
+            # Draft quality, because ten thousand frames would take half an hour.
             _DRAWN: _setup(MONITOR, small, workers=1, quality="draft"),
         }
         if steps == settings.short and has_moviepy():
@@ -129,7 +129,7 @@ def _note(name: str, settings: Settings) -> str:
 
 
 def _growths(peaks: _Peaks, settings: Settings) -> Iterator[Result]:
-    """Yield what the longer episode takes more than the shorter one."""
+    """Yield the additional memory that the longer episode needs."""
     for name in settings.recorders:
         if (name, settings.long) not in peaks:
             continue

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The least that saving the state of each step costs: a yardstick, and no recorder.
+"""A prototype that shows the minimum cost of saving the state of each step.
 
-A row is one `take` of 64-bit words out of the one block of memory that all arrays of
-`MjData` lie in, and goes into a mapped file whose pages stay hot; a full file is
-written away. It knows no actions, views, changed models or journal, and notices
-nothing.
+It is a yardstick, not a recorder. All arrays of `MjData` are in one block of memory. A
+row is one `take` of 64-bit words from that block into a memory-mapped file whose pages
+stay in the cache. When the file is full, it is written to the log. The prototype does
+not save actions or views, does not notice changes to the model, and has no journal.
 """
 
 from __future__ import annotations

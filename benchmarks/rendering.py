@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How fast one worker draws, against a bare `mujoco.Renderer` that writes nothing."""
+"""The drawing speed of one worker, compared with a bare `mujoco.Renderer`."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ from .results import Reference, Result, at_least
 from .rounds import Say, take_turns
 from .setups import MONITOR, UNENDING, Setup, random_actions
 
-TITLE = "Rendering: frames per second of one process, same model, size and states"
+TITLE = "Rendering: frames per second in one process; same model, size and states"
 
 
 @dataclass(frozen=True, kw_only=True)
 class Settings:
-    """How much is measured.
+    """The size of the measurement.
 
     Attributes:
-        environments: whose states are drawn.
-        rounds: of all variants.
-        frames: of each variant in a round.
+        environments: names of the environments whose states are drawn.
+        rounds: number of rounds.
+        frames: number of frames that each variant draws in a round.
         size: height and width of the frames.
     """
 
@@ -46,7 +46,7 @@ QUICK = Settings(environments=("HalfCheetah-v5",), rounds=3, frames=60)
 
 
 def measure(settings: Settings, say: Say) -> list[Result]:
-    """Return a line for each environment and way of drawing."""
+    """Return a result line for each environment and drawing method."""
     return [
         result
         for env_id in settings.environments
@@ -55,7 +55,7 @@ def measure(settings: Settings, say: Say) -> list[Result]:
 
 
 def record_states(setup: dict[str, Any], frames: int, directory: str) -> str:
-    """Record an episode into `directory` and return the path of its trajectory."""
+    """Record an episode in `directory` and return the path of its trajectory."""
     environment = Setup(**setup)
     env = environment.open(directory)
     env.reset(seed=0)
@@ -67,9 +67,9 @@ def record_states(setup: dict[str, Any], frames: int, directory: str) -> str:
 
 
 def draw_bare(trajectory: str, height: int, width: int) -> dict[str, float]:
-    """Draw the states in a loop over a `mujoco.Renderer`."""
-    # Here, because mujoco reads the backend when it is imported, and the process that
-    # only waits for measurements chooses it later.
+    """Draw the states with a `mujoco.Renderer` in a loop."""
+    # Imported here because mujoco reads the backend when it is imported, and the parent
+    # process chooses the backend after this module is imported.
     import mujoco
 
     recording = mjrec.load_trajectory(trajectory)
@@ -91,15 +91,15 @@ def draw_bare(trajectory: str, height: int, width: int) -> dict[str, float]:
 
 
 def draw_through_render(trajectory: str, height: int, width: int) -> dict[str, float]:
-    """Draw the same through `mjrec.render`, with one worker."""
+    """Draw the same states with `mjrec.render` and one worker."""
     start = time.perf_counter()
     frames = mjrec.render(trajectory, height=height, width=width, workers=1)
     return _timed(frames, start)
 
 
 def draw_as_worker(trajectory: str, height: int, width: int) -> dict[str, float]:
-    """Draw the same with what a worker draws with, in this process."""
-    # As above.
+    """Draw the same states in this process, with the code that a worker uses."""
+    # Imported here for the same reason as in `draw_bare`.
     from mjrec.rendering.worker import open_drawing
     from mjrec.simulation.renderer import Canvas
 
@@ -123,7 +123,7 @@ def _frame_count(trajectory: str) -> int:
 
 
 def _camera(facts: Mapping[str, Any]) -> Any:
-    """Return the camera that the episode was shown with."""
+    """Return the camera that the recording uses."""
     import mujoco
 
     camera = mujoco.MjvCamera()
@@ -136,7 +136,7 @@ def _camera(facts: Mapping[str, Any]) -> Any:
 
 
 def _timed(frames: Iterable[object], start: float) -> dict[str, float]:
-    """Return frames per second after the first, and seconds from `start` to that."""
+    """Return the rate after the first frame, and the seconds until that frame."""
     frames = iter(frames)
     next(frames)
     first = time.perf_counter()
@@ -151,7 +151,7 @@ def _measure_environment(env_id: str, settings: Settings, say: Say) -> list[Resu
         **UNENDING.get(env_id, {}),
         "height": height,
         "width": width,
-        # More than any: the episode ends where recording does.
+        # More steps than are taken, so that the episode ends with the recording.
         "max_episode_steps": 10 * settings.frames,
     }
     setup = Setup(env_id=env_id, recorder=MONITOR, make=make, options={"workers": 0})
@@ -188,7 +188,7 @@ def _result(
         samples=_rates(samples),
         reference=None if name == _BARE else bare,
         promise=at_least(0.9) if name == _RENDER else None,
-        note=f"first frame after {first:.2f} s, not counted",
+        note=f"first frame after {first:.2f} s (not counted)",
     )
 
 

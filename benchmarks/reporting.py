@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a report costs, beside loading the results that it shows."""
+"""The cost of a report, compared with loading the results that it shows."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ from .process_memory import peak_memory
 from .results import Reference, Result, at_most
 from .rounds import Say, take_turns
 
-TITLE = "Reporting: a training of many episodes on a page"
+TITLE = "Reporting: a page for a training run with many episodes"
 
 _LOADED, _WRITTEN, _OPENED = "results loaded", "report written", "page opened"
 _EMPTY = "empty page opened"
 _WRITING_PROMISE = at_most(3)
-# What a person takes for at once.
+# In milliseconds; people perceive this as immediate.
 _OPENING_PROMISE = at_most(300)
 _MEMORY_PROMISE = at_most(500)
 
@@ -42,13 +42,13 @@ _SIZE = 64
 
 @dataclass(frozen=True, kw_only=True)
 class Settings:
-    """How much is measured.
+    """The size of the measurement.
 
     Attributes:
-        rounds: of all variants.
-        episodes: that a report shows.
-        videos: of them.
-        many_episodes: that are loaded, for their memory.
+        rounds: number of rounds.
+        episodes: number of episodes in the report.
+        videos: number of episodes with a video.
+        many_episodes: number of episodes to load when memory is measured.
     """
 
     rounds: int = 5
@@ -62,7 +62,7 @@ QUICK = Settings(rounds=3, episodes=2000, videos=20, many_episodes=100_000)
 
 
 def measure(settings: Settings, say: Say) -> list[Result]:
-    """Return how long it takes to load results, to show them and to open the page."""
+    """Return the times to load results, write the report and open the page."""
     with tempfile.TemporaryDirectory() as place:
         recordings, many = Path(place) / "recordings", Path(place) / "many"
         say(f"recording {settings.episodes} episodes")
@@ -83,7 +83,7 @@ def measure(settings: Settings, say: Say) -> list[Result]:
 
 
 class _Flicker(gymnasium.Env[Any, Any]):
-    """Costs nothing to step, and shows something else each time."""
+    """An environment that costs nothing to step and shows a new image each time."""
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 30}  # noqa: RUF012  # Gymnasium's
     observation_space = gymnasium.spaces.Box(-1, 1, (1,), np.float32)
@@ -109,7 +109,7 @@ class _Flicker(gymnasium.Env[Any, Any]):
 
 
 def record(directory: str, episodes: int, videos: int) -> None:
-    """Record a training."""
+    """Record a training run."""
     every = max(1, episodes // videos)
     monitor: Any = mjrec.Monitor(_Flicker(), directory, lambda n: n % every == 0)
     for number in range(episodes):
@@ -120,7 +120,7 @@ def record(directory: str, episodes: int, videos: int) -> None:
 
 
 def write_journal(directory: Path, episodes: int) -> None:
-    """Write what a monitor that is still open has written of so many episodes."""
+    """Write the journal that a monitor has after many episodes, before it is closed."""
     directory.mkdir()
     info = {"gym_version": "mjrec-1", "env_id": "HalfCheetah-v5"}
     path = directory / "openaigym.episodes.0.1.jsonl"
@@ -145,14 +145,14 @@ def write_journal(directory: Path, episodes: int) -> None:
 
 
 def seconds_to_load(directory: str) -> float:
-    """Return how long it takes to load the results."""
+    """Return the seconds that it takes to load the results."""
     start = time.perf_counter()
     gather(directory)
     return time.perf_counter() - start
 
 
 def seconds_to_write(directory: str, report: str) -> float:
-    """Return how long it takes to write a report, but for the posters."""
+    """Return the seconds that it takes to write a report, without the posters."""
     at: dict[str, list[float]] = {}
 
     def note(progress: ReportProgress) -> None:
@@ -167,15 +167,15 @@ def seconds_to_write(directory: str, report: str) -> float:
 
 
 def milliseconds_to_open(page: str, empty: str) -> float:
-    """Return how long a browser takes to read a page and to run its script.
+    """Return the milliseconds that a browser takes to read a page and run its script.
 
-    Chromium is started anew and has no profile, so nothing of the page is cached or
-    compiled. It opens an empty file first: what follows is the page's own time, and
-    not that of the browser's start, during which it still loads parts of itself.
+    Chromium starts without a profile, so the page is neither cached nor compiled. It
+    opens an empty page first, because the browser is still loading parts of itself
+    during its start. The time of the second page does not include that.
 
     Args:
-        page: the file to open.
-        empty: an empty page, on the disk as well.
+        page: path of the page.
+        empty: path of an empty page.
     """
     from playwright.sync_api import sync_playwright
 
@@ -244,7 +244,7 @@ def _results(samples: Mapping[str, list[float]], settings: Settings) -> list[Res
             samples=tuple(samples[_WRITTEN]),
             reference=loaded,
             promise=_WRITING_PROMISE,
-            note="posters apart",
+            note="without the posters",
         ),
         Result(subject="no report", variant=_EMPTY, unit="ms", samples=empty),
         Result(

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What was measured, what it is compared with, and what was promised."""
+"""Measured results, the references to compare them with, and promised limits."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from typing import Any
 
 @dataclass(frozen=True)
 class Promise:
-    """A limit that a number is to keep.
+    """A promised limit for a number.
 
     Attributes:
-        bound: the limit itself is kept.
-        is_least: the number is to be this or more, not this or less.
+        bound: the limit, which is itself allowed.
+        is_least: whether `bound` is the smallest allowed number instead of the largest.
     """
 
     bound: float
     is_least: bool
 
     def is_kept_by(self, value: float) -> bool:
-        """Return whether a number is on the right side."""
+        """Return whether a number is within the limit."""
         return value >= self.bound if self.is_least else value <= self.bound
 
     def __str__(self) -> str:
@@ -31,23 +31,24 @@ class Promise:
 
 
 def at_least(bound: float) -> Promise:
-    """Return the promise of this much or more."""
+    """Return a promise that a number is at least `bound`."""
     return Promise(bound, is_least=True)
 
 
 def at_most(bound: float) -> Promise:
-    """Return the promise of this much or less."""
+    """Return a promise that a number is at most `bound`."""
     return Promise(bound, is_least=False)
 
 
 @dataclass(frozen=True)
 class Reference:
-    """What a result is compared with: measured in the same rounds, in the same unit.
+    """A reference for a result, measured in the same rounds and in the same unit.
 
     Attributes:
-        name: in the table.
-        samples: one for each round.
-        is_ratio: the result is divided by it; else it is subtracted.
+        name: name to show in the table.
+        samples: one sample per round.
+        is_ratio: whether to divide the result by the reference. If false, the reference
+            is subtracted from the result.
     """
 
     name: str
@@ -55,7 +56,7 @@ class Reference:
     is_ratio: bool = True
 
     def compare(self, value: float, reference: float) -> float:
-        """Return a number of the result in terms of one of the reference."""
+        """Return the ratio or difference of a number and a reference number."""
         if not self.is_ratio:
             return value - reference
         return value / reference if reference else math.nan
@@ -66,13 +67,14 @@ class Result:
     """One line of the table.
 
     Attributes:
-        subject: what was worked on: an environment, a model.
-        variant: how.
-        unit: of the samples.
-        samples: one for each round; none where it could not be measured.
-        reference: None where the number stands for itself.
-        promise: of the comparison, or of the number itself where there is none.
-        note: what else there is to say, such as why it could not be measured.
+        subject: the subject of the measurement, such as an environment or a model.
+        variant: name of the measured variant.
+        unit: unit of the samples.
+        samples: one sample per round; empty if the variant could not be measured.
+        reference: the reference to compare with; None for no comparison.
+        promise: the limit for the comparison, or for the number itself if there is no
+            reference.
+        note: a remark, such as the reason why the variant could not be measured.
     """
 
     subject: str
@@ -85,17 +87,17 @@ class Result:
 
     @property
     def median(self) -> float:
-        """The middle one of the samples."""
+        """The median of the samples."""
         return statistics.median(self.samples) if self.samples else math.nan
 
     @property
     def quartiles(self) -> tuple[float, float]:
-        """Half of the samples lie between these."""
+        """The first and third quartiles of the samples."""
         return _quartiles(self.samples)
 
     @property
     def compared(self) -> float | None:
-        """The comparison of the medians; None without a reference."""
+        """The comparison of the medians, or None without a reference."""
         if self.reference is None or not self.samples:
             return None
         reference = statistics.median(self.reference.samples)
@@ -103,7 +105,7 @@ class Result:
 
     @property
     def compared_quartiles(self) -> tuple[float, float] | None:
-        """Half of the rounds' own comparisons lie between these."""
+        """The first and third quartiles of the comparisons of each round."""
         if self.reference is None or not self.samples:
             return None
         pairs = zip(self.samples, self.reference.samples, strict=True)
@@ -111,7 +113,7 @@ class Result:
 
     @property
     def is_kept(self) -> bool | None:
-        """Whether the promise holds; None where nothing is promised or measured."""
+        """Whether the promise is kept; None without a promise or a measurement."""
         if self.promise is None or not self.samples:
             return None
         value = self.median if self.reference is None else self.compared
@@ -119,7 +121,7 @@ class Result:
         return self.promise.is_kept_by(value)
 
     def as_json(self) -> dict[str, Any]:
-        """Return everything in what JSON can hold."""
+        """Return the result as values that JSON can represent."""
         return {
             "subject": self.subject,
             "variant": self.variant,

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Measuring several things fairly: in rounds, each at every place in the order."""
+"""Fair measurement of several variants in rounds with a changing order."""
 
 from __future__ import annotations
 
@@ -8,17 +8,17 @@ from typing import TypeVar
 
 Key = TypeVar("Key", bound=Hashable)
 Sample = TypeVar("Sample")
-# Tells somebody who waits what is being done.
+# A function that shows the current activity to the user.
 Say = Callable[[str], None]
 
 
 def take_turns(
     variants: Mapping[Key, Callable[[], Sample]], *, rounds: int, say: Say
 ) -> dict[Key, list[Sample]]:
-    """Return what each variant gave in each round.
+    """Run all variants once per round, and return the samples of each variant.
 
-    A machine gets slower and faster while one waits. In a round every variant runs
-    once, and each round begins with another one.
+    The speed of a machine changes over time. Therefore each round begins with a
+    different variant.
     """
     samples: dict[Key, list[Sample]] = {key: [] for key in variants}
     keys = list(variants)

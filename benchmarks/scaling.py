@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How cost grows with the number of monitors that have recorded into a directory."""
+"""The growth of costs with the number of monitors that recorded in a directory."""
 
 from __future__ import annotations
 
@@ -31,12 +31,14 @@ from .process_memory import peak_memory
 from .results import Promise, Reference, Result, at_most
 from .rounds import Say, take_turns
 
-TITLE = "Scaling: a directory into which many monitors have recorded"
+TITLE = "Scaling: a directory in which many monitors have recorded"
 
-# What a reader keeps of a monitor with ten episodes, and what any reader needs.
+# The memory in MB that a reader keeps per monitor with ten episodes, and the memory
+# that it needs in any case.
 _KEPT_MB, _NEEDED_MB = 0.012, 30.0
 _RESULT_MB = 0.001
-# Half as much again as the number of monitors grows, for what is not the reader's.
+# The time may grow 1.5 times as much as the number of monitors, because other effects
+# contribute to it.
 _LINEAR = 1.5
 
 _Work = Callable[[], object]
@@ -45,14 +47,14 @@ _Prepare = Callable[[Path], _Work]
 
 @dataclass(frozen=True, kw_only=True)
 class Settings:
-    """How much is measured.
+    """The size of the measurement.
 
     Attributes:
-        rounds: of all variants.
-        monitors: in a directory, each time more.
-        episodes: of each monitor.
-        tasks: among which the monitors of an evaluation are spread.
-        results: how many episodes a driver holds, each time more.
+        rounds: number of rounds.
+        monitors: numbers of monitors per directory, in ascending order.
+        episodes: number of episodes per monitor.
+        tasks: number of tasks over which the monitors of an evaluation are distributed.
+        results: numbers of episodes that a driver holds, in ascending order.
     """
 
     rounds: int = 3
@@ -68,7 +70,7 @@ QUICK = Settings(monitors=(10, 100, 1000), tasks=5, results=(10_000, 100_000))
 
 @dataclass(frozen=True)
 class _Cost:
-    """Of an operation: the seconds, and the peaks before it and after it, in MB."""
+    """The cost of an operation: seconds, and peak memory before and after it in MB."""
 
     seconds: float
     before: float
@@ -76,7 +78,7 @@ class _Cost:
 
 
 def measure(settings: Settings, say: Say) -> list[Result]:
-    """Return how long each operation takes, how that grows, and in what memory."""
+    """Return the time of each operation, the growth of the time, and the memory."""
     with tempfile.TemporaryDirectory() as place:
         directories = _directories(Path(place), settings, say)
         variants: dict[tuple[str, int], Callable[[], _Cost]] = {
@@ -96,13 +98,13 @@ def measure(settings: Settings, say: Say) -> list[Result]:
 
 
 def run(operation: str, directory: str) -> list[float]:
-    """Do something once, and return its seconds, and the peaks before and after."""
+    """Run an operation once, and return its time and the memory before and after."""
     prepare = {**_OF_MONITORS, **_OF_EVALUATIONS}[operation]
     return _measured(prepare(Path(directory)))
 
 
 def hold(results: int) -> list[float]:
-    """Hold the results of so many episodes, as a driver does, and write them."""
+    """Hold the results of many episodes, as a driver does, and write them."""
     plan = EvaluationPlan(
         tasks=(EvaluatedTask(TASK, TASK),),
         policy="random",
@@ -141,7 +143,7 @@ def _cost(function: Callable[..., list[float]], **arguments: Any) -> _Cost:
 def _directories(
     place: Path, settings: Settings, say: Say
 ) -> dict[int, tuple[Path, Path]]:
-    """Return by number of monitors a task's folder, and an evaluation's directory."""
+    """Write a task's folder and an evaluation for each number of monitors."""
     directories = {}
     for count in settings.monitors:
         say(f"writing the files of {count} monitors, twice")
@@ -157,7 +159,8 @@ def _directories(
     return directories
 
 
-# What is done. Each gets ready first: what it imports is no part of the cost.
+# The operations. Each function prepares an operation, including its imports, so that
+# preparation does not count as part of the cost.
 
 
 def _load(directory: Path) -> _Work:
@@ -189,7 +192,7 @@ def _resume(directory: Path) -> _Work:
 
 
 def _monitor(env: Any, directory: Path, *, resume: bool | str = "join") -> Any:
-    """Open a monitor, by itself as a worker of an evaluation does."""
+    """Open a monitor with the options that a worker of an evaluation uses."""
     return mjrec.Monitor(
         env,
         directory,
@@ -265,7 +268,7 @@ def _time(
         before = tuple(cost.seconds for cost in less)
         reference = Reference(f"{growth:g} times fewer", before)
         exponent = math.log(statistics.median(seconds) / statistics.median(before))
-        note = f"grows with the power {exponent / math.log(growth):.2f}"
+        note = f"grows with an exponent of {exponent / math.log(growth):.2f}"
         promise = at_most(growth * _LINEAR) if name in _READERS else None
     return Result(
         subject=name,

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Environments, bare or with somebody who records them."""
+"""Environments, with or without a recorder."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ import mjrec
 
 BARE, MONITOR, RECORD_VIDEO = "bare", "mjrec.Monitor", "RecordVideo"
 
-# The names of dm_control's tasks begin with it.
+# The prefix of the names of dm_control's tasks.
 SUITE = "dm_control/"
 
-# What keeps episodes of random actions going until their time is over.
+# Options that prevent episodes with random actions from ending before the time limit.
 UNENDING: dict[str, dict[str, Any]] = {
     "Hopper-v5": {"terminate_when_unhealthy": False},
     "Humanoid-v5": {"terminate_when_unhealthy": False},
@@ -36,15 +36,15 @@ _EPISODES: dict[str, Callable[[int], bool] | bool | None] = {
 
 @dataclass(frozen=True, kw_only=True)
 class Setup:
-    """A Gymnasium environment and its recorder, in what JSON can hold.
+    """A Gymnasium environment and its recorder, as values that JSON can represent.
 
     Attributes:
-        env_id: of the environment.
+        env_id: id of the environment.
         recorder: `BARE`, `MONITOR` or `RECORD_VIDEO`.
-        episodes: which get a video: "all", "scheduled" or "none".
-        make: keyword arguments of `gymnasium.make`.
-        options: keyword arguments of `mjrec.Monitor`.
-        waits: whether its `close` waits for the videos.
+        episodes: the episodes that get a video: "all", "scheduled" or "none".
+        make: keyword arguments for `gymnasium.make`.
+        options: keyword arguments for `mjrec.Monitor`.
+        waits: whether the monitor's `close` waits for the videos.
     """
 
     env_id: str
@@ -55,11 +55,11 @@ class Setup:
     waits: bool = True
 
     def as_json(self) -> dict[str, Any]:
-        """Return what `Setup(**...)` takes in another process."""
+        """Return the keyword arguments that recreate the setup in another process."""
         return asdict(self)
 
     def open(self, directory: str | Path) -> Any:
-        """Return the environment, which is recorded into `directory`."""
+        """Create the environment, with a recorder that writes to `directory`."""
         if self.recorder == BARE:
             return gymnasium.make(self.env_id, **self.make)
         if self.recorder == RECORD_VIDEO:
@@ -72,7 +72,7 @@ class Setup:
         return mjrec.Monitor(env, directory, episodes, **self.options)
 
     def close(self, env: Any) -> float:
-        """Close what `open` returned, and return how long it took."""
+        """Close an environment from `open`, and return the seconds that it took."""
         start = time.perf_counter()
         if self.recorder == MONITOR:
             env.close(wait=self.waits)
@@ -82,7 +82,7 @@ class Setup:
 
 
 def has_moviepy() -> bool:
-    """Return whether RecordVideo can write videos here."""
+    """Return whether moviepy, which RecordVideo needs, is installed."""
     return importlib.util.find_spec("moviepy") is not None
 
 
@@ -92,8 +92,8 @@ def is_there(env_id: str) -> bool:
 
 
 def suite_environment(env_id: str) -> Any:
-    """Return a task of dm_control's suite, where `is_there`."""
-    # Here, because it may not be installed.
+    """Return a task from dm_control's suite, which must be installed."""
+    # Imported here because dm_control may not be installed.
     from dm_control import suite
 
     domain, _, task = env_id.removeprefix(SUITE).partition("-")
@@ -101,13 +101,13 @@ def suite_environment(env_id: str) -> Any:
 
 
 def random_actions(env: Any, count: int) -> list[Any]:
-    """Return the same actions at every call, made beforehand: drawing them takes time.
+    """Return random actions that are the same in every call.
 
-    After half a thousand they come again.
+    Sampling takes time, so the actions are sampled in advance. They repeat after 500.
 
     Args:
-        env: an environment of Gymnasium's or of dm_control's.
-        count: how many.
+        env: an environment from Gymnasium or dm_control.
+        count: number of actions.
     """
     draw = _drawing(env)
     some = [draw() for _ in range(min(count, 500))]
@@ -124,7 +124,7 @@ def _drawing(env: Any) -> Callable[[], Any]:
 
 
 def seconds_to_step(env: Any, actions: Iterable[Any]) -> float:
-    """Step the environment, reset it where an episode ends, return how long it took."""
+    """Step an environment, reset it after each episode, and return the seconds."""
     step, reset = env.step, env.reset
     start = time.perf_counter()
     for action in actions:

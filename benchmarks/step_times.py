@@ -1,12 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Single steps, in one process and in turns: `python -m benchmarks.step_times`.
+"""Times of single steps, in one process: `python -m benchmarks.step_times`.
 
-On a machine with other work whole runs differ more from each other than a monitor
-costs. Here every step is timed, in rounds that take turns, and the quantiles of all
-steps tell what the others hide. Writing, and what begins and ends an episode, is in the
-times of the episodes, and in the CPU time of whole runs, divided by their steps.
-Beside the monitor is what a prototype takes that only saves the state of each step
-(`prototype`).
+On a busy machine, whole runs differ from each other by more than the cost of a monitor.
+Therefore each step is timed separately in alternating rounds, and the quantiles of all
+step times are printed. The cost of writing and of beginning and ending episodes shows
+in the times of the episodes, and in the CPU time of whole runs divided by their number
+of steps. For comparison, a prototype (`prototype`) only saves the state of each step.
 """
 
 from __future__ import annotations
@@ -29,14 +28,14 @@ QUANTILES = (5, 25, 50)
 
 
 def make(env_id: str) -> Any:
-    """Return an environment of Gymnasium's or of dm_control's suite."""
+    """Return an environment from Gymnasium or from dm_control's suite."""
     if env_id.startswith(SUITE):
         return suite_environment(env_id)
     return gymnasium.make(env_id)
 
 
 def reset(env: Any, seed: int) -> None:
-    """Begin an episode; those of dm_control go on with their generator."""
+    """Begin an episode. Only Gymnasium environments use the seed."""
     if hasattr(env, "action_space"):
         env.reset(seed=seed)
     else:
@@ -44,14 +43,16 @@ def reset(env: Any, seed: int) -> None:
 
 
 def is_over(result: Any) -> bool:
-    """Return whether what a step returned ends an episode."""
+    """Return whether the result of a step ends an episode."""
     return bool(result[2] or result[3] if len(result) == 5 else result.last())
 
 
 def times(env: Any, actions: list[Any]) -> tuple[list[int], list[int], list[float]]:
-    """Return the nanoseconds of every step, and of every episode with its reset.
+    """Run episodes and return their times in nanoseconds.
 
-    And this thread's of all, by the step.
+    Returns:
+        The time of each step, the time of each episode with its reset, and this
+        thread's CPU time per step.
     """
     steps, episodes, seed = [], [], 0
     began, started = perf_counter_ns(), thread_time_ns()
@@ -69,7 +70,7 @@ def times(env: Any, actions: list[Any]) -> tuple[list[int], list[int], list[floa
 
 
 def measure(env_id: str, count: int) -> None:
-    """Print the quantiles of one environment."""
+    """Print the quantiles for one environment."""
     bare = make(env_id)
     actions = random_actions(bare, count)
     with (

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How fast environments step, bare and recorded."""
+"""The stepping speed of environments, with and without recording."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from .setups import (
     seconds_to_step,
 )
 
-TITLE = "Stepping: steps per second, resets included"
+TITLE = "Stepping: steps per second, including resets"
 
 _BARE = "bare"
 _COUNTED = "monitored, no episode recorded"
@@ -46,14 +46,15 @@ _CAPTURED_PROMISES = {"HalfCheetah-v5": at_least(0.8), "Humanoid-v5": at_least(0
 
 @dataclass(frozen=True, kw_only=True)
 class Settings:
-    """How much is measured.
+    """The size of the measurement.
 
     Attributes:
-        environments: their names; the episodes are as long as they are.
-        rounds: of all variants.
-        steps: of each variant in a round.
-        drawn_steps: likewise of RecordVideo, which takes a thousand times as long.
-        make: keyword arguments of `gymnasium.make`.
+        environments: names of the environments. Episodes have their natural length.
+        rounds: number of rounds.
+        steps: number of steps that each variant takes in a round.
+        drawn_steps: number of steps in a round with RecordVideo, which takes a thousand
+            times as long.
+        make: keyword arguments for `gymnasium.make`.
     """
 
     environments: tuple[str, ...] = ("HalfCheetah-v5", "Humanoid-v5")
@@ -68,7 +69,7 @@ QUICK = Settings(rounds=3, steps=10_000, drawn_steps=20, make={})
 
 
 def measure(settings: Settings, say: Say) -> list[Result]:
-    """Return a line for each environment and variant."""
+    """Return a result line for each environment and variant."""
     return [
         result
         for env_id in settings.environments
@@ -77,10 +78,10 @@ def measure(settings: Settings, say: Say) -> list[Result]:
 
 
 def run_episodes(setup: dict[str, Any], steps: int) -> dict[str, float]:
-    """Return steps per second, and per second of this thread's CPU time.
+    """Return the number of steps per second and per second of this thread's CPU time.
 
-    What is done once, in the first reset, does not count, and neither does closing,
-    whose seconds are given too.
+    The first reset and closing are not included. The time to close is returned
+    separately.
     """
     environment = Setup(**setup)
     with tempfile.TemporaryDirectory() as directory:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Results as a table for people."""
+"""Printable tables of results."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _COLUMNS = ("", "median", "half within", "compared", "half within", "promise", "
 
 
 def table_of(title: str, results: Sequence[Result]) -> Table:
-    """Return the table of one measurement."""
+    """Return the table for one measurement."""
     table = Table(title=title, title_justify="left")
     for number, name in enumerate(_COLUMNS):
         table.add_column(name, justify="left" if number == 0 else "right")
@@ -60,5 +60,5 @@ def _range(pair: tuple[float, float] | None) -> str:
 
 
 def _number(value: float) -> str:
-    """Return three significant digits, and no fraction of what is large."""
+    """Format a number with three significant digits, or as a whole number if large."""
     return f"{value:,.0f}" if abs(value) >= 100 else f"{value:.3g}"

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How long it takes until an episode is a finished mp4, from its reset on."""
+"""The time from the reset of an episode to its finished mp4."""
 
 from __future__ import annotations
 
@@ -24,17 +24,17 @@ from .setups import (
     random_actions,
 )
 
-TITLE = "Time to video: seconds from reset to the finished mp4 of one episode"
+TITLE = "Time to video: seconds from reset to finished mp4, one episode"
 
 
 @dataclass(frozen=True, kw_only=True)
 class Case:
-    """An episode, drawn by RecordVideo and by mjrec.
+    """An episode that RecordVideo and mjrec draw.
 
     Attributes:
-        env_id: of the environment.
-        variants: names, options of `mjrec.Monitor`, and what is promised, as a part of
-            RecordVideo's time.
+        env_id: id of the environment.
+        variants: options for `mjrec.Monitor`, and the promised limit as a fraction of
+            RecordVideo's time, keyed by the name of the variant.
     """
 
     env_id: str
@@ -58,14 +58,14 @@ CASES = (
 
 @dataclass(frozen=True, kw_only=True)
 class Settings:
-    """How much is measured.
+    """The size of the measurement.
 
     Attributes:
-        rounds: of all variants of a case.
-        steps: the lengths of the episodes.
+        rounds: number of rounds.
+        steps: lengths of the episodes.
         size: height and width of the frames.
-        workers: mjrec's processes that draw.
-        cases: what is measured.
+        workers: number of mjrec's drawing processes.
+        cases: the cases to measure.
     """
 
     rounds: int = 3
@@ -80,7 +80,7 @@ QUICK = Settings(rounds=1, steps=(200,))
 
 
 def measure(settings: Settings, say: Say) -> list[Result]:
-    """Return a line for each case and variant."""
+    """Return a result line for each case and variant."""
     return [
         result
         for case in settings.cases
@@ -90,10 +90,10 @@ def measure(settings: Settings, say: Say) -> list[Result]:
 
 
 def make_video(setup: dict[str, Any], steps: int) -> dict[str, float]:
-    """Record one episode; return the seconds it took, and those of stepping.
+    """Record one episode, and return its total time, stepping time and video size.
 
     Raises:
-        RuntimeError: there is no video.
+        RuntimeError: the number of videos is not one.
     """
     environment = Setup(**setup)
     with tempfile.TemporaryDirectory() as directory:
@@ -108,7 +108,7 @@ def make_video(setup: dict[str, Any], steps: int) -> dict[str, float]:
         end = time.perf_counter()
         sizes = [path.stat().st_size for path in Path(directory).glob("*.mp4")]
     if len(sizes) != 1:
-        raise RuntimeError(f"There are {len(sizes)} videos.")
+        raise RuntimeError(f"Expected one video, but there are {len(sizes)}.")
     return {"seconds": end - start, "stepping": stepped - start, "bytes": sizes[0]}
 
 
@@ -173,7 +173,7 @@ def _result(
         samples=_seconds(samples),
         reference=reference,
         promise=promise,
-        note=f"{stepping:.2f} s of it in reset and step",
+        note=f"of this, {stepping:.2f} s in reset and step",
     )
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What verifying costs: making again and comparing, beside recording and drawing."""
+"""The cost of verification, compared with recording and drawing."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ from .results import Reference, Result, at_most
 from .rounds import Say, take_turns
 from .setups import random_actions
 
-TITLE = "Verifying: packed runs of HalfCheetah-v5, recreated"
+TITLE = "Verification: packed runs of HalfCheetah-v5, recreated and compared"
 
 _ENV_ID = "HalfCheetah-v5"
 _STATS, _PHYSICS, _PIXELS = "--level stats", "--level physics", "all frames"
 _RECORDED = "recorded and drawn"
-# Of 1000 episodes of 25 steps.
+# Seconds for 1000 episodes of 25 steps.
 _STATS_PROMISE = at_most(20)
-# Four times as many take four times as long, and starting processes less than that.
+# Four times as many episodes take at most four times as long, plus some tolerance.
 _LINEAR = at_most(4.2)
 _STEPS_PER_SECOND = 2000
 _PIXELS_PROMISE = at_most(1.5)
@@ -36,18 +36,19 @@ _PIXELS_PROMISE = at_most(1.5)
 
 @dataclass(frozen=True, kw_only=True)
 class Settings:
-    """How much is measured.
+    """The size of the measurement.
 
     Attributes:
-        rounds: of all variants.
-        episodes: short ones, without videos; and four times as many.
-        short: steps of these.
-        long_episodes: long ones, without videos.
-        long: steps of these.
-        videos: of `frames` frames.
-        frames: likewise.
+        rounds: number of rounds.
+        episodes: number of short episodes without videos. Four times as many are
+            measured as well.
+        short: number of steps in a short episode.
+        long_episodes: number of long episodes without videos.
+        long: number of steps in a long episode.
+        videos: number of videos.
+        frames: number of frames per video.
         size: width and height of the videos.
-        workers: that draw.
+        workers: number of drawing processes.
     """
 
     rounds: int = 3
@@ -66,7 +67,7 @@ QUICK = Settings(rounds=1, videos=2, frames=100)
 
 
 def measure(settings: Settings, say: Say) -> list[Result]:
-    """Return how long verifications take."""
+    """Return the times that verifications take."""
     with tempfile.TemporaryDirectory() as name:
         place = Path(name)
         for run, episodes, steps in (
@@ -83,7 +84,7 @@ def measure(settings: Settings, say: Say) -> list[Result]:
 
 
 def record(directory: str, episodes: int, steps: int, **options: Any) -> None:
-    """Record episodes of random actions."""
+    """Record episodes with random actions."""
     env = gymnasium.make(_ENV_ID, max_episode_steps=steps)
     options = {"video_callable": False, "workers": 0, **options}
     monitor: Any = mjrec.Monitor(env, directory, mode="evaluation", **options)
@@ -100,14 +101,14 @@ def verify(path: str, level: str) -> dict[str, float]:
     start = time.perf_counter()
     verification = mjrec.verify(path, level=level)
     if verification.failures:
-        raise RuntimeError("an honest recording was not believed")
+        raise RuntimeError("Verification of a genuine recording failed.")
     return {"seconds": time.perf_counter() - start}
 
 
 def record_and_draw(
     directory: str, archive: str, videos: int, steps: int, size: int, workers: int
 ) -> dict[str, float]:
-    """Record videos, and return the seconds that they take; then pack them."""
+    """Record videos, pack them, and return the seconds that recording took."""
     shutil.rmtree(directory, ignore_errors=True)
     Path(archive).unlink(missing_ok=True)
     start = time.perf_counter()
@@ -145,7 +146,7 @@ def _variants(
             directory=str(place / "drawn"),
             archive=archive,
             videos=settings.videos,
-            # The frame of the reset is one.
+            # The reset adds one frame.
             steps=settings.frames - 1,
             size=settings.size,
             workers=settings.workers,

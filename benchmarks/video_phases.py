@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where the time of a video goes: `python -m benchmarks --only time_to_video --phases`.
+"""The time of each phase of a video.
 
-Each part of the way is done by itself, one after the other, by the functions that do
-it in a recording; there some of them go on at the same time. A GPU or none, the parts
-are the same.
+Run `python -m benchmarks --only time_to_video --phases`. The phases run one after
+another, with the same functions that a recording uses. In a recording, some phases run
+at the same time. The phases are the same with and without a GPU.
 """
 
 from __future__ import annotations
@@ -36,30 +36,30 @@ from .rounds import Say, take_turns
 from .setups import MONITOR, UNENDING, Setup, random_actions
 from .time_to_video import FULL, QUICK, Settings
 
-TITLE = "Time to video, part by part"
-# Of the same episodes.
+TITLE = "Time to video, phase by phase"
+# FULL and QUICK are those of `time_to_video`, so the episodes are the same.
 __all__ = ["FULL", "QUICK", "TITLE", "measure"]
 
-# As `child_python` asks for.
+# The size of the pipes that `child_python` creates.
 _PIPE_BYTES = 1 << 20
 
-# In the order of a recording.
+# The phases, in the order in which a recording runs them.
 _PARTS = {
-    "process beside the simulation": "Python and all imports, once for a monitor",
-    "OpenGL context": "once in a worker",
-    "reset and steps": "with the state of each step",
+    "process beside the simulation": "Python and all imports, once per monitor",
+    "OpenGL context": "once per worker",
+    "reset and steps": "including saving the state of each step",
     "trajectory": "rows to HDF5, compressed",
-    "model to the driver": "loading it, textures, shadow map; once in a worker",
+    "model to the driver": "loading, textures, shadow map; once per worker",
     "drawing": "mjr_render of all frames, by one worker",
     "reading back": "mjr_readPixels of all frames, by one worker",
-    "pipe": "frames from a worker's pipe, hashed",
+    "pipe": "reading and hashing frames from a worker's pipe",
     "x264": "hashing, ffmpeg and its pipe",
-    "check": "decoding the finished file: frames counted and hashed",
+    "check": "decoding the finished file, counting and hashing its frames",
 }
 
 
 def measure(settings: Settings, say: Say) -> list[Result]:
-    """Return a line for each part of the way to the videos of `time_to_video`."""
+    """Return a result line for each phase of the videos in `time_to_video`."""
     case, steps = settings.cases[0], settings.steps[0]
     height, width = settings.size
     samples = take_turns(
@@ -94,7 +94,7 @@ def measure(settings: Settings, say: Say) -> list[Result]:
 def seconds_of_parts(
     env_id: str, steps: int, height: int, width: int, quality: str
 ) -> Mapping[str, float]:
-    """Return how long each part takes for one episode."""
+    """Return the seconds that each phase takes for one episode."""
     parts: dict[str, float] = {}
 
     def timed(part: str, do: Callable[[], Any]) -> Any:
@@ -132,7 +132,7 @@ def seconds_of_parts(
         timed("pipe", lambda: _through_pipe(frames))
         path = Path(directory) / "video.mp4"
         timed("x264", lambda: _encode(frames, path))
-        # Finishing it was that, and the check of the file.
+        # The time for `_encode` includes a check of the file, so it is subtracted.
         even = (height + height % 2, width + width % 2)
         timed(
             "check",
@@ -151,16 +151,16 @@ def _encode(frames: list[Any], path: Path) -> None:
 
 
 def _begin_process(directory: str) -> None:
-    """Start what renders, until it could take a recording."""
+    """Start the rendering process and wait until it is ready for a recording."""
     arguments = (directory, "--workers", "1")
     module = "mjrec.rendering.background"
     with Child(module, *arguments, environ=os.environ) as child:
-        # It is no recording: the answer is that there is nothing to do.
+        # This recording does not exist, so the answer is that there is nothing to do.
         child.send(recording="openaigym.trajectory.0.1.episode000000.h5")
         for message in child.messages(60):
             if message is not None and "done" in message:
                 return
-    raise RuntimeError("The process that renders did not begin.")
+    raise RuntimeError("The rendering process did not start.")
 
 
 def _draw(
@@ -199,7 +199,7 @@ def _draw(
 
 
 def _through_pipe(frames: list[Any]) -> None:
-    """Send frames through a pipe as wide as a worker's, and hash what comes out."""
+    """Send frames through a pipe as large as a worker's, and hash the output."""
     reading, writing = os.pipe()
     fcntl.fcntl(writing, fcntl.F_SETPIPE_SZ, _PIPE_BYTES)
 
