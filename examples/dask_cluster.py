@@ -1,4 +1,7 @@
-"""Evaluate on a Dask cluster: any executor whose workers see the directory will do."""
+"""Evaluate on a Dask cluster.
+
+Any executor works if all of its workers can see the directory.
+"""
 
 import shutil
 from pathlib import Path
@@ -20,9 +23,9 @@ def main() -> None:
         evaluation = mjrec.evaluate(
             ["InvertedPendulum-v5", "Hopper-v5"],
             policy="random",
-            # A directory that all machines of the cluster see.
+            # On a cluster: a directory that all machines can see.
             directory=PLACE,
-            # Each job is done, though another one looks the same.
+            # Run every job, even if an identical job has already run.
             engine=client.get_executor(pure=False),
             episodes=2,
             num_seeds=2,

@@ -1,4 +1,4 @@
-"""Evaluate a policy of one's own on dm_control's cheetah, with a video of each run."""
+"""Evaluate your own policy on dm_control's cheetah, with a video of each episode."""
 
 import mjrec
 
@@ -11,7 +11,7 @@ DIRECTORY = "recordings/dm_control_policy"
 
 
 def gallop(time: float, joints: int) -> np.ndarray:
-    """Return a wave that runs through the joints twice a second."""
+    """Return an action that moves a wave through the joints twice per second."""
     return np.sin(4 * np.pi * time + np.arange(joints))
 
 

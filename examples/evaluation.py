@@ -1,4 +1,4 @@
-"""Evaluate two policies on the same starts, compare them, and make a page of one."""
+"""Evaluate two policies from the same initial states, and report on both."""
 
 import shutil
 from pathlib import Path
@@ -11,7 +11,7 @@ PLACE = Path("recordings/evaluation")
 
 
 class Wave:
-    """Moves each joint to and fro, one after the other, whatever is observed."""
+    """A policy that moves a wave through the joints and ignores the observations."""
 
     def __init__(self, env) -> None:
         self.shape = env.action_spec().shape

@@ -1,4 +1,4 @@
-"""Evaluate a policy, pack the run for a paper, and verify it as a reader would."""
+"""Evaluate a policy, pack the run for a paper, and verify it like a reader would."""
 
 from pathlib import Path
 
@@ -8,8 +8,8 @@ import mjrec
 
 directory, archive = Path("recordings/evidence"), Path("recordings/evidence.zip")
 
-# In evaluation every episode keeps its actions and its seed, so that a reader can make
-# all of them again.
+# In evaluation mode every episode keeps its actions and its seed, so that readers can
+# reproduce all episodes.
 env = gymnasium.make("HalfCheetah-v5", max_episode_steps=20)
 with mjrec.Monitor(
     env,

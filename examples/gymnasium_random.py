@@ -1,4 +1,4 @@
-"""Record ten short episodes of HalfCheetah; videos of episodes 0, 1 and 8."""
+"""Record ten short episodes of HalfCheetah, with videos of episodes 0, 1 and 8."""
 
 import gymnasium
 

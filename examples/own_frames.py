@@ -1,4 +1,4 @@
-"""Write frames of any origin into a video, with the hash of each."""
+"""Write your own frames to a video, together with the hash of each frame."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""Draw states of one's own: a batch of `mujoco.rollout`, side by side in one video."""
+"""Draw your own states: two rollouts from `mujoco.rollout`, side by side."""
 
 import mjrec
 

@@ -1,11 +1,11 @@
-"""Evaluate on a Ray cluster: that of RAY_ADDRESS, or one that is started here."""
+"""Evaluate on the Ray cluster in RAY_ADDRESS, or on one that is started locally."""
 
 import shutil
 from pathlib import Path
 
 import mjrec
 
-# On a cluster: a directory that all of its machines see.
+# On a cluster: a directory that all machines can see.
 PLACE = Path("recordings/ray_cluster")
 
 

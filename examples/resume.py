@@ -1,4 +1,4 @@
-"""Record in two runs into one directory, then read both together."""
+"""Record two runs in the same directory, then read the results of both together."""
 
 import gymnasium
 

@@ -1,4 +1,4 @@
-"""Evaluate in the jobs of a Slurm cluster; without one, in processes in their place."""
+"""Evaluate in Slurm jobs, or in local processes if there is no Slurm cluster."""
 
 import shutil
 from pathlib import Path
@@ -15,7 +15,7 @@ def main() -> None:
     evaluation = mjrec.evaluate(
         ["InvertedPendulum-v5", "Hopper-v5"],
         policy="random",
-        # A directory that all machines of the cluster see.
+        # On a cluster: a directory that all machines can see.
         directory=PLACE,
         engine=engine,
         episodes=2,

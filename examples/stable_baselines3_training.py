@@ -1,4 +1,4 @@
-"""Train Stable-Baselines3's PPO, with videos of the episodes on the way."""
+"""Train PPO from Stable-Baselines3, and record videos of episodes during training."""
 
 import argparse
 
@@ -29,7 +29,7 @@ def main() -> None:
         force=True,
         width=240,
         height=160,
-        allow_early_reset=True,  # learn() resets whenever it is called
+        allow_early_reset=True,  # each call to learn() resets the environment
         trackers=MonitorCsvTracker(),
     )
     torch.set_num_threads(1)  # the other cores draw the videos

@@ -1,4 +1,4 @@
-"""Tell TensorBoard, Weights & Biases and a class of one's own what is recorded."""
+"""Report recordings to TensorBoard, Weights & Biases and your own tracker class."""
 
 import gymnasium
 
@@ -15,10 +15,10 @@ DIRECTORY = "recordings/trackers"
 
 
 class PrintVideos(Tracker):
-    """Overrides the one thing that it wants to be told."""
+    """A tracker that prints the finished videos."""
 
     def video(self, run: Run, video: FinishedVideo) -> None:
-        """Print where the video is, and of what."""
+        """Print the environment, the episode and the file name of the video."""
         print(run.env_id, "episode", video.episode_id, video.path.name)
 
 
@@ -26,9 +26,9 @@ def main() -> None:
     mjrec.use_gl()
     env = gymnasium.make("Hopper-v5", max_episode_steps=50)
     trackers = [
-        # tensorboard --logdir recordings/trackers
+        # To see the results: tensorboard --logdir recordings/trackers
         TensorBoardTracker(),
-        # Offline; without `mode` it is uploaded.
+        # Nothing is uploaded in offline mode. Without `mode` the run is uploaded.
         WandbTracker(project="mjrec", mode="offline", dir="recordings"),
         PrintVideos(),
     ]

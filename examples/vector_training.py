@@ -1,4 +1,4 @@
-"""Train a linear policy on eight pendulums at once, each with its own videos."""
+"""Train a linear policy on eight pendulums in parallel, each with its own videos."""
 
 import gymnasium
 import numpy as np
@@ -17,7 +17,8 @@ def main(rounds: int = 8) -> None:
         envs, DIRECTORY, force=True, height=96, width=128, max_fps=25
     ) as envs:
         for number in range(rounds):
-            # Each pendulum tries gains of its own; the best three lead to the next.
+            # Each pendulum tries different gains. The best three determine the
+            # distribution for the next round.
             gains = mean + spread * random.normal(size=(PENDULUMS, 4))
             returns = episode_returns(envs, gains, seed=number)
             best = gains[np.argsort(-returns)[:3]]
@@ -26,7 +27,7 @@ def main(rounds: int = 8) -> None:
 
 
 def episode_returns(envs, gains, seed):
-    """Return what each row of gains gets out of one episode of its pendulum."""
+    """Run one episode per pendulum, and return the return for each row of gains."""
     observations, _ = envs.reset(seed=seed)
     returns, running = np.zeros(len(gains)), np.ones(len(gains), bool)
     while running.any():

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pages that MkDocs takes from the program itself: a hook of mkdocs.yml.
+"""A hook for mkdocs.yml that generates pages from the program itself.
 
-Commands come from their parsers, Python names from `mjrec.__all__` and their
-docstrings, OpenGL's errors from the table that `mjrec doctor` asks.
+The page of commands comes from their parsers, the page of Python names from
+`mjrec.__all__` and the docstrings, and the page of OpenGL errors from the table that
+`mjrec doctor` uses.
 """
 
 from __future__ import annotations
@@ -20,8 +21,8 @@ from mkdocs.structure.files import File, Files
 
 ROOT = Path(__file__).resolve().parents[1]
 
-# How Python names are grouped on their page; a test of the documentation sees that each
-# public name is in one group.
+# The groups of Python names on their page. A test checks that each public name is in
+# exactly one group.
 GROUPS = {
     "Record": (
         "Monitor GymnasiumMonitor VectorMonitor DmEnvMonitor use_gl exit_on_signals "
@@ -40,7 +41,7 @@ GROUPS = {
     "Share": "pack verify Verification Verdict Finding write_archive",
     "gym's recorders": "StatsRecorder VideoRecorder",
 }
-# What is public in modules of its own.
+# Public names in other modules.
 MODULES = {
     "All monitors": ("mjrec.monitors.base", "EnvironmentMonitor"),
     "Trackers": (
@@ -55,7 +56,7 @@ MODULES = {
     ),
 }
 
-# Messages as people meet them, each with the backend that says it.
+# Messages as users see them, each with the backend that prints it.
 GL_MESSAGES = (
     ("glfw", "an OpenGL platform library has not been loaded into this process"),
     ("glfw", "gladLoadGL error"),
@@ -88,7 +89,7 @@ GL_MESSAGES = (
     ("", "failed to open /dev/dri/renderD128: Permission denied"),
     ("", "EGLError: <exception str() failed>"),
 )
-# Where a message needs it to mean what it says.
+# Environment variables without which a message has a different cause.
 _GL_ENVIRONMENTS = {
     "GLContext'": {"MUJOCO_GL": "off"},
     "Cannot use": {"MUJOCO_GL": "egl", "PYOPENGL_PLATFORM": "osmesa"},
@@ -109,7 +110,7 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 
 def commands_page() -> str:
-    """Return the page of the command line, in the words of its parsers."""
+    """Return the page of the command line, with the help texts of its parsers."""
     from mjrec.commands import COMMANDS
 
     parts = ["# Commands\n", _block(_help())]
@@ -127,7 +128,7 @@ def _help(*command: str) -> str:
     from mjrec.commands import main
 
     out = io.StringIO()
-    # tyro and argparse ask the environment how wide a line is.
+    # tyro and argparse read the line width from the environment.
     earlier = os.environ.get("COLUMNS")
     os.environ["COLUMNS"] = "80"
     try:
@@ -138,7 +139,7 @@ def _help(*command: str) -> str:
         if earlier is not None:
             os.environ["COLUMNS"] = earlier
     plain = re.sub(r"\x1b\[[0-9;]*m", "", out.getvalue()).strip()
-    # tyro leaves paragraphs to the terminal.
+    # tyro does not wrap paragraphs.
     return "\n".join(
         textwrap.fill(line, 80) if len(line) > 80 else line
         for line in plain.splitlines()
@@ -146,7 +147,7 @@ def _help(*command: str) -> str:
 
 
 def api_page() -> str:
-    """Return the page of all public names, to be filled from their docstrings."""
+    """Return the page of all public names, with references to their docstrings."""
     import mjrec
 
     lines = [
@@ -173,7 +174,7 @@ def _errors() -> list[str]:
 
 
 def gl_page() -> str:
-    """Return the table of OpenGL's messages, causes and fixes."""
+    """Return the page of OpenGL errors, with their causes and fixes."""
     from mjrec.gl import diagnose
 
     lines = [
@@ -182,7 +183,7 @@ def gl_page() -> str:
         "`mjrec doctor` explains these, and so does `mjrec.gl.diagnose(text)`.",
         "",
     ]
-    # Messages with one cause and one fix stand together.
+    # Messages with the same cause and fix are grouped.
     answers: dict[tuple[str, str], list[str]] = {}
     for backend, message in GL_MESSAGES:
         environ = next(
@@ -214,7 +215,7 @@ def gl_page() -> str:
 
 
 def _fix(text: str) -> list[str]:
-    """Return a fix in Markdown: its commands are indented, each on a line."""
+    """Return a fix as Markdown lines, with each command indented on its own line."""
     lines: list[str] = []
     for line in text.strip().splitlines():
         if line.startswith("  ") and (not lines or not lines[-1].startswith("    ")):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Start the system's Chromium through Playwright's driver, as the tests do."""
+"""Start the system's Chromium with Playwright's driver, as the tests do."""
 
 from __future__ import annotations
 

@@ -1,13 +1,13 @@
-"""A policy for `mjrec record`, which finds it as `gallop:Gallop`."""
+"""A policy for `mjrec record`, to be used as `--policy gallop:Gallop`."""
 
 import numpy as np
 
 
 class Gallop:
-    """Lets a wave run through the joints, whatever it sees.
+    """A policy that moves a wave through the joints and ignores the observations.
 
     Args:
-        env: the environment; the command line gives it.
+        env: the environment, which `mjrec record` passes.
     """
 
     def __init__(self, env) -> None:
@@ -15,10 +15,10 @@ class Gallop:
         self._step = 0
 
     def reset(self, seed: int) -> None:
-        """Begin the wave anew with each episode."""
+        """Restart the wave at the beginning of each episode."""
         self._step = 0
 
     def __call__(self, observation: np.ndarray) -> np.ndarray:
-        """Return an action."""
+        """Return the next action."""
         self._step += 1
         return np.sin(0.6 * self._step + self._joints).astype(np.float32)
