@@ -159,7 +159,7 @@ def test_an_evaluation_is_recovered_and_rendered_as_one(
         ([TASK, "--fail-under", TASK], "TASK=VALUE"),
         ([TASK, "--fail-under", f"{TASK}=nan"], "TASK=VALUE"),
         ([TASK, "--score-range", f"{TASK}=3"], "TASK=LOW:HIGH"),
-        ([TASK, "--score-range", f"{TASK}=3:nan"], "counts as 0"),
+        ([TASK, "--score-range", f"{TASK}=3:nan"], "for a score of 0"),
         ([TASK, "--seeds", "0,x"], "0,1,2"),
         ([TASK, "--env-kwargs", "[]"], "JSON object"),
     ],

@@ -204,7 +204,7 @@ def test_what_is_decided_at_the_end_holds_all(keep, way, kept, tmp_path, caplog)
     with mjrec.Monitor(pendulum(), tmp_path, keep=keep, render=way, workers=1) as env:
         run(env, 8)
         assert (logs_of if way == "deferred" else videos_in)(tmp_path) == [*range(8)]
-    assert caplog.text.count("stay on disk") == 1
+    assert caplog.text.count("kept on disk") == 1
     assert videos_in(tmp_path) == kept
     name = getattr(keep, "__name__", keep)
     assert manifest_of(tmp_path)["mjrec"]["schedule"]["name"] == f"keep:{name}"

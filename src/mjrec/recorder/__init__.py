@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The recorder: follows the reset, step and close calls of any framework."""
+"""The recorder, which follows the reset, step and close calls of any framework."""

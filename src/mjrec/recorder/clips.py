@@ -1,18 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
 """Clips: videos of N steps, which may cross episodes.
 
-A clip may continue across resets, but a recording belongs to one episode. So a clip has
-one recording, called a part, for each episode that it touches. `clip` in a part's facts
-has these keys:
+A clip may continue across resets, but a recording belongs to one episode. Therefore a
+clip has one recording, called a part, for each episode that it touches. The field
+`clip` in a part's facts has these keys:
 
 - `first_step`: number of steps that the monitor had recorded when the clip began
-- `part`: the part's number, from 0
-- `steps_before`: number of steps of the running episode before the part begins
-- `reward_before`: sum of the rewards of those steps
-- `reset_time`: simulated time of that episode's reset, if it is written on the frames
+- `part`: the part's number, counted from 0
+- `steps_before`: number of steps in the running episode before the part begins
+- `reward_before`: sum of the rewards of these steps
+- `reset_time`: simulated time of the episode's reset, if frames show the time
 
-The last part ends with `complete`, like an episode's trajectory; earlier parts end with
-`continues`.
+The facts at the end of the last part contain `complete`, as at the end of an episode's
+trajectory. At the end of earlier parts they contain `continues`.
 """
 
 from __future__ import annotations
@@ -33,15 +33,15 @@ if TYPE_CHECKING:
 class Clips:
     """The clips of a run, recorded one at a time.
 
-    No clip begins while another is being recorded. A clip has its first frame and the
-    frames of exactly `video_length` steps. It continues across resets, which add a
-    frame each. Without a length it ends with the episode.
+    No clip begins while another clip is being recorded. A clip consists of a first
+    frame and the frames of exactly `video_length` steps. It continues across resets,
+    each of which adds a frame. If no length is set, the clip ends with the episode.
 
     Args:
-        run: the monitored run. Its options set the clips: `video_length` is the length
-            in steps, None for the rest of the episode. `step_trigger` is called with
-            the number of steps taken so far and returns whether a clip begins before
-            the next step; if it is None, clips begin only with episodes.
+        run: the monitored run. Two of its options define the clips. `video_length` is
+            the length in steps, or None for the rest of the episode. `step_trigger` is
+            called with the number of steps taken so far and returns whether a clip
+            begins before the next step. If it is None, clips begin only with episodes.
     """
 
     def __init__(self, run: MonitoredRun) -> None:
@@ -54,7 +54,8 @@ class Clips:
         """Take the first frame of an episode that has just begun.
 
         Args:
-            is_chosen: whether a clip begins with the episode, unless one is running.
+            is_chosen: whether to begin a clip with the episode. Ignored while a clip is
+                running.
         """
         if self._clip is not None:
             self._clip.reset()
@@ -88,15 +89,15 @@ class Clips:
                 self._end({"complete": True})
 
     def close(self, facts: Mapping[str, Any]) -> None:
-        """End the running clip, if any. Idempotent.
+        """End the running clip, if there is one. Idempotent.
 
         Args:
-            facts: why the clip ends early.
+            facts: the facts about why the clip ends early.
         """
         self._end({"complete": False, **facts})
 
     def leave(self) -> None:
-        """Release the files as they are; recovery finishes them."""
+        """Release the files as they are, so that recovery can finish them."""
         if self._clip is not None and self._clip.live is not None:
             self._clip.live.leave()
 
@@ -111,17 +112,17 @@ class Clips:
 
 
 class _Clip:
-    """One clip, drawn live or recorded in parts, one per episode.
+    """A clip that is either drawn live or recorded in parts, one per episode.
 
     Args:
         run: the monitored run.
-        taken: number of steps so far, if a step began the clip; None if it begins with
-            an episode.
+        taken: number of steps so far if a step began the clip; None if an episode began
+            it.
 
     Attributes:
         steps: number of steps in the clip.
-        reward: sum of their rewards.
-        live: draws the clip live; None if it is rendered later.
+        reward: sum of the rewards of these steps.
+        live: the live videos; None if the clip is rendered later.
     """
 
     def __init__(self, run: MonitoredRun, taken: int | None) -> None:
@@ -210,7 +211,8 @@ class _Clip:
                 last = {"last_episode_id": self._last_episode_id}
                 self._part.end({**known, **last, "end_time": run.clock()})
             finally:
-                # Otherwise the disk was too full for a single row: no video will come.
+                # Otherwise the disk was too full for even a single row, and there will
+                # be no video.
                 if self._parts > 1 or self._part.is_there:
                     run.note("clip", {**said, "clip": self._name(0)})
                     run.trackers.expect(self._video)
@@ -235,8 +237,8 @@ class _Clip:
             facts={**run.recording_facts(start), **facts},
             capture=run.env.clip_states,
             start=start,
-            # Frames do not depend on actions. `max_fps` is left out because frames are
-            # selected when they are drawn, counted over all parts.
+            # Frames do not depend on actions. `max_fps` is left out, because the frames
+            # of all parts are counted together, and are selected when they are drawn.
             has_actions=False,
         )
         self._parts += 1

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The recorded reasons why an episode ended early."""
+"""Reasons why an episode ended early, as recorded in files."""
 
 from __future__ import annotations
 
@@ -14,16 +14,17 @@ _LONGEST_MESSAGE = 1000
 
 
 def ending(error: BaseException | None, *, otherwise: str = CLOSE) -> dict[str, Any]:
-    """Return the facts about an early end, possibly caused by an exception.
+    """Return the facts about an early end, which an exception may have caused.
 
     Args:
-        error: the exception; None if there was none.
-        otherwise: the reason to give if there was no exception, or only an ordinary
-            way to leave a program (`sys.exit()`).
+        error: the exception, or None.
+        otherwise: the reason to give if there was no exception, or if the program left
+            in an ordinary way (`sys.exit()`).
 
     Returns:
-        `reason` and, for the reason "exception", `exception` with its `type` (module
-        and name; built-in exceptions without a module) and its `message`.
+        A dictionary with the key `reason`. If the reason is "exception", the key
+        `exception` holds the exception's `type` (its module and name, or only its name
+        if it is built in) and its `message`.
     """
     if error is None or _is_ordinary(error):
         return {"reason": otherwise}
@@ -38,12 +39,13 @@ def ending(error: BaseException | None, *, otherwise: str = CLOSE) -> dict[str, 
 def last_error() -> BaseException | None:
     """Return the exception that is ending this process, if it can be found.
 
-    At exit the interpreter has already printed and stored it. In an interactive session
-    the stored exception proves nothing, because printed exceptions do not end it.
+    At exit, the interpreter has already printed and stored the exception. In an
+    interactive session, the stored exception is not evidence, because exceptions do not
+    end such a session.
     """
     if hasattr(sys, "ps1"):
         return None
-    # `last_exc` since Python 3.12.
+    # `last_exc` exists since Python 3.12.
     error = getattr(sys, "last_exc", None) or getattr(sys, "last_value", None)
     return error if isinstance(error, BaseException) else received()
 
@@ -61,5 +63,5 @@ def _name(kind: type) -> str:
 def _message(error: BaseException) -> str:
     try:
         return str(error)[:_LONGEST_MESSAGE]
-    except Exception:  # a user's __str__ may do anything
+    except Exception:  # a user's __str__ may raise anything
         return ""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Choosing which episodes get a video and which keep their trajectory."""
+"""The choice of episodes that get a video or keep their trajectory."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ _EVALUATION = "e"
 
 
 class EpisodeChoice:
-    """Decides at the beginning of an episode, by the user's options.
+    """Decides what to record of an episode when it begins, based on the options.
 
     Args:
         options: the user's options.
-        mode: when frames are drawn.
+        mode: the rendering mode (`DEFERRED`, `LIVE` or `OFF`).
 
     Attributes:
-        selection: chooses among finished episodes; None if episodes are chosen when
-            they begin.
+        selection: the object that chooses among finished episodes; None if episodes are
+            chosen when they begin.
     """
 
     def __init__(self, options: RecorderOptions, *, mode: str) -> None:
@@ -38,7 +38,7 @@ class EpisodeChoice:
         self._trajectories = options.trajectory_callable
         stated = options.statements
         self._only_counted = stated is not None and stated.only_counted
-        # The last episode number passed to each function, and its result.
+        # The last episode number that was passed to each function, and the result.
         self._decided = (-1, False)
         self._kept = (-1, False)
 
@@ -58,10 +58,10 @@ class EpisodeChoice:
         return self._decided[1]
 
     def will_choose(self, episode_id: int) -> bool:
-        """Return whether it is already certain that an episode gets a video.
+        """Return whether an episode is already certain to get a video.
 
-        A user's schedule is not called before the episode begins, so this is True only
-        for the default schedule.
+        A user's schedule is not called before the episode begins, so the result is True
+        only for the default schedule.
         """
         is_ours = self._schedule is capped_cubic_video_schedule
         return is_ours and self._schedule(episode_id)
@@ -69,8 +69,8 @@ class EpisodeChoice:
     def decide(self, episode_id: int) -> bool:
         """Return whether an episode gets a video.
 
-        The schedule is called once per episode number, although several resets may
-        share it.
+        The schedule is called only once per episode number, even if several resets have
+        the same number.
         """
         if self._decided[0] != episode_id:
             self._decided = (episode_id, bool(self._schedule(episode_id)))
@@ -92,8 +92,8 @@ class EpisodeChoice:
     ) -> bool:
         """Return whether an episode keeps its trajectory.
 
-        A user's function is called once per episode number, although several resets may
-        share it.
+        A user's function is called only once per episode number, even if several resets
+        have the same number.
 
         Args:
             episode_id: the episode's number.
@@ -112,5 +112,5 @@ class EpisodeChoice:
         return self._kept[1]
 
     def keeps_without_video(self, episode_type: str) -> bool:
-        """Return whether a kept trajectory stays even if its video is dropped."""
+        """Return whether a trajectory is kept even if its video is dropped."""
         return self._trajectories is not None or episode_type == _EVALUATION

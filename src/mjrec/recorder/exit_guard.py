@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Closing exactly once: on a call, at garbage collection, or at exit."""
+"""A guard that closes an object exactly once, at the latest at exit."""
 
 from __future__ import annotations
 
@@ -9,22 +9,22 @@ import threading
 import weakref
 from collections.abc import Callable
 
-# Prefix of the names of this package's threads.
+# Prefix of the names of the threads that this package creates.
 _OWN_THREADS = "mjrec-"
 
 
 class ExitGuard:
-    """Calls `close` once: when called, when `owner` is collected, or at exit.
+    """Calls a function once: on request, when `owner` is collected, or at exit.
 
-    In a forked child nothing is called, because the files belong to the process that
-    created them.
+    In a forked child the function is not called, because the files belong to the
+    process that created them.
 
     Args:
-        owner: the object to close for when it is collected.
-        close: the function to call. It must not refer to `owner`, which would then
-            never be collected.
-        at_exit: called before `close` at interpreter exit. It must not refer to
-            `owner` either.
+        owner: the object whose garbage collection triggers `close`.
+        close: the function to call. It must not refer to `owner`, because `owner` would
+            then never be collected.
+        at_exit: function to call before `close` at interpreter exit. It must not refer
+            to `owner` either.
     """
 
     def __init__(
@@ -36,24 +36,24 @@ class ExitGuard:
     ) -> None:
         self._close = _in_process(os.getpid(), close)
         self._finalize = weakref.finalize(owner, _aside, self._close)
-        # weakref registers its exit hook at its first use in the process, and hooks run
-        # newest first: simulators would tear OpenGL down before this one.
+        # weakref registers its exit hook when it is first used in the process. Newer
+        # hooks run first, so simulators would tear down OpenGL before this hook.
         self._finalize.atexit = False
         self._first = False
         self._at_exit = _one_after_the_other(at_exit, self._finalize)
         atexit.register(self._at_exit)
 
     def run_first_at_exit(self) -> None:
-        """Run this hook before all exit hooks registered so far. Works once."""
+        """Move this guard's exit hook before all hooks so far. Works only once."""
         if not self._first and self._finalize.alive:
             self._first = True
             atexit.unregister(self._at_exit)
             atexit.register(self._at_exit)
 
     def close(self) -> None:
-        """Call `close`, unless it has already succeeded.
+        """Call the function, unless it has already succeeded.
 
-        If `close` raises or is interrupted (Ctrl-C), the next call tries again.
+        If the function raises or is interrupted (Ctrl-C), the next call tries again.
         """
         if self._finalize.alive:
             self._close()
@@ -81,10 +81,10 @@ def _one_after_the_other(
 
 
 def _aside(close: Callable[[], None]) -> None:
-    """Call `close`, on a new thread if the current one belongs to this package.
+    """Call `close`, using a new thread if the current thread is one of this package.
 
-    Garbage collection runs on any thread that allocates. Closing waits for the
-    encoder's thread, so it must not run on that thread.
+    Garbage collection can run on any thread that allocates memory. Closing waits for
+    the encoder's thread, so it must not run on that thread.
     """
     if threading.current_thread().name.startswith(_OWN_THREADS):
         threading.Thread(target=close, name="close").start()

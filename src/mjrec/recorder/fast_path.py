@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The fast path: recording steps that change nothing but the state.
+"""The fast path for recording ordinary steps.
 
 A step of a fast simulation takes as long as a few hundred lines of Python. Nearly all
-steps are alike: no error, no end, the same model, the same view. While a recorder has a
-`FastPath`, its functions are called instead of `Recorder.before_step` and
-`Recorder.step`. If one of them returns False, nothing was recorded, and the caller must
-call the recorder's method of that name.
+steps change only the state: there is no error, the episode does not end, and the model
+and the view stay the same. While a recorder has a `FastPath`, its functions are called
+instead of `Recorder.before_step` and `Recorder.step`. If a function returns False, it
+has recorded nothing, and the caller must call the recorder's method of the same name.
 """
 
 from __future__ import annotations
@@ -24,27 +24,27 @@ from ..formats.trajectory import FRAME, STEP, TERMINATED, TRUNCATED
 from ..simulation.raw_memory import WORDS
 from .stats_recorder import StatsRecorder
 
-# Rewards are usually NumPy's float64, and `+` would turn the sum into one, too.
+# Rewards are usually NumPy's float64, and `+` would make the sum a float64 as well.
 _sum = float.__add__
-# Floats represent every integer exactly up to here.
+# A float can represent every integer up to this one exactly.
 _LARGEST = 1 << 53
 
 
 class Step(Protocol):
-    """A function that records and counts a step, given its reward."""
+    """A function that records and counts a step."""
 
     def __call__(
         self, reward: Any, *, terminated: bool = ..., truncated: bool = ...
     ) -> bool:
-        """Return False if the step is unusual and was not recorded."""
+        """Record a step; return False, without recording it, if it is unusual."""
 
 
 class FastPath(NamedTuple):
     """The functions that record nearly all steps.
 
     Attributes:
-        before_step: notes the action and returns whether a step may be taken.
-        step: records a step. The recorder itself handles the end of the episode.
+        before_step: stores the action and returns whether a step may be taken.
+        step: records a step. The recorder itself handles the end of an episode.
     """
 
     before_step: Callable[[Any], bool]
@@ -55,14 +55,14 @@ def counting(stats: StatsRecorder) -> FastPath:
     """Return a fast path that only counts steps and rewards."""
 
     def before_step(action: Any) -> bool:
-        # The episode, or its recording, may have been ended elsewhere.
+        # Other code may have ended the episode or its recording.
         return stats.done is False and not stats.closed
 
     def step(reward: Any, *, terminated: bool = False, truncated: bool = False) -> bool:
         if not isinstance(reward, float):
             return False
         total = _sum(reward, stats.rewards)  # type: ignore[arg-type]
-        # No calls from here on, because a signal handler could raise after a call.
+        # There are no calls below, because a signal handler could raise after a call.
         stats.rewards = total
         stats.steps += 1  # type: ignore[operator]
         stats.total_steps += 1
@@ -84,20 +84,21 @@ def gathering(
     """Return a fast path that records each step with one copy of memory.
 
     Args:
-        stats: counts the steps.
+        stats: the recorder that counts the steps.
         span: the recording, which already has its first row.
-        words: indices into `WORDS` of a row's content after its head.
-        set_action: copies the action into the gathered memory; returns False if the
-            action has a different type or shape than before.
-        is_current: returns, after a step, whether nothing but the state has changed.
-        is_on_pace: returns, after the first step, whether it took the expected
-            simulated time.
-        stride: steps that are multiples of it get a frame, and so does the last step.
+        words: indices into `WORDS` for the content of a row after its head.
+        set_action: function that copies the action into the gathered memory. It returns
+            False if the type or shape of the action differs from before.
+        is_current: function that returns, after a step, whether only the state has
+            changed.
+        is_on_pace: function that returns, after the first step, whether the step took
+            the expected simulated time.
+        stride: number of steps per frame. The last step gets a frame in any case.
     """
     log, bodies = span.log.rows, span.log.bodies
     take, both = WORDS.take, STEP | FRAME
-    # The simulation evicts our code from the CPU's caches; then assigning an item is
-    # cheaper than `struct`.
+    # The simulation evicts our code from the CPU's caches. In that case, assigning an
+    # item is cheaper than `struct`.
     whole, floats = memoryview(log.memory).cast("q"), memoryview(log.memory).cast("d")
     capacity, width, first = log.capacity, log.row_size // 8, TAIL_HEAD // 8
 
@@ -126,8 +127,8 @@ def gathering(
         whole[head], whole[head + 1], whole[head + 3] = row, number, flags
         floats[head + 2] = reward
         total = _sum(reward, stats.rewards)  # type: ignore[arg-type]
-        # No calls from here on, because a signal handler could raise after a call, and
-        # the counters would not match the rows.
+        # There are no calls below, because a signal handler could raise after a call.
+        # The counters would then not match the rows.
         whole[0] = log.count = row + 1
         span.steps = number
         if is_frame:
@@ -142,8 +143,8 @@ def gathering(
 
 
 def _makes_room(log: RowLog) -> bool:
-    """Write a full tail to the log; return whether the next row may stay in it."""
-    # On a full disk the recorder tries again and reports it.
+    """Write a full tail to the log, and return whether it has room for the next row."""
+    # If the disk is full, the recorder tries again and reports the error.
     with contextlib.suppress(FileNotWritten):
         log.make_room()
     return log.count < log.limit

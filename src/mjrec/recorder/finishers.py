@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Finishers, which take over recordings that have ended."""
+"""Finishers, which process recordings that have ended."""
 
 from __future__ import annotations
 
@@ -14,21 +14,24 @@ class Finisher(Protocol):
     """Turns ended recordings into trajectories and videos while the simulation runs."""
 
     def expect(self, recording: Path | None = None) -> None:
-        """Get ready for a recording that will have a video. Never waits.
+        """Prepare for a recording that will have a video. Never waits.
 
         Args:
-            recording: the recording, once it has begun. Later ones will most likely
-                be drawn in the same way.
+            recording: the recording, once it has begun. Later recordings will most
+                likely be drawn in the same way.
         """
 
     def submit(self, recording: Path) -> None:
-        """Take over an ended trajectory, or a clip (its first part). Never waits."""
+        """Accept the trajectory of an ended episode or the first part of a clip.
+
+        Never waits.
+        """
 
     def wait(self, on_progress: Callable[[Any], None]) -> None:
         """Wait until all submitted recordings are finished."""
 
     def stop(self) -> None:
-        """Stop immediately and leave the rest pending. Idempotent."""
+        """Stop immediately and leave unfinished recordings pending. Idempotent."""
 
     @property
     def failures(self) -> Mapping[str, str]:
@@ -38,10 +41,10 @@ class Finisher(Protocol):
 class LaterFinisher:
     """A finisher that draws nothing and writes trajectories when the monitor closes.
 
-    It is the `Finisher` of runs whose videos are rendered later, or never.
+    It is used for runs whose videos are rendered later or never.
 
     Attributes:
-        bundles: whether all trajectories are written to one file.
+        bundles: whether all trajectories are written to a single file.
     """
 
     def __init__(self) -> None:
@@ -53,15 +56,15 @@ class LaterFinisher:
         """Do nothing."""
 
     def submit(self, recording: Path) -> None:
-        """Queue a trajectory. Clips stay as they are."""
+        """Queue a trajectory. Clips are left unchanged."""
         self._waiting.append(recording)
 
     def wait(self, on_progress: Callable[[Any], None]) -> None:
         """Write the queued trajectories.
 
         Raises:
-            Error: a trajectory could not be written. If several failed, this is the
-                last error; all other trajectories are written.
+            Error: a trajectory could not be written. If several trajectories failed,
+                this is the last error. All other trajectories are written.
         """
         # Imported here because it loads h5py, which the simulation does not need.
         from ..formats.trajectory_file import bundle_trajectories, finish_trajectories

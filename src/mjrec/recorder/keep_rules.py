@@ -1,28 +1,31 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rules for `keep`, which chooses the episodes that get a video by their results.
+"""Rules for `keep`, which chooses episodes for videos based on their results.
 
 A rule is one or more of these, separated by commas:
 
 ==============  ======================================================================
 `best[:N]`      the N episodes with the highest return; N defaults to 1
 `worst[:N]`     the N episodes with the lowest return; N defaults to 1
-`median`        the episode with the median return; the lower one for an even number
-`failures[:N]`  the first N failures, or all: episodes without success, or, if the
-                environment does not report success, those that it terminated; and
-                those that could not be completed
+`median`        the episode with the median return; if the number of episodes is even,
+                the lower of the two middle returns is used
+`failures[:N]`  the first N failures, or all failures if N is not given
 ==============  ======================================================================
 
-In an evaluation it may instead be one of these:
+An episode is a failure if it was unsuccessful or could not be completed. If the
+environment does not report success, an episode is a failure if the task terminated it.
+
+In an evaluation, the rule may instead be one of these:
 
 ==========  ==========================================================================
-`cubic`     0, 1, 8, 27 ... and every 1000th, counted over all seeds
+`cubic`     episodes 0, 1, 8, 27 ... and every 1000th, counted over all seeds
 `all`       every episode
 `none`      no episode
 ==========  ==========================================================================
 
-Ties go to the earlier episode. A NaN return ranks worst. An episode that could not be
-completed has no return and is never best, median or worst. One episode can fill several
-roles: if all returns are equal, the first is the best, the median and the worst.
+If returns are equal, the earlier episode is chosen. A NaN return ranks lowest. An
+episode that could not be completed has no return and is never the best, the median or
+the worst. An episode can have several roles. For example, if all returns are equal, the
+first episode is the best, the median and the worst.
 """
 
 from __future__ import annotations
@@ -58,7 +61,7 @@ class Ended(Protocol):
 
     @property
     def success(self) -> bool | None:
-        """Whether it was a success; None if the environment does not report that."""
+        """Whether the episode was a success; None if the environment does not say."""
 
 
 _E = TypeVar("_E", bound=Ended)
@@ -69,8 +72,8 @@ class Part:
     """A part of a rule.
 
     Attributes:
-        role: the role that it assigns: `"best"`, `"worst"`, `"median"`, `"failure"`,
-            `"cubic"` or `"all"`.
+        role: the role of the chosen episodes: `"best"`, `"worst"`, `"median"`,
+            `"failure"`, `"cubic"` or `"all"`.
         count: maximum number of episodes; None for no limit.
     """
 
@@ -81,7 +84,7 @@ class Part:
         """Return the chosen episodes, in the rule's order.
 
         Args:
-            episodes: all episodes, in order; None for one that never began.
+            episodes: all episodes, in order; None for an episode that never began.
         """
         begun = [each for each in episodes if each is not None]
         match self.role:
@@ -128,23 +131,23 @@ def keep_rule(text: str, rules: Sequence[str] = RULES_OF_EVALUATIONS) -> KeepRul
     """Parse a `keep` rule.
 
     Args:
-        text: the rule; see the module docstring.
-        rules: the valid names, listed in messages. `cubic`, `all` and `none` are
-            accepted only if listed here.
+        text: the rule, as described in the module docstring.
+        rules: the valid names, which are also listed in messages. `cubic`, `all` and
+            `none` are accepted only if they are in this list.
 
     Raises:
         UnknownName: the rule does not exist.
-        InvalidArgument: `text` is not a string, a part is given twice, or `cubic`,
-            `all` or `none` is combined with another part.
+        InvalidArgument: `text` is not a string, a part is repeated, or `cubic`, `all`
+            or `none` is combined with another part.
     """
     if not isinstance(text, str):
         raise InvalidArgument(
-            f"keep must be a string such as 'best,median,worst', got {text!r}."
+            f"keep must be a string such as 'best,median,worst', but it is {text!r}."
         )
     names = [name.strip() for name in text.split(",")]
     for name in names:
         if name not in rules and not _COUNTED.fullmatch(name):
-            raise UnknownName("keep rule", name, rules, hint="N is 1 or more.")
+            raise UnknownName("keep rule", name, rules, hint="N must be 1 or more.")
     kinds = [name.partition(":")[0] for name in names]
     if len(kinds) > 1 and set(kinds) & set(_ALONE):
         raise InvalidArgument(
@@ -160,8 +163,9 @@ def keep_rule(text: str, rules: Sequence[str] = RULES_OF_EVALUATIONS) -> KeepRul
 def has_failed(episode: Ended) -> bool:
     """Return whether an episode is a failure.
 
-    This is the success that the environment reports. Without a report, a terminated
-    episode is a failure, which is right for tasks that end when the robot falls.
+    An episode is a failure if it could not be completed or if the environment reports
+    no success. If the environment does not report success at all, a terminated episode
+    is a failure, which is right for tasks that end when the robot falls.
     """
     if episode.reward is None:
         return True
@@ -184,12 +188,12 @@ def _completed(episodes: Sequence[_E]) -> list[_E]:
 
 def _rank(episode: Ended) -> tuple[bool, float]:
     reward = episode.reward
-    # NaN must rank below minus infinity, hence the bool.
+    # The bool makes NaN rank below minus infinity.
     return (False, 0.0) if reward is None or math.isnan(reward) else (True, reward)
 
 
 def _median(episodes: Sequence[_E]) -> list[_E]:
-    # Sorting is stable, even in reverse.
+    # The sort is stable, even in reverse order.
     ordered = sorted(map(_rank, episodes))
     middle = ordered[(len(ordered) - 1) // 2 :][:1]
     return [each for each in episodes if _rank(each) in middle][:1]

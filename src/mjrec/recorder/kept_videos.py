@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """The recordings of a run whose videos are chosen after their episodes have ended.
 
-Every episode is recorded as if it got a video. Undecided recordings are held, and the
-log marks each of them as a candidate. While the monitor is open, no other process
-touches a candidate; once the monitor is gone, any process may render it. Dropped
-recordings are deleted immediately.
+Every episode is recorded as if it got a video. The recordings for which no decision has
+been made are held, and the log marks each of them as a candidate. While the monitor is
+open, other processes leave candidates alone. After that, any process may render them.
+Dropped recordings are deleted immediately.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ class KeptVideos:
     """Holds, submits or deletes recordings as a selection decides.
 
     Args:
-        selection: chooses the episodes that get a video.
+        selection: the object that chooses the episodes that get a video.
     """
 
     def __init__(self, selection: Selection) -> None:
         self.selection = selection
         self._held: dict[int, EpisodeRecording] = {}
         self._is_decided = False
-        # Why nothing could be decided, and the episodes that are kept because of that.
+        # The reason why no decision could be made, and the episodes kept because of it.
         self._failure: str | None = None
         self._left: list[int] = []
 
@@ -47,13 +47,13 @@ class KeptVideos:
 
         Args:
             episode_id: the episode's number.
-            episode: the episode; None if it was not completed.
+            episode: the episode, or None if it was not completed.
         """
         if episode is not None:
             if self.selection.holds_all and not self.selection.finished:
                 logger.info(
-                    "keep=%s chooses the episodes that get a video at the end. Until "
-                    "then the recordings of all episodes stay on disk.",
+                    "keep=%s chooses the episodes for videos at the end of the run. "
+                    "Until then, the recordings of all episodes are kept on disk.",
                     self.selection.name,
                 )
             self.selection.add(episode)
@@ -64,7 +64,7 @@ class KeptVideos:
         self._held[recording.episode_id] = recording
 
     def settle(self) -> None:
-        """Submit the recordings chosen by now, and delete the dropped ones.
+        """Submit the recordings that are already chosen, and delete dropped ones.
 
         Raises:
             DirectoryNotWritable, FileNotWritten: see `EpisodeRecording.choose` and
@@ -74,11 +74,11 @@ class KeptVideos:
             self._hand_on(list(self._held))
 
     def decide(self) -> None:
-        """Decide about all held recordings; no more episodes will come.
+        """Decide about all held recordings at the end of the run.
 
         Raises:
-            InvalidArgument: the user's function could not choose. All held episodes
-                are kept; their videos are pending or already exist.
+            InvalidArgument: the user's function could not choose. All held episodes are
+                kept, and their videos are pending or already exist.
             DirectoryNotWritable, FileNotWritten: see `settle`.
         """
         if self._is_decided or self._failure is not None:
@@ -92,12 +92,12 @@ class KeptVideos:
                 recording.expect()
             raise
         self._is_decided = True
-        # Chosen recordings first, so that a kill in between does not lose them.
+        # Chosen recordings come first, so that they survive if the process is killed.
         chosen = set(self.selection.chosen)
         self._hand_on(sorted(self._held, key=lambda number: number not in chosen))
 
     def details(self) -> dict[str, Any]:
-        """Return the journal's facts about the choice, once it is made."""
+        """Return the facts about the final choice for the journal."""
         failure = {} if self._failure is None else {"failure": self._failure}
         return {
             "rule": self.selection.name,

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""An episode's videos that are drawn while it runs, one for each camera."""
+"""The videos of an episode that are drawn while it runs, one for each camera."""
 
 from __future__ import annotations
 
@@ -21,10 +21,12 @@ class LiveVideos:
     """The live videos of one episode.
 
     Args:
-        recorders: the video recorders, at least one, the first camera's first.
-        tolerates: returns whether to continue after an error.
-        on_frame_error: called with an error that is not tolerated and was raised while
-            taking a step's frame. It may come from the environment itself.
+        recorders: the video recorders, in the order of the cameras. There must be at
+            least one.
+        tolerates: function that returns whether to continue after an error.
+        on_frame_error: function that is called with an error if taking a step's frame
+            raises an error that is not tolerated. The error may come from the
+            environment itself.
 
     Attributes:
         recorders: the video recorders.
@@ -47,14 +49,15 @@ class LiveVideos:
         return Path(str(self.recorders[0].path))
 
     def begin(self) -> None:
-        """Take the reset's frames."""
+        """Take the frames of the reset."""
         self._each(VideoRecorder.capture_frame)
 
     def take(self, *, is_there: bool, last: bool) -> None:
-        """Take a step's frames.
+        """Take the frames of a step.
 
         Args:
-            is_there: False if the environment has already reset itself.
+            is_there: whether the frames still exist. False if the environment has
+                already reset itself.
             last: whether the episode is over.
         """
         if not is_there:
@@ -80,7 +83,7 @@ class LiveVideos:
             recorder.metadata.update(facts)
 
     def give_up(self, reason: str) -> None:
-        """Stop taking frames and log the reason; keep the frames taken so far."""
+        """Stop taking frames and log the reason. Earlier frames are kept."""
         for recorder in self.recorders:
             recorder.give_up(reason)
 
@@ -90,18 +93,19 @@ class LiveVideos:
             recorder.discard()
 
     def leave(self) -> None:
-        """Release the files as SIGKILL would; recovery finishes them."""
+        """Release the files as if killed by SIGKILL, so that recovery finishes them."""
         for recorder in self.recorders:
             recorder.leave()
 
     def end(self, facts: Mapping[str, Any]) -> None:
         """Finish the files.
 
-        The metadata of the first camera's video lists the other videos and shows that
-        all of them exist. So it is written last, even if ending another video raises.
+        The metadata of the first camera's video lists the other videos and implies that
+        all of them exist. Therefore it is written last, even if an error occurs while
+        another video is finished.
 
         Args:
-            facts: the episode's facts, for the metadata.
+            facts: the facts about the episode for the metadata.
         """
         self.say(**facts)
         first, *others = self.recorders
@@ -140,8 +144,8 @@ class LiveVideos:
         Raises:
             DirectoryNotWritable: the files cannot be removed.
         """
-        # The first camera's metadata, written last, shows that all videos exist, so it
-        # is removed last.
+        # The first camera's metadata implies that all videos exist, so it is removed
+        # last.
         for recorder in reversed(self.recorders):
             video = Path(str(recorder.path))
             about = Path(str(recorder.metadata_path))
@@ -168,11 +172,11 @@ def live_videos(
     second_name: Mapping[str, str],
     on_frame_error: Callable[[Exception], object] = lambda _: None,
 ) -> LiveVideos:
-    """Return the live videos of the running episode, one for each camera.
+    """Create the live videos of the running episode, one for each camera.
 
     Args:
         run: the monitored run.
-        path: the first camera's video, without extension.
+        path: the path of the first camera's video, without the extension.
         second_name: the video's second name; see `MonitoredRun.second_name`.
         on_frame_error: see `LiveVideos`.
     """

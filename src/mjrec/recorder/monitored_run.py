@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The state shared by all recordings of one run: journal, logs, and facts."""
+"""The state that all recordings of a run share: the journal, the logs and facts."""
 
 from __future__ import annotations
 
@@ -41,17 +41,17 @@ What = Literal["video", "trajectory", "statistics", "journal", "model", "tracker
 
 @dataclass(frozen=True, kw_only=True)
 class BegunEpisode:
-    """The facts known about an episode when it begins.
+    """The facts that are known when an episode begins.
 
     Attributes:
         episode_id: the episode's number.
         type: `"t"` for training, `"e"` for evaluation.
-        start_time: wall clock just before the reset, in seconds since the epoch.
+        start_time: time just before the reset, in seconds since the Unix epoch.
         seed: the seed given to `reset`.
         options: the options given to `reset`.
-        random_state: state of the environment's random generator before the reset, for
-            JSON; None if unknown or not needed.
-        reset_clock: simulated time of the reset, if it is written on frames.
+        random_state: state of the environment's random generator before the reset, as
+            JSON values; None if unknown or not needed.
+        reset_clock: simulated time of the reset, if frames show the time.
     """
 
     episode_id: int
@@ -64,38 +64,39 @@ class BegunEpisode:
 
 
 class MonitoredRun:
-    """The state shared by all recordings of one run, and their facts for files.
+    """The state that all recordings of a run share, and their facts for files.
 
-    It writes the run's journal. With `on_error="raise"` the caller raises an error for
-    each fault; with `on_error="warn"` a fault is logged once and listed in the
+    It writes the run's journal. With `on_error="raise"`, the caller raises an error for
+    each fault. With `on_error="warn"`, a fault is logged once and listed in the
     manifest, and the simulation continues.
 
     Args:
         place: the open directory.
         env: the recorded environment.
         options: the user's options.
-        stats: counts steps and rewards.
-        finisher: takes over recordings that have ended.
+        stats: the recorder that counts steps and rewards.
+        finisher: the finisher that processes ended recordings.
         selection: facts for videos that are chosen after their episodes have ended;
-            empty if they are chosen before.
+            empty if videos are chosen before.
 
     Attributes:
         env: the recorded environment.
         options: the user's options.
-        stats: counts steps and rewards.
-        finisher: takes over recordings that have ended.
+        stats: the recorder that counts steps and rewards.
+        finisher: the finisher that processes ended recordings.
         selection: facts for videos that are chosen after their episodes have ended.
         directory: the monitor directory.
-        infix: the middle part of its file names.
-        clock: returns the time, in seconds since the epoch.
+        infix: the middle part of the monitor's file names.
+        clock: function that returns the time in seconds since the Unix epoch.
         events: the journal's content so far, including events that could not be written
             because the disk was full.
-        trackers: the trackers, notified of episodes and finished videos.
-        logs: logs of the episodes' rows.
-        clip_logs: logs of the clips' rows.
-        layouts: layout of the last recording in each of these logs.
-        paces: rate, timestep and stride of the last recording in each of these logs.
-        no_video: a disabled recorder, for episodes without a video.
+        trackers: the trackers, which are notified of episodes and finished videos.
+        logs: logs for the rows of episodes.
+        clip_logs: logs for the rows of clips.
+        layouts: for each of the two kinds of logs, the layout of the last recording.
+        paces: for each of the two kinds of logs, the rate, timestep and stride of the
+            last recording.
+        no_video: a disabled recorder for episodes without a video.
     """
 
     def __init__(
@@ -118,7 +119,7 @@ class MonitoredRun:
         self._faults: set[tuple[int | None, What, str]] = set()
         self._policy = _policy_facts(options)
         self._statements = options.statements
-        # Number of journal lines after the first.
+        # The number of journal lines after the first line.
         self._lines = 0
         self._provenance = None if options.statements else look_around()
         self._environment_facts = {
@@ -157,7 +158,7 @@ class MonitoredRun:
         self._late: list[Path] = []
         self.no_video = VideoRecorder(env.frames, enabled=False)
         self._episode: BegunEpisode | None = None
-        # The reasons for drawing videos live that were logged so far.
+        # The reasons for drawing videos live that have been logged so far.
         self._said: set[str] = set()
 
     # --- the journal -----------------------------------------------------------------
@@ -174,7 +175,11 @@ class MonitoredRun:
         self.note_provenance()
 
     def note(self, kind: str, facts: Any) -> None:
-        """Write another event, one of `formats.journal.EVENTS`, to the journal.
+        """Write an event to the journal.
+
+        Args:
+            kind: the kind of the event, from `formats.journal.EVENTS`.
+            facts: the facts about the event.
 
         Raises:
             FileNotWritten: the disk is full.
@@ -184,10 +189,10 @@ class MonitoredRun:
         self._write(lambda: self._journal.note(kind, facts))
 
     def note_provenance(self, *, wait: bool = False) -> None:
-        """Write the run's provenance to the journal, once it is known.
+        """Write the run's provenance to the journal if it is known by now.
 
         Args:
-            wait: whether to wait briefly for it.
+            wait: whether to wait briefly for the provenance.
         """
         if self.events.provenance is None:
             found = self._found(wait=wait)
@@ -197,7 +202,7 @@ class MonitoredRun:
     def tolerates(
         self, what: What, error: BaseException, *, of_episode: bool = True
     ) -> bool:
-        """Note a fault and return whether the simulation may continue.
+        """Record a fault, and return whether the simulation may continue.
 
         Args:
             what: the part of the recording that failed, such as "video".
@@ -216,7 +221,7 @@ class MonitoredRun:
     def tolerating(
         self, what: What, *kinds: type[Exception], of_episode: bool = True
     ) -> Iterator[None]:
-        """Suppress errors of these kinds if `on_error` tolerates them."""
+        """Suppress errors of the given types if `on_error` tolerates them."""
         try:
             yield
         except kinds as error:
@@ -224,7 +229,7 @@ class MonitoredRun:
                 raise
 
     def note_fault(self, what: What, reason: str, *, episode_id: int | None) -> bool:
-        """Write a fault to the journal; return whether it is new."""
+        """Write a fault to the journal, and return whether it is new."""
         fault = (episode_id, what, reason)
         if fault in self._faults:
             return False
@@ -234,7 +239,7 @@ class MonitoredRun:
         return True
 
     def submit(self, recording: Path) -> None:
-        """Submit a recording to the finisher, once the journal has its end."""
+        """Submit a recording to the finisher once its end is in the journal."""
         if self._journal.is_behind:
             self._late.append(recording)
         else:
@@ -244,7 +249,7 @@ class MonitoredRun:
         """Write all remaining rows and facts to the logs.
 
         Raises:
-            FileNotWritten: the disk is full; the next call tries again.
+            FileNotWritten: the disk is full. The next call tries again.
         """
         self.logs.close()
         self.clip_logs.close()
@@ -252,7 +257,7 @@ class MonitoredRun:
             self.finisher.submit(self._late.pop(0))
 
     def leave(self) -> None:
-        """Release journal and logs as they are. Idempotent."""
+        """Release the journal and the logs as they are. Idempotent."""
         for logs in (self.logs, self.clip_logs):
             logs.release()
         self._journal.close()
@@ -280,7 +285,7 @@ class MonitoredRun:
         return self._episode
 
     def begin(self, episode: BegunEpisode) -> None:
-        """Begin an episode, to which faults are attributed from now on."""
+        """Begin an episode. From now on, faults are attributed to it."""
         self._episode = episode
         self.events.begin(episode.episode_id, chosen=False)
 
@@ -297,7 +302,7 @@ class MonitoredRun:
     def can_be_deferred(self, start: EpisodeStart) -> bool:
         """Return whether frames can be rendered from the states that follow `start`.
 
-        If not, each reason is logged once.
+        Each reason why frames cannot be rendered later is logged once.
 
         Raises:
             PicturesDiffer, NoPictures: see `check_refusal`.
@@ -316,12 +321,12 @@ class MonitoredRun:
     def pending_video(
         self, name: str, recording: str, *, second_name: Mapping[str, str]
     ) -> dict[str, Any]:
-        """Return the facts about its video that a trajectory or clip holds.
+        """Return the facts about a video that its trajectory or clip stores.
 
         Args:
-            name: the video's file name, without extension.
-            recording: when the video is drawn, `DEFERRED` or `LIVE`.
-            second_name: the result of `second_name`.
+            name: the video's file name without the extension.
+            recording: the time when the video is drawn, `DEFERRED` or `LIVE`.
+            second_name: the result of `MonitoredRun.second_name`.
         """
         options, env = self.options, self.env
         pending: dict[str, Any] = {
@@ -342,11 +347,13 @@ class MonitoredRun:
         return {**pending, **second_name}
 
     def second_name(self, what: str, number: int) -> dict[str, str]:
-        """Return a video's second name, for its metadata; empty without `name_prefix`.
+        """Return the second name of a video for its metadata.
+
+        The result is empty if `name_prefix` is not set.
 
         Args:
             what: the kind of event that begins the video, "episode" or "step".
-            number: the number of that episode or step.
+            number: the number of the episode or step.
         """
         prefix = self.options.name_prefix
         if prefix is None:
@@ -357,7 +364,7 @@ class MonitoredRun:
         """Return the facts about the running episode for a recording of states.
 
         Args:
-            start: the start of the states; None if there are none.
+            start: the start of the states; None if no states are recorded.
         """
         episode = self.episode
         return {

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Opening a monitor directory: new, resumed, or emptied by force.
+"""Opening a monitor directory, which may be new, resumed, or cleared by force.
 
-Opening claims an infix, which identifies one monitor from then on. The claim is a lock
-file, created with `O_EXCL` and held with `flock` while the monitor is open. A lock file
-that exists but is not held belongs to a dead monitor.
+Opening claims an infix, which then identifies one monitor. The claim is a lock file
+that is created with `O_EXCL` and held with `flock` while the monitor is open. A lock
+file that exists but is not held belongs to a dead monitor.
 """
 
 from __future__ import annotations
@@ -38,28 +38,28 @@ from ..results import clear_monitor_files
 from ..results.journal_or_stats import MonitorResults
 from ..results.monitor_files import MonitorFiles, monitors_of
 
-# `resume` value to record next to monitors of the same environment without reading
-# their files.
+# The value of `resume` for recording next to monitors of the same environment without
+# reading their files.
 JOIN = "join"
 
 
-# Counts the monitors of this process.
+# Counts the monitors in this process.
 _monitor_ids = itertools.count()
 
 
 @dataclass(frozen=True, kw_only=True)
 class Statements:
-    """The facts of a run that recreating it cannot reproduce; the original's are used.
+    """Facts of an original run that a recreation cannot reproduce and must copy.
 
     Attributes:
-        infix: the middle part of its file names, not claimed yet.
-        first_episode_id: the number of its first episode.
-        provenance: its provenance; None if unknown.
+        infix: the middle part of the run's file names, which is not claimed yet.
+        first_episode_id: the number of the run's first episode.
+        provenance: the run's provenance; None if unknown.
         provenance_after: number of journal lines before the provenance, not counting
             the first line.
-        clock: returns the time, in seconds since the epoch.
-        only_counted: whether episodes without a video keep no trajectory, because only
-            their rewards and ends are compared.
+        clock: function that returns the time in seconds since the Unix epoch.
+        only_counted: whether episodes without a video keep no trajectory. This is the
+            case if only their rewards and ends are compared.
     """
 
     infix: Infix
@@ -75,7 +75,7 @@ class OpenDirectory:
     """A monitor directory in which an infix has been claimed.
 
     Attributes:
-        path: the directory, absolute.
+        path: absolute path of the directory.
         infix: the claimed infix.
         first_episode_id: the number of the next episode.
         lock: the lock, held until the monitor closes.
@@ -99,28 +99,30 @@ def open_directory(
     facts: Mapping[str, Any] = MappingProxyType({}),
     statements: Statements | None = None,
 ) -> OpenDirectory:
-    """Claim an infix in `directory`, creating the directory if it is missing.
+    """Claim an infix in a directory, which is created if it is missing.
 
     Args:
         directory: the monitor directory.
-        force: delete existing monitor files; overrides `resume`.
-        resume: add to existing recordings. Episode numbers continue after the highest
-            number of the monitors with this `uid` that closed or died (without `uid`,
-            of all such monitors); monitors that are still open do not count. `JOIN`
-            reads no other monitor's files, however many there are: the caller knows
-            that they record the same environment, and episodes are numbered from 0.
-        uid: used in file names instead of the process id.
+        force: whether to delete existing monitor files. Overrides `resume`.
+        resume: whether to add to existing recordings. Episode numbers continue after
+            the highest number of all closed or dead monitors, or only of those with the
+            same `uid` if it is given. Monitors that are still open do not count. `JOIN`
+            reads no files of other monitors, no matter how many there are. In this case
+            the caller knows that all monitors record the same environment, and episodes
+            are numbered from 0.
+        uid: string to use in file names instead of the process id.
         env_info: facts about the environment, including its `env_id`.
         facts: further facts about the run. They are written to the lock file, so they
-            survive even if the process is killed before its journal has a line.
+            survive even if the process is killed before the journal has a line.
         statements: the original's facts if a run is being recreated.
 
     Raises:
-        ExistingRecordings: the directory has recordings, and neither `force` nor
+        ExistingRecordings: the directory contains recordings, and neither `force` nor
             `resume` was given.
-        DirectoryInUse: `force` was given while another monitor is recording there.
-        DifferentEnvironment: `resume` was given, but the recordings are of a different
-            environment.
+        DirectoryInUse: `force` was given while another monitor is recording in the
+            directory.
+        DifferentEnvironment: `resume` was given, but the recordings are from a
+            different environment.
         DirectoryNotWritable: the directory cannot be created or written to.
         InvalidArgument: `uid` cannot be part of a file name.
     """
@@ -146,10 +148,12 @@ def open_directory(
 
 @contextlib.contextmanager
 def made_directory(path: Path) -> Iterator[None]:
-    """Create `path` and its parents; remove the created ones if the block raises.
+    """Create a directory and its parents, and remove them if the block raises.
+
+    Directories that already existed are not removed.
 
     Raises:
-        DirectoryNotWritable: `path` cannot be created or written to.
+        DirectoryNotWritable: the directory cannot be created or written to.
     """
     try:
         missing = [p for p in (path, *path.parents) if not p.exists()]
@@ -162,7 +166,7 @@ def made_directory(path: Path) -> Iterator[None]:
         yield
     except BaseException:
         for made in missing:
-            # Other files may have been added in the meantime.
+            # The directory is kept if other files have been added in the meantime.
             with contextlib.suppress(OSError):
                 made.rmdir()
         raise
@@ -192,7 +196,7 @@ def _recorded_env_ids(path: Path) -> Iterator[str]:
 
 
 def _next_episode_id(path: Path, *, uid: str | None) -> int:
-    """Return the next number after the highest one of all monitors that are closed."""
+    """Return the episode number after the highest number of all closed monitors."""
     highest = -1
     for files in monitors_of(path):
         infix = Infix.parse(files.infix)
@@ -204,9 +208,9 @@ def _next_episode_id(path: Path, *, uid: str | None) -> int:
 
 
 def _last_episode_id(files: MonitorFiles) -> int:
-    """Return the highest episode number in a monitor's files; -1 if there is none."""
-    # File names count too: an episode that was running when its process died has a
-    # number.
+    """Return the highest episode number in a monitor's files, or -1 for none."""
+    # File names count as well, because an episode that was running when its process
+    # died also has a number.
     results = MonitorResults(files)
     return max(
         files.last_episode_id, results.run.last_episode_id, _last_counted(results)
@@ -219,8 +223,8 @@ def _last_counted(results: MonitorResults) -> int:
         return -1
     if results.manifest.mjrec is not None:
         return int(results.manifest.mjrec.get("next_episode_id") or 0) - 1
-    # A manifest written by gym: episodes are numbered from 0 by resets, and each reset
-    # has a type.
+    # This manifest was written by gym. Resets number the episodes from 0, and each
+    # reset has a type.
     stats = results.saved
     if stats is None:
         return -1
@@ -230,16 +234,16 @@ def _last_counted(results: MonitorResults) -> int:
 def _claim(
     path: Path, *, uid: str | None, run: Mapping[str, Any], looks: bool
 ) -> tuple[Infix, Lock]:
-    """Claim a new infix for this monitor; return it with its lock.
+    """Claim a new infix for this monitor, and return the infix with its lock.
 
     Args:
         path: the directory.
-        uid: used in the infix instead of the process id. Its number then depends on
-            the directory, so that names are the same in any process.
+        uid: string to use in the infix instead of the process id. The infix's number
+            then depends on the directory, so that names are the same in any process.
         run: the run's facts.
-        looks: whether to look for stray files with the infix, too. Otherwise a
-            manifest, a journal or a lock shows that the infix is taken; each monitor
-            leaves one of them.
+        looks: whether to look for any file with the infix. Otherwise, only a manifest,
+            a journal or a lock shows that the infix is taken. Each monitor leaves at
+            least one of these files.
     """
     content = json_text.dumps({"pid": os.getpid(), "since": time.time(), "run": run})
     of_directory = itertools.count()
@@ -254,8 +258,8 @@ def _claim(
             continue
         except OSError as error:
             raise DirectoryNotWritable(path, error.strerror) from error
-        # The infix's previous monitor may have closed, and so released its lock,
-        # between the first check and taking the lock.
+        # The previous monitor with this infix may have closed and released its lock
+        # after the first check, before the lock was taken here.
         if not _is_taken(path, infix, besides=lock_name(infix), looks=looks):
             return infix, lock
         lock.release()
@@ -264,8 +268,8 @@ def _claim(
 def _is_taken(
     path: Path, infix: Infix, *, looks: bool, besides: str | None = None
 ) -> bool:
-    # A pid or uid is rarely used twice. The manifest, which every close leaves, usually
-    # answers this without listing the whole directory.
+    # A pid or uid is rarely used twice. Every monitor that closed has left a manifest,
+    # so usually there is no need to list the whole directory.
     if (path / manifest_name(infix)).exists() or (path / journal_name(infix)).exists():
         return True
     return looks and any(

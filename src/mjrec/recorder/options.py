@@ -26,16 +26,16 @@ from .tracking import FinishedEpisode, Tracker
 
 DEFERRED, LIVE, OFF = "deferred", "live", "off"
 RAISE, WARN = "raise", "warn"
-# Gym's own prefix is excluded: such files would be mistaken for monitor files.
+# Gym's own prefix is excluded, because such files would look like monitor files.
 _NAME_PREFIX = re.compile(r"(?!openaigym)[A-Za-z0-9_][A-Za-z0-9_.-]{0,99}", re.ASCII)
-# Options that change the content of files.
+# Switches that affect the content of files.
 _SWITCHES = ("observations", "annotate", "tiled")
 _MODES = {None: "t", "training": "t", "evaluation": "e"}
 
 
 @dataclass(frozen=True, kw_only=True)
 class RecorderOptions:
-    """A monitor's options; `mjrec.Monitor` describes each of them.
+    """A monitor's options, which `mjrec.Monitor` describes.
 
     Raises:
         InvalidArgument: a value is invalid.
@@ -66,11 +66,11 @@ class RecorderOptions:
     tiled: bool = False
     trackers: Tracker | Sequence[Tracker] = ()
     policy_file: str | os.PathLike[str] | None = None
-    # Size of a row log's tail; vector environments share a budget.
+    # Size of a row log's tail in bytes. Vector environments share a budget.
     tail_bytes: int = TAIL_BYTES
-    # The seed that the episodes' seeds are derived from, if they are.
+    # The seed from which the episodes' seeds are derived, if any.
     seed: int | None = None
-    # The original's facts if a run is being recreated.
+    # The facts of the original run if it is being recreated.
     statements: Statements | None = None
 
     def __post_init__(self) -> None:
@@ -81,35 +81,36 @@ class RecorderOptions:
         for name in ("observations", "strict", "episode_info", "annotate", "tiled"):
             if not isinstance(getattr(self, name), bool):
                 raise InvalidArgument(
-                    f"{name} must be True or False, got {getattr(self, name)!r}."
+                    f"{name} must be True or False, but it is {getattr(self, name)!r}."
                 )
         if not (isinstance(self.resume, bool) or self.resume == JOIN):
             raise InvalidArgument(
                 'resume must be True, False, or "join" to record next to other '
-                f"monitors without reading their files, got {self.resume!r}."
+                f"monitors without reading their files, but it is {self.resume!r}."
             )
         check_quality(self.quality)
         if self.render not in (None, DEFERRED, LIVE, OFF):
             raise InvalidArgument(
                 'render must be "deferred", "live", "off", or None for the best that '
-                f"the environment allows, got {self.render!r}."
+                f"the environment allows, but it is {self.render!r}."
             )
         workers = self.workers
         if workers is not None and (not _is_whole(workers) or workers < 0):
             raise InvalidArgument(
-                "workers must be a whole number of processes, 0 to render nothing now, "
-                f"or None for one per usable CPU, got {workers!r}."
+                "workers must be a whole number of processes (0 to render nothing now) "
+                f"or None for one per usable CPU, but it is {workers!r}."
             )
         if self.on_error not in (RAISE, WARN):
             raise InvalidArgument(
                 'on_error must be "raise", or "warn" to continue when something cannot '
-                f"be recorded, got {self.on_error!r}."
+                f"be recorded, but it is {self.on_error!r}."
             )
         chosen = self.trajectory_callable
         if not (chosen is None or isinstance(chosen, bool) or callable(chosen)):
             raise InvalidArgument(
-                "trajectory_callable must be a function from an episode's number to a "
-                f"bool, True, False or None, got {chosen!r}."
+                "trajectory_callable must be True, False, None, or a function that "
+                "takes an episode number and returns a bool, but it is "
+                f"{chosen!r}."
             )
         self._check_clips()
         self._check_keep()
@@ -122,20 +123,20 @@ class RecorderOptions:
         if self.step_trigger is not None:
             if not callable(self.step_trigger):
                 raise InvalidArgument(
-                    "step_trigger must be a function from the number of steps taken so "
-                    f"far to a bool, got {self.step_trigger!r}."
+                    "step_trigger must be a function that takes the number of steps "
+                    f"so far and returns a bool, but it is {self.step_trigger!r}."
                 )
             check_takes_one(self.step_trigger, "step_trigger", "the number of steps")
             if self.video_callable is not None:
                 raise InvalidArgument(
-                    "step_trigger chooses videos by steps, and video_callable by "
-                    "episodes. Give only one of them."
+                    "step_trigger chooses videos by step, and video_callable chooses "
+                    "them by episode. Give only one of them."
                 )
         length = self.video_length
         if length is not None and (not _is_whole(length) or length < 1):
             raise InvalidArgument(
-                "video_length must be a positive whole number of steps, or None for "
-                f"videos until the end of the episode, got {length!r}."
+                "video_length must be a positive whole number, or None for videos "
+                f"until the end of the episode, but it is {length!r}."
             )
         if self.has_clips and self.render == OFF:
             raise InvalidArgument(
@@ -149,7 +150,7 @@ class RecorderOptions:
             raise InvalidArgument(
                 "name_prefix becomes part of file names. It must consist of 1 to 100 "
                 "letters, digits, '_', '-' and '.', begin with a letter, digit or '_', "
-                f"and not begin with openaigym, got {prefix!r}."
+                f"and not begin with openaigym, but it is {prefix!r}."
             )
 
     def _check_keep(self) -> None:
@@ -178,12 +179,12 @@ class RecorderOptions:
         for tracker in self.all_trackers if several else (given,):
             if not isinstance(tracker, Tracker):
                 raise InvalidArgument(
-                    "trackers must be a mjrec.trackers.Tracker or a sequence of them, "
-                    f"got {tracker!r} of type {type(tracker).__name__}."
+                    "trackers must be a mjrec.trackers.Tracker or a sequence of "
+                    f"trackers, but {tracker!r} is of type {type(tracker).__name__}."
                 )
         if len(set(map(id, self.all_trackers))) < len(self.all_trackers):
             raise InvalidArgument(
-                f"The same tracker is twice in {given!r} and would get every call "
+                f"The same tracker appears twice in {given!r} and would get every call "
                 "twice. Give each tracker once."
             )
 
@@ -193,20 +194,20 @@ class RecorderOptions:
             return
         if not isinstance(given, str | os.PathLike) or not Path(given).is_file():
             raise InvalidArgument(
-                "policy_file must be the path of the policy's file, whose SHA-256 goes "
-                f"into the manifest, but {given!r} is not a file."
+                "policy_file must be the path of the policy's file, because the "
+                f"manifest contains its SHA-256, but {given!r} is not a file."
             )
 
     @property
     def clock(self) -> Callable[[], float]:
-        """A function that returns the time, in seconds since the epoch."""
+        """A function that returns the time in seconds since the Unix epoch."""
         return time.time if self.statements is None else self.statements.clock
 
     def recorded(self) -> dict[str, Any]:
-        """Return the options for the journal: those that other files depend on.
+        """Return the options that affect files, for the journal.
 
-        Defaults are left out. Functions are given by name. The schedule and the `keep`
-        rule are recorded elsewhere.
+        Defaults are left out, and functions are represented by their names. The
+        schedule and the `keep` rule are recorded elsewhere.
         """
         kept, trigger = self.trajectory_callable, self.step_trigger
         length = self.video_length
@@ -226,7 +227,7 @@ class RecorderOptions:
 
     @property
     def has_clips(self) -> bool:
-        """Whether videos are clips, counted in steps, instead of whole episodes."""
+        """Whether videos are clips with a number of steps instead of whole episodes."""
         return self.step_trigger is not None or self.video_length is not None
 
     @property
@@ -243,8 +244,9 @@ class RenderingChoice:
 
     Attributes:
         mode: `DEFERRED`, `LIVE` or `OFF`.
-        reason: why they are drawn live, if a user might not expect it.
-        is_forced: whether the user requested the mode, so that any other is an error.
+        reason: the reason why frames are drawn live, if users might not expect that.
+        is_forced: whether the user requested the mode. If so, using a different mode is
+            an error.
     """
 
     mode: str
@@ -260,7 +262,7 @@ def type_of_mode(mode: str | None) -> str:
     """
     if mode not in _MODES:
         raise InvalidArgument(
-            f'mode must be "training", "evaluation" or None, got {mode!r}.'
+            f'mode must be "training", "evaluation" or None, but it is {mode!r}.'
         )
     return _MODES[mode]
 

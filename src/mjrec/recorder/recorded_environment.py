@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The recorded environment, as the recorder sees it."""
+"""The recorder's interface to the recorded environment."""
 
 from __future__ import annotations
 
@@ -30,23 +30,27 @@ class RecordedEnvironment:
 
     Attributes:
         env_id: the environment's name.
-        env_index: index of a sub-environment in a vector environment; None for a single
-            environment.
+        env_index: index of the sub-environment in a vector environment; None for a
+            single environment.
         frames: the source of live frames.
-        further_frames: sources of live frames from further cameras, keyed by the
-            endings of their videos' names.
-        clock: returns the simulated time in seconds, or None.
-        declared: returns the rate to use without simulated time.
-        rendering: when frames are drawn.
-        cameras: all cameras, for JSON, if there are several.
-        states: captures the states of its simulation; None if no simulation is
+        further_frames: sources of live frames from additional cameras, keyed by the
+            endings of the videos' names.
+        clock: function that returns the simulated time in seconds, or None.
+        declared: function that returns the frame rate to use if there is no simulated
+            time.
+        rendering: the choice of when frames are drawn.
+        cameras: all cameras as JSON values, if there are several cameras.
+        states: the capture of the simulation's states; None if no simulation is
             accessible.
-        clip_states: a second capture of the same states, for clips. They overlap with
-            episodes, and a capture can have only one reader. None without clips.
-        environment: the facts needed to recreate it, for the trajectories.
-        view: the requested cameras and sizes, and the environment's own view, for JSON;
-            defaults are left out.
-        random_state: returns the state of its random generator, for JSON, or None.
+        clip_states: a second capture of the same states for clips; None without clips.
+            It is needed because clips overlap with episodes, and a capture can have
+            only one reader.
+        environment: the facts needed to recreate the environment, which trajectories
+            store.
+        view: the requested cameras and sizes, and the environment's own view, as JSON
+            values. Defaults are left out.
+        random_state: function that returns the state of the environment's random
+            generator as JSON values, or None.
     """
 
     env_id: str
@@ -65,7 +69,7 @@ class RecordedEnvironment:
 
     @property
     def further_views(self) -> list[str]:
-        """The parts of further cameras' video names before the extension."""
+        """The endings of additional cameras' video names, without the extensions."""
         return further_parts(self.cameras) or list(self.further_frames)
 
 
@@ -73,13 +77,13 @@ def check_frames(env: RecordedEnvironment) -> None:
     """Check that live frames are available.
 
     Raises:
-        NoPictures: the environment gives no frames.
+        NoPictures: the environment does not provide frames.
     """
     if can_give_frames(env.frames):
         return
     why = "" if env.rendering.reason is None else f" ({env.rendering.reason})"
     raise NoPictures(
-        f"Videos were requested, but {env.env_id} gives no frames{why}: "
+        f"Videos were requested, but {env.env_id} provides no frames{why}: "
         f"{what_is_missing(env.frames)}, or record statistics only with "
         "video_callable=False."
     )
@@ -90,7 +94,7 @@ def check_refusal(env: RecordedEnvironment, refusal: str) -> None:
 
     Args:
         env: the recorded environment.
-        refusal: why the videos cannot be rendered later.
+        refusal: the reason why the videos cannot be rendered later.
 
     Raises:
         PicturesDiffer: the user requested deferred rendering.
@@ -99,7 +103,7 @@ def check_refusal(env: RecordedEnvironment, refusal: str) -> None:
     if env.rendering.is_forced:
         raise PicturesDiffer(
             f"The videos of {env.env_id} cannot be rendered later from recorded "
-            f'states, as requested: {refusal}. Use render="live".'
+            f'states, as you requested: {refusal}. Use render="live".'
         )
     if not can_give_frames(env.frames):
         raise NoPictures(
@@ -110,7 +114,7 @@ def check_refusal(env: RecordedEnvironment, refusal: str) -> None:
 
 
 def what_is_missing(frames: FrameSource) -> str:
-    """Return why there are no frames and how to get them."""
+    """Return a message that says why there are no frames and how to get them."""
     mode = getattr(frames, "render_mode", None)
     return getattr(
         frames,

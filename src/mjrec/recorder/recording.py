@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Recording one episode: its states, its videos, or nothing."""
+"""The recording of one episode, with or without states and videos."""
 
 from __future__ import annotations
 
@@ -22,19 +22,20 @@ if TYPE_CHECKING:
 
 
 class EpisodeRecording:
-    """Records one episode, from its reset to its end, and then keeps or drops it.
+    """Records one episode from its reset to its end, and then keeps or drops it.
 
     Args:
         run: the monitored run.
-        on_frame_error: called with an error that is raised while a step's frame is
-            drawn live. It may come from the environment itself.
+        on_frame_error: function that is called with an error if drawing a step's frame
+            live raises it. The error may come from the environment itself.
 
     Attributes:
         episode_id: the episode's number.
-        video: the video recorder, live or deferred; disabled if there is no video.
-        states: records the states; None if they are not recorded.
-        live: draws the videos live; None if none are drawn live.
-        stays: whether the states are kept even if the video is not.
+        video: the live or deferred video recorder. It is disabled if the episode gets
+            no video.
+        states: the recorder of the states; None if states are not recorded.
+        live: the live videos; None if no videos are drawn live.
+        stays: whether the states are kept even if the video is dropped.
         is_over: whether the episode has ended.
     """
 
@@ -51,12 +52,12 @@ class EpisodeRecording:
         self.stays = self.is_over = False
         self._run = run
         self._on_frame_error = on_frame_error
-        # The log's facts about the video; None if there is no video.
+        # The facts about the video for the log; None if the episode gets no video.
         self._pending_video: Mapping[str, Any] | None = None
 
     @property
     def mode(self) -> str | None:
-        """`DEFERRED` or `LIVE`; None if the episode gets no video of its own."""
+        """`DEFERRED` or `LIVE`, or None if the episode gets no video of its own."""
         if self.live is not None:
             return LIVE
         return DEFERRED if isinstance(self.video, DeferredVideo) else None
@@ -75,7 +76,7 @@ class EpisodeRecording:
         run, capture = self._run, self._run.env.states
         deferred = wants_video and run.env.rendering.mode == DEFERRED
         if deferred:
-            # The finisher starts up while the model is inspected.
+            # The finisher starts while the model is inspected.
             run.finisher.expect(
                 run.logs.path_of(trajectory_prefix(run.infix, self.episode_id))
             )
@@ -109,7 +110,7 @@ class EpisodeRecording:
                 live.begin()
 
     def fast_path(self) -> FastPath | None:
-        """Return the fast path for the next steps, or None if there is none."""
+        """Return the fast path for the next steps, or None if it cannot be used."""
         if self.live is not None:
             return None
         if self.states is None:
@@ -117,25 +118,25 @@ class EpisodeRecording:
         return self.states.fast_path()
 
     def take_last(self) -> None:
-        """Take the last step's frame if it was left out."""
+        """Take the frame of the last step if it was left out."""
         if self.states is not None:
             self.states.take_frame()
         if self.live is not None:
             self.live.take_last()
 
     def discard(self) -> None:
-        """Discard everything recorded of the episode."""
+        """Discard everything that was recorded of the episode."""
         if self.live is not None:
             self.live.discard()
             self.live = None
         if self.states is not None:
-            # A full disk is reported by a later write.
+            # If the disk is full, a later write reports it.
             with contextlib.suppress(FileNotWritten):
                 self.states.drop()
             self.states = None
 
     def leave(self) -> None:
-        """Release the live videos as they are; recovery finishes them."""
+        """Release the live videos as they are, so that recovery can finish them."""
         if self.live is not None:
             self.live.leave()
 
@@ -157,26 +158,26 @@ class EpisodeRecording:
                 self.live.end(known)
 
     def hand_on(self) -> None:
-        """Submit the recording to the finisher, and its videos to the trackers."""
+        """Submit the recording to the finisher, and announce videos to the trackers."""
         self.expect()
         if self.states is not None:
             self.states.submit()
 
     def expect(self) -> None:
-        """Have the videos reported to the trackers once they exist."""
+        """Arrange for trackers to be notified of the videos once they exist."""
         if self.mode is not None and self._run.trackers:
             self._run.trackers.expect(Path(str(self.video.path)))
         if self.live is not None:
             self.live.name_again()
 
     def choose(self, selection: Mapping[str, Any]) -> None:
-        """Keep the video of an episode that was chosen after it had ended.
+        """Keep the video of an episode that was chosen after its end.
 
         Args:
             selection: the facts about the choice.
 
         Raises:
-            FileNotWritten: the disk is too full to record the choice; the recording is
+            FileNotWritten: the disk is too full to record the choice. The recording is
                 submitted anyway.
         """
         try:
@@ -193,8 +194,8 @@ class EpisodeRecording:
 
         Raises:
             DirectoryNotWritable: the files cannot be removed.
-            FileNotWritten: the states stay, but the disk is too full to record that
-                their video was dropped.
+            FileNotWritten: the states are kept, but the disk is too full to record that
+                the video was dropped.
         """
         if self.live is not None:
             self.live.remove()
@@ -219,7 +220,7 @@ class EpisodeRecording:
             "video": self._pending_video,
         }
         if self._pending_video is None and run.env.rendering.mode == DEFERRED:
-            # For a later choice among the episodes of several monitors.
+            # Needed if episodes of several monitors are chosen later.
             facts["possible_video"] = run.pending_video(name, DEFERRED, second_name={})
         is_candidate = bool(run.selection) and self._pending_video is not None
         if run.selection:
@@ -234,6 +235,7 @@ class EpisodeRecording:
             start=start,
             max_fps=run.options.max_fps,
             observation=observation if run.options.observations else None,
-            # A candidate may be dropped separately from the other episodes.
+            # A candidate needs its own log, because it may be dropped while other
+            # episodes are kept.
             is_alone=is_candidate,
         )

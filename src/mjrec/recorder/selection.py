@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Choosing episodes as they end: `Monitor(..., keep=...)`.
+"""The choice of episodes for `Monitor(..., keep=...)`, made as the episodes end.
 
-A selection is given every finished episode in turn and decides which ones are chosen,
-dropped, or still candidates. It knows nothing about files.
+A selection receives each finished episode and decides which episodes are chosen, which
+are dropped, and which are still candidates. It does not deal with files.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ class Standing(enum.Enum):
     """The state of an episode in a selection.
 
     Attributes:
-        CHOSEN: the episode gets a video; final.
-        CANDIDATE: later episodes, or the end of the run, decide.
-        DROPPED: the episode gets no video; final.
+        CHOSEN: the episode gets a video. This is final.
+        CANDIDATE: the decision depends on later episodes or on the end of the run.
+        DROPPED: the episode gets no video. This is final.
     """
 
     CHOSEN = "chosen"
@@ -34,24 +34,25 @@ class Standing(enum.Enum):
 
 
 class Selection:
-    """Chooses among the finished episodes of one run.
+    """Chooses among the finished episodes of a run.
 
-    It is also a schedule that includes every episode that may be chosen at its end.
+    A selection is also a schedule, which includes every episode that might be chosen
+    when it ends.
 
     Args:
         name: the rule's name in the manifest.
-        choose: returns the numbers of the chosen episodes among those given; None if
-            only failures are chosen.
+        choose: function that takes episodes and returns the numbers of the chosen ones;
+            None if only failures are chosen.
         holds_all: whether `choose` is called only once, at the end. Otherwise it is
-            called after each episode; an episode that it once rejects must stay
+            called after each episode, and an episode that it has rejected must remain
             rejected when more episodes are added.
-        most_failures: maximum number of failures that are chosen in addition, as they
-            end; None for all.
+        most_failures: maximum number of failures to choose in addition, as soon as they
+            end; None for no limit.
 
     Attributes:
         name: the rule's name in the manifest.
         holds_all: whether the choice is made only at the end.
-        finished: number of episodes added.
+        finished: number of episodes that have been added.
     """
 
     def __init__(
@@ -63,7 +64,7 @@ class Selection:
         most_failures: int | None = 0,
     ) -> None:
         self.name, self.holds_all = name, holds_all
-        # The name under which the manifest lists a schedule.
+        # The manifest lists schedules by this name.
         self.__qualname__ = f"keep:{name}"
         self.finished = 0
         self._choose = choose
@@ -85,8 +86,8 @@ class Selection:
     def add(self, episode: FinishedEpisode) -> None:
         """Add a finished episode.
 
-        Episodes must come in ascending order; one that was already added is ignored. A
-        candidate that has been dropped never returns.
+        Episodes must be added in ascending order. An episode that was added before is
+        ignored. A candidate that has been dropped is never considered again.
         """
         number = episode.episode_id
         if number <= self._last_id:
@@ -104,7 +105,7 @@ class Selection:
             self._candidates = {n: e for n, e in self._candidates.items() if n in best}
 
     def standing(self, episode_id: int) -> Standing:
-        """Return the standing of an episode that was added."""
+        """Return the standing of an episode that has been added."""
         if episode_id in self._chosen:
             return Standing.CHOSEN
         is_candidate = episode_id in self._candidates
@@ -112,7 +113,7 @@ class Selection:
 
     @property
     def undecided(self) -> int:
-        """Number of candidates."""
+        """Number of candidates for which no decision has been made."""
         return len(self._candidates.keys() - self._chosen)
 
     @property
@@ -121,11 +122,11 @@ class Selection:
         return sorted(self._chosen)
 
     def close(self) -> None:
-        """Decide about all candidates; no more episodes will come. Idempotent.
+        """Decide about all candidates at the end of the run. Idempotent.
 
         Raises:
-            InvalidArgument: the user's function raised, or did not return numbers of
-                finished episodes. In that case nothing is decided.
+            InvalidArgument: the user's function raised an exception or did not return
+                numbers of finished episodes. In that case no decision is made.
         """
         if self._choose is not None and not self._is_closed:
             self._chosen.update(self._choose([*self._candidates.values()]))
@@ -142,12 +143,12 @@ def selection_from(keep: object) -> Selection:
     """Return a new selection for a `keep` argument.
 
     Args:
-        keep: a rule (see `keep_rules`), or a function from the finished episodes to the
-            numbers of the chosen ones.
+        keep: a rule (see `keep_rules`), or a function that takes the finished episodes
+            and returns the numbers of the chosen episodes.
 
     Raises:
         UnknownName: the rule does not exist.
-        InvalidArgument: `keep` is neither a string nor a function, or names a part
+        InvalidArgument: `keep` is neither a string nor a function, or it names a part
             twice.
     """
     if callable(keep):
@@ -157,7 +158,8 @@ def selection_from(keep: object) -> Selection:
     if not isinstance(keep, str):
         raise InvalidArgument(
             f"keep must be one of {', '.join(RULES)}, or a function that takes the "
-            f"finished episodes and returns the numbers to keep, got {keep!r}."
+            "finished episodes and returns the numbers of those to keep, but it is "
+            f"{keep!r}."
         )
     rule = keep_rule(keep, RULES)
     ranked = [part for part in rule.parts if part.role != "failure"]
@@ -200,7 +202,7 @@ def _ask(
 
 def _number(value: Any) -> int:
     if isinstance(value, bool):
-        # Most likely a list of flags, which would be taken for episodes 0 and 1.
+        # Most likely the function returned flags, which would mean episodes 0 and 1.
         raise TypeError(f"{value} is not an episode number")
     return operator.index(value)
 

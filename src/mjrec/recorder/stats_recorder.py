@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Statistics of episodes: lengths, returns, times, types."""
+"""A recorder for the statistics of episodes: lengths, returns, times and types."""
 
 from __future__ import annotations
 
@@ -18,35 +18,37 @@ _TYPES = ("t", "e")
 
 
 class StatsRecorder:
-    """Counts steps and sums rewards of episodes, with gym's interface.
+    """Counts the steps and adds up the rewards of episodes, with gym's interface.
 
-    Call `before_reset`, reset the environment, call `after_reset`; for every step call
-    `before_step`, step the environment, call `after_step`. Only complete episodes are
-    in the statistics.
+    For each episode, call `before_reset`, reset the environment, and call
+    `after_reset`. For each step, call `before_step`, step the environment, and call
+    `after_step`. The statistics include only complete episodes.
 
     Args:
-        directory: the statistics file's directory. It must exist at `flush` or `close`.
-        file_prefix: the file is `<file_prefix>.stats.json`.
-        autoreset: whether the environment starts a new episode in the step that ends
-            the last one.
+        directory: the directory of the statistics file. It must exist when `flush` or
+            `close` is called.
+        file_prefix: prefix of the file name, `<file_prefix>.stats.json`.
+        autoreset: whether the step that ends an episode also starts a new episode.
         env_id: the environment's name, for messages.
         allow_early_reset: whether a reset in the middle of an episode drops the episode
             instead of raising `ResetNotAllowed`.
 
     Attributes:
-        initial_reset_timestamp: wall-clock seconds since the epoch, just before the
-            first reset. None before it.
-        timestamps: wall-clock time at the end of each complete episode.
-        episode_lengths: number of steps of each complete episode.
-        episode_rewards: sum of rewards of each complete episode, added in float64 in
-            step order.
-        episode_types: "t" (training) or "e" (evaluation) of each complete episode.
-        steps: number of steps of the running episode. None before the first reset.
-        rewards: sum of rewards of the running episode. None before the first reset.
-        done: whether the running episode is over. None before the first reset.
-        total_steps: number of all steps, including those of incomplete episodes.
-        closed: whether `close` was called.
-        path: the statistics file.
+        initial_reset_timestamp: time just before the first reset, in seconds since the
+            Unix epoch; None before the first reset.
+        timestamps: time at the end of each complete episode, in seconds since the Unix
+            epoch.
+        episode_lengths: number of steps in each complete episode.
+        episode_rewards: sum of the rewards in each complete episode, added in float64
+            in the order of the steps.
+        episode_types: type of each complete episode, "t" (training) or "e"
+            (evaluation).
+        steps: number of steps in the running episode; None before the first reset.
+        rewards: sum of the rewards in the running episode; None before the first reset.
+        done: whether the running episode is over; None before the first reset.
+        total_steps: total number of steps, including steps of incomplete episodes.
+        closed: whether the recorder is closed.
+        path: path of the statistics file.
     """
 
     def __init__(
@@ -81,10 +83,10 @@ class StatsRecorder:
 
     @property
     def type(self) -> str:
-        """The type of the episodes from the next reset on: "t" or "e".
+        """The type of episodes from the next reset on, "t" or "e".
 
         Raises:
-            InvalidArgument: set to something else.
+            InvalidArgument: the new value is not "t" or "e".
         """
         return self._type
 
@@ -92,8 +94,8 @@ class StatsRecorder:
     def type(self, value: str) -> None:
         if value not in _TYPES:
             raise InvalidArgument(
-                f'An episode\'s type must be "t" (training) or "e" (evaluation), got '
-                f"{value!r}."
+                f'An episode\'s type must be "t" (training) or "e" (evaluation), but '
+                f"it is {value!r}."
             )
         self._type = value
 
@@ -103,10 +105,10 @@ class StatsRecorder:
         return self._episode_type
 
     def before_step(self, action: object = None) -> None:
-        """Check that a step may be taken.
+        """Check that a step is allowed.
 
         Raises:
-            ResetNeeded: there has been no reset yet, or the episode is over.
+            ResetNeeded: the environment has not been reset yet, or the episode is over.
             ClosedError: the recorder is closed.
         """
         if self.done is False and not self.closed:
@@ -129,12 +131,12 @@ class StatsRecorder:
 
         Args:
             observation: unused.
-            reward: a number, or an array of one element.
+            reward: a number, or an array with one element.
             done: whether the episode is over (terminated or truncated).
             info: unused.
 
         Raises:
-            InvalidArgument: the reward is not one number.
+            InvalidArgument: the reward is not a single number.
         """
         self.count(reward_to_float(reward), bool(done))
         if done and self.autoreset:
@@ -143,7 +145,7 @@ class StatsRecorder:
         return bool(done)
 
     def count(self, reward: float, done: bool) -> None:
-        """Count a step like `after_step`, but never start a new episode."""
+        """Count a step as `after_step` does, but never start a new episode."""
         assert self.steps is not None  # before_step has checked it
         assert self.rewards is not None
         self.rewards += reward
@@ -159,12 +161,12 @@ class StatsRecorder:
         """Check that a reset is allowed.
 
         Args:
-            after_error: whether the environment has raised, so that a reset is the only
-                way to continue.
-            now: the time, if the caller has already read the clock.
+            after_error: whether the environment has raised an exception. In that case,
+                a reset is the only way to continue.
+            now: the current time, if the caller has already read the clock.
 
         Raises:
-            ResetNotAllowed: the episode has begun and is not over.
+            ResetNotAllowed: the episode has begun and is not over yet.
             ClosedError: the recorder is closed.
         """
         self._check_open()
@@ -173,8 +175,8 @@ class StatsRecorder:
             raise ResetNotAllowed(
                 f"reset() was called on {self._environment} after {self.steps} steps "
                 "of an episode that is not over. Continue until terminated or "
-                "truncated is true, or allow it with allow_early_reset=True, which "
-                "leaves the episode out of the statistics."
+                "truncated is true, or allow early resets with allow_early_reset=True, "
+                "which leaves such episodes out of the statistics."
             )
         if self.initial_reset_timestamp is None:
             self.initial_reset_timestamp = self.clock() if now is None else now
@@ -187,7 +189,7 @@ class StatsRecorder:
         self._episode_type = self._type
 
     def save_complete(self) -> None:
-        """Append the running episode to the statistics as complete."""
+        """Add the running episode to the statistics as a complete episode."""
         assert self.steps is not None
         assert self.rewards is not None
         self.episode_lengths.append(self.steps)
@@ -196,7 +198,7 @@ class StatsRecorder:
         self.timestamps.append(self.clock())
 
     def close(self) -> None:
-        """Write the statistics file and close. A second call does nothing."""
+        """Write the statistics file and close the recorder. Idempotent."""
         self.flush()
         self.closed = True
 
@@ -228,17 +230,17 @@ def reward_to_float(reward: Any) -> float:
     """Return a reward as a float.
 
     Args:
-        reward: a number, a NumPy scalar or an array of one element.
+        reward: a number, a NumPy scalar or an array with one element.
 
     Raises:
-        InvalidArgument: `reward` is something else.
+        InvalidArgument: the reward is not a single number.
     """
     if isinstance(reward, float):  # includes NumPy's float64
         return float(reward)
     array = np.asarray(reward)
     if array.dtype.kind not in "biuf" or array.size != 1:
         raise InvalidArgument(
-            f"A reward must be one number, got {reward!r}. An environment with several "
-            "rewards needs a wrapper that combines them into one number."
+            f"A reward must be a single number, but it is {reward!r}. An environment "
+            "with several rewards needs a wrapper that combines them into one number."
         )
     return float(array.item())

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Arrays for actions and observations, and the layout of rows."""
+"""Buffers for actions and observations, and the layout of rows."""
 
 from __future__ import annotations
 
@@ -11,22 +11,22 @@ from numpy.typing import NDArray
 
 _ARRAY = np.ndarray
 
-# Dtypes that hold every value of a kind exactly, because users may pass float32 in one
-# step and float64 in the next.
+# Dtypes that can store every value of a kind exactly. They are needed because users may
+# pass float32 in one step and float64 in the next.
 _WIDEST = {"f": np.dtype("<f8"), "i": np.dtype("<i8"), "b": np.dtype("<i8")}
 
 
 class StepArray:
-    """A buffer for an array that comes with every step.
+    """A buffer for an array that is recorded at every step.
 
     Attributes:
-        kind: dtype and shape, as a dtype.
-        values: the values set last; always the same memory.
-        parts: names and shapes of a dictionary's arrays, which are stored one after
-            another; None for a plain array.
-        given: the original dtype of the array set last; None before the first one, and
-            for dictionaries.
-        on_other_dtype: called when `given` has changed.
+        kind: dtype and shape of the array, as a subarray dtype.
+        values: the array that was set last. It always uses the same memory.
+        parts: names and shapes of the arrays in a dictionary, which are stored one
+            after another; None for a plain array.
+        given: the original dtype of the array that was set last; None before the first
+            array, and for dictionaries.
+        on_other_dtype: function that is called when `given` has changed.
     """
 
     def __init__(
@@ -39,10 +39,11 @@ class StepArray:
         self.parts = parts
         self.values: NDArray[Any] = np.zeros(shape, dtype)
         self._shape = self.values.shape
-        # The next array usually has the same dtype.
+        # Remembered because the next array usually has the same dtype.
         self.given: np.dtype[Any] | None = None
         self.on_other_dtype: Callable[[], object] = lambda: None
-        # The kinds that can be stored: integers fit into floats, but not vice versa.
+        # The kinds of dtypes that can be stored. Floats can store integers, but not the
+        # other way around.
         self._kinds = "fiub" if dtype.kind == "f" else "iub"
         if dtype.kind == "u":
             self._kinds = "u"
@@ -53,12 +54,12 @@ class StepArray:
         return self.values.nbytes
 
     def set(self, value: Any) -> bool:
-        """Copy `value` into the buffer; if it does not fit, zero it and return False.
+        """Copy a value into the buffer, and return whether it fits.
 
-        An environment may accept values that a file cannot hold; recording must not
-        prevent that.
+        If the value does not fit, the buffer is set to zero. There is no error, because
+        an environment may accept values that a file cannot store.
         """
-        # The usual case.
+        # This is the usual case.
         if (
             type(value) is _ARRAY
             and value.dtype is self.given
@@ -91,18 +92,18 @@ class StepArray:
 
 
 def step_array(example: Any) -> StepArray | None:
-    """Return a buffer for arrays like `example`; None if `example` is not an array.
+    """Return a buffer for arrays like `example`, or None if it is not an array.
 
-    Floats are stored as float64, and signed integers and bools as int64, so every value
-    is kept exactly. Unsigned integers (such as frames) keep their dtype. A dictionary
-    of arrays becomes one float64 vector.
+    Floats are stored as float64. Signed integers and bools are stored as int64. Thus
+    every value is stored exactly. Unsigned integers (such as frames) keep their dtype.
+    A dictionary of arrays becomes a single float64 vector.
     """
     if isinstance(example, Mapping):
         return _of_mapping(example)
     try:
         array = np.asarray(example)
     except ValueError:
-        # A ragged sequence.
+        # The example is a ragged sequence.
         return None
     if array.dtype.kind not in "fiub":
         return None
@@ -111,11 +112,11 @@ def step_array(example: Any) -> StepArray | None:
 
 
 def action_array(example: Any) -> StepArray | None:
-    """Return a buffer for actions like `example`; None if `example` is not an array.
+    """Return a buffer for actions like `example`, or None if it is not an array.
 
-    It is like `step_array`, except that arrays of signed integers become float64,
-    because `[0, 0]` may be followed by `[0.5, 0.1]`. A single integer is a discrete
-    action and stays an integer.
+    The buffer is the same as from `step_array`, except that arrays of signed integers
+    become float64. The reason is that `[0.5, 0.1]` may follow `[0, 0]`. A single
+    integer is a discrete action and remains an integer.
     """
     if isinstance(example, list | tuple | np.ndarray):
         array = step_array(example)
@@ -138,16 +139,17 @@ def _of_mapping(example: Mapping[str, Any]) -> StepArray | None:
 
 
 class RowLayout(NamedTuple):
-    """The layout of rows. The next recording usually has the same one.
+    """The layout of rows, which the next recording usually shares.
 
     Attributes:
         state: dtype of the simulation state.
         snapshot: dtype of the snapshot.
         action: buffer for actions.
         observation: dtype and shape of an observation.
-        start_words: memory locations of state and snapshot, if they can be gathered.
+        start_words: memory locations of the state and the snapshot, if both can be
+            gathered.
         dtype: dtype of a row.
-        words: memory locations of a row's content after its head, if it can be
+        words: memory locations of a row's content after its head, if the content can be
             gathered.
     """
 

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Experiment trackers, which are notified of finished episodes and videos.
 
-A tracker is called in the simulation's process, between two steps, so it should return
-quickly. It is given facts and file names, never frames.
+A tracker is called between two steps in the simulating process, so it should return
+quickly. It receives facts and file names, but never frames.
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ class Run:
     """One monitor's recording.
 
     Attributes:
-        directory: the monitor directory, absolute.
-        infix: the middle part of its file names.
+        directory: absolute path of the monitor directory.
+        infix: the middle part of the monitor's file names.
         env_id: the environment's name.
-        env_index: index of a sub-environment in a vector environment. None for a single
-            environment.
+        env_index: index of the sub-environment in a vector environment; None for a
+            single environment.
     """
 
     directory: Path
@@ -53,14 +53,15 @@ class FinishedEpisode:
         reward: sum of the rewards.
         type: `"t"` for training, `"e"` for evaluation.
         terminated: whether the task ended the episode.
-        truncated: whether a limit outside the task ended it.
-        success: `info["is_success"]` or `info["success"]` of the last step; None if
+        truncated: whether a limit outside the task ended the episode.
+        success: `info["is_success"]` or `info["success"]` from the last step; None if
             both are missing.
         seed: the seed given to `reset`.
         options: the options given to `reset`.
-        start_time: wall clock just before the reset, in seconds since the epoch.
-        end_time: wall clock after the last step, in seconds since the epoch.
-        total_steps: number of steps of the run so far, including unfinished episodes.
+        start_time: time just before the reset, in seconds since the Unix epoch.
+        end_time: time after the last step, in seconds since the Unix epoch.
+        total_steps: number of steps in the run so far, including steps of unfinished
+            episodes.
     """
 
     episode_id: int
@@ -82,12 +83,12 @@ class FinishedVideo:
     """A finished video.
 
     Attributes:
-        path: the video file.
-        metadata_path: its metadata file (JSON).
-        episode_id: number of its episode, or of the episode in which it starts.
-        view: the view in the file name: a further camera's name, or `tiled`; empty for
-            the first camera.
-        episode: its episode; None if the episode is not over or was not completed.
+        path: path of the video.
+        metadata_path: path of the video's metadata file (JSON).
+        episode_id: number of the episode that the video shows, or in which it starts.
+        view: the name of an additional camera, or `tiled`, as in the file name; empty
+            for the first camera.
+        episode: the episode; None if it is not over or was not completed.
     """
 
     path: Path
@@ -100,10 +101,11 @@ class FinishedVideo:
 class Tracker:
     """Base class for experiment trackers, for `mjrec.Monitor(..., trackers=...)`.
 
-    Subclass it and override methods; each does nothing by default. One tracker can
-    serve several runs at once, such as those of a vector environment: each call names
-    its run. If a method raises, the error is logged and noted in the manifest, the
-    tracker gets no more calls for that run, and the recording continues.
+    Override the methods in a subclass. By default they do nothing. A tracker can serve
+    several runs at the same time, such as the runs of a vector environment. Each call
+    therefore includes the run. If a method raises an exception, the error is logged and
+    recorded in the manifest. The tracker then gets no more calls for that run, and the
+    recording continues.
     """
 
     def begin(self, run: Run) -> None:
@@ -115,25 +117,26 @@ class Tracker:
     def video(self, run: Run, video: FinishedVideo) -> None:
         """Called when a video is finished.
 
-        Deferred videos are finished in the background and reported at the end of the
-        next episode, or in `close`.
+        Deferred videos are finished in the background. They are reported at the end of
+        the next episode or when the monitor closes.
         """
 
     def end(self, run: Run) -> None:
-        """Called at the end of a run, as its last call."""
+        """Called at the end of a run. No other call for the run follows."""
 
 
 class Trackers:
     """The trackers of one run.
 
-    A tracker that raises is not called again, so that a tracker that has lost its
-    server does not stop the simulation.
+    A tracker that raises an exception is not called again. For example, a tracker that
+    has lost its server does not stop the simulation.
 
     Args:
-        run: the run that is reported to the trackers.
+        run: the run to report to the trackers.
         trackers: the trackers.
-        on_fault: called when a tracker has raised, with its class name, the error, and
-            the number of the reported episode or None.
+        on_fault: function that is called when a tracker has raised an exception. Its
+            arguments are the tracker's class name, the error, and the number of the
+            reported episode or None.
     """
 
     def __init__(
@@ -146,9 +149,9 @@ class Trackers:
         self._run = run
         self._trackers: Sequence[Tracker] = tuple(trackers)
         self._on_fault = on_fault
-        # The first video of each episode or clip.
+        # The first video of each episode or clip that is not finished yet.
         self._awaited: dict[Path, None] = {}
-        # Episodes whose videos may still come.
+        # Episodes that may have unfinished videos.
         self._episodes: dict[int, FinishedEpisode] = {}
         self._notify(None, "begin")
 
@@ -157,12 +160,12 @@ class Trackers:
         return bool(self._trackers)
 
     def expect(self, video: Path) -> None:
-        """Watch for the first video of an episode or a clip."""
+        """Report the videos of an episode or clip once its first video exists."""
         if self._trackers:
             self._awaited[video] = None
 
     def episode(self, episode: FinishedEpisode, *, has_video: bool) -> None:
-        """Report an episode that has just ended, and all videos finished by now.
+        """Report an episode that has just ended, and all newly finished videos.
 
         Args:
             episode: the episode.
@@ -175,13 +178,13 @@ class Trackers:
             self._report_videos()
 
     def end(self) -> None:
-        """Report the end of the run. No tracker is called after that."""
+        """Report the end of the run. After that, no tracker is called again."""
         self._report_videos()
         self._notify(None, "end")
         self._trackers = ()
 
     def _report_videos(self) -> None:
-        # A video is done once its metadata exists, which is written last.
+        # A video is finished once its metadata exists, because that is written last.
         done = [video for video in self._awaited if is_done(video)]
         for video in done:
             del self._awaited[video]
@@ -202,12 +205,12 @@ class Trackers:
         for tracker in self._trackers:
             try:
                 getattr(tracker, what)(self._run, *facts)
-            except Exception as error:  # a user's tracker may do anything
+            except Exception as error:  # a user's tracker may raise anything
                 name = type(tracker).__name__
                 logger.exception("%s failed and will not be notified again.", name)
                 others = (each for each in self._trackers if each is not tracker)
                 self._trackers = tuple(others)
                 self._on_fault(name, error, episode_id)
-                # Give it a chance to release its resources.
+                # Gives the tracker a chance to release its resources.
                 with contextlib.suppress(Exception):
                     tracker.end(self._run)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Recording one video of one environment, frame by frame, with its metadata."""
+"""A recorder for one video of an environment, with its metadata."""
 
 from __future__ import annotations
 
@@ -30,55 +30,59 @@ _TEXT_MODES = ("ansi", "ansi_list")
 
 
 class FrameSource(Protocol):
-    """A source of frames: an environment or a stand-in for one."""
+    """A source of frames, such as an environment or an object that replaces it."""
 
     @property
     def render_mode(self) -> str | None:
         """The render mode: `rgb_array`, `rgb_array_list`, `ansi` or `ansi_list`.
 
-        Any other mode gives no frames.
+        Other modes do not provide frames.
         """
 
     def render(self) -> Any:
-        """Return the current frame, or the list of frames since the last call."""
+        """Return the current frame, or a list of all frames since the last call."""
 
 
 def can_give_frames(source: object) -> bool:
-    """Return whether `source` has a render mode that a video can be made from."""
+    """Return whether the render mode of `source` provides frames for a video."""
     return getattr(source, "render_mode", None) in (*_IMAGE_MODES, *_TEXT_MODES)
 
 
 class VideoRecorder:
     """Records `env.render()`, one frame per `capture_frame`, with gym's interface.
 
-    Images become an mp4 (see `VideoWriter`), text an asciicast version 1 (`.json`). The
-    video plays in real time: the rate follows from the simulated time between the first
-    two captures of a MuJoCo environment; for others it is the rate that `env` declares.
-    `close` finishes the file and writes `<path without extension>.meta.json`. Until
-    then a hidden file describes the unfinished mp4 for `mjrec.recover`.
+    Images become an mp4 file (see `VideoWriter`). Text becomes an asciicast version 1
+    (`.json`). The video plays in real time. For a MuJoCo environment, the frame rate
+    follows from the simulated time between the first two captures. For other
+    environments, it is the rate that `env` declares. `close` finishes the file and
+    writes `<path without extension>.meta.json`. Until then, a hidden file describes the
+    unfinished mp4 for `mjrec.recover`.
 
-    A bad frame (None, or a different size or type than the first) ends the video: the
-    frames so far stay as a playable file, `broken` is set, and a warning and the
-    metadata report it.
+    A bad frame (None, or a different size or type from the first frame) ends the video.
+    The earlier frames remain as a playable file, `broken` is set, and a warning and the
+    metadata report the bad frame.
 
     Args:
-        env: has `render_mode` and `render()`. If its render mode gives no frames, the
-            recorder is not enabled and does nothing.
-        path: the video, ending in `.mp4`, or `.json` for text. Without `path` and
-            `base_path`, a file in a new temporary directory is used.
-        metadata: first entries of the metadata file; copied.
-        enabled: False creates a recorder that does nothing.
-        base_path: the path without extension, instead of `path`.
-        fps: frames per second of the file, instead of real time.
-        max_fps: maximum frames per second. In the `rgb_array` mode every n-th frame is
-            taken, and the last one (see `capture_last`). Other render modes keep all.
-        frame_hashes: whether to write a `.framehash` file next to an image video.
-        clock: returns the simulated time in seconds, or None if there is none.
-        declared: returns the rate to use without simulated time.
-        facts: returns additional metadata, once there is a frame.
-        strict: whether `close` raises if the images show nothing (all black, one
-            colour, no movement). Otherwise it logs a warning.
-        caption: returns the text to write on the current frame, or None.
+        env: an object with `render_mode` and `render()`. If the render mode does not
+            provide frames, the recorder is disabled and does nothing.
+        path: path of the video, ending in `.mp4`, or in `.json` for text. Without
+            `path` and `base_path`, a file in a new temporary directory is used.
+        metadata: initial entries for the metadata file. The mapping is copied.
+        enabled: whether to record. If false, the recorder does nothing.
+        base_path: path without the extension, instead of `path`.
+        fps: frame rate of the file, instead of real time.
+        max_fps: maximum frame rate. In the `rgb_array` mode, every n-th frame and the
+            last frame are taken (see `capture_last`). Other render modes keep all
+            frames.
+        frame_hashes: whether to write a `.framehash` file next to a video of images.
+        clock: function that returns the simulated time in seconds, or None if there is
+            no simulated time.
+        declared: function that returns the rate to use without simulated time.
+        facts: function that returns additional metadata. It is called once there is a
+            frame.
+        strict: whether `close` raises an error if the images show nothing (all black, a
+            single color or no movement). Otherwise it logs a warning.
+        caption: function that returns the text to write on the current frame, or None.
 
     Raises:
         MissingDependency: captions were requested, but Pillow is not installed.
@@ -86,13 +90,13 @@ class VideoRecorder:
             wrong.
 
     Attributes:
-        path: the video. None if not enabled.
-        metadata_path: the metadata file. None if not enabled.
+        path: path of the video; None if the recorder is disabled.
+        metadata_path: path of the metadata file; None if the recorder is disabled.
         metadata: the content of the metadata file so far.
-        enabled: whether it records.
+        enabled: whether the recorder records frames.
         broken: whether a bad frame or a failed encoder ended the video early.
-        finished: whether the video exists and is complete; known after `close`.
-        closed: whether `close` or `discard` was called.
+        finished: whether the video exists and is complete. Only known after `close`.
+        closed: whether `close`, `leave` or `discard` was called.
     """
 
     def __init__(
@@ -122,7 +126,7 @@ class VideoRecorder:
         self.metadata = dict(metadata or {})
         mode = getattr(env, "render_mode", None)
         self.ansi_mode = mode in _TEXT_MODES
-        # With one image per step, some need not be drawn.
+        # If there is one image per step, some images do not have to be drawn.
         self._may_leave_out = mode == "rgb_array"
         self._caption = caption
         self._clock = clock or (lambda: simulation_time(env))
@@ -134,7 +138,7 @@ class VideoRecorder:
         self._frame_hashes = frame_hashes
         self._sink: VideoSink | None = None
         self._size: tuple[int, int] | None = None
-        # Frames wait here until the rate is known, at the second capture.
+        # Frames are kept here until the second capture, when the rate is known.
         self._waiting: list[tuple[Frame | str, Caption | None]] = []
         self._captures = 0
         self._first: tuple[int, float | None] | None = None
@@ -146,12 +150,12 @@ class VideoRecorder:
         if not self.enabled:
             if enabled:
                 logger.info(
-                    "No video of %s: its render mode is %r.",
+                    "%s gets no video because its render mode is %r.",
                     type(env).__name__,
                     mode,
                 )
             return
-        # Absolute, so that a later chdir does not separate video and metadata.
+        # Absolute, so that a later chdir does not separate the video and its metadata.
         self.path = str(Path(self._path_of(path, base_path)).absolute())
         self.metadata_path = str(Path(self.path).with_suffix(".meta.json"))
         self.metadata["content_type"] = (
@@ -160,12 +164,12 @@ class VideoRecorder:
 
     @property
     def functional(self) -> bool:
-        """Whether frames are (or were) recorded: enabled and not broken."""
+        """Whether the recorder is enabled and not broken."""
         return self.enabled and not self.broken
 
     @property
     def empty(self) -> bool:
-        """Whether it has no frames: none were captured, or the encoder lost them."""
+        """Whether there are no frames, even if the encoder has lost captured frames."""
         return self._steps.total == 0
 
     @property
@@ -176,15 +180,15 @@ class VideoRecorder:
     def capture_frame(self) -> None:
         """Record the current result of `env.render()`.
 
-        Does nothing if the recorder is closed or not functional. Exceptions raised by
-        `env.render()` propagate.
+        If the recorder is closed or not functional, nothing happens. Exceptions from
+        `env.render()` are passed on.
 
         Raises:
-            EncoderError: ffmpeg failed; the recorder is then broken.
+            EncoderError: ffmpeg failed. After that, the recorder is broken.
         """
         if not self.functional or self.closed:
             return
-        # Counted even if `render` raises, because frames belong to steps.
+        # The capture counts even if `render` raises, because frames belong to steps.
         step, self._captures = self._captures, self._captures + 1
         if self._may_leave_out:
             with self._abandoning():
@@ -193,23 +197,23 @@ class VideoRecorder:
             self._capture(step)
 
     def capture_last(self) -> None:
-        """Record the last step's frame if `max_fps` left it out.
+        """Record the frame of the last step if `max_fps` left it out.
 
-        Call it at the end of an episode, before the next reset or step. It raises the
-        same errors as `capture_frame`.
+        Call this method at the end of an episode, before the next reset or step. It
+        raises the same errors as `capture_frame`.
         """
         step = self._captures - 1
         if self.functional and not self.closed and step > self._last_taken >= 0:
             self._capture(step)
 
     def give_up(self, reason: str) -> None:
-        """Stop taking frames and log the reason; keep the frames taken so far."""
+        """Stop taking frames and log the reason. Earlier frames are kept."""
         if not self.functional:
             return
         self.broken = True
         self.metadata["broken_reason"] = reason
         logger.warning(
-            "The video %s ends after %d frames, because the next one was bad: %s",
+            "The video %s ends after %d frames because the next frame was bad: %s",
             self.path,
             self.frame_count,
             reason,
@@ -218,13 +222,13 @@ class VideoRecorder:
     def close(self) -> None:
         """Finish the video and write its metadata. A second call does nothing.
 
-        Without frames no video is written, and the metadata has `empty`. If Ctrl-C
-        interrupts the call, the next call continues.
+        If there are no frames, no video is written, and the metadata contains `empty`.
+        If Ctrl-C interrupts the call, the next call continues.
 
         Raises:
-            EncoderError: ffmpeg failed; the metadata is written anyway.
-            BlankVideo: `strict` is set and the video shows nothing. The video and its
-                metadata exist.
+            EncoderError: ffmpeg failed. The metadata is written anyway.
+            BlankVideo: `strict` is set, and the video shows nothing. The video and its
+                metadata are kept.
         """
         if self.closed:
             return
@@ -242,7 +246,7 @@ class VideoRecorder:
             self._sink.blank.judge(self._sink.path, strict=self._strict)
 
     def leave(self) -> None:
-        """Release the files as SIGKILL would; recovery finishes the video."""
+        """Release the files as if killed by SIGKILL; recovery can finish the video."""
         if not self.closed and self._sink is not None:
             self._sink.leave()
         self.closed = True
@@ -282,7 +286,7 @@ class VideoRecorder:
             kind = "text, an asciicast" if self.ansi_mode else "images, an mp4"
             raise InvalidArgument(
                 f"With render_mode={self.env.render_mode!r} the recording is {kind}, "
-                f"so its path must end in {extension}, got {os.fspath(path)!r}."
+                f"so its path must end in {extension}, but it is {os.fspath(path)!r}."
             )
         return os.fspath(path)
 
@@ -310,12 +314,12 @@ class VideoRecorder:
         if self._sink is not None:
             self._sink.write(taken, caption)
         else:
-            # The environment may draw the next frame into the same array.
+            # The environment may draw the next frame in the same array.
             taken = taken if isinstance(taken, str) else taken.copy()
             self._waiting.append((taken, caption))
 
     def _settle_rate(self, step: int, frames: int) -> None:
-        """Open the video, once frames of two steps show the time of a step."""
+        """Open the video once the frames of two steps show the duration of a step."""
         if self._sink is not None or self._first is None:
             return
         self._timestep = _time_of_a_step(self._first, (step, self._clock()))
@@ -344,7 +348,7 @@ class VideoRecorder:
         self._waiting.clear()
 
     def _note(self) -> tuple[Mapping[str, Any], Mapping[str, Any]]:
-        """Return metadata and timing that describe the unfinished video."""
+        """Return the metadata and the timing that describe the unfinished video."""
         timing = {**self._timing(), "frames_per_step": self._frames_per_step}
         return {**self.metadata, **self._facts()}, timing
 
@@ -359,7 +363,7 @@ class VideoRecorder:
 
     @contextlib.contextmanager
     def _abandoning(self) -> Iterator[None]:
-        """End the video at a bad frame; delete it if any other error occurs."""
+        """End the video at a bad frame. If any other error occurs, delete it."""
         try:
             yield
         except InvalidFrame as error:
@@ -405,7 +409,7 @@ class VideoRecorder:
 def _time_of_a_step(
     earlier: tuple[int, float | None], later: tuple[int, float | None]
 ) -> Fraction | None:
-    """Return the duration of a step, from two pairs of a step and its clock time."""
+    """Return the duration of a step, given two pairs of a step and a clock time."""
     (first, start), (last, end) = earlier, later
     if start is None or end is None or end <= start:
         return None
@@ -416,11 +420,11 @@ _DEFAULT_RATE = Fraction(30)
 
 
 def declared_rate(env: object) -> Fraction:
-    """Return the frames per second that an environment declares.
+    """Return the frame rate that an environment declares.
 
-    This is based on the control timestep of a dm_control environment, on `dt` of a
-    Gymnasium MuJoCo environment, and otherwise on `render_fps` in the metadata. The
-    default is 30, with a warning if the environment can be drawn.
+    The rate follows from the control timestep of a dm_control environment or from `dt`
+    of a Gymnasium MuJoCo environment. For other environments it is `render_fps` in the
+    metadata. The default is 30, with a warning if the environment can be drawn.
 
     Raises:
         InvalidArgument: `render_fps` is not a valid rate.
