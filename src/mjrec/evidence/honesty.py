@@ -41,6 +41,7 @@ def remarks(inputs: Inputs, arrays: Mapping[str, NDArray[Any]]) -> Iterator[Find
         yield from _gaps(recording, inputs.recordings)
         yield from _cuts(recording, inputs.recordings)
         yield from _types(recording)
+        yield from _faults(recording)
         yield from _seeds(recording)
     yield from _gaps_of_evaluations(inputs.recordings)
     yield from _repeated(inputs, arrays)
@@ -160,6 +161,26 @@ def _types(recording: RecordingInputs) -> Iterator[Finding]:
             f"others evaluation: {_listed(training)}",
             outcome=Outcome.NOTED,
             count=len(training),
+        )
+
+
+def _faults(recording: RecordingInputs) -> Iterator[Finding]:
+    """Yield the faults of the recorder. All of their effects are compared."""
+    said = [
+        f"{fault['what']}: {fault['reason']:.200}"
+        if fault["episode_id"] is None
+        else f"{fault['what']} of episode {fault['episode_id']}: {fault['reason']:.200}"
+        for _, fault in recording.faults
+    ]
+    if said:
+        yield _headline(
+            Topic.SELECTION,
+            recording.name,
+            "faults while recording, according to its author: "
+            f"{_shown(said[:_MOST_SHOWN], len(said))}",
+            outcome=Outcome.NOTED,
+            count=len(said),
+            unit="fault",
         )
 
 
