@@ -36,6 +36,7 @@ def remarks(inputs: Inputs, arrays: Mapping[str, NDArray[Any]]) -> Iterator[Find
         inputs: the run's inputs.
         arrays: the arrays that the inputs name.
     """
+    yield from _unfinished(inputs)
     for recording in inputs.recordings:
         yield from _name(recording)
         yield from _gaps(recording, inputs.recordings)
@@ -66,6 +67,21 @@ def remarks_on_video(metadata: Path, file: str) -> Iterator[Finding]:
             outcome=Outcome.NOTED,
             reason=reason,
             unit="video",
+        )
+
+
+def _unfinished(inputs: Inputs) -> Iterator[Finding]:
+    """Yield a remark if an evaluation planned more episodes than are complete."""
+    episodes = [each for one in inputs.recordings for each in one.episodes]
+    complete, planned = sum(e.cut is None for e in episodes), inputs.planned or 0
+    if complete < planned:
+        yield _headline(
+            Topic.SELECTION,
+            "",
+            f"{complete} of {planned} episodes: the evaluation is not finished, or "
+            "some of its episodes failed",
+            outcome=Outcome.BELIEVED,
+            count=planned - complete,
         )
 
 

@@ -193,10 +193,12 @@ class Inputs:
     Attributes:
         recordings: the recordings, sorted by the times of their first resets.
         packing: the options of `mjrec pack`; empty for a monitor directory.
+        planned: number of episodes in the plan of an evaluation, otherwise None.
     """
 
     recordings: Sequence[RecordingInputs]
     packing: Mapping[str, Any] = field(default_factory=dict)
+    planned: int | None = None
 
     def unusual(self) -> dict[str, dict[str, Any]]:
         """Return environments and non-default inputs, keyed by recording or "pack"."""
@@ -234,7 +236,7 @@ class Inputs:
             )
             for recording in said["recordings"]
         ]
-        return cls(recordings=tuple(recordings), packing=said["packing"])
+        return cls(**{**said, "recordings": tuple(recordings)})
 
 
 def given_actions(

@@ -85,6 +85,7 @@ def read_inputs(data: Path) -> tuple[Inputs, dict[str, NDArray[Any]]]:
     inputs = Inputs(
         recordings=tuple(sorted(recordings, key=_begun)),
         packing=packing,
+        planned=packing.get("planned"),
     )
     return inputs, arrays
 
@@ -121,8 +122,9 @@ def packing_options(said: Mapping[str, Any]) -> PackingOptions:
         options = PackingOptions(**{**said, **lists})
     except TypeError as error:
         raise ValueError(f"its packing options are invalid: {error}") from error
-    if type(options.anonymous) is not bool or not isinstance(
-        options.max_size, int | None
+    numbers = (options.max_size, options.planned)
+    if type(options.anonymous) is not bool or not all(
+        isinstance(number, int | None) for number in numbers
     ):
         raise ValueError(f"its packing options are invalid: {said!r:.200}")
     return options
