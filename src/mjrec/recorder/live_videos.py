@@ -24,6 +24,8 @@ class LiveVideos:
         recorders: the video recorders, in the order of the cameras. There must be at
             least one.
         tolerates: function that returns whether to continue after an error.
+        retry_at_close: function that takes a function to call when the run closes. It
+            is used to write metadata for which the disk had no room.
         on_frame_error: function that is called with an error if taking a step's frame
             raises an error that is not tolerated. The error may come from the
             environment itself.
@@ -37,10 +39,12 @@ class LiveVideos:
         recorders: Sequence[VideoRecorder],
         *,
         tolerates: Callable[[Exception], bool],
+        retry_at_close: Callable[[Callable[[], None]], object],
         on_frame_error: Callable[[Exception], object] = lambda _: None,
     ) -> None:
         self.recorders = recorders
         self._tolerates = tolerates
+        self._retry_at_close = retry_at_close
         self._on_frame_error = on_frame_error
 
     @property
@@ -119,8 +123,14 @@ class LiveVideos:
             except Error as error:
                 if not self._tolerates(error):
                     failure = failure or error
+        if not all(recorder.closed for recorder in self.recorders):
+            self._retry_at_close(functools.partial(self._end_again, facts))
         if failure is not None:
             raise failure
+
+    def _end_again(self, facts: Mapping[str, Any]) -> None:
+        self.end(facts)
+        self.name_again()
 
     def name_again(self) -> None:
         """Give the finished videos their second names, if they have any."""
@@ -136,7 +146,9 @@ class LiveVideos:
         """
         self.say(**facts)
         for recorder in self.recorders:
-            amend_metadata(Path(str(recorder.path)), facts)
+            # One that is not closed has no metadata yet.
+            if recorder.closed:
+                amend_metadata(Path(str(recorder.path)), facts)
 
     def remove(self) -> None:
         """Remove finished videos.
@@ -147,6 +159,7 @@ class LiveVideos:
         # The first camera's metadata implies that all videos exist, so it is removed
         # last.
         for recorder in reversed(self.recorders):
+            recorder.discard()
             video = Path(str(recorder.path))
             about = Path(str(recorder.metadata_path))
             for path in (about, video, frame_hash_path(video)):
@@ -212,5 +225,6 @@ def live_videos(
     return LiveVideos(
         recorders,
         tolerates=functools.partial(run.tolerates, "video"),
+        retry_at_close=run.retry_at_close,
         on_frame_error=on_frame_error,
     )
