@@ -36,7 +36,7 @@ class Step(Protocol):
     def __call__(
         self, reward: Any, *, terminated: bool = ..., truncated: bool = ...
     ) -> bool:
-        """Record a step; return False, without recording it, if it is unusual."""
+        """Record a step, or return False if it is unusual and was not recorded."""
 
 
 class FastPath(NamedTuple):

@@ -146,7 +146,7 @@ class LiveVideos:
         """
         self.say(**facts)
         for recorder in self.recorders:
-            # One that is not closed has no metadata yet.
+            # A recorder that is not closed has not written its metadata yet.
             if recorder.closed:
                 amend_metadata(Path(str(recorder.path)), facts)
 

@@ -155,7 +155,7 @@ class MonitoredRun:
         )
         self.layouts: dict[SpanLogs, RowLayout] = {}
         self.paces: dict[SpanLogs, Mapping[str, Any]] = {}
-        # What a full disk has delayed until the run closes.
+        # Functions to call when the run closes, because the disk was full.
         self._late: list[Callable[[], None]] = []
         self.no_video = VideoRecorder(env.frames, enabled=False)
         self._episode: BegunEpisode | None = None
@@ -249,11 +249,11 @@ class MonitoredRun:
             self.finisher.submit(recording)
 
     def retry_at_close(self, do: Callable[[], None]) -> None:
-        """Call a function in `close_logs`, because the disk is full now."""
+        """Delay a function until `close_logs`, because the disk is full now."""
         self._late.append(do)
 
     def close_logs(self) -> None:
-        """Write all remaining rows and facts to the logs, and do what was delayed.
+        """Write all remaining rows and facts to the logs, and call delayed functions.
 
         Raises:
             FileNotWritten: the disk is full. The next call tries again.

@@ -221,7 +221,7 @@ class VideoRecorder:
         )
 
     def break_off(self, reason: str, *, frames: int) -> None:
-        """Stop taking frames after so many; if that is none, delete those taken."""
+        """Stop after a number of frames. If it is 0, delete the frames so far."""
         if frames:
             self._breaks_off = frames, reason
         else:
@@ -254,7 +254,7 @@ class VideoRecorder:
             self._sink.blank.judge(self._sink.path, strict=self._strict)
 
     def leave(self) -> None:
-        """Release the files as if killed by SIGKILL; recovery can finish the video."""
+        """Release the files as SIGKILL would, so that recovery finishes the video."""
         if not self.closed and self._sink is not None:
             self._sink.leave()
         self.closed = True
