@@ -173,6 +173,7 @@ class MonitoredRun:
         self._lines += 1
         self._write(lambda: self._journal.append(entry))
         self.note_provenance()
+        self._note_stated_faults()
 
     def note(self, kind: str, facts: Any) -> None:
         """Write another event, one of `formats.journal.EVENTS`, to the journal.
@@ -183,6 +184,7 @@ class MonitoredRun:
         self.events.note(kind, facts)
         self._lines += 1
         self._write(lambda: self._journal.note(kind, facts))
+        self._note_stated_faults()
 
     def note_provenance(self, *, wait: bool = False) -> None:
         """Write the run's provenance to the journal, once it is known.
@@ -273,6 +275,13 @@ class MonitoredRun:
         found = None if self._provenance is None else self._provenance.found(wait=wait)
         return None if found is None else {**found, **self._policy}
 
+    def _note_stated_faults(self) -> None:
+        stated = () if self._statements is None else self._statements.faults
+        for lines, facts in stated:
+            if lines == self._lines:
+                self.note("fault", facts)
+                return
+
     def _write(self, write: Callable[[], None]) -> None:
         try:
             write()
@@ -292,6 +301,7 @@ class MonitoredRun:
         """Begin an episode, to which faults are attributed from now on."""
         self._episode = episode
         self.events.begin(episode.episode_id, chosen=False)
+        self._note_stated_faults()
 
     def caption(self) -> Caption:
         """Return the caption of the current frame."""
