@@ -22,6 +22,7 @@ from recordings import (
 from waiting import wait_until
 
 import mjrec
+from mjrec.formats import video_sink
 from mjrec.formats.trajectory_file import open_trajectory
 from mjrec.recorder.tracking import Tracker
 from mjrec.rendering.finish import finish
@@ -305,6 +306,27 @@ def test_a_full_disk_at_the_end_loses_no_chosen_video(tmp_path, on_error):
     assert not list(tmp_path.glob("*episode00000[024567]*"))
     render(tmp_path)
     assert videos_in(tmp_path) == [1, 3]
+
+
+@pytest.mark.parametrize(("returns", "kept"), [([2, 4], 0), ([4, 2], 1)])
+def test_a_full_disk_at_the_metadata_of_a_live_candidate(returns, kept, tmp_path):
+    """It is written at the end with the choice, or nothing of the video is left."""
+
+    def full(video, metadata):
+        raise mjrec.FileNotWritten(video, "No space left on device")
+
+    env = pendulum(returns)
+    options = {"keep": "worst:1", "render": "live", "on_error": "warn"}
+    with mjrec.Monitor(env, tmp_path, **options) as monitor:
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(video_sink, "write_metadata", full)
+            run(monitor, 1)
+        run(monitor, 1)
+    assert videos_in(tmp_path) == [kept]
+    assert metadata_of(tmp_path, kept)["selection"]["decided"] is True
+    assert len(manifest_of(tmp_path)["videos"]) == 1
+    assert len(list(tmp_path.glob("openaigym.video.*"))) == 3
+    assert not list(tmp_path.glob(".*"))
 
 
 PROGRAM = """

@@ -67,19 +67,23 @@ def from_json(kind: type[D], value: Any) -> D:
         ValueError: `value` is not an object of this kind.
     """
     values = mapping(value)
-    fields, hints = _fields_and_hints(typing.cast(Any, kind))
-    given = {}
-    for each in fields:
-        if each.name in values or _is_needed(each):
-            given[each.name] = field(values, each.name, _reader(hints[each.name]))
+    given = {
+        name: field(values, name, read)
+        for name, read, is_needed in _readers(typing.cast(Any, kind))
+        if is_needed or name in values
+    }
     return kind(**given)
 
 
+# Cached because a journal may have millions of entries.
 @functools.cache
-def _fields_and_hints(
-    kind: Any,
-) -> tuple[tuple[dataclasses.Field[Any], ...], dict[str, Any]]:
-    return dataclasses.fields(kind), typing.get_type_hints(kind, include_extras=True)
+def _readers(kind: Any) -> list[tuple[str, _Read, bool]]:
+    """Return name and reader of each field, and whether it has no default."""
+    hints = typing.get_type_hints(kind, include_extras=True)
+    return [
+        (each.name, _reader(hints[each.name]), _is_needed(each))
+        for each in dataclasses.fields(kind)
+    ]
 
 
 def _is_needed(each: dataclasses.Field[Any]) -> bool:

@@ -31,22 +31,13 @@ import re
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 from ..errors import ClosedError, FileNotWritten
 from ..json_text import dumps
 from .appending import append_whole, open_for_appending
-from .json_fields import (
-    boolean,
-    field,
-    integer,
-    json_object,
-    mapping,
-    number,
-    optional,
-    text,
-    unreadable,
-)
+from .dataclass_json import from_json
+from .json_fields import integer, json_object, unreadable
 from .regular_files import open_regular
 
 logger = logging.getLogger(__name__)
@@ -104,8 +95,8 @@ class JournalEntry:
         evaluation: `seed`, `episode` and `warnings` of an evaluation's episode.
     """
 
-    episode_id: int
-    length: int
+    episode_id: Annotated[int, _count]
+    length: Annotated[int, _count]
     reward: float
     type: str
     start_time: float
@@ -364,22 +355,7 @@ def entry_of(values: Mapping[str, Any]) -> JournalEntry:
     Raises:
         ValueError: a member is missing or has the wrong type.
     """
-    return JournalEntry(
-        episode_id=field(values, "episode_id", _count),
-        length=field(values, "length", _count),
-        reward=field(values, "reward", number),
-        type=field(values, "type", text),
-        start_time=field(values, "start_time", number),
-        end_time=field(values, "end_time", number),
-        seed=values.get("seed"),
-        options=values.get("options"),
-        terminated=field(values, "terminated", boolean),
-        truncated=field(values, "truncated", boolean),
-        success=field(values, "success", optional(boolean), default=None),
-        chosen=field(values, "chosen", boolean, default=False),
-        recording=field(values, "recording", optional(text), default=None),
-        evaluation=field(values, "evaluation", optional(mapping), default=None),
-    )
+    return from_json(JournalEntry, {"seed": None, "options": None, **values})
 
 
 def _count(value: Any) -> int:

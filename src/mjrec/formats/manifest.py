@@ -18,20 +18,19 @@ import contextlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 from ..atomic_files import write_text
 from ..json_text import dumps
+from .dataclass_json import from_json
 from .json_fields import (
     base_name,
     field,
     integer,
     list_of,
     mapping,
-    number,
     optional,
     read_object,
-    text,
     unreadable,
 )
 from .regular_files import read_regular
@@ -52,10 +51,10 @@ class Manifest:
         mjrec: facts that gym did not write; None in gym's own manifests.
     """
 
-    stats: str
-    videos: tuple[tuple[str, str], ...]
-    env_info: Mapping[str, Any]
-    mjrec: Mapping[str, Any] | None = None
+    stats: Annotated[str, base_name]
+    videos: Annotated[tuple[tuple[str, str], ...], list_of(_pair)]
+    env_info: Annotated[Mapping[str, Any], mapping]
+    mjrec: Annotated[Mapping[str, Any] | None, optional(_details)] = None
 
 
 def read_manifest(path: Path) -> Manifest:
@@ -66,13 +65,7 @@ def read_manifest(path: Path) -> Manifest:
             directory.
     """
     with unreadable(path):
-        values = read_object(path)
-        return Manifest(
-            stats=field(values, "stats", base_name),
-            videos=field(values, "videos", list_of(_pair)),
-            env_info=field(values, "env_info", mapping),
-            mjrec=field(values, "mjrec", optional(_details), default=None),
-        )
+        return from_json(Manifest, read_object(path))
 
 
 def write_manifest(path: Path, manifest: Manifest) -> bool:
@@ -141,19 +134,9 @@ def read_stats_file(path: Path) -> StatsFile:
         UnreadableFile: the file is missing or damaged, or its lists differ in length.
     """
     with unreadable(path):
-        values = read_object(path)
-        stats = StatsFile(
-            # The first versions of gym did not write it.
-            initial_reset_timestamp=field(
-                values, "initial_reset_timestamp", optional(number), default=None
-            ),
-            timestamps=field(values, "timestamps", list_of(number)),
-            episode_lengths=field(values, "episode_lengths", list_of(integer)),
-            episode_rewards=field(values, "episode_rewards", list_of(number)),
-            episode_types=field(
-                values, "episode_types", optional(list_of(text)), default=None
-            ),
-        )
+        # The first versions of gym did not write these.
+        missing = {"initial_reset_timestamp": None, "episode_types": None}
+        stats = from_json(StatsFile, {**missing, **read_object(path)})
         _check_lengths(stats)
     return stats
 
