@@ -72,7 +72,7 @@ class Rules:
         return text
 
 
-_REWARD: Final = Rule(Topic.REWARDS, Aspect.DERIVED)
+_RETURN: Final = Rule(Topic.REWARDS, Aspect.SUMMED)
 _END: Final = Rule(Topic.REWARDS)
 _BEGINNING: Final = Rule(Topic.BEGINNING)
 _SELECTION: Final = Rule(Topic.SELECTION)
@@ -85,7 +85,7 @@ _MODEL: Final = Rule(Topic.IDENTITY, Aspect.MODEL)
 
 # For all files: a key means the same everywhere.
 KEYS: Final[Mapping[str, Rule]] = {
-    **dict.fromkeys(("reward", "episode_rewards", "reward_before"), _REWARD),
+    **dict.fromkeys(("reward", "episode_rewards", "reward_before"), _RETURN),
     **dict.fromkeys(("length", "episode_lengths", "terminated", "truncated"), _END),
     **dict.fromkeys(("type", "episode_types", "warnings"), _END),
     "success": Rule(Topic.REWARDS, Aspect.OBSERVED),
@@ -279,7 +279,7 @@ def _leaf(
     may_be_gone = aspect is Aspect.STATEMENT or (
         aspect is Aspect.CLAIM and rule.claim != "machine"
     )
-    if (is_gone and not may_be_gone) or (aspect is Aspect.DERIVED and size is None):
+    if (is_gone and not may_be_gone) or (aspect is Aspect.SUMMED and size is None):
         # No version turns a non-number into a number, or omits a key. But a package or
         # OpenGL's names may be missing here.
         aspect = Aspect.EXACT

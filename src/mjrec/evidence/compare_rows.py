@@ -39,6 +39,7 @@ _DATASETS: Final = {
     "frame_steps": (Topic.VIDEOS, Aspect.EXACT),
     "actions": (Topic.PHYSICS, Aspect.EXACT),
 }
+_MEMBERS: Final = {"warmstart": Aspect.SOLVER, "qvel": Aspect.VELOCITY}
 _UNITS: Final = {"snapshots": "snapshot", "model_changes": "change"}
 _FACTS: Final = "facts"
 # Derived from the facts; reading a trajectory checks it.
@@ -254,7 +255,9 @@ class _Rows:
         for member in a.dtype.names or ("",):
             left, right = (_table(each[member] if member else each) for each in (a, b))
             is_other = _bits(left) != _bits(right)
-            aspect = Aspect.SOLVER if member == "warmstart" else self._aspect
+            aspect = self._aspect
+            if aspect is Aspect.STATE:
+                aspect = _MEMBERS.get(member, aspect)
             parts = [(self._topic, slice(None))]
             if is_beginning:
                 parts = [(Topic.BEGINNING, np.s_[:1]), (self._topic, np.s_[1:])]

@@ -27,7 +27,9 @@ class Aspect(enum.Enum):
     Attributes:
         EXACT: values that must be equal; no version or machine changes them.
         STATE: numbers of the simulation.
+        VELOCITY: velocities of the simulation.
         DERIVED: numbers that the environment computes from states.
+        SUMMED: sums of such numbers, the returns.
         OBSERVED: other outputs of the environment or a wrapper than rewards and ends:
             observations, success.
         SOLVER: the warm start, which only the solver uses.
@@ -43,7 +45,9 @@ class Aspect(enum.Enum):
 
     EXACT = "exact"
     STATE = "state"
+    VELOCITY = "velocity"
     DERIVED = "derived"
+    SUMMED = "summed"
     OBSERVED = "observed"
     SOLVER = "solver"
     MODEL = "model"
