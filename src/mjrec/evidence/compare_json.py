@@ -10,7 +10,7 @@ from __future__ import annotations
 import itertools
 import math
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, BinaryIO, Final, NamedTuple, TypeAlias
@@ -18,7 +18,15 @@ from typing import Any, BinaryIO, Final, NamedTuple, TypeAlias
 from ..formats.journal import is_of_spans
 from ..formats.json_fields import json_object, read_object, unreadable
 from ..formats.regular_files import open_regular, read_regular
-from .differences import Aspect, Difference, Same, only_in, relative_error, unlike
+from .differences import (
+    Aspect,
+    Difference,
+    Same,
+    only_in,
+    relative_error,
+    stored_differently,
+    unlike,
+)
 from .findings import Topic
 
 _LONGEST_LINE: Final = 1 << 24
@@ -296,19 +304,12 @@ def _leaf(
     )
 
 
-def _or_bytes(found: Any, file: str) -> Iterator[Same | Difference]:
+def _or_bytes(found: Iterable[Difference], file: str) -> Iterator[Same | Difference]:
     """Yield differences; if there are none, one in how the values are written."""
-    is_any = False
-    for difference in found:
-        is_any = True
-        yield difference
-    if not is_any:
-        yield Difference(
-            topic=Topic.FILES,
-            file=file,
-            aspect=Aspect.STORED,
-            how="the same values, written differently",
-        )
+    differences = list(found)
+    yield from differences
+    if not differences:
+        yield stored_differently(file)
 
 
 def _lines(file: BinaryIO) -> Iterator[bytes]:

@@ -136,6 +136,20 @@ def unlike(given: Any, made: Any) -> str:
     return f"the archive has {short(given)}, the recreated run has {short(made)}"
 
 
+def differs(
+    topic: Topic, file: str, where: str, given: Any, made: Any, *, unit: str = "file"
+) -> Difference:
+    """Return the difference between two values that must be equal."""
+    how = unlike(given, made)
+    return Difference(topic=topic, file=file, unit=unit, where=where, how=how)
+
+
+def stored_differently(file: str) -> Difference:
+    """Return the difference for a file with equal contents but different bytes."""
+    how = "the same contents, stored differently"
+    return Difference(topic=Topic.FILES, file=file, aspect=Aspect.STORED, how=how)
+
+
 def only_in(is_given: bool, value: Any) -> str:
     """Return a clause that only one of the two runs has a value."""
     who = "the archive" if is_given else "the recreated run"

@@ -149,6 +149,8 @@ _BY_NAME: Final[Mapping[str, _Rule]] = {
     "broken video": _Rule(
         kind=ExcuseKind.EVENT,
         costs="where it breaks off is believed",
+        # An encoder's death may show only at the end: the keys' order depends on it.
+        allows=_RESTORED,
         fed=(Topic.VIDEOS,),
     ),
     **dict.fromkeys(
