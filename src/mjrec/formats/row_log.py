@@ -61,7 +61,6 @@ class RowLog:
 
     Raises:
         FileNotWritten: the disk has no room for the tail, or the directory was removed.
-        FileNotWritten: the disk has no room for the tail, or the directory is gone.
     """
 
     def __init__(

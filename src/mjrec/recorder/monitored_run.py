@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import itertools
 import logging
 from collections.abc import Callable, Iterator, Mapping
@@ -153,8 +154,8 @@ class MonitoredRun:
         )
         self.layouts: dict[SpanLogs, RowLayout] = {}
         self.paces: dict[SpanLogs, Mapping[str, Any]] = {}
-        # Recordings whose ends are not in the journal yet because the disk was full.
-        self._late: list[Path] = []
+        # What a full disk has delayed until the run closes.
+        self._late: list[Callable[[], None]] = []
         self.no_video = VideoRecorder(env.frames, enabled=False)
         self._episode: BegunEpisode | None = None
         # The reasons for drawing videos live that were logged so far.
@@ -238,20 +239,28 @@ class MonitoredRun:
     def submit(self, recording: Path) -> None:
         """Submit a recording to the finisher, once the journal has its end."""
         if self._journal.is_behind:
-            self._late.append(recording)
+            self.retry_at_close(functools.partial(self.finisher.submit, recording))
         else:
             self.finisher.submit(recording)
 
+    def retry_at_close(self, do: Callable[[], None]) -> None:
+        """Call a function in `close_logs`, because the disk is full now."""
+        self._late.append(do)
+
     def close_logs(self) -> None:
-        """Write all remaining rows and facts to the logs.
+        """Write all remaining rows and facts to the logs, and do what was delayed.
 
         Raises:
             FileNotWritten: the disk is full; the next call tries again.
         """
         self.logs.close()
         self.clip_logs.close()
-        while self._late:
-            self.finisher.submit(self._late.pop(0))
+        late, self._late = self._late, []
+        try:
+            while late:
+                late.pop(0)()
+        finally:
+            self._late += late
 
     def leave(self) -> None:
         """Release journal and logs as they are. Idempotent."""
