@@ -239,11 +239,11 @@ def test_sizes_are_read_as_people_write_them() -> None:
     assert {text: byte_count(text) for text in sizes} == sizes
 
 
-def test_without_the_bagit_package_it_says_what_to_install(
+def test_without_jinja_it_says_what_to_install(
     recorded: Path, place: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """And does nothing."""
-    monkeypatch.setitem(sys.modules, "bagit", None)
+    monkeypatch.setitem(sys.modules, "jinja2", None)
     message = refusal(mjrec.MissingDependency, recorded, place)
     assert 'pip install "mjrec[evidence]"' in message
 

@@ -19,6 +19,7 @@ VIDEO = "recordings/openaigym.video.0.u.video000003.mp4"
 EXCUSES = {
     "mujoco": ("mujoco", "3.16.0", "3.17.0", RECORDING),
     "major": ("mujoco", "3.17.0", "4.0.0", RECORDING),
+    "rk4": ("rk4", "quaternions", "", RECORDING),
     "machine": ("machine", "x86_64 a", "x86_64 b", RECORDING),
     "numpy": ("numpy", "2.3.0", "2.4.0", RECORDING),
     "gymnasium": ("gymnasium", "1.3.0", "1.4.0", RECORDING),
@@ -63,6 +64,13 @@ WITHIN, BELIEVED, NOTED, DIFFERENT = (
         ("mujoco", difference(Aspect.SOLVER, 1.0), BELIEVED),
         ("mujoco", difference(Aspect.EXACT), DIFFERENT),
         ("major", difference(Aspect.STATE, 5e-3), WITHIN),
+        ("major", difference(Aspect.SUMMED, 5e-3, **REWARD), WITHIN),
+        ("rk4", difference(Aspect.STATE, 0.2), DIFFERENT),
+        ("rk4", difference(Aspect.VELOCITY, 0.5), WITHIN),
+        # A step's reward, which contacts may change, and a return, which adds them up.
+        ("rk4", difference(Aspect.DERIVED, 0.06, **REWARD), WITHIN),
+        ("rk4", difference(Aspect.DERIVED, 0.2, **REWARD), DIFFERENT),
+        ("rk4", difference(Aspect.SUMMED, 0.06, **REWARD), DIFFERENT),
         # A reward of one that is doubled.
         ("major", difference(Aspect.DERIVED, 0.5, **REWARD), DIFFERENT),
         ("machine", difference(Aspect.DERIVED, 0.5, **REWARD), DIFFERENT),

@@ -428,6 +428,7 @@ def test_the_options_of_packing_are_said(bag: Path, one_chosen: Path) -> None:
         "episodes": None,
         "anonymous": False,
         "max_size": None,
+        "planned": None,
     }
     assert said[1]["options"]["episodes"] == [1]
 

@@ -89,6 +89,8 @@ def test_it_says_how_to_make_it_again(tmp_path: Path) -> None:
         "mjrec verify run.zip --level pixels --sample 20 --seed 7 --trust 'A b-v0' "
         "--allow gl=H100"
     ) in shown
+    assert "It runs the installed code of A b-v0, but no other code that" in shown
+    assert "It runs no code that the archive names" in words(page(tmp_path))
 
 
 def test_the_page_is_whole_and_loads_nothing(tmp_path: Path) -> None:

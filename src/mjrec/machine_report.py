@@ -44,7 +44,7 @@ _PACKAGES = (
 _EXTRAS = (
     ("SciPy", ("scipy",), "mjrec"),
     ("report", ("jinja2", "pillow"), "mjrec[report]"),
-    ("evidence", ("bagit", "jinja2"), "mjrec[evidence]"),
+    ("evidence", ("jinja2", "packaging"), "mjrec[evidence]"),
     ("robotics", ("gymnasium-robotics",), "mjrec[robotics]"),
     ("TensorBoard", ("tensorboard",), "mjrec[tensorboard]"),
     ("W&B", ("wandb",), "mjrec[wandb]"),

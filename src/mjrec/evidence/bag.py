@@ -2,8 +2,8 @@
 """BagIt bags (RFC 8493): writing and checking them, and packing a folder as a zip file.
 
 The bag's files are written here because `bagit.make_bag` writes version 0.97, in
-directory order, and changes the working directory of the whole process. The independent
-`bagit` package then validates the bag.
+directory order, and changes the working directory of the whole process. The tests let
+that package validate them.
 
 The zip file is reproducible byte for byte: its order, times, modes and system are
 fixed, and owners are left out. Files that are compressed already are stored; the others
@@ -15,8 +15,6 @@ file must exist.
 
 from __future__ import annotations
 
-import importlib
-import importlib.util
 import os
 import re
 import shutil
@@ -24,9 +22,8 @@ import stat
 import zipfile
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Any
 
-from ..errors import FileNotWritten, MissingDependency, PackError
+from ..errors import FileNotWritten, PackError
 from ..formats.regular_files import read_regular
 from .archive import BAG_DECLARATION, digest_of
 from .findings import Finding, Outcome, Topic
@@ -59,18 +56,6 @@ _LONGEST_TEXT = 1 << 26
 _MOST_FAILURES = 100
 
 _OnProgress = Callable[[int, int], object]
-
-
-def check_bagit() -> None:
-    """Check that the `bagit` package is installed.
-
-    Raises:
-        MissingDependency: `bagit` is not installed.
-    """
-    if importlib.util.find_spec("bagit") is None:
-        raise MissingDependency(
-            "bagit", purpose="Packing a run", install='pip install "mjrec[evidence]"'
-        )
 
 
 def bag_tags(folder: Path, *, date: str, title: str) -> dict[str, str]:
@@ -106,21 +91,17 @@ def make_bag(folder: Path, *, date: str, title: str) -> None:
         title: the run's title.
 
     Raises:
-        PackError: the `bagit` package finds the bag invalid.
+        PackError: a file changed while it was being packed.
     """
     for name, text in bag_tags(folder, date=date, title=title).items():
         (folder / name).write_text(text, encoding="utf-8", newline="\n")
     _write_manifest(folder, "manifest", _files(folder / PAYLOAD))
     _write_manifest(folder, "tagmanifest", sorted(folder.glob("*.txt")))
-    # Optional, so it is not imported with this module; it has no types.
-    bagit: Any = importlib.import_module("bagit")
-    try:
-        bagit.Bag(str(folder)).validate()
-    except bagit.BagError as error:
+    for name, reason in _objections(folder):
         raise PackError(
-            f"The new bag is invalid: {error}. A file changed while it was being "
-            "packed, or this is a bug in mjrec."
-        ) from error
+            f"The new bag is invalid: {name}: {reason}. A file changed while it was "
+            "being packed, or this is a bug in mjrec."
+        )
 
 
 def write_zip(folder: Path, path: Path) -> None:
@@ -208,7 +189,9 @@ def _add(archive: zipfile.ZipFile, source: Path, name: str) -> None:
         shutil.copyfileobj(file, entry, _BLOCK)
 
 
-def _objections(bag: Path, on_progress: _OnProgress) -> Iterator[tuple[str, str]]:
+def _objections(
+    bag: Path, on_progress: _OnProgress = lambda *_: None
+) -> Iterator[tuple[str, str]]:
     try:
         if not _DECLARATION.fullmatch(_text_of(bag / BAG_DECLARATION)):
             yield BAG_DECLARATION, "it does not declare BagIt 1.0 or 0.97"

@@ -32,7 +32,7 @@ _COMPILING: Final = ("mujoco", "machine")
 # A version may not be a sentence.
 VERSION: Final = re.compile(r"[\w.+-]{1,40}", re.ASCII)
 # Other keys are not claims of versions: some excuses have other names.
-_PACKAGES: Final = frozenset(("python", *PACKAGES, "bagit", "zlib"))
+_PACKAGES: Final = frozenset(("python", *PACKAGES, "zlib"))
 _RECORDING: Final = "recording "
 _GL: Final = ("gl_vendor", "gl_renderer", "gl_version")
 

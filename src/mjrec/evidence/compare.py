@@ -86,6 +86,8 @@ _TOPICS: Final = {
 }
 _OF_MANIFEST: Final = (Topic.SELECTION, Topic.IDENTITY)
 _NOT_MADE: Final = "nothing recreated this file"
+# How numbers differ that other code has computed.
+_COMPUTED: Final = (Aspect.STATE, Aspect.VELOCITY, Aspect.DERIVED, Aspect.SUMMED)
 _NO_DIFFERENCES: Final = (Aspect.CLAIM, Aspect.STATEMENT)
 # Excuses for recordings that were not replayed.
 _UNPLAYED: Final = ("environment", "wrappers", "actions not kept")
@@ -151,7 +153,7 @@ class Comparison:
                 if finding.outcome is not Outcome.DIFFERENT:
                     sums.add(finding)
                     continue
-                is_other_code |= found.aspect in (Aspect.STATE, Aspect.DERIVED)
+                is_other_code |= found.aspect in _COMPUTED
                 if sums.fail(finding):
                     yield finding
             elif not trial.same(found):

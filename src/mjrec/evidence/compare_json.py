@@ -10,7 +10,7 @@ from __future__ import annotations
 import itertools
 import math
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, BinaryIO, Final, NamedTuple, TypeAlias
@@ -18,7 +18,15 @@ from typing import Any, BinaryIO, Final, NamedTuple, TypeAlias
 from ..formats.journal import is_of_spans
 from ..formats.json_fields import json_object, read_object, unreadable
 from ..formats.regular_files import open_regular, read_regular
-from .differences import Aspect, Difference, Same, only_in, relative_error, unlike
+from .differences import (
+    Aspect,
+    Difference,
+    Same,
+    only_in,
+    relative_error,
+    stored_differently,
+    unlike,
+)
 from .findings import Topic
 
 _LONGEST_LINE: Final = 1 << 24
@@ -72,7 +80,7 @@ class Rules:
         return text
 
 
-_REWARD: Final = Rule(Topic.REWARDS, Aspect.DERIVED)
+_RETURN: Final = Rule(Topic.REWARDS, Aspect.SUMMED)
 _END: Final = Rule(Topic.REWARDS)
 _BEGINNING: Final = Rule(Topic.BEGINNING)
 _SELECTION: Final = Rule(Topic.SELECTION)
@@ -85,7 +93,7 @@ _MODEL: Final = Rule(Topic.IDENTITY, Aspect.MODEL)
 
 # For all files: a key means the same everywhere.
 KEYS: Final[Mapping[str, Rule]] = {
-    **dict.fromkeys(("reward", "episode_rewards", "reward_before"), _REWARD),
+    **dict.fromkeys(("reward", "episode_rewards", "reward_before"), _RETURN),
     **dict.fromkeys(("length", "episode_lengths", "terminated", "truncated"), _END),
     **dict.fromkeys(("type", "episode_types", "warnings"), _END),
     "success": Rule(Topic.REWARDS, Aspect.OBSERVED),
@@ -279,7 +287,7 @@ def _leaf(
     may_be_gone = aspect is Aspect.STATEMENT or (
         aspect is Aspect.CLAIM and rule.claim != "machine"
     )
-    if (is_gone and not may_be_gone) or (aspect is Aspect.DERIVED and size is None):
+    if (is_gone and not may_be_gone) or (aspect is Aspect.SUMMED and size is None):
         # No version turns a non-number into a number, or omits a key. But a package or
         # OpenGL's names may be missing here.
         aspect = Aspect.EXACT
@@ -296,19 +304,12 @@ def _leaf(
     )
 
 
-def _or_bytes(found: Any, file: str) -> Iterator[Same | Difference]:
+def _or_bytes(found: Iterable[Difference], file: str) -> Iterator[Same | Difference]:
     """Yield differences; if there are none, one in how the values are written."""
-    is_any = False
-    for difference in found:
-        is_any = True
-        yield difference
-    if not is_any:
-        yield Difference(
-            topic=Topic.FILES,
-            file=file,
-            aspect=Aspect.STORED,
-            how="the same values, written differently",
-        )
+    differences = list(found)
+    yield from differences
+    if not differences:
+        yield stored_differently(file)
 
 
 def _lines(file: BinaryIO) -> Iterator[bytes]:

@@ -20,7 +20,7 @@ from typing import Final
 from .. import json_text
 from ..errors import UnreadableFile
 from ..formats.json_fields import json_object
-from .differences import Aspect, Difference, Same
+from .differences import Aspect, Difference, Same, stored_differently
 from .findings import Topic
 from .zip_contents import check_entries, check_table
 
@@ -83,12 +83,7 @@ def compare_models(given: Path, made: Path, file: str) -> Iterator[Same | Differ
     if contents[0] != contents[1]:
         yield recompiled(file)
     else:
-        yield Difference(
-            topic=Topic.FILES,
-            file=file,
-            aspect=Aspect.STORED,
-            how="the same model, compressed differently",
-        )
+        yield stored_differently(file)
 
 
 def recompiled(file: str) -> Difference:

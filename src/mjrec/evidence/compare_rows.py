@@ -20,7 +20,7 @@ from ..errors import UnreadableFile
 from ..formats.json_fields import json_object
 from ..formats.trajectory_hdf5 import open_hdf5
 from .compare_json import Rules, json_differences
-from .differences import Aspect, Difference, Same, unlike
+from .differences import Aspect, Difference, Same, differs, stored_differently, unlike
 from .findings import Topic
 
 _BLOCK_BYTES: Final = 1 << 22
@@ -39,6 +39,7 @@ _DATASETS: Final = {
     "frame_steps": (Topic.VIDEOS, Aspect.EXACT),
     "actions": (Topic.PHYSICS, Aspect.EXACT),
 }
+_MEMBERS: Final = {"warmstart": Aspect.SOLVER, "qvel": Aspect.VELOCITY}
 _UNITS: Final = {"snapshots": "snapshot", "model_changes": "change"}
 _FACTS: Final = "facts"
 # Derived from the facts; reading a trajectory checks it.
@@ -70,12 +71,7 @@ def compare_trajectories(
     except (AttributeError, LookupError, OSError, RuntimeError, ValueError) as error:
         raise UnreadableFile(given, error) from error
     if not differs:
-        yield Difference(
-            topic=Topic.FILES,
-            file=file,
-            aspect=Aspect.STORED,
-            how="the same contents, stored differently",
-        )
+        yield stored_differently(file)
 
 
 def same_trajectory(path: Path, file: str) -> Iterator[Same]:
@@ -97,7 +93,7 @@ def compare_rewards(
         rewards = reader.rewards
     if rewards.shape != made.shape:
         counts = [f"{len(each)} steps" for each in (rewards, made)]
-        yield _difference(Topic.REWARDS, file, "rewards", *counts)
+        yield differs(Topic.REWARDS, file, "rewards", *counts)
         return
     found = _Rows("rewards", *_DATASETS["rewards"], file)
     if rewards.tobytes() != made.tobytes():
@@ -113,21 +109,21 @@ def _compare_groups(
     named = [_objects(each) for each in (one, other)]
     before = [f"{each.userblock_size} bytes" for each in (one, other)]
     if before[0] != before[1]:
-        yield _difference(Topic.FILES, file, "the bytes before the HDF5 data", *before)
+        yield differs(Topic.FILES, file, "the bytes before the HDF5 data", *before)
     yield from _compare_attributes(one, other, file, rules)
     for name in sorted(named[0] | named[1]):
         dataset = name.partition("/")[0]
         topic, _ = _DATASETS.get(dataset, (Topic.FILES, Aspect.EXACT))
         if name not in named[0] or name not in named[1]:
             where = ["it" if name in each else "none" for each in named]
-            yield _difference(topic, file, name, *where)
+            yield differs(topic, file, name, *where)
             continue
         a, b = one[name], other[name]
         yield from _compare_attributes(a, b, file, rules, name)
         if isinstance(a, h5py.Dataset) and isinstance(b, h5py.Dataset):
             yield from _compare_datasets(name, a, b, file)
         elif type(a) is not type(b):
-            yield _difference(topic, file, name, type(a).__name__, type(b).__name__)
+            yield differs(topic, file, name, type(a).__name__, type(b).__name__)
 
 
 def _objects(file: h5py.File) -> set[str]:
@@ -156,7 +152,7 @@ def _compare_attributes(
     for key in sorted({*a.attrs, *b.attrs}):
         if key not in a.attrs or key not in b.attrs:
             values = ["one" if key in each.attrs else "none" for each in (a, b)]
-            yield _difference(Topic.FILES, file, f"{where}{key}", *values)
+            yield differs(Topic.FILES, file, f"{where}{key}", *values)
             continue
         left, right = (_raw_attribute(each, key) for each in (a, b))
         if left == right or (key == _CHECKSUM and not name):
@@ -166,7 +162,7 @@ def _compare_attributes(
             made = json_object(bytes(b.attrs[key]))
             yield from json_differences(given, made, file, rules)
         else:
-            yield _difference(Topic.FILES, file, f"{where}{key}", left[-1], right[-1])
+            yield differs(Topic.FILES, file, f"{where}{key}", left[-1], right[-1])
 
 
 def _raw_attribute(owner: Any, key: str) -> tuple[Any, ...]:
@@ -185,7 +181,7 @@ def _compare_datasets(
         raise ValueError(f"its {name} is stored in another file")
     kinds = [f"{each.dtype} of {each.shape}" for each in (a, b)]
     if kinds[0] != kinds[1]:
-        other = _difference(topic, file, name, *kinds)
+        other = differs(topic, file, name, *kinds)
         # A wrapper may change the shape of observations.
         yield replace(other, aspect=aspect) if aspect is Aspect.OBSERVED else other
         return
@@ -254,7 +250,9 @@ class _Rows:
         for member in a.dtype.names or ("",):
             left, right = (_table(each[member] if member else each) for each in (a, b))
             is_other = _bits(left) != _bits(right)
-            aspect = Aspect.SOLVER if member == "warmstart" else self._aspect
+            aspect = self._aspect
+            if aspect is Aspect.STATE:
+                aspect = _MEMBERS.get(member, aspect)
             parts = [(self._topic, slice(None))]
             if is_beginning:
                 parts = [(Topic.BEGINNING, np.s_[:1]), (self._topic, np.s_[1:])]
@@ -324,9 +322,3 @@ def _errors(left: NDArray[Any], right: NDArray[Any]) -> NDArray[np.float64]:
 
 def _bits(values: NDArray[Any]) -> NDArray[Any]:
     return np.ascontiguousarray(values).view(f"u{values.dtype.itemsize}")
-
-
-def _difference(
-    topic: Topic, file: str, where: str, given: Any, made: Any
-) -> Difference:
-    return Difference(topic=topic, file=file, where=where, how=unlike(given, made))

@@ -8,6 +8,7 @@ compared.
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import itertools
 import re
@@ -22,7 +23,7 @@ import numpy as np
 from ..formats.json_fields import unreadable
 from ..formats.regular_files import open_regular, read_regular
 from .decoded_video import DecodedVideo, has_messages, has_usual_colours
-from .differences import Aspect, Difference, Same, short, unlike
+from .differences import Aspect, Difference, Same, differs, short
 from .findings import Topic
 from .frame_similarity import (
     OTHER_CPU,
@@ -45,6 +46,7 @@ _LONGEST_HASHES: Final = 1 << 28
 _LONGEST_LINE: Final = 1 << 20
 _HASH_BEGINS: Final = re.compile(rb"0, +\d+, +\d+, +1, +\d+, ")
 _EQUAL: Final = Similarity(100.0, 1.0, 0.0)
+_differs = functools.partial(differs, Topic.VIDEOS, unit="video")
 
 
 def compare_videos(
@@ -262,16 +264,6 @@ def _lower(one: Similarity, other: Similarity) -> Similarity:
         min(one.psnr, other.psnr),
         min(one.ssim, other.ssim),
         max(one.block, other.block),
-    )
-
-
-def _differs(file: str, where: str, given: str, made: str) -> Difference:
-    return Difference(
-        topic=Topic.VIDEOS,
-        file=file,
-        unit="video",
-        where=where,
-        how=unlike(given, made),
     )
 
 

@@ -104,7 +104,6 @@ def packed_with() -> dict[str, str]:
     """Return the versions of the packages that pack a run here."""
     return {
         "mjrec": importlib.metadata.version("mjrec"),
-        "bagit": importlib.metadata.version("bagit"),
         "python": platform.python_version(),
         # Determines the bytes of compressed files.
         "zlib": zlib.ZLIB_RUNTIME_VERSION,

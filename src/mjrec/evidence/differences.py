@@ -27,7 +27,9 @@ class Aspect(enum.Enum):
     Attributes:
         EXACT: values that must be equal; no version or machine changes them.
         STATE: numbers of the simulation.
+        VELOCITY: velocities of the simulation.
         DERIVED: numbers that the environment computes from states.
+        SUMMED: sums of such numbers, the returns.
         OBSERVED: other outputs of the environment or a wrapper than rewards and ends:
             observations, success.
         SOLVER: the warm start, which only the solver uses.
@@ -43,7 +45,9 @@ class Aspect(enum.Enum):
 
     EXACT = "exact"
     STATE = "state"
+    VELOCITY = "velocity"
     DERIVED = "derived"
+    SUMMED = "summed"
     OBSERVED = "observed"
     SOLVER = "solver"
     MODEL = "model"
@@ -130,6 +134,20 @@ class Difference(Place):
 def unlike(given: Any, made: Any) -> str:
     """Return the difference between two values as a clause."""
     return f"the archive has {short(given)}, the recreated run has {short(made)}"
+
+
+def differs(
+    topic: Topic, file: str, where: str, given: Any, made: Any, *, unit: str = "file"
+) -> Difference:
+    """Return the difference between two values that must be equal."""
+    how = unlike(given, made)
+    return Difference(topic=topic, file=file, unit=unit, where=where, how=how)
+
+
+def stored_differently(file: str) -> Difference:
+    """Return the difference for a file with equal contents but different bytes."""
+    how = "the same contents, stored differently"
+    return Difference(topic=Topic.FILES, file=file, aspect=Aspect.STORED, how=how)
 
 
 def only_in(is_given: bool, value: Any) -> str:

@@ -11,15 +11,9 @@ import imageio.v3
 import numpy as np
 
 from ..errors import Error
-from ..formats.manifest import read_manifest
-from ..formats.monitor_directory import (
-    further_parts,
-    is_manifest,
-    iter_monitor_files,
-    with_part,
-)
 from ..formats.trajectory_file import open_trajectory
 from ..rendering.pool import WorkerPool
+from ..rendering.recordings import look_at, recordings
 from ..rendering.render_videos import render_videos
 from ..rendering.views import View
 
@@ -80,20 +74,16 @@ def draw_sample(
 
 def _pending(directory: Path) -> Iterator[tuple[str, Path, int, Any]]:
     """Yield the name, trajectory, number of frames and camera of each pending video."""
-    for path in iter_monitor_files(directory):
-        if not is_manifest(path.name):
+    for key in recordings(directory):
+        plan = None if key.is_clip else look_at(directory, key)
+        if plan is None:
             continue
-        for entry in (read_manifest(path).mjrec or {}).get("pending", ()):
-            if "clip" in entry:
-                continue
-            trajectory = directory / f"{entry['trajectory']}.h5"
-            with open_trajectory(trajectory) as reader:
-                promise: Mapping[str, Any] = reader.facts.get("video") or {}
-                count = reader.frame_count
-            if promise.get("annotate") or promise.get("tiled"):
-                continue
-            yield entry["video"], trajectory, count, None
-            cameras = promise.get("cameras", ())
-            parts = further_parts(cameras)
-            for part, camera in zip(parts, cameras[1:], strict=False):
-                yield with_part(entry["video"], part), trajectory, count, camera
+        [trajectory] = plan.parts
+        with open_trajectory(trajectory) as reader:
+            promise: Mapping[str, Any] = reader.facts.get("video") or {}
+            count = reader.frame_count
+        if promise.get("annotate") or promise.get("tiled"):
+            continue
+        cameras = [None, *promise.get("cameras", ())[1:]]
+        for video, camera in zip(plan.videos, cameras, strict=True):
+            yield video.name, trajectory, count, camera

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 from ..errors import InvalidArgument
 from ..formats.journal import read_journal
-from ..formats.monitor_directory import Infix, journal_name
+from ..formats.monitor_directory import journal_name
 from ..plain_text import counted
 from ..recorder.keep_rules import keep_rule
 from ..rendering.chosen_videos import write_choice
@@ -78,8 +78,7 @@ def _choose(
         )
     for finished, chosen in sorted(choices.items()):
         for each in group:
-            infix = Infix.parse(each.infix)
-            own = {key: roles for key, roles in chosen.items() if key.infix == infix}
+            own = {k: roles for k, roles in chosen.items() if k.infix == each.own_infix}
             write_choice(directory, own, rule=rule, finished=finished, among=each.infix)
 
 
@@ -87,18 +86,16 @@ def _stated(group: Iterable[RecordingInputs]) -> _Choices:
     """Return the choices that the archive states."""
     found: _Choices = {}
     for recording in group:
-        infix = Infix.parse(recording.infix)
-        assert infix is not None, "it was read"
         known: set[int] = set()
         for keep in recording.evaluation_keeps:
             numbers = {*keep["chosen"]} - known
             chosen = found.setdefault(_count(keep), {})
             # A later choice overwrites the roles of an earlier one.
-            chosen |= {RecordingKey(infix, number): [] for number in numbers}
+            chosen |= {_key(recording, number): [] for number in numbers}
             known |= numbers
         for episode in recording.episodes:
             if (selection := episode.selection) is not None:
-                key = RecordingKey(infix, episode.episode_id)
+                key = _key(recording, episode.episode_id)
                 roles = selection.get("roles")
                 found.setdefault(_count(selection), {})[key] = [*map(str, roles or ())]
     return found
@@ -110,16 +107,13 @@ def _made_again(
     """Return the rule's choice among the replayed episodes."""
     ended: dict[tuple[Any, Any], _Ended | None] = {}
     for recording in group:
-        infix = Infix.parse(recording.infix)
-        assert infix is not None, "it was read"
         for facts in recording.failed:
-            number, key = facts.get("episode_id"), None
+            number, failed = facts.get("episode_id"), None
             if isinstance(number, int):
-                key = RecordingKey(infix, number)
-            failed = None if key is None else _Ended(key, None, None, None)
+                failed = _Ended(_key(recording, number), None, None, None)
             ended[facts["seed"], facts["episode"]] = failed
-        for entry in read_journal(directory / journal_name(infix)):
-            unit, key = entry.evaluation or {}, RecordingKey(infix, entry.episode_id)
+        for entry in read_journal(directory / journal_name(recording.infix)):
+            unit, key = entry.evaluation or {}, _key(recording, entry.episode_id)
             ended[unit.get("seed"), unit.get("episode")] = _Ended(
                 key, entry.reward, entry.terminated, entry.success
             )
@@ -131,6 +125,10 @@ def _made_again(
     for each, role in chosen:
         roles.setdefault(each.key, []).append(role)
     return {len(ended): roles}
+
+
+def _key(recording: RecordingInputs, number: int) -> RecordingKey:
+    return RecordingKey(recording.own_infix, number)
 
 
 def _count(facts: Mapping[str, object]) -> int:

@@ -17,6 +17,7 @@ import os
 import signal
 import zipfile
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -50,23 +51,12 @@ _SOURCE = "source/"
 _MODES = {"e": "evaluation"}
 
 
-def play_recording(
-    recording: RecordingInputs,
-    directory: Path,
-    *,
-    arrays: Mapping[str, NDArray[Any]],
-    trust: frozenset[str],
-    sources: Path,
-    only_counted: bool,
-    notes: Notes,
-    on_steps: Callable[[int], object],
-) -> Mapping[str, NDArray[np.float64]]:
-    """Replay a recording into a monitor directory, with pending videos.
+@dataclass(frozen=True, kw_only=True)
+class Making:
+    """The facts shared by all recordings of a run that is recreated.
 
-    Args:
-        recording: the recording's inputs.
-        directory: the monitor directory, which may already contain other recordings of
-            the same run.
+    Attributes:
+        directory: the monitor directory.
         arrays: actions and first states by the names in the inputs.
         trust: ids of environments that may be created in addition to those in the
             registries.
@@ -75,6 +65,21 @@ def play_recording(
             with a video.
         notes: receives the facts that could not be recreated, with their excuses.
         on_steps: called with the number of steps taken since the last call.
+    """
+
+    directory: Path
+    arrays: Mapping[str, NDArray[Any]]
+    trust: frozenset[str]
+    sources: Path
+    only_counted: bool
+    notes: Notes
+    on_steps: Callable[[int], object]
+
+
+def play_recording(
+    recording: RecordingInputs, making: Making
+) -> Mapping[str, NDArray[np.float64]]:
+    """Replay a recording into a monitor directory, with pending videos.
 
     Returns:
         If `only_counted`, the rewards of each replayed episode by the name of its
@@ -87,16 +92,16 @@ def play_recording(
     """
     if recording.environment is None:
         raise NotRecreated("the journal does not name its environment")
+    directory, notes = making.directory, making.notes
     mjcf = None
     if recording.sources is not None:
-        mjcf = _unpack_sources(sources / recording.sources, directory.parent)
+        mjcf = _unpack_sources(making.sources / recording.sources, directory.parent)
     recreated = recreate(
         recording.environment,
         own_camera=recording.options.get("own_camera"),
-        trust=trust,
+        trust=making.trust,
         mjcf=mjcf,
     )
-
     if recreated.turns_by_rk4():
         notes.add(
             recording.name,
@@ -104,31 +109,13 @@ def play_recording(
             "MuJoCo 4.0 rotates free bodies differently with the integrator RK4",
             count=len(recording.episodes),
         )
-
-    def play() -> Mapping[str, NDArray[np.float64]]:
-        playing = _Playing(
-            recording,
-            recreated,
-            directory,
-            arrays=arrays,
-            only_counted=only_counted,
-            notes=notes,
-            on_steps=on_steps,
-        )
-        try:
-            playing.run()
-        except NotRecreated:
-            playing.abandon()
-            raise
-        return playing.rewards
-
     if not recording.was_killed:
-        return play()
+        return _Playing(recording, recreated, making).run()
     # A child process is killed in the same place, so that it leaves the same files.
     child = os.fork()
     if child == 0:
         with contextlib.suppress(BaseException):
-            play()
+            _Playing(recording, recreated, making).run()
         # Only reached if the replay failed: a successful one kills the process.
         os._exit(1)
     _, status = os.waitpid(child, 0)
@@ -143,45 +130,52 @@ def play_recording(
 
 
 class _Playing:
-    """The replay of one recording; see `play_recording` for its arguments."""
+    """The replay of one recording.
+
+    Args:
+        recording: the recording's inputs.
+        recreated: its environment.
+        making: the facts shared with the run's other recordings.
+    """
 
     def __init__(
-        self,
-        recording: RecordingInputs,
-        recreated: Recreated,
-        directory: Path,
-        *,
-        arrays: Mapping[str, NDArray[Any]],
-        only_counted: bool,
-        notes: Notes,
-        on_steps: Callable[[int], object],
+        self, recording: RecordingInputs, recreated: Recreated, making: Making
     ) -> None:
-        self._recording = recording
-        self._recreated = recreated
-        self._directory = directory
-        self._arrays = arrays
-        self._notes = notes
-        self._on_steps = on_steps
-        self._only_counted = only_counted
+        self._recording, self._recreated = recording, recreated
+        self._making = making
         self._now = 0.0
         self._warned: Mapping[str, int] = {}
         self._events = [*recording.evaluation_events]
-        self.rewards: dict[str, NDArray[np.float64]] = {}
+        self._rewards: dict[str, NDArray[np.float64]] = {}
         # A monitor for Gymnasium or dm_env.
         self._monitor: Any = monitor_again(
             recording,
             recreated,
-            directory,
+            making.directory,
             clock=self._clock,
-            only_counted=only_counted,
-            notes=notes,
+            only_counted=making.only_counted,
+            notes=making.notes,
         )
 
     def _clock(self) -> float:
         return self._now
 
-    def run(self) -> None:
-        """Replay all episodes; if the recording was killed, kill this process too."""
+    def run(self) -> Mapping[str, NDArray[np.float64]]:
+        """Replay all episodes; if the recording was killed, kill this process too.
+
+        Returns:
+            See `play_recording`.
+        """
+        try:
+            self._play_all()
+        except NotRecreated:
+            # Its files are of no use.
+            with contextlib.suppress(Error):
+                self._monitor.close()
+            raise
+        return self._rewards
+
+    def _play_all(self) -> None:
         recorder = self._monitor.recorder
         for episode in self._recording.episodes:
             if self._recording.is_evaluation:
@@ -203,7 +197,7 @@ class _Playing:
         for event in self._events:
             self._say(*event)
         if self._recording.was_killed and not self._recording.episodes:
-            self._notes.add(
+            self._making.notes.add(
                 self._recording.name,
                 "kill",
                 "it was killed before the first step of an episode, which is believed",
@@ -211,7 +205,7 @@ class _Playing:
         if self._recording.has_sources:
             recorder.finish_models()
         if self._recording.was_killed:
-            self._notes.write(self._directory.parent)
+            self._making.notes.write(self._making.directory.parent)
             os.kill(os.getpid(), signal.SIGKILL)
         self._monitor.close()
 
@@ -231,17 +225,12 @@ class _Playing:
     def _say(self, kind: str, facts: Mapping[str, Any] | None) -> None:
         self._monitor.recorder.note_event(kind, None if facts is None else dict(facts))
         if kind == "failed" and facts is not None:
-            self._notes.add(
+            self._making.notes.add(
                 self._recording.name,
                 "exception",
                 f"seed {facts['seed']}, episode {facts['episode']} failed, according "
                 f"to its author: {facts.get('failure')!s:.200}",
             )
-
-    def abandon(self) -> None:
-        """Close a recording that cannot continue; its files are of no use."""
-        with contextlib.suppress(Error):
-            self._monitor.close()
 
     def _evaluation_facts(self, said: Mapping[str, Any]) -> Mapping[str, Any]:
         warnings = new_warnings(self._warned, self._recreated.warnings())
@@ -293,7 +282,7 @@ class _Playing:
         This happens only if nothing leads there: no seed was recorded and the
         environment has no random generator.
         """
-        known = self._arrays.get(episode.first_state or "")
+        known = self._making.arrays.get(episode.first_state or "")
         base = getattr(self._recreated.environment, "unwrapped", None)
         if known is None or base is None or self._recreated.random_state() is not None:
             yield
@@ -320,23 +309,23 @@ class _Playing:
         step, is_dm_env = self._monitor.step, self._recreated.is_dm_env
         self._begin_stand_in(episode)
         counted, rewards = 0, []
-        states = self._arrays.get(episode.states or "")
+        states = self._making.arrays.get(episode.states or "")
         self._break_videos(episode)
-        for action in given_actions(episode, self._arrays):
+        for action in given_actions(episode, self._making.arrays):
             if states is not None:
                 self._recreated.put_into(states[counted : counted + 1])
             result = step(action)
             counted += 1
-            if self._only_counted:
+            if self._making.only_counted:
                 rewards.append(result.reward if is_dm_env else result[1])
             if counted % _STEPS_BETWEEN_COUNTS == 0:
-                self._on_steps(_STEPS_BETWEEN_COUNTS)
+                self._making.on_steps(_STEPS_BETWEEN_COUNTS)
             if result.last() if is_dm_env else result[2] or result[3]:
                 break
         self._note_stand_in(episode)
-        if self._only_counted and episode.actions is not None:
-            self.rewards[episode.actions] = np.array(rewards, np.float64)
-        self._on_steps(counted % _STEPS_BETWEEN_COUNTS)
+        if self._making.only_counted and episode.actions is not None:
+            self._rewards[episode.actions] = np.array(rewards, np.float64)
+        self._making.on_steps(counted % _STEPS_BETWEEN_COUNTS)
 
     def _break_videos(self, episode: EpisodeInputs) -> None:
         """Make the live videos that broke off do so again."""
@@ -363,7 +352,7 @@ class _Playing:
                 excuse="wrappers",
             )
         fields = (each.name for each in dataclasses.fields(RecordedSteps))
-        parts = {part: self._arrays[f"{name}.{part}"] for part in fields}
+        parts = {part: self._making.arrays[f"{name}.{part}"] for part in fields}
         stand_in.begin(RecordedSteps(**parts))
 
     def _note_stand_in(self, episode: EpisodeInputs) -> None:
@@ -423,7 +412,7 @@ class _Playing:
         self._monitor.recorder.note_error(kind(said.get("message", "")))
 
     def _note(self, episode: EpisodeInputs, excuse: str, reason: str) -> None:
-        self._notes.add(self._recording.item(episode), excuse, reason)
+        self._making.notes.add(self._recording.item(episode), excuse, reason)
 
 
 def _exception_kind(name: str) -> type[BaseException]:

@@ -37,7 +37,7 @@ from ..formats.trajectory_hdf5 import open_hdf5, write_hdf5
 from ..rendering.jobs import Progress
 from ..results import iter_episodes
 from .anonymity import make_anonymous
-from .bag import TRY_AGAIN, check_bagit, make_bag, write_zip
+from .bag import TRY_AGAIN, make_bag, write_zip
 from .contents import Contents, look_for_contents
 from .descriptions import descriptions, packed_with
 from .identity import Identity, identity_of_user
@@ -191,7 +191,6 @@ def _bag(
     on_progress: Callable[[Progress], object],
 ) -> Path:
     """Make the bag below `folder`; with a size limit, also make the archive there."""
-    check_bagit()
     _check_count(contents)
     staged, bag = folder / "staged", folder / "whole" / options.name
     _stage(contents, staged)

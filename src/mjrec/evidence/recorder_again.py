@@ -12,7 +12,6 @@ from typing import Any
 
 from ..environments.recreate import NotRecreated, Recreated
 from ..errors import Error, InvalidArgument
-from ..formats.monitor_directory import Infix
 from ..monitors.base import EnvironmentMonitor
 from ..recorder.keep_rules import RULES, keep_rule
 from ..recorder.opening import JOIN, Statements
@@ -56,8 +55,6 @@ def monitor_again(
         NotRecreated: an option is invalid, or the monitor cannot be created.
     """
     given = recording.options
-    infix = Infix.parse(recording.infix)
-    assert infix is not None, "it was read"
     try:
         options = RecorderOptions(
             video_callable=_schedule(recording, notes),
@@ -80,7 +77,7 @@ def monitor_again(
             tiled=given.get("tiled", False),
             trackers=_trackers(recording),
             statements=Statements(
-                infix=infix,
+                infix=recording.own_infix,
                 first_episode_id=recording.first_episode_id,
                 provenance=recording.provenance,
                 provenance_after=recording.provenance_after,

@@ -119,7 +119,7 @@ def _make(request: Mapping[str, Any], say: _Say) -> None:
     from ..rendering.recovery import recover
     from .draw_again import draw_all, draw_sample
     from .evaluation_choice import choose_for_evaluations
-    from .make_again import play_recording
+    from .make_again import Making, play_recording
     from .pack import pack_folder
     from .read_inputs import packing_options
 
@@ -140,18 +140,18 @@ def _make(request: Mapping[str, Any], say: _Say) -> None:
         counter(min(taken, steps - 1), steps)
 
     with np.load(folder / ARRAYS_FILE, allow_pickle=False) as arrays:
+        making = Making(
+            directory=played,
+            arrays=arrays,
+            trust=frozenset(request["trust"]),
+            sources=folder,
+            only_counted=level is Level.STATS,
+            notes=notes,
+            on_steps=count_steps,
+        )
         for recording in inputs.recordings:
             try:
-                rewards |= play_recording(
-                    recording,
-                    played,
-                    arrays=arrays,
-                    trust=frozenset(request["trust"]),
-                    sources=folder,
-                    only_counted=level is Level.STATS,
-                    notes=notes,
-                    on_steps=count_steps,
-                )
+                rewards |= play_recording(recording, making)
             except NotRecreated as error:
                 # A part of a recording proves nothing.
                 for path in iter_monitor_files(played, hidden=True):

@@ -103,6 +103,7 @@ def _page(verification: Verification) -> dict[str, Any]:
         "findings": [_row(finding) for finding in ordered[:_MOST_LISTED]],
         "findings_left_out": len(ordered[_MOST_LISTED:]),
         "facts": list(_flat(verification.facts)),
+        "trusted": list(verification.facts.get("trust") or ()),
         "command": _command(verification),
     }
 
