@@ -57,8 +57,8 @@ def render(
     Without options, all pending videos of the directory are rendered as planned.
     Several such commands running on one directory share the work.
 
-    With an option that changes the video (such as --camera, --size, --quality, or
-    --out), recorded episodes are rendered again, into new files next to the originals:
+    With an option that changes the video (--camera, --size, --quality, --out and the
+    like), recorded episodes are rendered again, into new files next to the originals:
     openaigym.video.<...>.video000027.side.mp4. An episode with several cameras gives
     one video: from --camera if given, otherwise from the first camera, or tiled if it
     was recorded tiled.
