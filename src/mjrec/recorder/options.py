@@ -183,8 +183,8 @@ class RecorderOptions:
                 )
         if len(set(map(id, self.all_trackers))) < len(self.all_trackers):
             raise InvalidArgument(
-                f"The same tracker is twice in {given!r} and would get every call "
-                "twice. Give each tracker once."
+                f"trackers={given!r} contains the same tracker twice, which would get "
+                "every call twice. Give each tracker once."
             )
 
     def _check_policy_file(self) -> None:
