@@ -4,7 +4,7 @@
 Settings: `{"directory": DIR, "plan": <the plan as JSON, without its chunks>}`. If the
 policy is an object, `"payload"` is the file with the pickled policy. With
 `"chooses_gl": true` the worker chooses an OpenGL backend that works on its machine, if
-episodes get videos.
+episodes get videos. `"command"` is the command line that recordings name.
 
 Jobs, by their `kind`; repeating a job is harmless:
 
@@ -20,6 +20,7 @@ Jobs, by their `kind`; repeating a job is harmless:
 from __future__ import annotations
 
 import logging
+import sys
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
@@ -51,6 +52,8 @@ class EvaluationWorker:
     def __init__(self, settings: Mapping[str, Any]) -> None:
         self._directory = Path(settings["directory"])
         self._plan = from_json(EvaluationPlan, settings["plan"])
+        # A reader of the recordings needs the command that started the evaluation.
+        sys.orig_argv[:] = settings.get("command", sys.orig_argv)
         policy = settings.get("payload")
         self._evaluator = Evaluator(
             self._plan, None if policy is None else Path(policy).read_bytes()
