@@ -320,6 +320,20 @@ def test_list_says_which_videos_are_pending(mjrec, tmp_path):
     assert second["video"] is None
 
 
+def test_list_names_the_best_episode_and_its_monitor(mjrec, tmp_path):
+    """Sub-environments count their episodes separately; a NaN is not the best."""
+    write_journal(tmp_path, "0.7", "X-v0", [entry(0, reward=float("nan"))])
+    _, out, _ = mjrec("list", tmp_path)
+    assert "monitor" not in out
+    assert "Best return" not in out
+    write_journal(tmp_path, "1.7", "X-v0", [entry(0, reward=2.0), entry(1, reward=9.0)])
+    _, out, _ = mjrec("list", tmp_path)
+    lines = out.splitlines()
+    assert lines[0].split()[:2] == ["monitor", "episode"]
+    assert sorted(line.split()[0] for line in lines[1:-1]) == ["0.7", "1.7", "1.7"]
+    assert lines[-1] == "Best return: episode 1 of 1.7, 9"
+
+
 @pytest.mark.thorough
 def test_list_shows_the_directories_in_one(mjrec, tmp_path):
     """As of an evaluation, which has one for each task; others are passed over."""

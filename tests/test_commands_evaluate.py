@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 import json
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -55,6 +56,10 @@ def test_a_table_says_what_came_of_it(run, tmp_path):
     assert "1 video:" in out
     assert str(tmp_path / "e") in out
     assert "2/2 episodes" in err
+    # The recordings name the command that started the workers.
+    manifest = next((tmp_path / "e").rglob("*.manifest.json"))
+    provenance = json.loads(manifest.read_text())["mjrec"]["provenance"]
+    assert provenance["command"] == sys.orig_argv
 
 
 def test_tasks_with_a_scale_are_summarized_together(run):

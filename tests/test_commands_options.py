@@ -2,9 +2,12 @@
 """What the command line says of an engine."""
 
 import pytest
+from recordings import metadata_of
 
-from mjrec import Error, LocalEngine, RayEngine, SlurmEngine
-from mjrec.commands.options import NO_ENGINE, EngineOptions
+from mjrec import Error, InvalidArgument, LocalEngine, RayEngine, SlurmEngine
+from mjrec.commands import main
+from mjrec.commands.evaluate import evaluate
+from mjrec.commands.options import NO_ENGINE, EngineOptions, camera_of
 
 SLURM = (SlurmEngine, 0.0, False)
 
@@ -55,3 +58,29 @@ def test_what_contradicts_itself_is_one_clear_error(options, words):
     """It says what there is, or how it is meant."""
     with pytest.raises(Error, match=words):
         EngineOptions(**options).chosen(None)
+
+
+PLACE = '{"distance": 3, "azimuth": 90}'
+
+
+def test_a_camera_is_a_name_a_number_or_json():
+    """What Python takes as a mapping is JSON on the command line."""
+    assert [camera_of(text) for text in ("side", "-1", None)] == ["side", -1, None]
+    assert camera_of(PLACE) == {"distance": 3, "azimuth": 90}
+    for text, words in [
+        ('{"distance": 3', "--camera must be a JSON object"),
+        ('{"zoom": 3}', "zoom.*azimuth"),
+        ('{"lookat": 3}', "lookat must be three numbers"),
+    ]:
+        with pytest.raises(Error, match=f"(?s){words}"):
+            camera_of(text)
+
+
+def test_a_camera_from_json_draws_the_recording(tmp_path):
+    """For `mjrec record`; `mjrec evaluate` says how to get the same."""
+    small = ["InvertedPendulum-v5", "--size", "32x32", "--max-steps", "3"]
+    near = ["--camera", PLACE, "--workers", "1", "--out", str(tmp_path)]
+    assert main(["record", *small, *near]) == 0
+    assert metadata_of(tmp_path, 0)["camera"]["distance"] == 3
+    with pytest.raises(InvalidArgument, match="mjrec render DIR"):
+        evaluate((), policy="zero", camera=PLACE)

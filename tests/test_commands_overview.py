@@ -60,6 +60,16 @@ def test_what_people_use_comes_first(
     assert options[1:6] == FIRST[command].split()
 
 
+@pytest.mark.parametrize("command", COMMANDS)
+def test_help_shows_nothing_of_python(
+    command: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """An option that need not be given is shown as `--seed INT`."""
+    status, text = said(capsys, command, "--help")
+    assert status == 0
+    assert not re.search(r"\bNone\b|\(default: (False)?\)", text)
+
+
 @pytest.mark.parametrize("command", EXAMPLES)
 def test_a_command_without_arguments_shows_examples(
     command: str, capsys: pytest.CaptureFixture[str]

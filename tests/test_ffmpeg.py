@@ -57,7 +57,7 @@ def test_a_program_that_cannot_be_started_is_told_from_one_that_failed(
     broken = script(tmp_path / "broken", "")
     broken.write_bytes(b"\0\0\0\0")
     error = MissingDependency
-    reason = r"working ffmpeg \(not .*broken: Exec format error\)"
+    reason = r"ffmpeg, but .*broken cannot be started: Exec format error\. Run: pip"
     if is_named:
         monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", str(broken))
         error = InvalidArgument

@@ -17,12 +17,23 @@ import mjrec
 from mjrec.errors import Error
 from mjrec.evidence.inputs import (
     ARRAYS_FILE,
+    OPTIONS,
     EpisodeInputs,
     Inputs,
     RecordingInputs,
     given_actions,
 )
 from mjrec.evidence.read_inputs import read_inputs
+from mjrec.recorder.options import RecorderOptions
+
+# Options of the recorder that are no inputs, with the reason.
+OTHERS = {
+    "given otherwise": "video_callable keep mode trajectory_callable statements",
+    "how it records, not what": "workers tail_bytes on_error strict trackers resume",
+    "what must be there before, or may happen": "force uid allow_early_reset",
+    "statistics while it runs": "write_upon_reset episode_info",
+    "a fact for the manifest": "policy_file",
+}
 
 
 @pytest.fixture(scope="module")
@@ -154,3 +165,10 @@ def test_what_is_no_input_is_refused(
         (folder / path.name).write_bytes(content)
     with pytest.raises(Error, match="inputs cannot be read"):
         read_inputs(tmp_path)
+
+
+def test_each_option_is_an_input_or_has_a_reason_not_to_be() -> None:
+    """An option that changes files, and is not an input, would never verify."""
+    fields = {field.name for field in dataclasses.fields(RecorderOptions)}
+    others = {name for names in OTHERS.values() for name in names.split()}
+    assert fields - OPTIONS.keys() == others

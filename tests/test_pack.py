@@ -289,8 +289,9 @@ def test_the_environment_says_what_drew_and_encoded(
     assert content["packed_with"]["mjrec"] == mjrec.__version__
 
 
-def test_the_readme_leads_a_stranger(infix: str, bag: Path) -> None:
+def test_the_readme_leads_a_stranger(infix: str, recorded: Path, bag: Path) -> None:
     """What it is, how to verify it, what was shown, by which rule."""
+    returns = mjrec.load_results(recorded)["episode_rewards"]
     text = (bag / "data/README.md").read_text()
     for part in (
         f"# {STATED['title']}",
@@ -299,7 +300,8 @@ def test_the_readme_leads_a_stranger(infix: str, bag: Path) -> None:
         "CC-BY-4.0",
         "capped_cubic_video_schedule",
         f"openaigym.video.{infix}.video000001.mp4",
-        "- OpenGL: ",
+        "| OpenGL | ",
+        f"| {infix} | InvertedPendulum-v5 | 3 | {sum(returns) / 3:.6g} | ",
     ):
         assert part in text
     assert "has chosen" not in text
@@ -315,7 +317,7 @@ def test_the_readme_says_what_environments_were_made_with(tmp_path: Path) -> Non
     folder = unpacked(mjrec.pack(directory, tmp_path / "a.zip"), tmp_path / "x")
     text = (folder / "data/README.md").read_text()
     said = (
-        "- Environment: HalfCheetah-v5, made with forward_reward_weight=100.0, in the"
+        "| environment | HalfCheetah-v5, made with forward_reward_weight=100.0, in the"
     )
     assert said in text
     assert "ClipReward(min_reward=1.0" in text

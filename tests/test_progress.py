@@ -21,19 +21,19 @@ LINES = [
 
 
 @pytest.mark.parametrize("where", ["log", "console", "quiet"])
-def test_a_log_gets_a_line_now_and_then(where, monkeypatch, caplog):
+def test_a_log_gets_a_line_now_and_then(where, monkeypatch, caplog, capsys):
     """After five seconds, then every 30; a quiet console gets none."""
     clock = SimpleNamespace(now=0.0)
     monkeypatch.setattr(progress, "time", SimpleNamespace(monotonic=lambda: clock.now))
-    console, printed = None, io.StringIO()
+    console = None
     if where != "log":
-        console = rich.console.Console(file=printed, quiet=where == "quiet")
+        console = rich.console.Console(file=io.StringIO(), quiet=where == "quiet")
     with render_progress(console) as show:
         for clock.now, done in MOMENTS.items():
             frames = 1200 + done
             show(Progress(videos_done=done, videos=9, frames_done=frames, frames=2700))
     expected = LINES if where != "quiet" else []
-    assert (caplog.messages or printed.getvalue().splitlines()) == expected
+    assert (caplog.messages or capsys.readouterr().err.splitlines()) == expected
 
 
 def test_close_says_that_it_waits(tmp_path, monkeypatch, caplog):
@@ -43,6 +43,6 @@ def test_close_says_that_it_waits(tmp_path, monkeypatch, caplog):
     with mjrec.Monitor(env, tmp_path, height=32, width=32, workers=1) as monitor:
         monitor.reset(seed=0)
         for _ in range(4):
-            monitor.step(monitor.action_space.sample())
+            monitor.step([0.0])
     (line,) = [text for text in caplog.messages if text.startswith("Rendering: ")]
     assert " of 1 video done" in line

@@ -422,13 +422,21 @@ class UntrustedModel(UnreadableFile):
 
 
 class MissingDependency(Error, ImportError):
-    """An optional package is needed but not installed."""
+    """An optional package or program is needed, but missing or unusable.
 
-    def __init__(self, package: str, *, purpose: str, install: str) -> None:
+    Args:
+        package: its name.
+        purpose: what needs it.
+        install: the command that installs it.
+        reason: what is wrong with it; None if it is not installed.
+    """
+
+    def __init__(
+        self, package: str, *, purpose: str, install: str, reason: str | None = None
+    ) -> None:
         self.package = package
-        super().__init__(
-            f"{purpose} needs {package}, which is not installed. Run: {install}"
-        )
+        what = "which is not installed" if reason is None else f"but {reason}"
+        super().__init__(f"{purpose} needs {package}, {what}. Run: {install}")
 
 
 KINDS: Mapping[str, type[Error]] = {

@@ -26,6 +26,7 @@ from .formats.monitor_directory import Infix, infix_of, manifest_name
 from .gl import use_gl
 from .monitors.monitor import monitored
 from .recorder.options import DEFERRED, LIVE, OFF, RecorderOptions
+from .rendering.views import PlainCamera
 from .schedules import disable_videos, schedule_from_text
 from .simulation.find_simulation import simulation_in
 
@@ -50,6 +51,8 @@ class Session:
         policy_kwargs: extra arguments for the policy.
         schedule: the episodes that get a video: `cubic`, `all`, `none`, `every:N` or
             `at:0,5,9`. None means `cubic`, unless `monitor` has a `keep`.
+        placed_camera: members of an `mujoco.MjvCamera` by name, to be used instead of
+            `made.camera`. Only workers can draw from it.
         further_cameras: cameras for additional videos of the same episodes.
         made: options for creating the environment; the session sets `frames` and
             `seed`.
@@ -64,7 +67,8 @@ class Session:
     policy: str = "random"
     policy_kwargs: Mapping[str, Any] = field(default_factory=dict)
     schedule: str | None = None
-    further_cameras: tuple[str | int, ...] = ()
+    placed_camera: Mapping[str, Any] | None = None
+    further_cameras: tuple[PlainCamera | None, ...] = ()
     made: EnvironmentOptions = field(default_factory=EnvironmentOptions)
     monitor: RecorderOptions = field(default_factory=RecorderOptions)
 
@@ -125,6 +129,8 @@ def record_session(
             schedule, options = disable_videos, replace(options, keep=None)
         policy = load_policy(session.policy, named.environment, session.policy_kwargs)
         view = dict(named.view)
+        if session.placed_camera is not None:
+            view["camera"] = session.placed_camera
         if session.further_cameras:
             # An environment that was created with its camera already shows it.
             view["camera"] = [view.get("camera"), *session.further_cameras]

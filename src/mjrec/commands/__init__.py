@@ -66,14 +66,14 @@ def _run(argv: Sequence[str] | None) -> int:
     try:
         command = importlib.import_module(f".{module}", __name__)
         # Imported only now, because the overview must be quick.
-        from .help_text import flowing_help
+        from .help_text import PARSING, flowing_help
 
         tyro = importlib.import_module("tyro")
         status: int = tyro.cli(
             flowing_help(getattr(command, module)),
             prog=f"mjrec {name}",
             args=arguments,
-            config=(tyro.conf.FlagCreatePairsOff,),
+            config=PARSING,
         )
         # Flush here, not at exit, so that a closed pipe raises here.
         sys.stdout.flush()

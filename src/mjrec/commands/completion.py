@@ -8,6 +8,8 @@ from typing import Annotated, Literal
 
 import tyro
 
+from .help_text import PARSING
+
 
 def completion(
     shell: Annotated[
@@ -34,6 +36,6 @@ def completion(
         commands,
         prog="mjrec",
         args=["--tyro-print-completion", shell],
-        config=(tyro.conf.FlagCreatePairsOff,),
+        config=PARSING,
     )
     return 0

@@ -6,6 +6,7 @@ from __future__ import annotations
 import fnmatch
 import math
 import re
+import shlex
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
@@ -128,6 +129,13 @@ def evaluate(
             own processes.
     """
     height, width = size_of(size)
+    view_from = camera_of(camera)
+    if isinstance(view_from, dict):
+        raise InvalidArgument(
+            "mjrec evaluate needs a camera's name or number. To use a camera at any "
+            "other place, render the episodes afterwards: mjrec render DIR --episode N "
+            f"--camera {shlex.quote(str(camera))}"
+        )
     least = _by_task("--fail-under", fail_under, float, "TASK=VALUE")
     options: dict[str, Any] = {
         "policy": policy,
@@ -138,7 +146,7 @@ def evaluate(
         "protocol": protocol,
         "max_steps": max_steps,
         "episode_timeout": episode_timeout,
-        "camera": camera_of(camera),
+        "camera": view_from,
         "height": height,
         "width": width,
         "max_fps": max_fps,

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
@@ -14,15 +15,19 @@ from ..errors import UnreadableFile
 from ..evaluation.chunk_results import recorded_results
 from ..evaluation.episode_results import EpisodeResult
 from ..evaluation.evaluation import is_evaluation, read_results
-from ..formats.monitor_directory import iter_monitor_files, recording_directories
+from ..formats.monitor_directory import (
+    infix_of,
+    iter_monitor_files,
+    recording_directories,
+)
 from ..formats.video_metadata import finished_videos, metadata_path
 from ..results import Episode, iter_episodes
 from .options import AsJson
-from .terminal import print_json, print_rows
+from .terminal import print_json, print_rows, printable
 
 _Rows = Iterator[Sequence[str]]
 
-_TEXTS = ("task", "ended", "video")
+_TEXTS = ("task", "monitor", "ended", "video")
 
 
 def list_episodes(
@@ -130,9 +135,16 @@ def _end(terminated: bool | None) -> str:
 def _print_monitors(directory: Path) -> None:
     # The names of the videos that each show one completed episode.
     known: set[str] = set()
+    best: list[Episode] = []
+    # Sub-environments of a vector environment number their episodes separately.
+    monitors = {infix_of(path.name) for path in iter_monitor_files(directory)}
+    has_several = len(monitors - {None}) > 1
 
     def rows() -> _Rows:
         for episode in iter_episodes(directory):
+            is_best = not best or episode.reward > best[0].reward
+            if is_best and math.isfinite(episode.reward):
+                best[:] = [episode]
             further = _further_videos(episode)
             video = "pending" if episode.pending else ""
             if episode.video is not None:
@@ -140,12 +152,17 @@ def _print_monitors(directory: Path) -> None:
                 video = episode.video.name
                 video += f" and {len(further)} from other cameras" * bool(further)
             yield (
+                *([episode.monitor] if has_several else []),
                 *(str(episode.episode_id), str(episode.length)),
                 *(_return(episode.reward), _end(episode.terminated), video),
             )
 
     names = ("episode", "steps", "return", "ended", "video")
-    _print_table(directory, names, rows())
+    _print_table(directory, ("monitor", *names) if has_several else names, rows())
+    for episode in best:
+        of = f" of {episode.monitor}" if has_several else ""
+        what = f"episode {episode.episode_id}{of}, {_return(episode.reward)}"
+        sys.stdout.write(f"Best return: {printable(what)}\n")
     # For example clips, and videos that show all sub-environments.
     others = [path.name for path in _videos(directory) if path.name not in known]
     if others:

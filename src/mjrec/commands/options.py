@@ -15,6 +15,7 @@ from ..engines.choice import engine_from
 from ..errors import InvalidArgument
 from ..frames import check_size
 from ..json_text import has_nan, loads
+from ..rendering.views import PlainCamera, plain_camera
 from .help_text import flowing_help
 
 AsJson: TypeAlias = Annotated[bool, tyro.conf.arg(name="json")]
@@ -43,9 +44,18 @@ def number_or_name(text: str) -> str | int:
     return int(text) if re.fullmatch(r"-?\d+", text, re.ASCII) else text
 
 
-def camera_of(text: str | None) -> str | int | None:
-    """Return a camera's number or name; None for None."""
-    return None if text is None else number_or_name(text)
+def camera_of(text: str | None) -> PlainCamera | None:
+    """Return a camera: a number, a name, or members of an `MjvCamera` from JSON.
+
+    Raises:
+        InvalidArgument: the JSON is invalid, or a member's value is.
+        UnknownName: a member does not exist.
+    """
+    if text is None:
+        return None
+    if text.lstrip().startswith("{"):
+        return plain_camera(kwargs_of(text, "--camera"))
+    return number_or_name(text)
 
 
 def kwargs_of(text: str, option: str = "--env-kwargs") -> dict[str, Any]:

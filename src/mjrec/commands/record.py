@@ -24,7 +24,7 @@ from ..sessions import (
     record_session,
     with_chosen_videos,
 )
-from .options import AsJson, camera_of, kwargs_of, number_or_name, size_of
+from .options import AsJson, camera_of, kwargs_of, size_of
 from .terminal import print_json, print_lines
 
 _FAILED = 1
@@ -77,8 +77,9 @@ def record(
         size: size of the videos, WIDTHxHEIGHT in pixels.
         max_steps: truncate episodes after this many steps. By default the
             environment's limit, or 1000.
-        camera: name or number. By default the model's tracking camera, if it has one.
-            Repeat the option to get a video from each camera.
+        camera: name or number, or a free camera as JSON ('{"distance": 3, "azimuth":
+            90}'). By default the model's tracking camera, if it has one. Repeat the
+            option to get a video from each camera.
         schedule: which episodes get a video: cubic (0, 1, 8, 27 ... and every 1000th),
             all, none, every:N or at:0,5,9. By default cubic.
         keep: choose the videos after the episodes have ended: best:N or worst:N (by
@@ -106,6 +107,7 @@ def record(
         as_json: print one JSON object at the end, and nothing else.
     """
     height, width = size_of(size)
+    first, *further = map(camera_of, camera or [None])
     if seed is None:
         seed = secrets.randbits(31)
     session = Session(
@@ -116,9 +118,10 @@ def record(
         policy_kwargs=kwargs_of(policy_kwargs, "--policy-kwargs"),
         seed=seed,
         schedule=schedule,
-        further_cameras=tuple(number_or_name(each) for each in camera[1:]),
+        placed_camera=first if isinstance(first, dict) else None,
+        further_cameras=tuple(further),
         made=EnvironmentOptions(
-            camera=camera_of(camera[0] if camera else None),
+            camera=None if isinstance(first, dict) else first,
             height=height,
             width=width,
             max_steps=max_steps,

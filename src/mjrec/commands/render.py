@@ -57,8 +57,8 @@ def render(
     Without options, all pending videos of the directory are rendered as planned.
     Several such commands running on one directory share the work.
 
-    With an option that changes the video (such as --camera, --size, --quality, or
-    --out), recorded episodes are rendered again, into new files next to the originals:
+    With an option that changes the video (--camera, --size, --quality, --out and the
+    like), recorded episodes are rendered again, into new files next to the originals:
     openaigym.video.<...>.video000027.side.mp4. An episode with several cameras gives
     one video: from --camera if given, otherwise from the first camera, or tiled if it
     was recorded tiled.
@@ -68,7 +68,9 @@ def render(
             videos, for that episode only.
         episode: number of the episode. By default all recorded ones. In an evaluation,
             the episode with that number for every task and seed.
-        camera: name or number. By default as recorded, like the options below.
+        camera: name or number, or a free camera as JSON, such as '{"distance": 3,
+            "azimuth": 90, "elevation": -20, "lookat": [0, 0, 1]}'. By default as
+            recorded, like the options below.
         size: WIDTHxHEIGHT in pixels.
         quality: full (the model's own settings) or draft (several times faster).
         workers: processes that render. By default one per free CPU. With --engine, the

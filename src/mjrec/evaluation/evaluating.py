@@ -11,6 +11,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import os
+import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import replace
@@ -344,6 +345,7 @@ def _work(
             "plan": to_json(replace(plan, chunks=())),
             # A backend that works here may not work on an engine's machines.
             "chooses_gl": chooses_gl,
+            "command": sys.orig_argv,
         },
         environ=_environ_of_workers(plan, is_elsewhere=chooses_gl),
         shared_directory=directory.absolute(),

@@ -4,7 +4,7 @@
 The settings are `{"directory": DIR, "plan": <the plan as JSON, without its chunks>}`.
 If the policy is an object, `"payload"` is the path of the file with the pickled policy.
 If `"chooses_gl"` is true and episodes get videos, the worker chooses an OpenGL backend
-that works on its machine.
+that works on its machine. `"command"` is the command line that recordings name.
 
 There are two kinds of jobs. It is safe to repeat a job.
 
@@ -21,6 +21,7 @@ There are two kinds of jobs. It is safe to repeat a job.
 from __future__ import annotations
 
 import logging
+import sys
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
@@ -52,6 +53,8 @@ class EvaluationWorker:
     def __init__(self, settings: Mapping[str, Any]) -> None:
         self._directory = Path(settings["directory"])
         self._plan = from_json(EvaluationPlan, settings["plan"])
+        # A reader of the recordings needs the command that started the evaluation.
+        sys.orig_argv[:] = settings.get("command", sys.orig_argv)
         policy = settings.get("payload")
         self._evaluator = Evaluator(
             self._plan, None if policy is None else Path(policy).read_bytes()

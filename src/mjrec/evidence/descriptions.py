@@ -18,7 +18,7 @@ import shlex
 import urllib.parse
 import uuid
 import zlib
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -38,11 +38,14 @@ from .layout import (
     STATISTICS,
     STATISTICS_COLUMNS,
 )
-from .packed_run import PackedRun, Session
+from .packed_run import PackedRun, Session, facts_in
 from .statements import Author
 
 # Maximum number of rows in the table of videos. The statistics list all videos.
 _MOST_VIDEOS = 200
+# Maximum number of monitors named for a value that only some of them have.
+_MOST_MONITORS = 3
+_UNKNOWN = "not recorded"
 _FORMATS = {
     ".json": "application/json",
     ".jsonl": "application/jsonl",
@@ -161,6 +164,52 @@ def _made_with(session: Session) -> dict[str, Any]:
     }
 
 
+def _made_with_rows(sessions: Sequence[Session]) -> Iterator[tuple[str, str, str]]:
+    """Yield the facts that the README lists, each with its value and its monitors."""
+    monitors: dict[str, dict[str, list[str]]] = {}
+    for session in sessions:
+        for what, value in _shown_facts(session).items():
+            monitors.setdefault(what, {}).setdefault(value, []).append(session.infix)
+    for what, values in monitors.items():
+        for value, infixes in values.items():
+            more = len(infixes) - _MOST_MONITORS
+            shown = ", ".join(infixes[:_MOST_MONITORS])
+            if len(infixes) == len(sessions):
+                shown = "all"
+            elif more > 0:
+                shown += f" and {more} more"
+            yield what, value, shown
+
+
+def _shown_facts(session: Session) -> dict[str, str]:
+    said = session.provenance
+    cpu, machine, code, policy = (
+        facts_in(said.get(name)) for name in ("cpu", "machine", "code", "policy")
+    )
+    drawn_with = [str(each["gl_renderer"]) for each in session.different("gl_renderer")]
+    versions = [f"{name} {version}" for name, version in session.versions.items()]
+    command = said.get("command")
+    made_with = [arguments or "its defaults" for arguments in session.made_with]
+    shown = {
+        "system": said.get("system") or _UNKNOWN,
+        "CPU": cpu.get("model") or _UNKNOWN,
+        "C library": machine.get("libc") or _UNKNOWN,
+        "versions": ", ".join(versions) or _UNKNOWN,
+        "OpenGL": ", ".join(drawn_with) or _UNKNOWN,
+    }
+    if any(session.made_with):
+        arguments = "; in other episodes with ".join(made_with)
+        shown["environment"] = f"{session.env_id}, made with {arguments}"
+    if isinstance(command, list):
+        shown["command"] = " ".join(map(str, command))
+    if code:
+        changed = " with uncommitted changes" if code.get("dirty") else ""
+        shown["code"] = f"git commit {code.get('commit')}{changed}"
+    if policy:
+        shown["policy"] = f"{policy.get('file')}, sha256 {policy.get('sha256')}"
+    return {what: str(value) for what, value in shown.items()}
+
+
 def _cells(episode: Episode) -> dict[str, Any]:
     metadata: Any = {}
     if episode.video is not None and episode.metadata is not None:
@@ -218,7 +267,8 @@ def _rendered(
         format=f"{FORMAT_KEY} {FORMAT_VERSION}",
         videos=[video for session in run.sessions for video in session.videos],
         most_videos=_MOST_VIDEOS,
-        unknown="not recorded",
+        made_with=_made_with_rows(run.sessions),
+        unknown=_UNKNOWN,
         **facts,
     )
 

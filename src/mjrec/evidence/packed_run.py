@@ -61,12 +61,14 @@ class Tally:
     Attributes:
         episodes: number of episodes.
         steps: number of their steps.
+        total_return: sum of their returns.
         start: the time when the first began, in ISO 8601 in UTC; None if unknown.
         end: the time when the last ended, in ISO 8601 in UTC; None if unknown.
     """
 
     episodes: int = 0
     steps: int = 0
+    total_return: float = 0.0
     start: str | None = None
     end: str | None = None
 
@@ -74,11 +76,17 @@ class Tally:
         """Add an episode to the totals."""
         self.episodes += 1
         self.steps += episode.length
+        self.total_return += episode.reward
         starts = (self.start, _iso_time(episode.start_time))
         ends = (self.end, _iso_time(episode.end_time))
         # All have the same length and time zone, so strings sort by time.
         self.start = min(filter(None, starts), default=None)
         self.end = max(filter(None, ends), default=None)
+
+    @property
+    def mean_return(self) -> float | None:
+        """The mean return of the episodes; None without episodes."""
+        return self.total_return / self.episodes if self.episodes else None
 
 
 @dataclass(frozen=True, kw_only=True)

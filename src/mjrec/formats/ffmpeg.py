@@ -65,10 +65,10 @@ def ffmpeg_executable() -> str:
     try:
         name: str = imageio_ffmpeg.get_ffmpeg_exe()
     except RuntimeError as error:
-        raise _unusable("ffmpeg", "no ffmpeg was found") from error
+        raise _unusable("no ffmpeg was found") from error
     path = shutil.which(name)
     if path is None:
-        raise _unusable(f"ffmpeg ({name})", "no such program exists")
+        raise _unusable("no such program exists", name)
     return path
 
 
@@ -418,11 +418,10 @@ def _not_started(executable: str, error: OSError) -> Error:
     # memory, processes or open files.
     if error.filename != executable:
         return Error(f"ffmpeg ({executable}) could not be started: {error}.")
-    reason = str(error.strerror)
-    return _unusable(f"a working ffmpeg (not {executable}: {reason})", reason)
+    return _unusable(str(error.strerror), executable)
 
 
-def _unusable(package: str, reason: str) -> Error:
+def _unusable(reason: str, executable: str | None = None) -> Error:
     named = os.environ.get(_ENVIRONMENT_VARIABLE)
     if named:
         return InvalidArgument(
@@ -430,8 +429,9 @@ def _unusable(package: str, reason: str) -> Error:
             "Unset it, or set it to the path of an ffmpeg."
         )
     return MissingDependency(
-        package,
+        "ffmpeg",
         purpose="Writing a video",
+        reason=executable and f"{executable} cannot be started: {reason}",
         install="pip install --force-reinstall imageio-ffmpeg, or set "
         f"{_ENVIRONMENT_VARIABLE} to the path of an ffmpeg",
     )

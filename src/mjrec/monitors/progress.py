@@ -118,8 +118,9 @@ def _progress_lines(
         if console is None:
             # Python shows warnings on stderr even if nothing configures logging.
             logger.warning("%s.", line)
-        else:
-            console.print(f"{line}.", highlight=False, markup=False, soft_wrap=True)
+        elif not console.quiet:
+            # A command's results are on standard output.
+            sys.stderr.write(f"{line}.\n")
 
     return show_line
 

@@ -19,8 +19,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..evaluation.summaries import AcrossTasks, TaskSummary
+from ..plain_text import counted
 from .contents import ReportTask
-from .page_text import counted, decimals_for, interval_text, number
+from .page_text import decimals_for, interval_text, number
 
 _Floats: TypeAlias = NDArray[np.float64]
 _Ticks: TypeAlias = Sequence[tuple[float, str]]

@@ -26,13 +26,12 @@ from numpy.typing import NDArray
 from ..errors import MissingDependency
 from ..evaluation.statistics import PERCENTILE_BOOTSTRAP, Bootstrap, Interval
 from ..evaluation.summaries import TaskSummary
-from ..plain_text import spelled_out
+from ..plain_text import counted, spelled_out
 from .contents import FAILED, ReportContents, ReportTask, ReportVideo
 from .curves import SERIES, evaluation_curve, learning_curve, profile_curve
 from .page_text import (
     NOTHING,
     address,
-    counted,
     decimals_for,
     interval_text,
     number,

@@ -54,11 +54,6 @@ def interval_text(interval: Interval | None, decimals: int) -> str:
     return f"{number(interval.low, decimals)} to {number(interval.high, decimals)}"
 
 
-def counted(count: int, noun: str) -> str:
-    """Return `1 task`, `2 tasks`."""
-    return f"{number(count, 0)} {noun}{'' if count == 1 else 's'}"
-
-
 def address(path: str) -> str:
     """Return the address of a file next to the page, whatever its name looks like."""
     if _DATA.fullmatch(path):
