@@ -101,7 +101,7 @@ def _dtype_from_text(text: str) -> np.dtype[Any]:
         own = row_dtype(**{name: dtype[name] for name in PARTS if name in names})
     # NumPy raises many kinds of errors for an invalid dtype.
     except Exception as error:
-        raise ValueError(f"the layout of its rows is invalid: {error}") from error
+        raise ValueError(f"the layout of its rows cannot be read: {error}") from error
     if dtype != own:
         raise ValueError("its rows have unknown parts or gaps")
     return own
