@@ -140,6 +140,8 @@ def test_a_state_of_another_model_is_refused_whole(change, said):
     parts = {k: v for k, v in {**own, **change}.items() if v is not None}
     with pytest.raises(InvalidArgument, match=said):
         set_state(model, data, parts, np.append(row, 0.0))
-    with pytest.raises(InvalidArgument, match=r"has \d+ numbers, got .* \(3,\)"):
+    with pytest.raises(
+        InvalidArgument, match=r"has \d+ numbers, but this array has the shape \(3,\)"
+    ):
         set_state(model, data, own, row[:3])
     np.testing.assert_array_equal(read_state(model, data), before)

@@ -285,7 +285,7 @@ class Capture:
         self._look_closely = seen.clear
 
     def _at_moment(self, do: Callable[[], T]) -> T:
-        """Call `do` at the moment when a frame would be drawn, and return its result."""
+        """Call `do` when the environment would draw, and return its result."""
         results: list[T] = []
         self._at_frame(lambda: results.append(do()))
         return results[-1]
@@ -316,7 +316,7 @@ class Capture:
         return changed
 
     def _followed(self) -> tuple[_StoredModel, _Frames]:
-        """Return the stored model and its frames, even if their objects have changed."""
+        """Return the stored model and its frames, even if other objects hold them."""
         model, data = self._simulation()
         stored, frames = self._stored, self._frames
         if stored is None or frames is None:

@@ -83,7 +83,7 @@ def snapshot_dtype(
 
 
 def array_kind(holder: Any, name: str) -> np.dtype[Any] | None:
-    """Return the dtype and shape of an array of a model or data; None if empty."""
+    """Return the dtype and shape of a model's or data's array, or None if empty."""
     # Some arrays, such as `bvh_active`, are not in every version.
     array = getattr(holder, name, None)
     if array is None or not array.size:

@@ -187,12 +187,12 @@ def _compile(authored: AuthoredModel) -> mujoco.MjModel:
 
 
 class _References:
-    """The files that one MJCF file refers to, as written there.
+    """The files that one MJCF file refers to, as their names are written there.
 
     Attributes:
         xml: other MJCF files.
         assets: all other files.
-        directories: the directories in which they are looked up.
+        directories: the directories in which the other files are looked up.
         go_up: whether a path leaves a folder with `..`.
 
     Raises:
@@ -226,7 +226,7 @@ def _parsed(name: str, content: bytes) -> ElementTree.Element:
     if "\0" in text or re.search(r"<\s*!\s*(DOCTYPE|ENTITY)", text, re.IGNORECASE):
         raise ValueError(f"{name} is not plain XML")
     if re.search(r"<\s*plugin\b", text):
-        raise ValueError(f"{name} uses a plugin, and plugins are not loaded here")
+        raise ValueError(f"{name} uses a plugin, but plugins are not loaded here")
     try:
         return ElementTree.fromstring(text)
     except ElementTree.ParseError as error:
@@ -234,7 +234,7 @@ def _parsed(name: str, content: bytes) -> ElementTree.Element:
 
 
 def _check_reference(value: str) -> None:
-    # A colon marks a drive, or a resource provider's name.
+    # A colon marks a drive or the name of a resource provider.
     if value.startswith(("/", "~")) or any(c in value for c in "\\:\0"):
         raise ValueError(f"it refers to {value!r}, which is not a plain relative path")
     if value.split("/").count("..") > _MOST_UP:
@@ -264,8 +264,8 @@ def _gathered(main: Path) -> AuthoredModel:
 def _existing(
     bases: Iterable[Path], directories: Iterable[str], reference: str
 ) -> list[Path]:
-    """Return every file that the reference may denote."""
-    # `strippath` strips the directories.
+    """Return every file that the reference may mean."""
+    # MJCF's `strippath` removes the directories from a name.
     names = {reference, PurePosixPath(reference).name}
     candidates = {
         Path(os.path.normpath(base / directory / name))
