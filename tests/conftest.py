@@ -5,7 +5,6 @@ import gc
 import importlib.util
 import os
 import signal
-import time
 
 # Before anything imports mujoco, which reads it once.
 os.environ.setdefault("MUJOCO_GL", "egl")
@@ -17,7 +16,7 @@ import gymnasium
 import numpy as np
 import pytest
 from packed_runs import record_pendulum
-from processes import children
+from processes import children, kill_children
 from trajectories_by_hand import Painter
 
 from mjrec.formats.ffmpeg import ffmpeg_executable
@@ -159,20 +158,6 @@ def run_episodes(env, count, *, seed=None):
 def play():
     """Return `run_episodes`."""
     return run_episodes
-
-
-def kill_children(name):
-    """Kill this process's children of that name, and return how many there were.
-
-    One that was started just now has its parent's name for a moment.
-    """
-    deadline = time.monotonic() + 10
-    named = []
-    while not named and time.monotonic() < deadline:
-        named = [p for p in children() if name in Path(f"/proc/{p}/comm").read_text()]
-    for pid in named:
-        os.kill(pid, signal.SIGKILL)
-    return len(named)
 
 
 @pytest.fixture

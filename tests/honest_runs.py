@@ -13,9 +13,11 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
+from processes import kill_children
 
 import mjrec
 from mjrec.environments.mjcf_environments import MjcfEnvironment
+from mjrec.trackers import Tracker
 
 _SMALL: dict[str, Any] = {"render_mode": "rgb_array", "width": 32, "height": 32}
 _POLE = "InvertedPendulum-v5"
@@ -244,6 +246,66 @@ def wrapped_in_code(directory: Path) -> None:
     env: Any = gymnasium.make("HalfCheetah-v5", max_episode_steps=4, **_SMALL)
     env = gymnasium.wrappers.TransformReward(env, lambda reward: 2 * reward)
     play(mjrec.Monitor(env, directory, mode="evaluation", workers=1), 2)
+
+
+class _Away(Tracker):
+    def episode(self, *_: Any) -> None:
+        raise ConnectionError("the server is away")
+
+
+def tracker_away(directory: Path) -> None:
+    """Record on when a tracker has raised."""
+    pendulum(directory, episodes=3, trackers=_Away())
+
+
+def _undecided(episode: int) -> bool:
+    if episode == 1:
+        raise ValueError("no idea")
+    return True
+
+
+def schedule_raises(directory: Path) -> None:
+    """Record on when a schedule has raised for the second of three episodes."""
+    pendulum(directory, episodes=3, video_callable=_undecided, on_error="warn")
+
+
+def trigger_raises(directory: Path) -> None:
+    """Record on when the trigger of clips has raised."""
+    clips = {"step_trigger": _undecided, "video_length": 3}
+    pendulum(directory, episodes=2, on_error="warn", **clips)
+
+
+def encoder_killed(directory: Path) -> None:
+    """Record on when the encoder of a live video was killed in the second episode."""
+    env = gymnasium.make(_POLE, max_episode_steps=5, **_SMALL)
+    monitor = mjrec.Monitor(
+        env, directory, mode="evaluation", render="live", on_error="warn"
+    )
+    with monitor:
+        for episode in range(2):
+            monitor.reset(seed=episode)
+            for step in range(5):
+                if (episode, step) == (1, 2):
+                    kill_children("ffmpeg")
+                monitor.step(np.full(1, 0.1, np.float32))
+
+
+def frame_missing(directory: Path) -> None:
+    """Record on when `render` has raised in the second episode of a live recording."""
+    env = gymnasium.make(_POLE, max_episode_steps=5, **_SMALL)
+    draw = env.unwrapped.render
+    drawn = iter([*range(5), None])
+
+    def render() -> Any:
+        if next(drawn, 0) is None:
+            raise RuntimeError("the window is gone")
+        return draw()
+
+    vars(env.unwrapped)["render"] = render
+    monitor = mjrec.Monitor(
+        env, directory, mode="evaluation", render="live", on_error="warn"
+    )
+    play(monitor, 2)
 
 
 def text(directory: Path) -> None:

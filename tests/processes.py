@@ -4,6 +4,7 @@
 import functools
 import os
 import signal
+import time
 from pathlib import Path
 
 
@@ -24,6 +25,20 @@ def children(of="self"):
         except (FileNotFoundError, ProcessLookupError):
             # A thread or a child ended meanwhile; a thread's children went to another.
             continue
+
+
+def kill_children(name):
+    """Kill this process's children of that name, and return how many there were.
+
+    One that was started just now has its parent's name for a moment.
+    """
+    deadline = time.monotonic() + 10
+    named = []
+    while not named and time.monotonic() < deadline:
+        named = [p for p in children() if name in Path(f"/proc/{p}/comm").read_text()]
+    for pid in named:
+        os.kill(pid, signal.SIGKILL)
+    return len(named)
 
 
 def forked(child):

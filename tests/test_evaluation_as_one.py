@@ -12,6 +12,7 @@ import mjrec
 from mjrec import commands
 from mjrec.errors import InvalidArgument, PackError, UnfinishedRecordings
 from mjrec.evidence.findings import Verdict
+from mjrec.evidence.summary import remarks
 
 TASKS = ("InvertedPendulum-v5", "InvertedDoublePendulum-v5")
 
@@ -49,6 +50,22 @@ def test_it_is_packed_and_verified_as_one(evaluation, tmp_path):
         assert not verification.excuses
         counts = {str(each.topic): each.count for each in verification.findings}
         assert counts["physics"] == 12
+
+
+def test_an_unfinished_evaluation_says_so(evaluation, tmp_path, caplog):
+    """When it is packed, in the README, and in the first line of a verification."""
+    directory = shutil.copytree(evaluation, tmp_path / "begun")
+    plan = json.loads((directory / "evaluation.json").read_text())
+    plan["plan"]["seeds"].append(2)
+    (directory / "evaluation.json").write_text(json.dumps(plan))
+    (directory / "results.json").unlink()
+    archive = mjrec.pack(directory, tmp_path / "e.zip")
+    assert "has 4 of 6 episodes" in caplog.text
+    with zipfile.ZipFile(archive) as packed:
+        assert "**4 of 6 planned episodes" in packed.read("e/data/README.md").decode()
+    for given in (archive, directory):
+        first, *_ = remarks(mjrec.verify(given, level="stats"))
+        assert first.startswith("4 of 6 episodes")
 
 
 def test_episodes_of_several_directories_are_not_chosen_from(evaluation, tmp_path):

@@ -232,6 +232,35 @@ def test_a_full_disk_at_the_journal(on_error, pendulum, out):
     assert on_error == "raise" or faults_of(out) == [(1, "journal")]
 
 
+@both_ways
+@pytest.mark.parametrize("what", ["note", "metadata"])
+def test_a_full_disk_at_a_live_video(what, on_error, make_corridor, out):
+    """Closed with room again, the run has its metadata, and nothing is left to do."""
+    options = {"on_error": on_error, "name_prefix": "rl-video"}
+    monitor = Monitor(make_corridor(4), out, lambda _: True, **options)
+    run(monitor, 4)
+    [metadata] = out.glob("openaigym.*.meta.json")
+    errors = []
+    with file_size_limit(metadata.stat().st_size - 10 if what == "metadata" else 300):
+        monitor.reset()
+        for _ in range(4):
+            try:
+                go_on(monitor, 1)
+            except FileNotWritten as error:
+                errors.append(error)
+    assert bool(errors) == (on_error == "raise")
+    run(monitor, 4)
+    monitor.close()
+    manifest = manifest_of(out)
+    is_whole = what == "metadata"
+    assert len(manifest["videos"]) == 2 + is_whole
+    assert len(manifest["mjrec"]["broken"]) == 1 - is_whole
+    assert metadata_of(out, 1)["complete"] is True
+    assert (out / "rl-video-episode-1.mp4").exists() == is_whole
+    assert not list(out.glob(".*"))
+    assert not mjrec.recover(out)
+
+
 def test_a_disk_without_any_room(pendulum, out):
     """Nothing is pending of which nothing was written; results come later, and stay."""
     monitor = pendulum(workers=0, on_error="warn")

@@ -437,6 +437,21 @@ def call_it_broken(run: ForgedRun) -> None:
     run.edit_json("*.manifest.json", lambda said: _list_broken(said, name))
 
 
+def blame_the_schedule(run: ForgedRun) -> None:
+    """For the video and the trajectory of an episode that should not be seen."""
+    run.remove_video(1)
+    run.trajectory(1).unlink()
+    fault = {"episode_id": 1, "what": "video", "reason": "no idea"}
+
+    def edit(lines: list[Any]) -> None:
+        [at] = [n for n, line in enumerate(lines) if line.get("episode_id") == 1]
+        del lines[at]["recording"]
+        lines.insert(at, {"fault": fault})
+
+    run.edit_journal(edit)
+    run.edit_json("*.manifest.json", lambda said: said["mjrec"].update(faults=[fault]))
+
+
 def _list_broken(manifest: dict[str, Any], name: str) -> None:
     manifest["videos"] = [pair for pair in manifest["videos"] if pair[1] != name]
     manifest["mjrec"]["broken"] = [name]
@@ -978,6 +993,20 @@ FORGERIES = (
     Forgery("draft called full", draft_called_full),
     Forgery("a close-up added", add_a_close_up),
     Forgery("a video called broken", call_it_broken, "no such file"),
+    Forgery("a video left out, the schedule blamed", blame_the_schedule, "no such"),
+    # The returns of such an episode count, and the first lines name it.
+    Forgery(
+        "the encoder killed before the fall",
+        of=honest.encoder_killed,
+        line=r"faults while recording.* video of episode 1(.|\n)*\[broken video\]",
+        verdict=PARTLY,
+    ),
+    Forgery(
+        "rewards doubled of an episode whose encoder was killed",
+        lambda run: run.say_rewards(1, lambda rewards: 2 * rewards),
+        "reward",
+        of=honest.encoder_killed,
+    ),
     Forgery("the worst's video called pending", bag=pending_worst),
     Forgery("a video called made smaller", bag=say_it_was_made_smaller),
     # What was chosen.

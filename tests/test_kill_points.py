@@ -2,6 +2,7 @@
 """SIGKILL between any two things that a recorder or a finisher does to its files."""
 
 import json
+import shutil
 import signal
 from pathlib import Path
 
@@ -38,19 +39,13 @@ def run(program, directory, place):
     return done.returncode != 0
 
 
-# Renames, removals and openings for writing, of which each comes with a file's name.
-FINISH = """
-from pathlib import Path
-from trajectories_by_hand import Painter
-import mjrec.rendering.finisher
-from mjrec.rendering.finish import finish
-
-mjrec.rendering.finisher.WorkerPool = lambda count, **rest: Painter()
+# Kills the process before one of the renames, links, removals and openings for writing.
+COUNT = """
 left = int(place)
 
 def count(event, arguments):
     global left
-    changes = event in ("os.rename", "os.remove") or (
+    changes = event in ("os.rename", "os.remove", "os.link") or (
         event == "open" and isinstance(arguments[2], int) and arguments[2] & os.O_CREAT
     )
     if changes and str(arguments[0]).startswith(directory):
@@ -59,6 +54,15 @@ def count(event, arguments):
         left -= 1
 
 sys.addaudithook(count)
+"""
+FINISH = f"""
+from pathlib import Path
+from trajectories_by_hand import Painter
+import mjrec.rendering.finisher
+from mjrec.rendering.finish import finish
+
+mjrec.rendering.finisher.WorkerPool = lambda count, **rest: Painter()
+{COUNT}
 for result in finish(Path(directory), workers=1):
     assert not result.failures, result
 """
@@ -96,6 +100,76 @@ def test_a_finisher_killed_at_any_change_of_a_file_is_taken_up_again(
         assert len(manifest["videos"]) == 2
         assert manifest["mjrec"]["pending"] == []
         assert not list(directory.glob(".*")) + list(directory.glob("*.states.*"))
+        assert not mjrec.recover(directory)
+        if not was_killed:
+            break
+    else:
+        pytest.fail("there were more changes than moments")
+
+
+# An episode, the beginning of another one, and an encoder that has every frame.
+CUT = """
+import mjrec
+from conftest import Corridor
+
+env = mjrec.Monitor(
+    Corridor(4, place), directory, lambda _: True, env_id="Short-v0", name_prefix="a"
+)
+for steps in (4, 2):
+    env.reset(seed=0)
+    for _ in range(steps):
+        env.step(1)
+writer = env.video_recorder._sink._writer
+while place == "rgb_array" and writer._encoding._encoded < writer.frame_count:
+    time.sleep(0.001)
+die()
+"""
+RECOVER = f"""
+import mjrec
+{COUNT}
+assert not mjrec.recover(directory).failures
+"""
+
+
+def contents(directory):
+    """Return the content of each file; one who comes later says so in the journal."""
+    files = {path.name: path.read_bytes() for path in directory.iterdir()}
+    said = b'{"recovered": {}}\n'
+    return {name: content.replace(said, b"") for name, content in files.items()}
+
+
+# Takes more than five seconds: a process that recovers, for each moment.
+@parametrize(
+    ("mode", "moments"),
+    [
+        (mode, range(first, 100, 8))
+        for mode in ("rgb_array", "ansi")
+        for first in range(8)
+    ],
+    default=[("rgb_array", range(6, 100, 8))],
+    part=pytest.mark.crashes,
+)
+def test_a_recovery_killed_at_any_change_of_a_file_is_taken_up_again(
+    mode, moments, tmp_path
+):
+    """Of live videos; the next one leaves every file as one alone would have."""
+
+    def copied(name):
+        shutil.copytree(tmp_path / "cut", tmp_path / name)
+        # A copy of a second name is another file.
+        for link in (tmp_path / name).glob("a-*"):
+            link.unlink()
+        return tmp_path / name
+
+    assert run(CUT, tmp_path / "cut", mode)
+    whole = copied("whole")
+    assert not mjrec.recover(whole).failures
+    assert len(manifest_of(whole)["videos"]) == 2
+    for moment in moments:
+        directory = copied(str(moment))
+        was_killed = run(RECOVER, directory, moment)
+        assert not mjrec.recover(directory).failures
+        assert contents(directory) == contents(whole)
         assert not mjrec.recover(directory)
         if not was_killed:
             break

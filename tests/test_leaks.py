@@ -56,7 +56,7 @@ def _file(descriptor):
     try:
         # Pipes and sockets have numbers of their own, and so has each log.
         name = str(descriptor.readlink()).split(":")[0]
-        return re.sub(r"\.\d{6}\.(log|spans|looks|tail)$", "", name)
+        return re.sub(r"\.\d{6}\.(log|looks|tail)$", "", name)
     except FileNotFoundError:  # of the listing itself
         return ""
 

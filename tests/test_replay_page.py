@@ -17,7 +17,10 @@ import mujoco
 import numpy as np
 import pytest
 from axe_playwright_python.sync_playwright import Axe
+from parts import parametrize
+from PIL import Image
 from playwright.sync_api import Page, sync_playwright
+from robots import robots_that_reset
 from waiting import wait_until
 
 import mjrec
@@ -26,10 +29,17 @@ from mjrec.commands import main
 pytest.importorskip("viser")
 pytest.importorskip("mjviser")
 from mjrec.viewing.episodes import recorded_episodes
+from mjrec.viewing.geometry import mesh_of
 from mjrec.viewing.live import LiveView
+from mjrec.viewing.motion import Shape
 
 _STEPS = 12
 _SIZE = {"width": 240, "height": 240}
+# Meshes, skins, height fields, tendons, mocap bodies; hundreds of geoms.
+_ENVIRONMENTS = ("Humanoid-v5", "Ant-v5", "Pusher-v5", "FetchPickAndPlace-v4")
+_ENVIRONMENTS += ("AdroitHandDoor-v1", "HandManipulateBlock-v1")
+_ENVIRONMENTS += ("dm_control/dog-run", "dm_control/quadruped-escape")
+_ENVIRONMENTS += ("dm_control/ball_in_cup-catch", "dm_control/fish-swim")
 _READY = "html[data-replay=ready]"
 # No sandbox, which root and most containers cannot have: it opens our own pages only.
 _OPTIONS = ("--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage")
@@ -52,6 +62,16 @@ _SOFT = """
       <site site="above"/> <geom geom="pulley"/> <site site="below"/>
     </spatial>
   </tendon>
+</mujoco>
+"""
+
+_BOX = """
+<mujoco>
+  <asset>
+    <texture name="side" type="cube" file="side.png"/>
+    <material name="side" texture="side"/>
+  </asset>
+  <worldbody><geom type="box" size=".1 .2 .3" material="side"/></worldbody>
 </mujoco>
 """
 
@@ -146,17 +166,27 @@ def data_at(trajectory: mjrec.Trajectory, step: int) -> mujoco.MjData:
     return data
 
 
-def check_geoms(page: Page, data: mujoco.MjData, count: int) -> None:
-    """Check that the page's geoms are where MuJoCo's are."""
+def check_geoms(page: Page, data: mujoco.MjData) -> None:
+    """Check that the page has the geoms that MuJoCo draws, where MuJoCo has them."""
     page.wait_for_timeout(500)
     poses = {k: v for k, v in page.evaluate(_POSES).items() if k.startswith("/geom/")}
-    assert len(poses) == count
+    scene = mujoco.MjvScene(data.model, maxgeom=10_000)
+    view = (mujoco.MjvOption(), None, mujoco.MjvCamera(), mujoco.mjtCatBit.mjCAT_ALL)
+    mujoco.mjv_updateScene(data.model, data, *view, scene)
+    drawn = scene.geoms[: scene.ngeom]
+    ids = {each.objid for each in drawn if each.objtype == mujoco.mjtObj.mjOBJ_GEOM}
+    assert poses.keys() == {f"/geom/{number}" for number in ids}
     for name, (*position, w, x, y, z) in poses.items():
         geom = int(name.rpartition("/")[2])
         matrix = np.empty(9)
         mujoco.mju_quat2Mat(matrix, np.array([w, x, y, z]))
         assert position == pytest.approx(data.geom_xpos[geom], abs=1e-5)
         assert matrix == pytest.approx(data.geom_xmat[geom], abs=1e-5)
+    for skin in range(data.model.nskin):
+        first, count = scene.skinvertadr[skin], scene.skinvertnum[skin]
+        expected = np.reshape(scene.skinvert, (-1, 3))[first : first + count]
+        shown = np.reshape(page.evaluate(_VERTICES, f"/skin/{skin}"), (-1, 3))
+        assert shown == pytest.approx(expected, abs=1e-5)
 
 
 # --- The page -----------------------------------------------------------------------
@@ -165,7 +195,29 @@ def check_geoms(page: Page, data: mujoco.MjData, count: int) -> None:
 @pytest.mark.browser
 def test_geoms_stand_where_mujoco_has_them(page: Page, cheetah: Path) -> None:
     """A replay begins at the state that its address names, and shows it exactly."""
-    check_geoms(page, data_at(mjrec.load_trajectory(cheetah), 7), 9)
+    check_geoms(page, data_at(mjrec.load_trajectory(cheetah), 7))
+
+
+@pytest.mark.browser
+@parametrize("name", _ENVIRONMENTS, default=0, part=pytest.mark.environments)
+def test_all_kinds_of_scenes_stand_where_mujoco_has_them(
+    name: str, pages: Any, tmp_path: Path
+) -> None:
+    """So do meshes, skins, height fields, and bodies that the simulation moves."""
+    if name.startswith("dm_control/"):
+        suite = pytest.importorskip("dm_control.suite")
+        domain, _, task = name.partition("/")[2].partition("-")
+        env = suite.load(domain, task, task_kwargs={"random": 0})
+        path = record_suite(env, tmp_path / "run")
+    else:
+        with robots_that_reset():
+            if name not in gymnasium.registry:
+                pytest.skip("Gymnasium-Robotics is not installed")
+            path = record(gymnasium.make(name), tmp_path / "run")
+    trajectory = mjrec.load_trajectory(path)
+    mjrec.write_replay(trajectory, tmp_path / "page.html")
+    page = pages(f"{(tmp_path / 'page.html').as_uri()}#step={_STEPS}")
+    check_geoms(page, data_at(trajectory, _STEPS))
 
 
 @pytest.mark.browser
@@ -188,7 +240,7 @@ def test_keys_go_through_the_states(page: Page, cheetah: Path) -> None:
     page.keyboard.press("End")
     assert page.inner_text("#replay-ending") == "Episode truncated"
     assert page.evaluate("location.hash") == "#step=12&camera=track&speed=2"
-    check_geoms(page, data_at(trajectory, _STEPS), 9)
+    check_geoms(page, data_at(trajectory, _STEPS))
 
 
 @pytest.mark.browser
@@ -358,6 +410,19 @@ def test_colours_change_when_the_model_does(tmp_path: Path) -> None:
     assert colours["/geom/2"] == [3, "/geom/2", [1, 0, 0, 1]]
     assert colours["/geom/3"][0] == 3
     assert colours["/geom/3"][2][3] == 0
+
+
+def test_sides_have_the_whole_texture_and_normals(tmp_path: Path) -> None:
+    """One image for all sides is not cut into six; round shapes look smooth."""
+    Image.new("RGB", (8, 8), "red").save(tmp_path / "side.png")
+    path = tmp_path / "box.xml"
+    path.write_text(_BOX)
+    model = mujoco.MjModel.from_xml_path(str(path))
+    kinds = (mujoco.mjtObj.mjOBJ_GEOM, 0, mujoco.mjtGeom.mjGEOM_BOX)
+    mesh = mesh_of(model, Shape("/geom/0", *map(int, kinds), (1.0, 1.0, 1.0, 1.0)))
+    assert b"NORMAL" in mesh.export(file_type="glb")
+    top = mesh.vertex_normals[:, 2] > 0.9
+    assert np.ptp(mesh.visual.uv[top], axis=0) == pytest.approx([1, 1])
 
 
 def test_states_that_are_no_numbers_are_left_out(cheetah: Path, tmp_path: Path) -> None:

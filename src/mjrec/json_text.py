@@ -116,7 +116,7 @@ def _is_plain(value: object, room: int = _DEEPEST) -> bool:
     # Flat values are tested first because statistics are long lists of numbers.
     return room > 0 and (
         _FLAT.issuperset(map(type, value))
-        or all(_is_plain(item, room - 1) for item in value)
+        or all(_is_plain(item, room - 1) for item in value if type(item) not in _FLAT)
     )
 
 

@@ -137,6 +137,11 @@ _BY_NAME: Final[Mapping[str, _Rule]] = {
         costs="its initial state is believed",
         fed=(Topic.BEGINNING,),
     ),
+    "broken video": _Rule(
+        kind=ExcuseKind.EVENT,
+        costs="where it breaks off is believed",
+        fed=(Topic.VIDEOS,),
+    ),
     **dict.fromkeys(
         ("kill", "early reset", "exception", "fault"),
         _Rule(

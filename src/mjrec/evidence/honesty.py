@@ -36,11 +36,13 @@ def remarks(inputs: Inputs, arrays: Mapping[str, NDArray[Any]]) -> Iterator[Find
         inputs: the run's inputs.
         arrays: the arrays that the inputs name.
     """
+    yield from _unfinished(inputs)
     for recording in inputs.recordings:
         yield from _name(recording)
         yield from _gaps(recording, inputs.recordings)
         yield from _cuts(recording, inputs.recordings)
         yield from _types(recording)
+        yield from _faults(recording)
         yield from _seeds(recording)
     yield from _gaps_of_evaluations(inputs.recordings)
     yield from _repeated(inputs, arrays)
@@ -65,6 +67,21 @@ def remarks_on_video(metadata: Path, file: str) -> Iterator[Finding]:
             outcome=Outcome.NOTED,
             reason=reason,
             unit="video",
+        )
+
+
+def _unfinished(inputs: Inputs) -> Iterator[Finding]:
+    """Yield a remark if an evaluation planned more episodes than are complete."""
+    episodes = [each for one in inputs.recordings for each in one.episodes]
+    complete, planned = sum(e.cut is None for e in episodes), inputs.planned or 0
+    if complete < planned:
+        yield _headline(
+            Topic.SELECTION,
+            "",
+            f"{complete} of {planned} episodes: the evaluation is not finished, or "
+            "some of its episodes failed",
+            outcome=Outcome.BELIEVED,
+            count=planned - complete,
         )
 
 
@@ -160,6 +177,26 @@ def _types(recording: RecordingInputs) -> Iterator[Finding]:
             f"others evaluation: {_listed(training)}",
             outcome=Outcome.NOTED,
             count=len(training),
+        )
+
+
+def _faults(recording: RecordingInputs) -> Iterator[Finding]:
+    """Yield the faults of the recorder. All of their effects are compared."""
+    said = [
+        f"{fault['what']}: {fault['reason']:.200}"
+        if fault["episode_id"] is None
+        else f"{fault['what']} of episode {fault['episode_id']}: {fault['reason']:.200}"
+        for _, fault in recording.faults
+    ]
+    if said:
+        yield _headline(
+            Topic.SELECTION,
+            recording.name,
+            "faults while recording, according to its author: "
+            f"{_shown(said[:_MOST_SHOWN], len(said))}",
+            outcome=Outcome.NOTED,
+            count=len(said),
+            unit="fault",
         )
 
 

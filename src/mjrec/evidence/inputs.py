@@ -73,6 +73,8 @@ class EpisodeInputs:
         cut: the reason why the episode is not in the statistics (`reset`, `close`,
             `killed` ...); None for a complete episode.
         exception: the exception, if one cut the episode off.
+        broken: for each live video that broke off, by its name without extension, the
+            reason and the number of frames kept.
         has_trajectory: whether its trajectory was kept.
         is_chosen: whether its video was chosen.
         start_time: the stated start time.
@@ -98,6 +100,7 @@ class EpisodeInputs:
     irregular: Sequence[Mapping[str, Any]] = ()
     cut: str | None = None
     exception: Mapping[str, Any] | None = None
+    broken: Mapping[str, tuple[str, int]] = field(default_factory=dict)
     has_trajectory: bool = False
     is_chosen: bool = False
     start_time: float | None = None
@@ -129,6 +132,8 @@ class RecordingInputs:
             episodes ("begun" or "failed"), in the journal's order.
         evaluation_keeps: the facts of each choice among all recordings of an
             evaluation.
+        faults: the facts of each fault of the recorder, after the number of lines in
+            the journal before it, not counting the first.
         monitor_csv_start: the stated time in Stable-Baselines3's file; None if that
             file was not requested.
         provenance: the stated provenance, or None if unknown.
@@ -152,6 +157,7 @@ class RecordingInputs:
     episodes: Sequence[EpisodeInputs] = ()
     evaluation_events: Sequence[tuple[str, Mapping[str, Any] | None]] = ()
     evaluation_keeps: Sequence[Mapping[str, Any]] = ()
+    faults: Sequence[tuple[int, Mapping[str, Any]]] = ()
     monitor_csv_start: float | None = None
     provenance: Mapping[str, Any] | None = None
     provenance_after: int = 0
@@ -187,10 +193,12 @@ class Inputs:
     Attributes:
         recordings: the recordings, sorted by the times of their first resets.
         packing: the options of `mjrec pack`; empty for a monitor directory.
+        planned: number of episodes in the plan of an evaluation, otherwise None.
     """
 
     recordings: Sequence[RecordingInputs]
     packing: Mapping[str, Any] = field(default_factory=dict)
+    planned: int | None = None
 
     def unusual(self) -> dict[str, dict[str, Any]]:
         """Return environments and non-default inputs, keyed by recording or "pack"."""
@@ -228,7 +236,7 @@ class Inputs:
             )
             for recording in said["recordings"]
         ]
-        return cls(recordings=tuple(recordings), packing=said["packing"])
+        return cls(**{**said, "recordings": tuple(recordings)})
 
 
 def given_actions(

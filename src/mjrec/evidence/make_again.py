@@ -28,6 +28,7 @@ from ..environments.scenes import new_warnings
 from ..environments.stand_ins import RecordedSteps
 from ..errors import Error, UnreadableFile
 from ..formats.journal import KILLED
+from ..plain_text import counted
 from ..recorder.ending_reasons import EXCEPTION, INTERRUPT, RESET
 from ..simulation.model_sources import read_authored
 from .inputs import EpisodeInputs, RecordingInputs, given_actions
@@ -320,6 +321,7 @@ class _Playing:
         self._begin_stand_in(episode)
         counted, rewards = 0, []
         states = self._arrays.get(episode.states or "")
+        self._break_videos(episode)
         for action in given_actions(episode, self._arrays):
             if states is not None:
                 self._recreated.put_into(states[counted : counted + 1])
@@ -335,6 +337,21 @@ class _Playing:
         if self._only_counted and episode.actions is not None:
             self.rewards[episode.actions] = np.array(rewards, np.float64)
         self._on_steps(counted % _STEPS_BETWEEN_COUNTS)
+
+    def _break_videos(self, episode: EpisodeInputs) -> None:
+        """Make the live videos that broke off do so again."""
+        for video in self._monitor.recorder.live_videos:
+            name = Path(video.path).stem
+            if name not in episode.broken:
+                continue
+            reason, frames = episode.broken[name]
+            video.break_off(reason, frames=frames)
+            self._note(
+                episode,
+                "broken video",
+                f"{name} broke off after {counted(frames, 'frame')}, according to its "
+                f"author: {reason:.200}",
+            )
 
     def _begin_stand_in(self, episode: EpisodeInputs) -> None:
         stand_in, name = self._recreated.stand_in, episode.steps_taken

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import logging
 import os
 import shutil
 import stat
@@ -34,6 +35,7 @@ from ..formats.monitor_directory import FILE_PREFIX
 from ..formats.trajectory import row_dtype
 from ..formats.trajectory_hdf5 import open_hdf5, write_hdf5
 from ..rendering.jobs import Progress
+from ..results import iter_episodes
 from .anonymity import make_anonymous
 from .bag import TRY_AGAIN, check_bagit, make_bag, write_zip
 from .contents import Contents, look_for_contents
@@ -46,9 +48,11 @@ from .layout import (
     RECORDINGS,
     STATES_LEFT_OUT,
 )
-from .packed_run import PackingOptions, read_run
+from .packed_run import PackingOptions, planned_episodes, read_run
 from .size_limit import archive_within, byte_count
 from .statements import state
+
+logger = logging.getLogger(__name__)
 
 _ENDING = ".zip"
 # The archive's name until it is complete.
@@ -133,6 +137,7 @@ def pack(
         episodes=contents.packed_episodes,
         anonymous=anonymous,
         max_size=None if max_size is None else byte_count(max_size),
+        planned=planned_episodes(source),
     )
     identity = None
     if anonymous:
@@ -151,6 +156,15 @@ def pack(
         except OSError as error:
             reason = error.strerror or error
             raise FileNotWritten(target, reason, then=TRY_AGAIN) from error
+    if options.planned is not None:
+        complete = sum(1 for place in contents.places for _ in iter_episodes(place))
+        if complete < options.planned:
+            logger.warning(
+                "The archive has %d of %d episodes: the evaluation is not finished, "
+                "or some of its episodes failed.",
+                complete,
+                options.planned,
+            )
     return target
 
 

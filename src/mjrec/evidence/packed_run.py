@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from ..environments.scenes import shown_arguments, shown_wrappers
+from ..formats import json_fields
 from ..formats.json_fields import read_object, unreadable
 from ..formats.monitor_directory import infix_of, iter_monitor_files
 from ..formats.trajectory_hdf5 import open_hdf5
@@ -23,6 +24,8 @@ from .layout import STATES_LEFT_OUT
 from .statements import Statements, state
 
 _SHOWN = 3
+# The file of an evaluation's plan; see `evaluation.plan`.
+_PLAN = "evaluation.json"
 _NEVER = "1970-01-01"
 
 
@@ -38,6 +41,7 @@ class PackingOptions:
         episodes: numbers of the chosen episodes; None for all.
         anonymous: whether names of users, machines and authors are removed.
         max_size: maximum size of the archive in bytes; None for no limit.
+        planned: number of episodes in the plan of an evaluation, otherwise None.
     """
 
     name: str
@@ -47,6 +51,7 @@ class PackingOptions:
     episodes: tuple[int, ...] | None = None
     anonymous: bool = False
     max_size: int | None = None
+    planned: int | None = None
 
 
 @dataclass
@@ -157,11 +162,20 @@ class PackedRun:
         return self.statements.title or f"Recordings of {', '.join(ids[:_SHOWN])}{more}"
 
     @property
+    def episodes(self) -> int:
+        """The number of complete episodes."""
+        return sum(session.tally.episodes for session in self.sessions)
+
+    @property
+    def is_unfinished(self) -> bool:
+        """Whether an evaluation planned more episodes than are complete."""
+        return self.episodes < (self.options.planned or 0)
+
+    @property
     def holds(self) -> str:
         """A summary of the archive's content in words."""
-        episodes = sum(session.tally.episodes for session in self.sessions)
         return (
-            f"statistics of {counted(episodes, 'episode')} of "
+            f"statistics of {counted(self.episodes, 'episode')} of "
             f"{', '.join(self.env_ids)}, "
             f"{counted(sum(len(s.videos) for s in self.sessions), 'video')}, actions "
             f"of {counted(sum(s.with_actions for s in self.sessions), 'episode')} and "
@@ -211,6 +225,23 @@ def read_run(recordings: Path, *, options: PackingOptions) -> PackedRun:
             if monitor.manifest is not None
         ),
     )
+
+
+def planned_episodes(directory: Path) -> int | None:
+    """Return the number of episodes that an evaluation planned.
+
+    Return None if the directory has no evaluation.
+
+    Raises:
+        UnreadableFile: the plan is damaged.
+    """
+    path = directory / _PLAN
+    if not path.is_file():
+        return None
+    with unreadable(path):
+        plan = json_fields.field(read_object(path), "plan", json_fields.mapping)
+        tasks, seeds = (len(plan[name]) for name in ("tasks", "seeds"))
+        return tasks * seeds * json_fields.field(plan, "episodes", json_fields.integer)
 
 
 def facts_in(value: object) -> Mapping[str, Any]:

@@ -17,13 +17,15 @@ from numpy.typing import NDArray
 from .. import json_text
 from ..errors import Error, UnreadableFile
 from ..formats.journal import JournalEntry, JournalReader
-from ..formats.json_fields import read_object, unreadable
-from ..formats.monitor_directory import FILE_PREFIX, Infix
+from ..formats.json_fields import base_name, read_object, unreadable
+from ..formats.manifest import read_manifest
+from ..formats.monitor_directory import FILE_PREFIX, Infix, episode_of
 from ..formats.regular_files import open_regular
 from ..formats.trajectory import TrajectoryReader
 from ..formats.trajectory_hdf5 import open_hdf5
 from ..machine import machine_fingerprint
 from ..provenance import versions
+from ..recorder.options import LIVE
 from ..results.monitor_files import MonitorFiles, monitors_of
 from ..results.run import EVALUATION
 from .inputs import OPTIONS, EpisodeInputs, Inputs, RecordingInputs
@@ -51,6 +53,7 @@ _PROVENANCE: Mapping[str, tuple[str, ...]] = {
 # The keys of a choice among an evaluation's episodes, in a video's facts and a journal.
 _SELECTION = ("rule", "decided", "scope", "finished", "roles")
 _EVALUATION_KEEP = (*_SELECTION[:-1], "chosen", "recorded", "recording")
+_FAULT = ("episode_id", "what", "reason")
 _DTYPES = frozenset(
     f"{kind}{bits}" for kind in ("float", "int", "uint") for bits in (8, 16, 32, 64)
 ) | {"bool"}
@@ -79,9 +82,12 @@ def read_inputs(data: Path) -> tuple[Inputs, dict[str, NDArray[Any]]]:
         raise Error(f"{_UNREADABLE}: {error.path.name}: {error.reason}") from error
     except (AttributeError, LookupError, TypeError, ValueError) as error:
         raise Error(f"{_UNREADABLE}: {error!s:.300}") from error
-    return Inputs(recordings=tuple(sorted(recordings, key=_begun)), packing=packing), (
-        arrays
+    inputs = Inputs(
+        recordings=tuple(sorted(recordings, key=_begun)),
+        packing=packing,
+        planned=packing.get("planned"),
     )
+    return inputs, arrays
 
 
 def _begun(recording: RecordingInputs) -> tuple[float, str]:
@@ -116,8 +122,9 @@ def packing_options(said: Mapping[str, Any]) -> PackingOptions:
         options = PackingOptions(**{**said, **lists})
     except TypeError as error:
         raise ValueError(f"its packing options are invalid: {error}") from error
-    if type(options.anonymous) is not bool or not isinstance(
-        options.max_size, int | None
+    numbers = (options.max_size, options.planned)
+    if type(options.anonymous) is not bool or not all(
+        isinstance(number, int | None) for number in numbers
     ):
         raise ValueError(f"its packing options are invalid: {said!r:.200}")
     return options
@@ -144,6 +151,7 @@ def _recording(files: MonitorFiles, arrays: dict[str, NDArray[Any]]) -> Recordin
         episodes=tuple(_episodes(files, journal, arrays)),
         evaluation_events=tuple(journal.evaluation_events),
         evaluation_keeps=tuple(journal.evaluation_keeps),
+        faults=tuple(journal.faults),
         monitor_csv_start=_monitor_csv_start(files),
         provenance=journal.provenance,
         provenance_after=journal.provenance_after,
@@ -182,6 +190,7 @@ class _Journal:
         self.clips: list[Mapping[str, Any]] = []
         self.evaluation_events: list[tuple[str, Mapping[str, Any] | None]] = []
         self.evaluation_keeps: list[Mapping[str, Any]] = []
+        self.faults: list[tuple[int, Mapping[str, Any]]] = []
         self.kept: tuple[int, ...] = ()
         self.was_killed = self.is_closed = False
         if path is None:
@@ -233,6 +242,8 @@ class _Journal:
                 self.evaluation_keeps.append(_known(known, _EVALUATION_KEEP))
             case "keep", {"recorded": list(numbers)}:
                 self.kept = tuple(map(_count, numbers))
+            case "fault", {"episode_id": int() | None, "what": str(), "reason": str()}:
+                self.faults.append((self._lines, _known(facts, _FAULT)))
             case "recovered", _:
                 self.was_killed = True
             case "closed", _:
@@ -244,6 +255,7 @@ class _Journal:
 def _episodes(
     files: MonitorFiles, journal: _Journal, arrays: dict[str, NDArray[Any]]
 ) -> Iterator[EpisodeInputs]:
+    broken = _broken(files)
     for number in sorted({*journal.entries, *journal.cuts}):
         entry, cut = journal.entries.get(number), journal.cuts.get(number)
         episode = EpisodeInputs(episode_id=number)
@@ -265,7 +277,25 @@ def _episodes(
                 is_chosen=cut.get("chosen") is True,
                 evaluation=journal.failed_unit(number),
             )
-        yield episode
+        yield dataclasses.replace(episode, broken=broken.get(number, {}))
+
+
+def _broken(files: MonitorFiles) -> dict[int, dict[str, tuple[str, int]]]:
+    """Return the inputs `broken` of the episodes that have them, by number."""
+    found: dict[int, dict[str, tuple[str, int]]] = {}
+    details = read_manifest(files.manifest).mjrec if files.manifest else None
+    for name in map(base_name, (details or {}).get("broken") or ()):
+        path, number = files.paths[0].with_name(name), episode_of(name)
+        if number is None or not path.exists():
+            continue
+        with unreadable(path):
+            said = read_object(path)
+        # A deferred video cannot break off: its states are kept to render it again.
+        if said.get("recording") == LIVE and said.get("broken") is True:
+            video = name.removesuffix(".meta.json")
+            broken = str(said.get("broken_reason")), _count(said.get("frame_count", 0))
+            found.setdefault(number, {})[video] = broken
+    return found
 
 
 def _with_entry(episode: EpisodeInputs, entry: JournalEntry) -> EpisodeInputs:

@@ -85,6 +85,7 @@ def monitor_again(
                 provenance=recording.provenance,
                 provenance_after=recording.provenance_after,
                 clock=clock,
+                faults=recording.faults,
                 only_counted=only_counted,
             ),
         )

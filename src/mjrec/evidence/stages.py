@@ -13,6 +13,7 @@ machine does not have enough space.
 
 from __future__ import annotations
 
+import dataclasses
 import shutil
 import sys
 import time
@@ -80,6 +81,7 @@ def _open(request: Mapping[str, Any], say: _Say) -> None:
     from .archive import BAG_DECLARATION, bring_in
     from .bag import check_bag, unchanged
     from .honesty import remarks
+    from .packed_run import planned_episodes
     from .read_inputs import read_inputs
 
     given, counter = Path(request["given"]), _Counter(say)
@@ -93,6 +95,9 @@ def _open(request: Mapping[str, Any], say: _Say) -> None:
             say(finding=to_json(unchanged(given)))
         return
     inputs, arrays = read_inputs(given / PAYLOAD)
+    if not inputs.packing:
+        planned = planned_episodes(Path(request["path"]))
+        inputs = dataclasses.replace(inputs, planned=planned)
     folder = Path(request["inputs"])
     folder.mkdir()
     inputs.write(folder, arrays)

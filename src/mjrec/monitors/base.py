@@ -81,9 +81,10 @@ class MonitorBase:
         """Finish the recordings, then close the environment. Idempotent.
 
         Args:
-            wait: whether to wait, with a progress bar on a terminal, until all videos
-                are rendered. If False, or after Ctrl-C during the wait, the remaining
-                videos stay pending, and `mjrec render DIR` renders them.
+            wait: whether to wait until all videos are rendered, with a progress bar on
+                a terminal, otherwise with a line every 30 seconds. If False, or after
+                Ctrl-C during the wait, the remaining videos stay pending, and
+                `mjrec render DIR` renders them.
 
         Raises:
             EncoderError: a running video could not be finished; everything else is

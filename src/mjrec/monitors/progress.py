@@ -1,14 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Progress bars for long operations, shown only on a terminal."""
+"""Progress of long operations: bars on a terminal, now and then a line in a log."""
 
 from __future__ import annotations
 
 import contextlib
+import logging
 import random
 import sys
+import time
 from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, TypeAlias
 
+from ..plain_text import counted
 from ..rendering.jobs import Progress
 
 if TYPE_CHECKING:
@@ -17,6 +20,12 @@ if TYPE_CHECKING:
 # Shows the progress of an operation: its name, the amount done, the total amount (None
 # if unknown), and the same in words.
 ShowProgress: TypeAlias = Callable[[str, int, int | None, str], None]
+
+logger = logging.getLogger(__name__)
+
+# Seconds until a log's first line about rendering, and between further lines.
+_FIRST_LINE_S = 5.0
+_LINES_EVERY_S = 30.0
 
 
 @contextlib.contextmanager
@@ -29,8 +38,7 @@ def progress_bar(console: rich.console.Console | None = None) -> Iterator[ShowPr
         console: the console to use; if None, standard error. Lines printed to it in the
             meantime appear above the bars.
     """
-    is_terminal = sys.stderr.isatty() if console is None else console.is_terminal
-    if not is_terminal:
+    if not _is_terminal(console):
         yield lambda what, done, total, words: None
         return
     # Imported only if there is a bar to show. Importing Rich draws random numbers,
@@ -67,10 +75,15 @@ def render_progress(
 ) -> Iterator[Callable[[Progress], None]]:
     """Yield a function that shows the progress of rendering.
 
+    Without a terminal it writes a line after five seconds, and then every 30.
+
     Args:
         console: see `progress_bar`.
         title: the bar's label.
     """
+    if not _is_terminal(console):
+        yield _progress_lines(console, title)
+        return
     with progress_bar(console) as show:
 
         def show_rendering(progress: Progress) -> None:
@@ -84,3 +97,32 @@ def render_progress(
                 show(title, frames, progress.frames, words)
 
         yield show_rendering
+
+
+def _progress_lines(
+    console: rich.console.Console | None, title: str
+) -> Callable[[Progress], None]:
+    next_line = time.monotonic() + _FIRST_LINE_S
+
+    def show_line(progress: Progress) -> None:
+        nonlocal next_line
+        if time.monotonic() < next_line or not progress.videos:
+            return
+        next_line = time.monotonic() + _LINES_EVERY_S
+        line = (
+            f"{title.capitalize()}: {progress.videos_done} of "
+            f"{counted(progress.videos, 'video')} done"
+        )
+        if progress.frames:
+            line += f", {progress.frames_done:,} of {counted(progress.frames, 'frame')}"
+        if console is None:
+            # Python shows warnings on stderr even if nothing configures logging.
+            logger.warning("%s.", line)
+        else:
+            console.print(f"{line}.", highlight=False, markup=False, soft_wrap=True)
+
+    return show_line
+
+
+def _is_terminal(console: rich.console.Console | None) -> bool:
+    return sys.stderr.isatty() if console is None else console.is_terminal

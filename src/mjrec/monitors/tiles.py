@@ -172,7 +172,9 @@ class TiledVideo:
             facts=self._tiles.facts,
             strict=self._options.strict,
         )
-        self._live = LiveVideos([video], tolerates=self._tolerates)
+        self._live = LiveVideos(
+            [video], tolerates=self._tolerates, retry_at_close=run.retry_at_close
+        )
         self._live.begin()
 
     def _tolerates(self, error: Exception) -> bool:

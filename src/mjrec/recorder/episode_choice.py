@@ -52,10 +52,9 @@ class EpisodeChoice:
         """Whether any episode may get a video of its own."""
         return self._schedule is not disable_videos
 
-    @property
-    def is_scheduled(self) -> bool:
-        """Whether the schedule chose the episode of the last call to `decide`."""
-        return self._decided[1]
+    def has_chosen(self, episode_id: int) -> bool:
+        """Return whether the schedule chose the running episode."""
+        return self._decided == (episode_id, True)
 
     def will_choose(self, episode_id: int) -> bool:
         """Return whether it is already certain that an episode gets a video.

@@ -23,6 +23,8 @@ class LiveVideos:
     Args:
         recorders: the video recorders, at least one, the first camera's first.
         tolerates: returns whether to continue after an error.
+        retry_at_close: calls a function when the run closes. It is given one for
+            metadata that the disk had no room for.
         on_frame_error: called with an error that is not tolerated and was raised while
             taking a step's frame. It may come from the environment itself.
 
@@ -35,10 +37,12 @@ class LiveVideos:
         recorders: Sequence[VideoRecorder],
         *,
         tolerates: Callable[[Exception], bool],
+        retry_at_close: Callable[[Callable[[], None]], object],
         on_frame_error: Callable[[Exception], object] = lambda _: None,
     ) -> None:
         self.recorders = recorders
         self._tolerates = tolerates
+        self._retry_at_close = retry_at_close
         self._on_frame_error = on_frame_error
 
     @property
@@ -115,8 +119,14 @@ class LiveVideos:
             except Error as error:
                 if not self._tolerates(error):
                     failure = failure or error
+        if not all(recorder.closed for recorder in self.recorders):
+            self._retry_at_close(functools.partial(self._end_again, facts))
         if failure is not None:
             raise failure
+
+    def _end_again(self, facts: Mapping[str, Any]) -> None:
+        self.end(facts)
+        self.name_again()
 
     def name_again(self) -> None:
         """Give the finished videos their second names, if they have any."""
@@ -132,7 +142,9 @@ class LiveVideos:
         """
         self.say(**facts)
         for recorder in self.recorders:
-            amend_metadata(Path(str(recorder.path)), facts)
+            # One that is not closed has no metadata yet.
+            if recorder.closed:
+                amend_metadata(Path(str(recorder.path)), facts)
 
     def remove(self) -> None:
         """Remove finished videos.
@@ -143,6 +155,7 @@ class LiveVideos:
         # The first camera's metadata, written last, shows that all videos exist, so it
         # is removed last.
         for recorder in reversed(self.recorders):
+            recorder.discard()
             video = Path(str(recorder.path))
             about = Path(str(recorder.metadata_path))
             for path in (about, video, frame_hash_path(video)):
@@ -208,5 +221,6 @@ def live_videos(
     return LiveVideos(
         recorders,
         tolerates=functools.partial(run.tolerates, "video"),
+        retry_at_close=run.retry_at_close,
         on_frame_error=on_frame_error,
     )

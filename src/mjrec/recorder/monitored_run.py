@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import itertools
 import logging
 from collections.abc import Callable, Iterator, Mapping
@@ -153,8 +154,8 @@ class MonitoredRun:
         )
         self.layouts: dict[SpanLogs, RowLayout] = {}
         self.paces: dict[SpanLogs, Mapping[str, Any]] = {}
-        # Recordings whose ends are not in the journal yet because the disk was full.
-        self._late: list[Path] = []
+        # What a full disk has delayed until the run closes.
+        self._late: list[Callable[[], None]] = []
         self.no_video = VideoRecorder(env.frames, enabled=False)
         self._episode: BegunEpisode | None = None
         # The reasons for drawing videos live that were logged so far.
@@ -172,6 +173,7 @@ class MonitoredRun:
         self._lines += 1
         self._write(lambda: self._journal.append(entry))
         self.note_provenance()
+        self._note_stated_faults()
 
     def note(self, kind: str, facts: Any) -> None:
         """Write another event, one of `formats.journal.EVENTS`, to the journal.
@@ -182,6 +184,7 @@ class MonitoredRun:
         self.events.note(kind, facts)
         self._lines += 1
         self._write(lambda: self._journal.note(kind, facts))
+        self._note_stated_faults()
 
     def note_provenance(self, *, wait: bool = False) -> None:
         """Write the run's provenance to the journal, once it is known.
@@ -236,20 +239,28 @@ class MonitoredRun:
     def submit(self, recording: Path) -> None:
         """Submit a recording to the finisher, once the journal has its end."""
         if self._journal.is_behind:
-            self._late.append(recording)
+            self.retry_at_close(functools.partial(self.finisher.submit, recording))
         else:
             self.finisher.submit(recording)
 
+    def retry_at_close(self, do: Callable[[], None]) -> None:
+        """Call a function in `close_logs`, because the disk is full now."""
+        self._late.append(do)
+
     def close_logs(self) -> None:
-        """Write all remaining rows and facts to the logs.
+        """Write all remaining rows and facts to the logs, and do what was delayed.
 
         Raises:
             FileNotWritten: the disk is full; the next call tries again.
         """
         self.logs.close()
         self.clip_logs.close()
-        while self._late:
-            self.finisher.submit(self._late.pop(0))
+        late, self._late = self._late, []
+        try:
+            while late:
+                late.pop(0)()
+        finally:
+            self._late += late
 
     def leave(self) -> None:
         """Release journal and logs as they are. Idempotent."""
@@ -263,6 +274,13 @@ class MonitoredRun:
             return stated.provenance if is_time else None
         found = None if self._provenance is None else self._provenance.found(wait=wait)
         return None if found is None else {**found, **self._policy}
+
+    def _note_stated_faults(self) -> None:
+        stated = () if self._statements is None else self._statements.faults
+        for lines, facts in stated:
+            if lines == self._lines:
+                self.note("fault", facts)
+                return
 
     def _write(self, write: Callable[[], None]) -> None:
         try:
@@ -283,6 +301,7 @@ class MonitoredRun:
         """Begin an episode, to which faults are attributed from now on."""
         self._episode = episode
         self.events.begin(episode.episode_id, chosen=False)
+        self._note_stated_faults()
 
     def caption(self) -> Caption:
         """Return the caption of the current frame."""

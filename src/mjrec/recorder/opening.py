@@ -12,7 +12,7 @@ import contextlib
 import itertools
 import os
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
@@ -58,6 +58,7 @@ class Statements:
         provenance_after: number of journal lines before the provenance, not counting
             the first line.
         clock: returns the time, in seconds since the epoch.
+        faults: the facts of each fault, after the number of journal lines before it.
         only_counted: whether episodes without a video keep no trajectory, because only
             their rewards and ends are compared.
     """
@@ -67,6 +68,7 @@ class Statements:
     provenance: Mapping[str, Any] | None
     provenance_after: int
     clock: Callable[[], float]
+    faults: Sequence[tuple[int, Mapping[str, Any]]] = ()
     only_counted: bool = False
 
 

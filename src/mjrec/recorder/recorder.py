@@ -7,7 +7,7 @@ import contextlib
 import logging
 import os
 import weakref
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any, Final
@@ -159,6 +159,12 @@ class Recorder:
     def video_recorder(self) -> VideoRecorder | DeferredVideo | None:
         """The running episode's video recorder; None before the first reset."""
         return None if self._recording is None else self._recording.video
+
+    @property
+    def live_videos(self) -> Sequence[VideoRecorder]:
+        """The recorders of the running episode's live videos, one for each camera."""
+        live = None if self._recording is None else self._recording.live
+        return () if live is None else live.recorders
 
     def bundle_trajectories(self) -> None:
         """Write all trajectories to one file when the recorder closes.
@@ -440,19 +446,24 @@ class Recorder:
 
     def _begin_episode(self, recording: EpisodeRecording, observation: Any) -> None:
         episode = self.run.episode
-        wanted = self._choice.decide(episode.episode_id)
+        wanted = keeps = False
+        # If a user's function raises, the episode is recorded without what it decides.
+        with self.run.tolerating("video", Exception):
+            wanted = self._choice.decide(episode.episode_id)
         if self._clips is not None:
             self._clips.reset(is_chosen=wanted)
         chosen = wanted and self._kept is None
         self.run.events.begin(episode.episode_id, chosen=chosen)
         # With clips the episode has no video of its own.
         wanted = wanted and self._clips is None
+        with self.run.tolerating("trajectory", Exception):
+            keeps = self._choice.keeps_trajectory(
+                episode.episode_id, episode_type=episode.type, has_video=wanted
+            )
         recording.begin(
             observation,
             wants_video=wanted,
-            keeps=self._choice.keeps_trajectory(
-                episode.episode_id, episode_type=episode.type, has_video=wanted
-            ),
+            keeps=keeps,
             stays=self._choice.keeps_without_video(episode.type),
         )
 
@@ -527,7 +538,7 @@ class Recorder:
             return
         # Only once, even if this is interrupted: recovery completes the rest.
         recording.is_over = True
-        if not self._choice.is_scheduled:
+        if not self._choice.has_chosen(recording.episode_id):
             # A schedule's decision is final.
             kept = None
         standing = Standing.CHOSEN
@@ -596,7 +607,10 @@ class Recorder:
         episode: FinishedEpisode | None,
         standing: Standing,
     ) -> None:
-        is_chosen = self._choice.is_scheduled and standing is Standing.CHOSEN
+        is_chosen = (
+            self._choice.has_chosen(recording.episode_id)
+            and standing is Standing.CHOSEN
+        )
         is_out = standing is Standing.DROPPED
         choice = {"chosen": is_chosen, "recording": None if is_out else recording.mode}
         if episode is None:

@@ -99,11 +99,13 @@ class StateRecorder:
         if self._observation is not None:
             self._observation.set(observation)
             self._first_observation = self._observation.values.copy()
-        self._first_state = np.full(_words(self._state), np.nan)
+        self._first_state = np.empty(_words(self._state))
         self._first_snapshot = np.empty(_words(self._snapshot), np.uint64)
         self._first_change: Mapping[str, NDArray[Any]] | None = None
         self._first_time = run.env.clock()
-        if capture is not None:
+        if capture is None:
+            self._first_state.fill(np.nan)
+        else:
             capture.capture_state(self._first_state)
             if self._takes_frames:
                 self._first_change = capture.capture_snapshot(self._first_snapshot)

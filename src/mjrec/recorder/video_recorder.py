@@ -139,6 +139,7 @@ class VideoRecorder:
         self._captures = 0
         self._first: tuple[int, float | None] | None = None
         self._last_taken = -1
+        self._breaks_off: tuple[int, str] | None = None
         self._steps = StepRuns()
         self._stride = self._frames_per_step = 1
         self._timestep: Fraction | None = None
@@ -215,6 +216,13 @@ class VideoRecorder:
             reason,
         )
 
+    def break_off(self, reason: str, *, frames: int) -> None:
+        """Stop taking frames after so many; if that is none, delete those taken."""
+        if frames:
+            self._breaks_off = frames, reason
+        else:
+            self._fail(reason)
+
     def close(self) -> None:
         """Finish the video and write its metadata. A second call does nothing.
 
@@ -287,6 +295,9 @@ class VideoRecorder:
         return os.fspath(path)
 
     def _capture(self, step: int) -> None:
+        if self._breaks_off is not None and self.frame_count >= self._breaks_off[0]:
+            self.give_up(self._breaks_off[1])
+            return
         rendered = self.env.render()
         self._last_taken = step
         frames = rendered if isinstance(rendered, list) else [rendered]
@@ -365,11 +376,14 @@ class VideoRecorder:
         except InvalidFrame as error:
             self.give_up(str(error))
         except Exception as error:
-            self.broken = True
-            self.metadata["broken_reason"] = str(error)
-            self._steps = StepRuns()
-            self._drop_frames()
+            self._fail(str(error))
             raise
+
+    def _fail(self, reason: str) -> None:
+        self.broken = True
+        self.metadata["broken_reason"] = reason
+        self._steps = StepRuns()
+        self._drop_frames()
 
     def _drop_frames(self) -> None:
         self._waiting.clear()

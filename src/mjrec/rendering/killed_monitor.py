@@ -26,6 +26,7 @@ from ..formats.journal import (
     JournalWriter,
     entry_of,
 )
+from ..formats.killed_episodes import missing_line
 from ..formats.locks import try_lock
 from ..formats.monitor_directory import (
     Infix,
@@ -291,20 +292,12 @@ class _KilledMonitor:
             facts = self._facts(number)
             is_filmed = number in now.videos or number in now.metadata
             video = facts.get("video") or ({"recording": "live"} if is_filmed else {})
-            line = {
+            choice = {
                 "episode_id": number,
                 "chosen": bool(video) and not is_choosing,
                 "recording": video.get("recording"),
             }
-            try:
-                entry_of({**facts, **line})
-                is_complete = facts.get("complete") is True
-            except ValueError:
-                is_complete = False
-            if is_complete:
-                yield "episode", {**facts, **line}
-            else:
-                yield "cut", {**line, "reason": facts.get("reason", KILLED)}
+            yield missing_line(facts, choice)
 
     def _missing_clips(self, now: MonitorFiles) -> Iterator[_Line]:
         """Yield a line for each clip, deferred or live.

@@ -1,8 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Functions that write statistics files and manifests from a monitor's other files.
 
-Nothing else writes them. The functions are used by the monitor, by a process that has
-rendered some of its videos, and by a process that recovers a dead monitor's files.
+Only this module writes them, and only if their content changes, at these moments:
+
+- A monitor closes or, with `write_upon_reset`, begins an episode (`recorder.recorder`).
+- A process has rendered pending videos (`rendering.finish`).
+- A process has recovered a dead monitor's files (`rendering.killed_monitor`).
+- An evaluation has chosen its videos (`rendering.chosen_videos`).
+
+While a monitor is open, no other process writes its files.
 """
 
 from __future__ import annotations

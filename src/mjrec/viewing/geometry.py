@@ -75,18 +75,17 @@ def mesh_of(model: mujoco.MjModel, shape: Shape) -> trimesh.Trimesh:
         mesh, uv = _asset_mesh(model, int(model.geom_dataid[geom]))
     else:
         mesh, uv = create_primitive_mesh(model, geom), None
-        if shape.geom_type == _FIELD:
-            uv = _unit_square(mesh.vertices)
-        else:
+        if shape.geom_type != _FIELD:
             mesh = _smoothed(mesh)
     if texture is None:
         return _coloured(mesh, shape)
-    image = _image(model, texture)
     if int(model.tex_type[texture]) != _TEXTURE_2D:
-        mesh, uv = _on_cube(mesh)
-    if uv is None:
-        return _coloured(mesh, shape, np.asarray(image).reshape(-1, 3).mean(axis=0))
-    return _textured(mesh, uv, image, shape)
+        # If all sides are equal, there is only one.
+        sides = int(model.tex_height[texture]) // int(model.tex_width[texture])
+        mesh, uv = _on_cube(mesh, sides)
+    elif uv is None:
+        mesh, uv = _repeated(model, shape, mesh)
+    return _textured(mesh, uv, _image(model, texture), shape)
 
 
 def soft_mesh(model: mujoco.MjModel, shape: Shape) -> trimesh.Trimesh:
@@ -136,11 +135,11 @@ def linear(rgba: Any) -> list[float]:
     return [*(max(0.0, c) ** _GAMMA for c in (red, green, blue)), alpha]
 
 
-def sky(model: mujoco.MjModel) -> NDArray[np.uint8] | None:
-    """Return the model's sky as a narrow image, top to bottom; None without a sky."""
+def sky(model: mujoco.MjModel) -> NDArray[np.uint8]:
+    """Return the model's sky as a narrow image, top to bottom; black without a sky."""
     kinds = model.tex_type.tolist()
     if int(mujoco.mjtTexture.mjTEXTURE_SKYBOX) not in kinds:
-        return None
+        return np.zeros((2, 2, 3), np.uint8)
     texture = kinds.index(int(mujoco.mjtTexture.mjTEXTURE_SKYBOX))
     pixels = np.asarray(_image(model, texture))
     width = pixels.shape[1]
@@ -150,14 +149,8 @@ def sky(model: mujoco.MjModel) -> NDArray[np.uint8] | None:
     return np.repeat(column, 2, axis=1)
 
 
-def _coloured(
-    mesh: trimesh.Trimesh, shape: Shape, tint: NDArray[Any] | None = None
-) -> trimesh.Trimesh:
-    rgba = np.array(shape.rgba)
-    if tint is not None:
-        rgba[:3] *= tint / 255
-    mesh.visual = TextureVisuals(material=_material(rgba))
-    return mesh
+def _coloured(mesh: trimesh.Trimesh, shape: Shape) -> trimesh.Trimesh:
+    return _with_visual(mesh, TextureVisuals(material=_material(np.array(shape.rgba))))
 
 
 def _textured(
@@ -165,9 +158,15 @@ def _textured(
 ) -> trimesh.Trimesh:
     # glTF's texture origin is the top of the image, trimesh's is the bottom.
     flipped = image.transpose(Image.Transpose.FLIP_TOP_BOTTOM)
-    mesh.visual = TextureVisuals(
-        uv=uv, material=_material(np.array(shape.rgba), baseColorTexture=flipped)
-    )
+    material = _material(np.array(shape.rgba), baseColorTexture=flipped)
+    return _with_visual(mesh, TextureVisuals(uv=uv, material=material))
+
+
+def _with_visual(mesh: trimesh.Trimesh, visual: TextureVisuals) -> trimesh.Trimesh:
+    mesh.visual = visual
+    # trimesh exports normals only if they are known. Without them, the page would show
+    # every triangle flat.
+    mesh.vertex_normals = mesh.vertex_normals
     return mesh
 
 
@@ -274,17 +273,35 @@ def _smoothed(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
     return made
 
 
-def _unit_square(vertices: NDArray[Any]) -> NDArray[np.float64]:
-    flat = np.asarray(vertices[:, :2], float)
-    low, size = flat.min(axis=0), np.ptp(flat, axis=0)
-    uv: NDArray[np.float64] = (flat - low) / np.maximum(size, 1e-9)
-    return uv
+def _repeated(
+    model: mujoco.MjModel, shape: Shape, mesh: trimesh.Trimesh
+) -> tuple[trimesh.Trimesh, NDArray[np.float64]]:
+    """Return a mesh split for a repeated 2D texture, and its texture coordinates.
+
+    Each side of a primitive shows the texture. On a height field, or a mesh without
+    texture coordinates, it is projected along z.
+    """
+    material = int(model.geom_matid[shape.object_id])
+    half = np.maximum(mesh.extents[:2] / 2, 1e-9)
+    repeat = model.mat_texrepeat[material].astype(float)
+    if model.mat_texuniform[material]:
+        repeat *= half
+    if shape.geom_type in (_MESH, _FIELD):
+        flat = np.asarray(mesh.vertices[:, :2], float)
+        return mesh, 0.5 * repeat * flat * [1, -1] / half - 0.5
+    mesh, uv = _on_cube(mesh, 1)
+    return mesh, uv * repeat
 
 
-def _on_cube(mesh: trimesh.Trimesh) -> tuple[trimesh.Trimesh, NDArray[np.float64]]:
+def _on_cube(
+    mesh: trimesh.Trimesh, sides: int
+) -> tuple[trimesh.Trimesh, NDArray[np.float64]]:
     """Return a mesh split for a cube texture, and its texture coordinates.
 
-    The six sides of the texture are stacked vertically in one image.
+    Args:
+        mesh: the mesh.
+        sides: number of the texture's sides, stacked vertically in one image: six, or
+            one that is used six times.
     """
     extents = np.maximum(mesh.extents / 2, 1e-9)
     directions = mesh.vertices / extents
@@ -299,7 +316,7 @@ def _on_cube(mesh: trimesh.Trimesh) -> tuple[trimesh.Trimesh, NDArray[np.float64
         at = directions[unique[here, 0]]
         depth = np.maximum(np.abs(at[:, major]), 1e-9)
         s, t = (np.clip((at[:, i] * sign / depth + 1) / 2, 0, 1) for i, sign in across)
-        uv[here] = np.column_stack([s, (number + t) / 6])
+        uv[here] = np.column_stack([s, (number % sides + t) / sides])
     made = trimesh.Trimesh(
         mesh.vertices[unique[:, 0]], inverse.reshape(-1, 3), process=False
     )
