@@ -41,7 +41,7 @@ _PLAIN: dict[object, _Read] = {
 
 
 def to_json(instance: Any) -> dict[str, Any]:
-    """Convert a dataclass to a JSON object; only `json_text` replaces NaN with null."""
+    """Convert a dataclass to a JSON object. NaN is kept; `json_text` makes it null."""
     names = [each.name for each in dataclasses.fields(instance)]
     return {name: _plain(getattr(instance, name)) for name in names}
 

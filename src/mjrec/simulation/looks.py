@@ -115,8 +115,8 @@ class Looks:
             anything: whether to compare textures, meshes and the like too.
 
         Returns:
-            Copies by name, or None if nothing has changed. This takes less than a
-            microsecond if nothing has changed.
+            Copies by name, or None if nothing has changed, which is found out in less
+            than a microsecond.
         """
         if not anything and self.seen == self.present:
             return None

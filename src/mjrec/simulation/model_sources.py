@@ -187,7 +187,7 @@ def _compile(authored: AuthoredModel) -> mujoco.MjModel:
 
 
 class _References:
-    """The files that one MJCF file refers to, as their names are written there.
+    """The files that one MJCF file refers to, by the names in that file.
 
     Attributes:
         xml: other MJCF files.
@@ -196,7 +196,7 @@ class _References:
         go_up: whether a path leaves a folder with `..`.
 
     Raises:
-        ValueError: the file is not plain MJCF, or refers to files outside.
+        ValueError: the file is not plain MJCF, or refers to files outside its folder.
     """
 
     def __init__(self, name: str, content: bytes) -> None:

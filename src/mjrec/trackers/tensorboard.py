@@ -36,7 +36,7 @@ _MANY_FRAMES = 10_000
 class TensorBoardTracker(Tracker):
     """A tracker that writes event files for TensorBoard.
 
-    Scalars are logged over the steps of the run: `training/return`, `training/length`
+    Scalars are logged against the run's steps: `training/return`, `training/length`
     and, if the environment reports it, `training/success`. Evaluation episodes use
     `evaluation/`. TensorBoard cannot play videos (its issue 39), so each mp4 is shown
     as a small animated GIF, `training/video` under Images, with its file name under

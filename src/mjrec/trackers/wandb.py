@@ -98,7 +98,7 @@ class WandbTracker(Tracker):
         self._log(group, {_VIDEO_STEPS: steps, name: frame})
 
     def end(self, run: Run) -> None:
-        """Finish W&B's run, if it was started here and this was its last monitor."""
+        """Finish W&B's run if the tracker started it and this was its last monitor."""
         del self._last_episodes[run]
         if self._last_episodes:
             return
