@@ -126,10 +126,10 @@ class Looks:
 
 
 class _Piece:
-    """A piece of memory, as it was at first (`stored`) and when it was last `seen`.
+    """A piece of memory, as it was at the start (`stored`) and the last look (`seen`).
 
-    For memory that is not watched at each step, which may be large, the two share one
-    copy until something changes.
+    Memory that is not watched at each step may be large, so for such memory, the two
+    are one copy until something changes.
     """
 
     def __init__(self, address: int, size: int, *, is_watched: bool = True) -> None:

@@ -155,8 +155,8 @@ def _compile(authored: AuthoredModel) -> mujoco.MjModel:
     """Compile a model, reading only the files in `authored`.
 
     Raises:
-        ValueError: MuJoCo rejects the model, a name in it points outside, or it uses a
-            plugin.
+        ValueError: MuJoCo rejects the model, it refers to a file outside its folder, or
+            it uses a plugin.
     """
     by_base_name: dict[str, list[str]] = {}
     for name in authored.files:
