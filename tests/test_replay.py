@@ -126,8 +126,8 @@ def test_a_state_comes_back_by_the_names_of_its_parts(order):
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        ({"act": None}, "act has 0, in this model 1"),
-        ({"qpos": slice(0, 9)}, "qpos has 9, in this model 8"),
+        ({"act": None}, "act has 0, but in this model 1"),
+        ({"qpos": slice(0, 9)}, "qpos has 9, but in this model 8"),
         ({"aura": slice(0, 1)}, r"aura, which MuJoCo .* not know"),
     ],
 )
