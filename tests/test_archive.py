@@ -86,7 +86,7 @@ def test_a_hundred_videos_fit_and_no_more(tmp_path: Path) -> None:
     write_archive(pairs, io.BytesIO())
     missing = (tmp_path / "missing.mp4", tmp_path / "missing.meta.json")
     assert refusal([missing, *pairs]).startswith(
-        "101 videos were given, and an archive holds at most 100."
+        "101 videos were given, but an archive holds at most 100."
     )
 
 

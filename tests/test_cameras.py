@@ -102,9 +102,9 @@ def test_wrappers_are_opened():
     data = mujoco.MjData(model)
     assert raw_model(Wrapper(model)) is raw_model(model) is model
     assert raw_data(Wrapper(data)) is raw_data(data) is data
-    with pytest.raises(InvalidArgument, match=r"MjModel.*got mujoco.*MjData"):
+    with pytest.raises(InvalidArgument, match=r"MjModel.*not mujoco.*MjData"):
         raw_model(data)
-    with pytest.raises(InvalidArgument, match=r"MjData.*got .*Wrapper"):
+    with pytest.raises(InvalidArgument, match=r"MjData.*not .*Wrapper"):
         raw_data(Wrapper(3))
 
 

@@ -208,7 +208,7 @@ def test_children_that_die_as_they_begin(begin):
         submit(run, "a", do="echo")
         with pytest.raises(
             Error,
-            match=r"No worker can start. The last one ended with status 3. "
+            match=r"No worker can start. The last worker ended with status 3. "
             r"Its last output: a library is missing",
         ):
             outcomes(run)

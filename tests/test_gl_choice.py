@@ -72,7 +72,10 @@ def test_mujoco_then_takes_the_choice():
         (
             "mjrec.use_gl()",
             {"MUJOCO_GL": "nonsense"},
-            ["UnknownName There is no OpenGL backend", "variable MUJOCO_GL names it"],
+            [
+                "UnknownName There is no OpenGL backend",
+                "comes from the environment variable MUJOCO_GL",
+            ],
         ),
         ("mjrec.use_gl()", {"MUJOCO_GL": "Off"}, ["GLError", "turns rendering off"]),
         (

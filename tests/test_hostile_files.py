@@ -292,7 +292,7 @@ def beginning_with(line: bytes, path: Path) -> None:
 
 HEAD = DTYPE.descr[:4]
 ROWS = {
-    "its rows' layout cannot be read": 5,
+    "the layout of its rows cannot be read": 5,
     "the state of a row": [*HEAD, ["state", "<f8"]],
     "not all float64": [*HEAD, ["state", [["a", "<f4"], ["", "|V4"]]]],
     "is not a valid array name": [*HEAD, ["snapshot", [["a/b", "<f8"]]]],
@@ -496,7 +496,7 @@ def test_only_names_of_the_monitor_are_believed(directory: Path) -> None:
 def test_a_newer_format_is_refused_with_the_way_out(directory: Path) -> None:
     """Nothing of it is guessed at, and it is not removed."""
     journal, log = put_journal(directory, NAME, version=12), log_name(INFIX, 0)
-    with pytest.raises(UnreadableFile, match=r"newer mjrec, in .* 12.* 1: update mjr"):
+    with pytest.raises(UnreadableFile, match=r"newer mjrec in .* 12.* 1: update mjr"):
         load_trajectory(directory / f"{NAME}.h5")
     remove_if_done(directory / log)
     assert (directory / log).exists()

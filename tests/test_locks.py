@@ -106,7 +106,7 @@ def test_no_other_file_is_taken_for_a_lock(put, get, path):
     victim = path.with_name("victim")
     victim.write_text("valuable")
     put(victim, path)
-    with pytest.raises(DirectoryNotWritable, match="so not a lock"):
+    with pytest.raises(DirectoryNotWritable, match="so it is not a lock"):
         get(path)
     assert victim.read_text() == "valuable"
     assert not is_locked(path)

@@ -188,7 +188,7 @@ def test_what_is_no_action_is_refused(write, space, action):
     write("action = None\ndef policy(observation):\n    return action\n")
     policy = load("policy", acting_in(space))
     sys.modules["mjrec_test_policy"].action = action
-    with pytest.raises(mjrec.PolicyError, match="must return an action of ") as caught:
+    with pytest.raises(mjrec.PolicyError, match="must return an action in ") as caught:
         policy(None)
     assert str(space) in str(caught.value)
     assert repr(action) in str(caught.value)

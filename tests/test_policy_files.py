@@ -90,7 +90,7 @@ def test_what_is_in_no_such_file_is_refused(tmp_path):
     torch = pytest.importorskip("torch")
     env = gymnasium.make("InvertedPendulum-v5")
     torch.save(torch.nn.Linear(4, 1).state_dict(), tmp_path / "weights.pt")
-    with pytest.raises(mjrec.PolicyError, match=r"not hold a network.*torch\.jit"):
+    with pytest.raises(mjrec.PolicyError, match=r"not contain a network.*torch\.jit"):
         load_policy(str(tmp_path / "weights.pt"), env)
     (tmp_path / "other.zip").write_bytes(b"PK\x05\x06" + bytes(18))
     with pytest.raises(mjrec.PolicyError, match=r"other\.zip"):

@@ -180,8 +180,8 @@ def test_a_restored_snapshot_gives_the_same_scene(xml):
         ("ten_wrapadr", 2**31 - 1, "use points up to"),
         ("ten_wrapnum", 10**8, "use points up to"),
         ("ten_wrapnum", -5, "use points up to"),
-        ("wrap_obj", 10**8, "but it holds values"),
-        ("wrap_obj", -3, "but it holds values"),
+        ("wrap_obj", 10**8, "but its values range"),
+        ("wrap_obj", -3, "but its values range"),
         # It would become some index.
         ("ten_wrapadr", np.full(4, np.nan), "ten_wrapadr is .*f8"),
         ("geom_xpos", np.zeros((1, 3)), "belong to another model or version"),

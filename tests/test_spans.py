@@ -653,7 +653,7 @@ def test_rows_of_a_newer_version_are_no_rows(logs: SpanLogs, path: Path) -> None
     journal, log, *_ = files_of(path.parent)
     journal.write_bytes(journal.read_bytes().replace(b'"version": 1', b'"version": 9'))
     for look in (lambda: read(path), lambda: recordings_in(log)):
-        with pytest.raises(UnreadableFile, match="newer mjrec, in format version 9"):
+        with pytest.raises(UnreadableFile, match="newer mjrec in format version 9"):
             look()
     logs.release()
     remove_if_done(log)

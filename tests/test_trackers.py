@@ -34,7 +34,7 @@ def test_import_loads_no_service(tmp_path):
     assert answer.stdout.split() == ["[]"], answer.stderr
     with pytest.raises(AttributeError, match="no attribute 'Neptune'"):
         _ = mjrec.trackers.Neptune
-    with pytest.raises(InvalidArgument, match="got a run and project, tags"):
+    with pytest.raises(InvalidArgument, match="not a run and project, tags"):
         mjrec.trackers.WandbTracker(object(), project="p", tags=["a"])
 
 

@@ -237,7 +237,7 @@ def test_a_file_has_its_name_at_the_end(tmp_path):
     assert sorted(one.name for one in tmp_path.iterdir()) == ["a.framehash", "a.mp4"]
     assert [number_of(frame) for frame in read(path)] == list(range(64))
     video.close()
-    with pytest.raises(ClosedError, match=r"a\.mp4 is closed after 64 frames"):
+    with pytest.raises(ClosedError, match=r"a\.mp4 was closed after 64 frames"):
         video.write(numbered(2))
     record(path, map(numbered, range(5)))
     assert [one.name for one in tmp_path.iterdir()] == ["a.mp4"]
@@ -312,7 +312,7 @@ def test_a_file_with_other_frames_is_not_kept(tmp_path, arguments, left):
     video = VideoWriter(tmp_path / "a.mp4", fps=40, encoder_arguments=arguments)
     for number in range(100):
         video.write(numbered(number))
-    message = f"should hold 100 frames, but decoding gives {left}"
+    message = f"should contain 100 frames, but decoding gives {left}"
     with pytest.raises(FrameCountError, match=message):
         video.close()
     assert video.result is None

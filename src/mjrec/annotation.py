@@ -42,7 +42,7 @@ class Caption:
 
     Attributes:
         episode_id: the episode's number.
-        step: number of steps before the frame.
+        step: number of steps taken before the frame.
         time: simulated seconds since the reset; None if unknown.
         reward: sum of the rewards so far.
     """
@@ -90,7 +90,7 @@ def annotated(frame: Frame, caption: Caption) -> Frame:
         draw.text((left, bottom), text, fill=255, font=font, anchor="ls")
     band = result[: layout.height]
     np.take(_UNDER_BAND, band, out=band, mode="clip")
-    # Adding 1 makes full cover 256, so that dividing by 256 keeps all of it.
+    # Adding 1 makes full coverage 256, so that dividing by 256 loses nothing.
     cover = np.asarray(written)[:, :, None].astype(np.uint16) + 1
     band[:, : layout.width] += ((255 - band[:, : layout.width]) * cover >> 8).astype(
         np.uint8

@@ -18,9 +18,9 @@ from .errors import FileNotWritten
 
 
 def temporary_path(path: Path) -> Path:
-    """Return a new name for an unfinished `path`, in the same directory.
+    """Return a new temporary name for `path`, in the same directory.
 
-    The name starts with exactly one dot, even if `path` is hidden itself: programs that
+    The name starts with exactly one dot, even if `path` itself is hidden: programs that
     clean up a directory recognize the file by that dot.
     """
     name = path.name.removeprefix(".")

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Detection of videos that show nothing: all black, a single colour, or no movement.
 
-With a missing light, a camera inside a wall, or an OpenGL context from another thread,
-a video has all of its frames and is still useless.
+If a light is missing, the camera is inside a wall, or the OpenGL context belongs to
+another thread, a video can have all of its frames and still be useless.
 """
 
 from __future__ import annotations
@@ -25,15 +25,16 @@ _STEP = 16
 
 
 class BlankFrames:
-    """A check whether the frames of a video show anything.
+    """A check for whether the frames of a video show anything.
 
-    Once one frame has two colours and one differs from the first, no more frames are
-    checked. Only frames that could be blank are checked completely.
+    Checking stops once there has been a frame that is not black, a frame with two
+    colours, and a frame that differs from the first. Only frames that could be blank
+    are checked completely.
     """
 
     def __init__(self) -> None:
         self._count = 0
-        # The looks that all frames so far have.
+        # The kinds of blankness that all frames so far have in common.
         self._suspects = set(_LOOKS)
         self._first: Frame | None = None
 
@@ -51,11 +52,11 @@ class BlankFrames:
             self._first = None
 
     def facts(self) -> dict[str, bool]:
-        """Return the facts for the video's metadata; empty if nothing is wrong.
+        """Return facts for the video's metadata, or an empty dict if nothing is wrong.
 
         `suspect_black`: all frames are black. `suspect_constant`: each frame has a
         single colour, or there are several frames and all are equal. Black frames of a
-        single colour are both.
+        single colour have both.
         """
         if not self._count:
             return {}
@@ -65,7 +66,7 @@ class BlankFrames:
         return {name: True for name, is_so in facts.items() if is_so}
 
     def suspicion(self) -> str | None:
-        """Return a phrase for what is wrong with the video; None if nothing is."""
+        """Return a phrase that describes the problem, or None if nothing is wrong."""
         if not self.facts():
             return None
         frames = f"all {self._count} frames are" if self._count > 1 else "its frame is"

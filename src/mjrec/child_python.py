@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Child processes that run one of mjrec's modules, which creates a `Parent` there.
+"""Child processes that run one of mjrec's modules, which creates a `Parent`.
 
-multiprocessing is not used: its children import the caller's main module (which runs a
-script without a guard a second time), cannot be started from daemonic processes, and
-with "fork" inherit OpenGL's locks without its threads.
+multiprocessing is not used. Its children import the caller's main module (so a script
+without a `__main__` guard runs twice) and cannot be started from daemonic processes.
+Children that it forks inherit OpenGL's locks without its threads.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from .messages import (
 )
 from .timeouts import Timeout
 
-# The most that unprivileged users may have; it holds more than one 480x480 frame.
+# The maximum pipe size for unprivileged users. It holds more than one 480x480 frame.
 _PIPE_BYTES = 1 << 20
 _MOST_WORDS_READ = 20_000
 _LOOKS_FOR_STACKS = 20
@@ -54,21 +54,21 @@ class Child:
     Args:
         module: the module to run.
         arguments: its command-line arguments.
-        environ: its environment variables, without the module search path.
+        environ: its environment variables, except the module search path.
         cwd: its working directory; if None, the parent's.
         is_heard: whether the caller reads the output from the pipe `words`. If False,
-            the output is kept in memory, and `last_words` includes the end of it.
-        fork: a function that a fork of this process calls, instead of starting a new
-            Python with the module. Only valid if this process has a single thread and
-            has not used OpenGL.
+            the output is kept in memory, and `last_words` includes its end.
+        fork: a function to call in a fork of this process, instead of running the
+            module in a new Python process. Only valid if this process has a single
+            thread and has not used OpenGL.
 
     Raises:
         OSError: the process cannot be started.
 
     Attributes:
         pid: the process id.
-        most_bytes: maximum size of a message; a longer one, which no frame is, ends the
-            messages.
+        most_bytes: maximum size of a message, which no frame reaches. After a longer
+            message, no more messages are received.
     """
 
     most_bytes = MOST_BYTES
@@ -122,9 +122,9 @@ class Child:
         return self._answers.fileno()
 
     def send(self, **message: Any) -> None:
-        """Send a message without blocking; what does not fit is sent with the next one.
+        """Send a message without blocking; any part that does not fit is sent later.
 
-        If the child has died, this is noticed only when waiting for its messages.
+        If the child has died, the caller finds out only when it waits for messages.
         """
         self._unsent += b"".join(packed(message))
         self._send_on()
@@ -143,7 +143,7 @@ class Child:
         """Yield the child's messages until it ends.
 
         Args:
-            seconds: timeout in seconds without a message. When it passes, None is
+            seconds: maximum time in seconds without a message. After that, None is
                 yielded and the iterator ends.
         """
         timeout = Timeout(seconds)
@@ -174,7 +174,7 @@ class Child:
         return self._words_from(before) or "(no output)"
 
     def last_words(self) -> str:
-        """Return how the child ended, and the end of its output."""
+        """Return a description of how the child ended, with the end of its output."""
         how = self.how_it_ended()
         # Python's crash report ends with the names of dozens of modules.
         words = self.printed().partition("\nExtension modules:")[0].strip()
@@ -186,7 +186,7 @@ class Child:
         return self._words_from(max(0, self._size_of_words() - _MOST_WORDS_READ))
 
     def how_it_ended(self) -> str:
-        """Wait a few seconds for the exit status and return it in words."""
+        """Wait a few seconds for the exit status, and describe it in words."""
         status = self._process.wait(_SECONDS_TO_END)
         if status is None:
             return "is alive but silent"
@@ -205,7 +205,7 @@ class Child:
     def cpu_seconds(self) -> float:
         """Return the child's CPU time in seconds; 0 once it has ended."""
         with contextlib.suppress(OSError):
-            # The kernel's id of the CPU clock of another process.
+            # The kernel's clock id for another process's CPU time.
             return time.clock_gettime((~self.pid << 3) | 2)
         return 0.0
 
@@ -214,7 +214,7 @@ class Child:
         self._process.send_signal(signal.SIGTERM)
 
     def kill(self) -> None:
-        """Kill the child and its children, which may hang too; `end` does the rest."""
+        """Kill the child and its children, which may hang too; `end` cleans up."""
         children = _pids_of_children(self.pid)
         self._process.send_signal(signal.SIGKILL)
         for pid in children:
@@ -281,19 +281,19 @@ def wait_for_news(children: Iterable[Child], seconds: float) -> list[Child]:
 
 
 class _Process:
-    """The exit status of a process that this one has started, and signals to it."""
+    """A process that this one has started: its exit status, and signals to it."""
 
     def __init__(self, pid: int) -> None:
         self._pid = pid
         self._status: int | None = None
 
     def send_signal(self, signum: int) -> None:
-        # After it has been waited for, its pid may belong to another process.
+        # Once a process has been waited for, its pid may belong to another process.
         if self.wait(0) is None:
             os.kill(self._pid, signum)
 
     def wait(self, seconds: float) -> int | None:
-        """Return the exit status as `subprocess` does, or None if still running."""
+        """Return the exit status in `subprocess`'s form, or None if it still runs."""
         deadline, pause = time.monotonic() + seconds, 0.0005
         while (status := self._poll()) is None:
             rest = deadline - time.monotonic()
@@ -316,7 +316,7 @@ class _Process:
 
 
 def _pipe() -> tuple[int, int]:
-    """Return the two ends of a pipe, with descriptors above the standard streams'.
+    """Return both ends of a pipe, as descriptors above those of the standard streams.
 
     If a standard stream is closed, a new pipe may get its number, and the child's own
     standard stream would then replace it.
@@ -435,21 +435,21 @@ def python_command(module: str) -> list[str]:
 def environment_of_child(environ: Mapping[str, str]) -> dict[str, str]:
     """Return `environ` with this process's module search path in `PYTHONPATH`.
 
-    The path is complete and in order, so the child has the same mujoco and mjrec, no
-    matter how this process found them. The exception is the directory of the main
-    script, or the working directory: Python puts it first, and the child searches it
+    The path is complete and in order, so the child imports the same mujoco and mjrec,
+    no matter how this process found them. The exception is the directory of the main
+    script (or the working directory): Python puts it first, but the child searches it
     last.
     """
     first, rest = sys.path[:1], sys.path[1:]
     path = [*rest, *first] if first and _is_of_main(first[0]) else sys.path
     entries = (str(Path(entry).absolute()) for entry in path if isinstance(entry, str))
-    # A path that contains the separator cannot be listed there.
+    # A path that contains the separator cannot be listed in PYTHONPATH.
     entries_said = [entry for entry in entries if os.pathsep not in entry]
     return {**environ, "PYTHONPATH": os.pathsep.join(entries_said)}
 
 
 def places_of_main() -> list[str]:
-    """Return the main script's folder if modules are imported from it."""
+    """Return a list with the main script's folder, if modules are imported from it."""
     first = sys.path[:1]
     return [str(Path(each).absolute()) for each in first if _is_of_main(each)]
 

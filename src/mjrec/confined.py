@@ -1,15 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A process without network, home folder or other files, run as `python -m` MODULE.
+"""A process without access to the network, the home folder or other files.
 
-The process confines itself before it imports anything, because confining a thread does
-not confine threads that already exist. An unprivileged Linux process can use:
+`python -m mjrec.confined MODULE` runs a module in such a process. The process confines
+itself before it imports the module, because confining a thread does not confine threads
+that already exist. An unprivileged Linux process can use:
 
 - Landlock (Linux 5.13): only Python, the system and the named paths can be read, and
   only named paths can be written; since Linux 6.7, TCP connections are blocked too.
 - An empty network namespace, if the system lets users create one.
 
-If the kernel supports neither, only the sandbox's limits, an empty home folder and a
-short list of environment variables remain.
+If the kernel supports neither, the only protection is the sandbox's limits, an empty
+home folder and a short list of environment variables.
 """
 
 from __future__ import annotations
@@ -89,7 +90,7 @@ def confine(
         _NO_TCP if has_tcp else 0,
         _SCOPES if version >= _WITH_SCOPES else 0,
     )
-    # Older kernels know a shorter structure.
+    # Older kernels expect a shorter structure.
     size = 8 if not has_tcp else 16 if version < _WITH_SCOPES else 24
     ruleset = _libc.syscall(_CREATE, ctypes.byref(rules), ctypes.c_size_t(size), 0)
     if ruleset < 0:
@@ -139,7 +140,7 @@ def _allow(ruleset: int, path: str, rights: int) -> None:
 
 
 def main() -> None:
-    """Confine this process as its environment variable says, then run the module."""
+    """Confine this process as its environment variable requests, and run the module."""
     said = json.loads(os.environ.pop(VARIABLE))
     holds = confine(**said)
     os.environ[f"{VARIABLE}_HOLDS"] = json.dumps(holds)

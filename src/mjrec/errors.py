@@ -31,9 +31,9 @@
     │   ├── UnfinishedRecordings            render or recover first
     │   ├── ArchiveTooLarge                 exceeds max_size
     │   └── IdentityLeft                    anonymous=True: a name remains
-    ├── UnreadableFile                      a damaged file, or the wrong kind
-    │   ├── UnreadableArchive               given to `mjrec verify`
-    │   └── UntrustedModel                  from a stranger, without its sources
+    ├── UnreadableFile                      a damaged file, or the wrong kind of file
+    │   ├── UnreadableArchive               `mjrec verify` cannot read the archive
+    │   └── UntrustedModel                  an untrusted model without its sources
     └── MissingDependency (also ImportError)  an extra is not installed
 
 Every message says what was requested, what was found, and what to do.
@@ -69,7 +69,7 @@ _MOST_NAMES = 20
 
 
 def _first_of(names: Sequence[str], count: int, *, between: str = ", ") -> str:
-    """Return the first few names, and how many more there are."""
+    """Return the first few names, and the number of the others."""
     more = len(names) - count
     shown = between.join(names[:count])
     return f"{shown} and {more} more" if more > 0 else shown
@@ -172,8 +172,8 @@ class DifferentEnvironment(Error):
         self.asked = asked
         super().__init__(
             f"{directory} contains recordings of {recorded}, but this monitor records "
-            f"{asked}. Use another directory: results of two environments cannot share "
-            "one."
+            f"{asked}. Use another directory, because one directory cannot hold the "
+            "results of two environments."
         )
 
 
@@ -282,9 +282,9 @@ class EncoderError(Error):
     """ffmpeg failed or died.
 
     Attributes:
-        command: its arguments.
-        returncode: its exit status; if negative, the signal that killed it.
-        stderr: the end of its output.
+        command: ffmpeg's command line.
+        returncode: ffmpeg's exit status, or -N if signal N killed it.
+        stderr: the end of ffmpeg's output.
     """
 
     def __init__(
@@ -305,7 +305,7 @@ class FrameCountError(EncoderError):
 
 
 class GLError(Error):
-    """No OpenGL backend works here, or another one is already in use."""
+    """No OpenGL backend works here, or the wrong backend is already in use."""
 
 
 class PolicyError(Error):
@@ -321,7 +321,7 @@ class PackError(Error):
 
 
 class UnfinishedRecordings(PackError):
-    """Recordings are not finished.
+    """The recordings are not finished.
 
     Attributes:
         directory: the directory of the recordings.
@@ -343,7 +343,7 @@ class ArchiveTooLarge(PackError):
     Attributes:
         size: lower bound on the size of the smallest archive tried, in bytes.
         limit: the limit in bytes.
-        largest: names and sizes of its largest files.
+        largest: names and sizes of that archive's largest files.
     """
 
     def __init__(
@@ -414,7 +414,7 @@ class UntrustedModel(UnreadableFile):
 
     Attributes:
         path: the model's path.
-        reason: why its sources cannot be used, and how to trust it.
+        reason: why its sources cannot be used, and how to trust the model.
     """
 
     _message = "The model {path} was not loaded: {reason}."

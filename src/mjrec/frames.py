@@ -14,7 +14,8 @@ from .errors import InvalidArgument, InvalidFrame, UnknownName
 
 Frame: TypeAlias = NDArray[np.uint8]
 
-# "full" uses the model's own settings, "draft" no multisampling and a small shadow map.
+# "full" uses the model's own settings. "draft" uses a small shadow map and no
+# multisampling.
 QUALITIES = ("full", "draft")
 
 # The limit of H.264 level 6.2.
@@ -22,7 +23,7 @@ _MAX_SIDE = 16384
 
 
 def check_frame(frame: object, *, size: tuple[int, int] | None = None) -> Frame:
-    """Return `frame` if it is a frame.
+    """Return `frame` if it is a valid frame.
 
     Args:
         frame: the object that an environment returned.
@@ -33,20 +34,22 @@ def check_frame(frame: object, *, size: tuple[int, int] | None = None) -> Frame:
     """
     if not isinstance(frame, np.ndarray):
         raise InvalidFrame(
-            "A frame must be a (height, width, 3) uint8 array, got "
+            "A frame must be a (height, width, 3) uint8 array, not "
             f"{type(frame).__name__}."
         )
     if frame.ndim != 3 or frame.shape[2] != 3 or frame.dtype != np.uint8:
         raise InvalidFrame(
-            "A frame must be a (height, width, 3) uint8 array, got shape "
-            f"{frame.shape} and dtype {frame.dtype}."
+            "A frame must be a (height, width, 3) uint8 array, but this one has the "
+            f"shape {frame.shape} and the dtype {frame.dtype}."
         )
     if 0 in frame.shape:
-        raise InvalidFrame(f"A frame must not be empty, got shape {frame.shape}.")
+        raise InvalidFrame(
+            f"A frame must not be empty, but this one has the shape {frame.shape}."
+        )
     if size is not None and frame.shape[:2] != size:
         raise InvalidFrame(
             f"All frames of a video must have the same size: the first was (height, "
-            f"width) {size}, this one is {frame.shape[:2]}."
+            f"width) {size}, but this one is {frame.shape[:2]}."
         )
     return frame
 
@@ -73,7 +76,7 @@ def check_size(height: int, width: int) -> tuple[int, int]:
         if not whole or not 1 <= value <= _MAX_SIDE:
             raise InvalidArgument(
                 f"{name} must be a whole number of pixels from 1 to {_MAX_SIDE}, "
-                f"got {value!r}."
+                f"not {value!r}."
             )
     return int(height), int(width)
 
@@ -81,8 +84,9 @@ def check_size(height: int, width: int) -> tuple[int, int]:
 def pad_to_even(frame: Frame) -> Frame:
     """Return `frame` with an odd side extended by repeating its last row or column.
 
-    yuv420p stores one colour sample for two by two pixels, so a video's sides must be
-    even. Repeating an edge leaves all other pixels unchanged and in place.
+    yuv420p stores one colour sample for each block of two by two pixels, so a video's
+    sides must be even. Repeating an edge leaves all other pixels unchanged and in
+    place.
     """
     height, width = frame.shape[:2]
     if height % 2 == 0 and width % 2 == 0:
@@ -93,7 +97,7 @@ def pad_to_even(frame: Frame) -> Frame:
 def grid_shape(count: int) -> tuple[int, int]:
     """Return the numbers of rows and columns of a grid for `count` frames.
 
-    The grid is as square as possible, and never higher than wide.
+    The grid is as square as possible, and never has more rows than columns.
 
     >>> [grid_shape(n) for n in (1, 2, 3, 4, 5, 7, 12)]
     [(1, 1), (1, 2), (2, 2), (2, 2), (2, 3), (3, 3), (3, 4)]
@@ -120,8 +124,8 @@ def grid_frame(frames: Sequence[Frame]) -> Frame:
     if len(sizes) != 1:
         shown = ", ".join(f"{shape[1]}x{shape[0]}" for shape in sorted(sizes)) or "none"
         raise InvalidArgument(
-            "Frames that share a video must have the same size, got "
-            f"{shown}. Give all the same height and width, or make separate videos."
+            "Frames that share a video must have the same size, but their sizes are: "
+            f"{shown}. Use one height and width for all, or make separate videos."
         )
     [(height, width, channels)] = sizes
     rows, columns = grid_shape(len(frames))

@@ -5,8 +5,8 @@ JSON (RFC 8259) has no NaN or infinity. Infinity is written as the number `1e999
 is valid JSON and which every IEEE-754 reader, including Python's, reads as infinity.
 NaN is written as `null`. NumPy scalars and arrays are written as numbers and lists.
 
-Text to be read may be untrusted. It is rejected if two readers could interpret it
-differently (a duplicate key), or if it needs far more memory or stack than its length
+Input may be untrusted. It is rejected if two readers could interpret it differently
+(because of a duplicate key), or if it needs far more memory or stack than its length
 suggests.
 """
 
@@ -25,7 +25,7 @@ import numpy as np
 _DEEPEST = 100
 
 # The maximum number of lists, objects and their items; each takes about 80 bytes at
-# most. The statistics of four million episodes have as many.
+# most. The statistics of four million episodes reach this number.
 _MOST_VALUES = 1 << 24
 
 _FLAT = {str, int, float, bool, type(None)}
@@ -42,7 +42,7 @@ def dumps(value: object, *, indent: int | None = None) -> str:
     with the keys 1 and "1") are written as `{"repr": ...}`, because information for
     people must never stop a run.
     """
-    # Nearly everything is plain, which is many times faster to write.
+    # Nearly all values are plain, and plain values are many times faster to write.
     try:
         text = json.dumps(
             value if _is_plain(value) else _made_plain(value), indent=indent
@@ -55,7 +55,7 @@ def dumps(value: object, *, indent: int | None = None) -> str:
 
 
 def loads(text: str | bytes) -> Any:
-    """Return the value of the JSON text.
+    """Parse JSON text and return its value.
 
     The tokens `NaN` and `Infinity`, which are not JSON but which gym writes, are
     accepted too.
@@ -80,7 +80,7 @@ def loads(text: str | bytes) -> Any:
 
 
 def float_from_json(value: float | None) -> float:
-    """Return the number that `dumps` was given: None, from `null`, is NaN."""
+    """Convert a number read from JSON to a float; None (`null`) becomes NaN."""
     return math.nan if value is None else float(value)
 
 

@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Facts about this machine, and the resources that this process may use.
 
-The facts are those that the last bits of a simulation depend on, apart from MuJoCo's
-version. MuJoCo calls the C library's sine and exponential functions, which choose their
-code by CPU features: without FMA, the same wheel on the same machine gives different
-trajectories.
+The last bits of a simulation depend on these facts and on MuJoCo's version. MuJoCo
+calls the C library's sine and exponential functions, which choose their code by CPU
+features: without FMA, the same wheel on the same machine gives different trajectories.
 """
 
 from __future__ import annotations
@@ -28,7 +27,7 @@ _MODELS = ("model name", "CPU part")
 
 
 def usable_cpus() -> int:
-    """Return the number of CPUs that this process can keep busy; at least 1.
+    """Return the number of CPUs that this process can keep busy, which is at least 1.
 
     This is the number of CPUs that the process may run on (its affinity), or its
     cgroup's quota if that is less: a container with 2.5 of 64 CPUs can use 2.
@@ -43,11 +42,11 @@ def cgroup_cpu_quota(
 ) -> float | None:
     """Return the number of CPUs that the cgroup allows, or None if unlimited.
 
-    Limits on parent groups count too. Only cgroups of version 2 are read.
+    Limits on parent groups count too. Only version 2 cgroups are supported.
 
     Args:
         root: mount point of the cgroup file system.
-        own: the file that names this process's groups.
+        own: the file that lists this process's groups.
     """
     # Inside a container the path may be the host's, which is not mounted. The root is
     # then the container's own group.
@@ -137,6 +136,6 @@ def check_workers(workers: int | None) -> int | None:
     if workers is not None and not (whole and workers >= 1):
         raise InvalidArgument(
             "workers must be a positive whole number, or None for one per usable CPU, "
-            f"got {workers!r}."
+            f"not {workers!r}."
         )
     return workers

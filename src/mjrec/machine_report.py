@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A check of everything that a recording needs from a machine."""
+"""A check of everything that recording needs on a machine."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ from .gl import BACKENDS, Diagnosis, Probe, choose, diagnose, probe
 from .gl.backends import platforms_contradict
 from .machine import cgroup_cpu_quota, gpu_device_files, usable_cpus
 
-# A distribution, a program that uses it as a recording does but renders nothing, and
-# the command to run if it is missing.
+# Each entry: a distribution, a program that uses it as a recording does but does not
+# render, and the command that installs it.
 _PACKAGES = (
     ("mjrec", "", ""),
     ("mujoco", "import mujoco", "python -m pip install mujoco"),
@@ -39,8 +39,8 @@ _PACKAGES = (
     ),
     ("numpy", "", ""),
 )
-# Optional packages and engines: name, distributions, and the requirement that installs
-# them.
+# Optional packages and engines. Each entry: a name, its distributions, and the
+# requirement that installs them.
 _EXTRAS = (
     ("SciPy", ("scipy",), "mjrec"),
     ("report", ("jinja2", "pillow"), "mjrec[report]"),
@@ -66,8 +66,8 @@ class Package:
         name: the package's name.
         version: its version; None if it is not installed.
         works: whether a minimal program that uses it succeeds; None if not tried.
-        cause: why it does not work.
-        fix: how to fix or install it.
+        cause: the reason why it does not work.
+        fix: instructions for fixing or installing it.
     """
 
     name: str
@@ -85,8 +85,8 @@ class Ffmpeg:
         path: path of the executable; None if it was not found.
         version: the first line of its version output.
         encodes: whether it encoded a test frame as H.264.
-        cause: why it failed.
-        fix: how to fix it.
+        cause: the reason why it failed.
+        fix: instructions for fixing it.
     """
 
     path: str | None
@@ -98,13 +98,13 @@ class Ffmpeg:
 
 @dataclass(frozen=True)
 class Cpus:
-    """Numbers of CPUs.
+    """The CPUs of the machine and of this process.
 
     Attributes:
-        usable: CPUs that this process can keep busy.
-        present: CPUs of the machine; None if unknown.
-        allowed: CPUs that the process may run on (its affinity).
-        quota: the cgroup's limit; None if unlimited.
+        usable: number of CPUs that this process can keep busy.
+        present: number of CPUs in the machine; None if unknown.
+        allowed: number of CPUs that the process may run on (its affinity).
+        quota: number of CPUs that the cgroup allows; None if unlimited.
     """
 
     usable: int
@@ -120,16 +120,16 @@ class MachineReport:
     Attributes:
         can_render: whether recordings can be rendered now.
         backend: the backend that `use_gl` would choose; None if it would raise.
-        reason: why this backend was chosen, or the error.
+        reason: why this backend was chosen, or the error's message.
         backends: the result of each backend's test.
         problems: questionable settings that do not prevent rendering.
         gpu_device_files: device files of the GPUs.
         ffmpeg: the encoder.
         packages: Python packages that recording uses.
         extras: optional packages, engines, and the GPU's driver.
-        cpus: numbers of CPUs.
+        cpus: the CPUs of the machine and of this process.
         python: the interpreter's version.
-        platform: operating system and processor.
+        platform: the operating system and processor.
     """
 
     can_render: bool
@@ -147,7 +147,7 @@ class MachineReport:
 
 
 def examine_machine() -> MachineReport:
-    """Test everything that a recording needs; this takes a few seconds.
+    """Test everything that recording needs, which takes a few seconds.
 
     The tests run in other processes, so nothing is imported or changed in this one.
     """
@@ -288,8 +288,8 @@ def _gpu() -> Package:
         output = _NVIDIA_VERSION.read_text(errors="replace")
     except OSError:
         if gpu_device_files():
-            return Package("GPU", "found, without NVIDIA's driver")
-        fix = "No GPU device file in /dev: videos are rendered on the CPU."
+            return Package("GPU", "found, but without NVIDIA's driver")
+        fix = "There is no GPU device file in /dev: videos are rendered on the CPU."
         return Package("GPU", None, fix=fix)
     return Package("GPU", output.partition("\n")[0].strip())
 

@@ -2,7 +2,7 @@
 """Messages between a process and its child: JSON objects and the bytes of frames.
 
 Errors are sent as JSON (`carried`, `unpacked`), because pickle would let a process that
-writes into the pipe run code here.
+writes into the pipe run code in this one.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ Message: TypeAlias = "dict[str, Any] | bytearray"
 PIPES_VARIABLE = "MJREC_PARENT"
 # The signal that makes a child write the stacks of its threads to standard error.
 STACKS_SIGNAL = signal.SIGUSR1
-# The maximum size of a message. A longer one, which no frame is, ends the messages.
+# The maximum size of a message. No frame is as large; a longer message ends the stream.
 MOST_BYTES = 1 << 32
 
-# Each message starts with a flag (whether it is the bytes of a frame) and its length.
+# Each message starts with a flag (whether its content is a frame) and its length.
 _HEADER = struct.Struct("=?Q")
 
 
@@ -46,7 +46,7 @@ def packed(
 
 
 def received(pipe: int, most_bytes: int) -> Generator[Message | None, None, None]:
-    """Yield the messages from a pipe until it ends, and None while none is complete.
+    """Yield the messages from a pipe until it closes, and None while one is incomplete.
 
     Args:
         pipe: the descriptor to read from.
@@ -90,7 +90,7 @@ def _taken(pipe: int, size: int) -> Generator[None, None, bytearray]:
 
 
 def log_message(message: Mapping[str, Any]) -> bool:
-    """Log a child's `log` message here; return whether the message is one."""
+    """Log a child's message if it is a `log` message, and return whether it is."""
     if "log" in message:
         name, level, text = message["log"]
         logging.getLogger(name).log(level, "%s", text)
@@ -98,7 +98,7 @@ def log_message(message: Mapping[str, Any]) -> bool:
 
 
 def carried(error: BaseException) -> dict[str, Any]:
-    """Return an error as plain JSON, from which `unpacked` rebuilds it."""
+    """Convert an error to plain JSON values, from which `unpacked` rebuilds it."""
     if not isinstance(error, Error):
         told = "".join(traceback.format_exception(error)).strip()
         return {
@@ -115,10 +115,11 @@ def carried(error: BaseException) -> dict[str, Any]:
 
 
 def unpacked(plain: Mapping[str, Any]) -> Error:
-    """Rebuild the error that `carried` was given.
+    """Rebuild an error from the result of `carried`.
 
-    It has the error's class (or its nearest public base class), its message, and those
-    attributes that are numbers, strings, lists of these, paths or None.
+    The new error has the original class (or its nearest public base class), the same
+    message, and the attributes that are numbers, strings, lists of these, paths or
+    None.
     """
     facts = {
         key: Path(value["path"]) if isinstance(value, dict) else value

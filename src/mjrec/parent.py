@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The parent side of a `Child`'s pipes: the process that started this one."""
+"""The connection from a child process to its parent, which created a `Child`."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from .messages import MOST_BYTES, PIPES_VARIABLE, STACKS_SIGNAL, packed, receive
 class Parent:
     """The connection to the process that started this one as a `Child`.
 
-    Messages do not use standard input, which is empty, or standard output, which goes
-    to standard error: libraries and drivers print whenever they like. Processes that
-    this one starts or forks cannot use the connection.
+    Messages do not use standard input or output, because libraries and drivers print
+    whenever they like. Standard input is empty, and standard output goes to standard
+    error. Processes that this one starts or forks cannot use the connection.
 
     This process writes the stacks of its threads to standard error when `Child.stacks`
-    requests it and when it dies of a signal such as SIGSEGV.
+    requests them, and when a signal such as SIGSEGV kills it.
     """
 
     def __init__(self) -> None:
@@ -46,7 +46,7 @@ class Parent:
             seconds: maximum time to wait, if `listen` was called; None for no limit.
 
         Raises:
-            queue.Empty: no message arrived in that time.
+            queue.Empty: no message arrived within `seconds`.
             EOFError: the parent has ended, and `listen` was not called.
         """
         if self._listens:
@@ -62,11 +62,12 @@ class Parent:
         return not self._said.empty()
 
     def listen(self, at_end: Callable[[], object] | None = None) -> None:
-        """Receive on a thread from now on, so that the parent's end is always noticed.
+        """Receive on a thread from now on, to notice at once when the parent ends.
 
         Args:
-            at_end: called on that thread when the parent has ended. Afterwards, or at
-                once if None, this process ends, because its work has no other use.
+            at_end: a function to call on that thread when the parent has ended. After
+                that (or at once if None), this process exits, because nothing else
+                needs its work.
         """
         self._listens = True
         threading.Thread(
@@ -74,9 +75,9 @@ class Parent:
         ).start()
 
     def send(self, content: memoryview | None = None, **message: Any) -> None:
-        """Send a message or the bytes of a frame. May be called on any thread."""
+        """Send a message or the bytes of a frame. May be called from any thread."""
         parts = packed(message if content is None else content)
-        # If the parent has ended, `listen` handles it.
+        # If the parent has ended, the thread of `listen` ends this process.
         with contextlib.suppress(OSError), self._one_at_a_time:
             for part in parts:
                 rest = memoryview(part)
@@ -84,7 +85,7 @@ class Parent:
                     rest = rest[os.write(self._answers, rest) :]
 
     def send_warnings(self) -> None:
-        """Send warnings and errors that are logged here as `log`, from now on."""
+        """From now on, send logged warnings and errors to the parent as `log`."""
         logging.getLogger().addHandler(_ToParent(self))
 
     def _listen(self, at_end: Callable[[], object] | None) -> None:
@@ -112,5 +113,5 @@ class _ToParent(logging.Handler):
         try:
             self._parent.send(log=[record.name, record.levelno, self.format(record)])
         except Exception:
-            # Like all handlers, do not let an error reach the code that logs.
+            # No handler may let an error reach the code that logs.
             self.handleError(record)

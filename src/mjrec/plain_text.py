@@ -5,15 +5,15 @@ from __future__ import annotations
 
 from typing import Final
 
-# Line ends, and the spaces between digits, are harmless although not printable.
+# Newlines and the spaces between digits are harmless, although they are not printable.
 _SEEN: Final = "\n\N{NO-BREAK SPACE}\N{NARROW NO-BREAK SPACE}"
 
 
 def spelled_out(text: str, longest: int = 1000) -> str:
     """Return text with invisible characters escaped, truncated if it is too long.
 
-    Invisible characters are, for example, control characters and marks that change the
-    direction of the text.
+    Invisible characters include control characters and marks that change the direction
+    of the text.
 
     Args:
         text: the text to show.

@@ -1,15 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Provenance of a recording: packages, machine, variables, command line and code.
 
-Collecting it takes a third of a second or more, nearly all of it in other processes. It
-is done once, on a thread, and requested when a manifest is written.
+Collecting it takes a third of a second or more, most of which is spent in other
+processes. A thread collects it once, and it is read when a manifest is written.
 
 Reading the files of a hundred packages keeps Python busy for a fifth of a second. On a
-thread of a simulating process this would cost more than its share: whenever a step
-releases the interpreter lock, the thread keeps it for five milliseconds, which nearly
-stops the simulation until everything is read (200 steps of HalfCheetah in a tenth of a
-second instead of 1600). So a separate process (`python -m` with this module) reads
-them.
+thread of the simulating process, this would cost even more: whenever a step releases
+the interpreter lock, the thread holds it for five milliseconds. That nearly stops the
+simulation until everything is read (200 steps of HalfCheetah in a tenth of a second
+instead of 1600). So a separate process reads the files, by running this module.
 """
 
 from __future__ import annotations
@@ -36,7 +35,7 @@ from .parent import Parent
 
 logger = logging.getLogger(__name__)
 
-# Variables that change frames, the last bits of numbers, or which library is loaded.
+# Variables that can change frames, the last bits of numbers, or the loaded libraries.
 _VARIABLES = frozenset(
     {
         *("CUDA_VISIBLE_DEVICES", "DISPLAY", "GLIBC_TUNABLES", "LD_LIBRARY_PATH"),
@@ -47,7 +46,7 @@ _PREFIXES = (
     *("EGL_", "GALLIUM_", "GALLIVM_", "LIBGL_", "LP_", "MESA_", "MJREC_", "MKL_"),
     *("MUJOCO_", "NVIDIA_", "OMP_", "OPENBLAS_", "__EGL_"),
 )
-# Files that an installer adds to those of a wheel, or changes.
+# Files that an installer changes, or adds to the files of a wheel.
 _OF_INSTALLATION = ("INSTALLER", "REQUESTED", "RECORD", "direct_url.json")
 _NAME_OR_VERSION = re.compile(r"^(Name|Version): *(.*?) *$", re.MULTILINE)
 _SECONDS_FOR_PACKAGES = 60.0
@@ -65,7 +64,7 @@ class Provenance:
     """The provenance of this process, collected on a separate thread.
 
     Args:
-        root: the directory of the user's code.
+        root: the directory that contains the user's code.
     """
 
     def __init__(self, root: Path) -> None:
@@ -85,7 +84,7 @@ class Provenance:
         self._thread.start()
 
     def found(self, *, wait: bool) -> Mapping[str, Any] | None:
-        """Return the provenance, if it has been collected.
+        """Return the provenance, or None if it has not been collected.
 
         Args:
             wait: whether to wait for it, for at most two seconds.
@@ -123,15 +122,15 @@ class Provenance:
             self._found = {**found, "code": None}
             self._found = {**found, "code": _code(self._root)}
         except Exception:
-            # A recording must not fail because of this. A process that exits ends the
-            # child that lists its packages, and no longer needs the list.
+            # A recording must not fail because of this. A process that is exiting has
+            # ended the child that lists its packages, and no longer needs the list.
             if threading.main_thread().is_alive():
                 logger.warning("The provenance could not be collected.", exc_info=True)
 
 
 @functools.cache
 def look_around() -> Provenance:
-    """Start collecting this process's provenance, once, and return it."""
+    """Return this process's provenance; the first call starts collecting it."""
     return Provenance(_code_root())
 
 
@@ -169,7 +168,7 @@ def _code(root: Path) -> dict[str, Any] | None:
 
 
 def _git(root: Path, *arguments: str) -> str | None:
-    """Return git's output; None without git, a repository, or an answer."""
+    """Return git's output, or None if git is missing, fails or takes too long."""
     try:
         done = subprocess.run(
             # A repository's own configuration could name a program to run.
@@ -228,14 +227,14 @@ def _packages_in(places: Sequence[str]) -> dict[str, Any]:
 def _name_and_version(
     distribution: importlib.metadata.Distribution,
 ) -> tuple[str | None, str | None]:
-    """Return a package's name and version, without the slow parsing of all metadata."""
+    """Return a package's name and version, without slowly parsing all metadata."""
     text = distribution.read_text("METADATA") or distribution.read_text("PKG-INFO")
     answer = dict(_NAME_OR_VERSION.findall((text or "").partition("\n\n")[0]))
     return answer.get("Name"), answer.get("Version")
 
 
 def _record_sha256(distribution: importlib.metadata.Distribution) -> str | None:
-    """Return the SHA-256 of the sorted lines of a wheel's list of files; None if empty.
+    """Return the SHA-256 of the sorted lines of a wheel's file list, or None if empty.
 
     Files that an installer adds, such as compiled Python, are left out, so that two
     installations of the same wheel have the same digest.
@@ -274,7 +273,7 @@ PACKAGES = (
 
 @functools.cache
 def versions(*more: str) -> Mapping[str, str]:
-    """Return the versions of Python and of mjrec's main packages, if installed.
+    """Return the versions of Python and of mjrec's main packages that are installed.
 
     Args:
         *more: names of additional packages.

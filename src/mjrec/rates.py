@@ -10,17 +10,17 @@ from fractions import Fraction
 
 from .errors import InvalidArgument
 
-# Floats are binary. This limit finds the intended fraction (0.05 is 1/20), with an
-# error of less than a millionth of a millionth of a second.
+# Floats are binary. This limit recovers the intended fraction (0.05 becomes 1/20) with
+# an error of less than a millionth of a millionth of a second.
 MAX_DENOMINATOR = 10**6
 
 
 def to_rate(fps: float | Fraction, *, name: str = "fps") -> Fraction:
-    """Return `fps` frames per second as an exact fraction.
+    """Return a frame rate as an exact fraction.
 
-    A `Fraction` or an integer is used as it is. A float is converted to the simplest
-    fraction with the same float value to within a millionth: 29.97 becomes 2997/100,
-    and the float 30000/1001 becomes 30000/1001.
+    A `Fraction` or an integer is used as is. A float is converted to the closest
+    fraction whose denominator is at most a million: 29.97 becomes 2997/100, and the
+    float 30000/1001 becomes the fraction 30000/1001.
 
     Args:
         fps: frames per second.
@@ -32,11 +32,11 @@ def to_rate(fps: float | Fraction, *, name: str = "fps") -> Fraction:
     """
     if isinstance(fps, bool) or not isinstance(fps, numbers.Real):
         raise InvalidArgument(
-            f"{name} must be a positive number of frames per second, got {fps!r}."
+            f"{name} must be a positive number of frames per second, not {fps!r}."
         )
     if not math.isfinite(fps) or fps <= 0:
         raise InvalidArgument(
-            f"{name} must be a positive, finite number of frames per second, got {fps}."
+            f"{name} must be a positive, finite number of frames per second, not {fps}."
         )
     rate = (
         Fraction(fps)
@@ -46,7 +46,7 @@ def to_rate(fps: float | Fraction, *, name: str = "fps") -> Fraction:
     )
     if not Fraction(1, 1000) <= rate <= MAX_DENOMINATOR:
         raise InvalidArgument(
-            f"{name} must be from 0.001 to {MAX_DENOMINATOR}, got {fps}."
+            f"{name} must be from 0.001 to {MAX_DENOMINATOR}, but it is {fps}."
         )
     return rate
 
@@ -62,8 +62,8 @@ def rate_from_timestep(timestep: float) -> Fraction:
     """
     if not math.isfinite(timestep) or timestep < 1 / MAX_DENOMINATOR:
         raise InvalidArgument(
-            "A timestep must be a number of seconds, at least "
-            f"{1 / MAX_DENOMINATOR:g}, got {timestep}."
+            f"A timestep must be at least {1 / MAX_DENOMINATOR:g} seconds, but it is "
+            f"{timestep}."
         )
     rate = 1 / Fraction(timestep).limit_denominator(MAX_DENOMINATOR)
     # Steps longer than a second would have numerators too large for a video file.
@@ -71,7 +71,7 @@ def rate_from_timestep(timestep: float) -> Fraction:
 
 
 def stride_for(rate: Fraction, max_fps: float | Fraction | None) -> int:
-    """Return the smallest number of steps between video frames that obeys `max_fps`.
+    """Return the smallest number of steps between frames that satisfies `max_fps`.
 
     Args:
         rate: steps per second.

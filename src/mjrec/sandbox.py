@@ -37,13 +37,13 @@ LIMITS: Final[Mapping[str, int]] = {
     "RLIMIT_FSIZE": 8 * _GIB,
     "RLIMIT_NOFILE": 1024,
     "RLIMIT_CORE": 0,
-    # Seconds: a day.
+    # One day, in seconds.
     "RLIMIT_CPU": 86_400,
 }
 
-# Allows loading compiled models from untrusted sources.
+# If set, compiled models from untrusted sources may be loaded.
 _TRUST_VARIABLE = "MJREC_TRUST_MODELS"
-# Tells a process, and the processes it starts, that it runs in a sandbox.
+# Set in a sandboxed process and in the processes that it starts.
 _INSIDE_VARIABLE = "MJREC_SANDBOX"
 
 _CONFINED = "mjrec.confined"
@@ -68,8 +68,8 @@ class Sandbox(Child):
         more_environ: environment variables in addition to this process's.
         readable: if given, the process can read only Python, the system and these
             paths, can write only to `place` and `writable`, and has no network or home
-            folder, as far as `confined` can enforce this here.
-        writable: more folders that it can write to.
+            folder, if `confined` can enforce this here.
+        writable: additional folders that the process can write to.
 
     Raises:
         Error: the process cannot be started.
@@ -113,7 +113,7 @@ class Sandbox(Child):
         """Yield the process's answers until it ends.
 
         Args:
-            timeout_s: timeout in seconds without an answer. When it passes, None is
+            timeout_s: maximum time in seconds without an answer. After that, None is
                 yielded and the iterator ends.
         """
         for message in self.messages(timeout_s):
@@ -135,7 +135,7 @@ def is_inside() -> bool:
 
 
 def enter() -> tuple[Any, Callable[..., None]]:
-    """Apply the limits to this process, and make it end with its parent.
+    """Apply the limits to this process, and make it end when its parent ends.
 
     Returns:
         The request, and a function that sends its keyword arguments to the parent.

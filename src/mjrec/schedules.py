@@ -20,9 +20,9 @@ _CAP = 1000
 
 
 def capped_cubic_video_schedule(episode_id: int) -> bool:
-    """Return whether an episode is a cube below 1000 or a multiple of 1000.
+    """Return whether an episode's number is a cube below 1000 or a multiple of 1000.
 
-    Negative numbers are never recorded.
+    Negative numbers are never chosen.
 
     Examples:
         >>> [n for n in range(3001) if capped_cubic_video_schedule(n)]
@@ -43,8 +43,8 @@ def disable_videos(episode_id: int) -> bool:
 def to_schedule(video_callable: object) -> Schedule:
     """Return the schedule for gym's `video_callable` argument.
 
-    None means the capped cubic schedule; False, or a number equal to it, means no
-    videos; a function is used as it is, and its result is tested for truth.
+    None means the capped cubic schedule. False, or a number equal to False, means no
+    videos. A function is used as is, and its result is tested for truth.
 
     Raises:
         InvalidArgument: `video_callable` is anything else, such as True.
@@ -58,7 +58,7 @@ def to_schedule(video_callable: object) -> Schedule:
         return disable_videos
     raise InvalidArgument(
         "video_callable must be a function from an episode's number to a bool, None "
-        "(the cubes 0, 1, 8, 27 ... and every 1000th) or False (no videos), got "
+        "(the cubes 0, 1, 8, 27 ... and every 1000th) or False (no videos), not "
         f"{type(video_callable).__name__}: {video_callable!r}. For a video of every "
         "episode, use video_callable=lambda episode_id: True."
     )
@@ -69,8 +69,8 @@ def check_takes_one(function: Callable[..., Any], name: str, what: str) -> None:
 
     Args:
         function: the user's function.
-        name: the option that it was given as.
-        what: a description of the argument that it will be called with.
+        name: the option through which the function was given.
+        what: a description of the argument that the function will receive.
 
     Raises:
         InvalidArgument: the function cannot be called with exactly one argument.
@@ -78,7 +78,7 @@ def check_takes_one(function: Callable[..., Any], name: str, what: str) -> None:
     try:
         signature = inspect.signature(function)
     except ValueError:
-        # A function in C may have no signature.
+        # A function written in C may have no signature.
         return
     try:
         signature.bind(None)
@@ -90,7 +90,7 @@ def check_takes_one(function: Callable[..., Any], name: str, what: str) -> None:
 
 
 def schedule_name(schedule: Schedule) -> str:
-    """Return the name of a schedule that is written to the manifest."""
+    """Return the name under which a schedule is written to the manifest."""
     name = getattr(schedule, "__qualname__", None) or type(schedule).__qualname__
     return str(name)
 
@@ -101,7 +101,7 @@ def record_all(episode_id: int) -> bool:
 
 
 def schedule_from_text(text: str) -> Schedule:
-    """Return the schedule for a command-line option.
+    """Return the schedule that a command-line option names.
 
     Args:
         text: `cubic`, `all`, `none`, `every:N` or `at:0,5,9`.

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """A recording session: N episodes of a named environment under a policy.
 
-`mjrec record` runs one. Episode i of a session with seed S starts from
+`mjrec record` runs a session. Episode i of a session with seed S starts from
 `SeedSequence([S, i])` (see `environments.episode_seeds`), so any episode can be
-recorded again without the episodes before it.
+rerecorded without the episodes before it.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ class Session:
         directory: the monitor directory.
         seed: the session's seed, a whole number from 0 to 2**32 - 1.
         episodes: number of episodes.
-        policy: the policy's name, see `environments.policies`.
+        policy: the policy's name; see `environments.policies`.
         policy_kwargs: extra arguments for the policy.
         schedule: the episodes that get a video: `cubic`, `all`, `none`, `every:N` or
             `at:0,5,9`. None means `cubic`, unless `monitor` has a `keep`.
@@ -56,8 +56,8 @@ class Session:
         further_cameras: cameras for additional videos of the same episodes.
         made: options for creating the environment; the session sets `frames` and
             `seed`.
-        monitor: options for recording it; the session sets the choice of episodes and
-            the policy's file.
+        monitor: options for the monitor; the session sets the schedule and the policy's
+            file.
     """
 
     environment: str
@@ -98,11 +98,11 @@ def record_session(
     """Record a session, and yield each episode as it ends.
 
     If the environment cannot be rendered here, only statistics are recorded, and the
-    log says why. If `render` requests videos, this is an error instead.
+    log says why. If `render` requests videos, an error is raised instead.
 
     The recordings are closed when the iterator ends, is closed, or raises. So make sure
-    to close it, preferably with `contextlib.closing`. Pending videos are waited for
-    only if the iterator is exhausted; otherwise they stay pending.
+    to close the iterator, preferably with `contextlib.closing`. Only an iterator that
+    is exhausted waits for pending videos; otherwise they stay pending.
 
     Args:
         session: the session's options.
@@ -132,7 +132,7 @@ def record_session(
         if session.placed_camera is not None:
             view["camera"] = session.placed_camera
         if session.further_cameras:
-            # An environment that was created with its camera already shows it.
+            # An environment that was created with a camera already uses it.
             view["camera"] = [view.get("camera"), *session.further_cameras]
         recorded = monitored(
             named.environment,
@@ -175,9 +175,9 @@ def record_session(
 
 
 def with_chosen_videos(episodes: Sequence[SessionEpisode]) -> list[SessionEpisode]:
-    """Return the episodes of a finished session with `keep`, with their final videos.
+    """Return the episodes of a finished session that used `keep`, with final videos.
 
-    `video` is None for episodes whose video was not kept.
+    `video` is None for each episode whose video was not kept.
 
     Raises:
         UnreadableFile: the manifest, which lists the choice, is missing or damaged.
@@ -200,13 +200,13 @@ def _check(session: Session) -> None:
     keep = session.monitor.keep
     if session.episodes < 1:
         raise InvalidArgument(
-            f"episodes must be a positive whole number, got {session.episodes}."
+            f"episodes must be a positive whole number, not {session.episodes}."
         )
     if keep is not None and session.schedule is not None:
         raise InvalidArgument(
-            "Episodes that get a video are chosen either by keep (--keep "
-            f"{keep}) or by a schedule (--schedule {session.schedule}), not by both: "
-            "omit one."
+            "The episodes that get a video are chosen either by keep (--keep "
+            f"{keep}) or by a schedule (--schedule {session.schedule}), but not by "
+            "both: omit one of them."
         )
     parse_environment_name(session.environment)
     episode_seeds(session.seed, 0)

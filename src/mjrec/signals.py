@@ -13,7 +13,8 @@ from types import FrameType
 
 from .errors import Error
 
-# Schedulers and CI send these at a time limit, terminals when they are closed.
+# Schedulers and CI systems send these signals at a time limit, and terminals send them
+# when they are closed.
 _SIGNALS = (signal.SIGTERM, signal.SIGHUP)
 
 
@@ -39,9 +40,9 @@ class Terminated(SystemExit):
 def exit_on_signals() -> None:
     """Make SIGTERM and SIGHUP end this process like Ctrl-C.
 
-    By default these signals kill the process, and `mjrec recover` finishes its files.
-    After this call they raise `Terminated` in the main thread, so monitors close their
-    files. Pending videos are not rendered; one line says how many there are. The
+    By default, these signals kill the process, and `mjrec recover` has to finish its
+    files. After this call, they raise `Terminated` in the main thread, so monitors
+    close their files. Pending videos are not rendered, but their number is logged. The
     `mjrec` command calls this function.
 
     Signals that are ignored (`nohup`) or that have a handler are left alone.
@@ -89,9 +90,9 @@ def _deadly() -> list[signal.Signals]:
 
 
 def received() -> Terminated | None:
-    """Return the exception that the first signal raised, or None without a signal.
+    """Return the exception that the first signal raised, or None if there was none.
 
-    At exit, the interpreter does not report an uncaught `SystemExit`.
+    An exit handler needs this, because it cannot see an uncaught `SystemExit`.
     """
     return _received[0] if _received else None
 
@@ -111,12 +112,13 @@ def _send_again(unraisable: sys.UnraisableHookArgs) -> None:
     """Resend a signal whose exception was lost.
 
     The exception was raised inside a finalizer or a callback, where Python only reports
-    exceptions and continues. Schedulers send no second SIGTERM, but SIGKILL.
+    exceptions and continues. Schedulers do not send a second SIGTERM; they send
+    SIGKILL.
     """
     error = unraisable.exc_value
     if not isinstance(error, Terminated):
         _hooks[0](unraisable)
         return
-    # Send it a little later: here, the exception would be lost again.
+    # Send the signal a little later, because here the exception would be lost again.
     signum = error.signal
     threading.Timer(_MOMENT, lambda: os.kill(os.getpid(), signum)).start()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Timeouts without progress, after which something counts as hanging."""
+"""Timeouts for work that makes no progress and is then considered to hang."""
 
 from __future__ import annotations
 
@@ -42,9 +42,9 @@ def timeout_s() -> float:
 class Timeout:
     """A timeout that waits for progress in short slices.
 
-    A slice never counts for more than its planned duration: if the waiting process was
+    A slice never counts for more than its planned duration. If the waiting process was
     stopped, suspended or starved, the process that it waits for probably was too, and
-    gets that time again.
+    that time does not count against it.
 
     ::
 
@@ -71,11 +71,11 @@ class Timeout:
         self._waited = 0.0
 
     def wait(self, look: Callable[[float], object]) -> bool:
-        """Wait for a slice of the time, and restart the timeout if there was progress.
+        """Wait for one slice, and restart the timeout if there was progress.
 
         Args:
-            look: waits for at most the number of seconds it is given, and returns
-                whether there was progress.
+            look: a function that waits for at most the given number of seconds, and
+                returns whether there was progress.
 
         Returns:
             Whether there was progress.

@@ -67,7 +67,7 @@ class WorkerThread(Generic[T]):
 
     @property
     def failed(self) -> bool:
-        """Whether the function has raised; no more items will be consumed."""
+        """Whether the function has raised an error; then no more items are consumed."""
         return self._error is not None
 
     def put(self, item: T) -> None:
@@ -108,7 +108,10 @@ class WorkerThread(Generic[T]):
             self._raise_error()
 
     def leave(self) -> None:
-        """Close the queue; the thread consumes waiting items and ends. Never blocks."""
+        """Close the queue. The thread consumes the waiting items and ends.
+
+        Never blocks.
+        """
         with self._lock:
             self._closing = True
             self._changed.notify_all()
@@ -146,7 +149,7 @@ class WorkerThread(Generic[T]):
                 self._consume(item[0])
             if self._finish is not None and not self._aborted:
                 self._finish()
-        # All errors are kept for the caller; no one would see them on this thread.
+        # All errors are kept for the caller, because on this thread they would be lost.
         except BaseException as error:
             with self._lock:
                 self._error = error
@@ -156,7 +159,7 @@ class WorkerThread(Generic[T]):
             self._has_ended.set()
 
     def _next(self) -> tuple[T] | None:
-        """Wait for the next item and return it in a tuple; None after the last one."""
+        """Wait for the next item and return it in a tuple, or None after the last."""
         with self._lock:
             self._changed.wait_for(lambda: self._closing or bool(self._waiting))
             if not self._waiting:

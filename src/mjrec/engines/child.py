@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A child process that does jobs: `python -m mjrec.engines.child`.
 
-The first message from its parent describes the work, see `jobs.Run`. Jobs follow, one
+The first message from the parent describes the work (see `jobs.Run`). Jobs follow, one
 at a time::
 
     {"key": "a", "arguments": {...}}
@@ -9,14 +9,14 @@ at a time::
 The child sends::
 
     {"ready": true}                       the handler was created; sent first
-    {"error": {...}}                      sent instead if it could not be created
+    {"error": {...}}                      sent instead if creating the handler failed
     {"key": "a", "value": {...}}          a job is done
     {"key": "b", "failure": "..."}        a job failed: the handler's error
     {"log": ["mjrec.x", 30, "..."]}       a record for the parent's log
     {"limit": [2.0, "FILE", "..."]}       see `worker.time_limit`
 
-It exits at once, even in the middle of a job, when the pipe from its parent closes, or
-on SIGTERM or SIGUSR2.
+The child exits at once, even in the middle of a job, if the pipe from the parent closes
+or if it receives SIGTERM or SIGUSR2.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ _SECONDS_TO_LEAVE = 2.0
 def main() -> None:
     """Do jobs until the run ends."""
     parent = worker.parent = Parent()
-    # Line buffering, as in a terminal, so that printed lines survive the process's
+    # Use line buffering, as in a terminal, so that printed lines survive the process's
     # death.
     cast("io.TextIOWrapper", sys.stdout).reconfigure(line_buffering=True)
     parent.send_warnings()
@@ -57,14 +57,14 @@ def main() -> None:
     is_leaving = threading.Lock()
 
     def leave(*_: object) -> None:
-        # Leave once: both a signal and the end of the pipe may come. The second one
-        # waits for the first.
+        # Leave only once, although both a signal and the end of the pipe may come. The
+        # second call waits for the first.
         if is_leaving.acquire(timeout=_SECONDS_TO_LEAVE) and hasattr(handler, "leave"):
             handler.leave()
         # Not `sys.exit`, which would wait for a driver.
         os._exit(0)
 
-    # Slurm sends these signals to all processes of a job, not only to the first.
+    # Slurm sends these signals to all processes of a job, not only to the first one.
     for signum in (signal.SIGTERM, signal.SIGUSR2):
         signal.signal(signum, leave)
         signal.pthread_sigmask(signal.SIG_UNBLOCK, [signum])
@@ -78,7 +78,7 @@ def main() -> None:
 
 
 def _next_job(parent: Parent, work: Path) -> dict[str, Any] | None:
-    """Wait for the next job and return it; return None if the run is over."""
+    """Wait for the next job and return it, or return None if the run is over."""
     while True:
         try:
             return parent.receive(_SECONDS_BETWEEN_LOOKS)
@@ -88,14 +88,15 @@ def _next_job(parent: Parent, work: Path) -> dict[str, Any] | None:
 
 
 def _handler(work: Mapping[str, Any], parent: Parent) -> Any:
-    """Create the handler; report any error to the parent and exit."""
+    """Create the handler, or report the error to the parent and exit."""
     try:
-        # This machine's own entries of sys.path come first.
+        # This machine's own entries in `sys.path` come first.
         known = {*sys.path}
         more = (entry for entry in work["path"] if entry not in known)
         sys.path += [entry for entry in more if Path(entry).exists()]
         if work["require_gpu"] is not None:
-            # Before importing the handler's module, which may import mujoco.
+            # This must precede the import of the handler's module, which may import
+            # mujoco.
             render_on_given_gpu(required=work["require_gpu"])
         module, _, name = work["entry"].partition(":")
         make = operator.attrgetter(name)(importlib.import_module(module))

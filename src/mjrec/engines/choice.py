@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Creating an engine from its name and options."""
+"""Functions that create an engine from its name and options."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ ENGINES = ("local", "ray", "slurm", f"{_DASK}ADDRESS")
 
 
 def given_engine(engine: Executor | str | None, workers: int | None) -> Executor | None:
-    """Return the engine that a caller names or passes; None if there is none.
+    """Return the engine that a caller passed or named, or None if there is none.
 
     Args:
         engine: an executor, or the name of an engine.
@@ -26,8 +26,9 @@ def given_engine(engine: Executor | str | None, workers: int | None) -> Executor
 
     Raises:
         UnknownName: no engine has that name.
-        InvalidArgument: `engine` is not an executor or a name, `workers` is not a valid
-            number, or `workers` is given with an executor, which has its own.
+        InvalidArgument: `engine` is neither an executor nor a name, `workers` is not a
+            valid number, or `workers` is given although `engine` is an executor, which
+            has its own workers.
         MissingDependency: a package that the engine needs is not installed.
     """
     if engine is None:
@@ -37,7 +38,7 @@ def given_engine(engine: Executor | str | None, workers: int | None) -> Executor
     if not isinstance(engine, Executor):
         raise InvalidArgument(
             "engine must be a concurrent.futures.Executor, such as "
-            f"mjrec.LocalEngine(), or a name such as 'ray', got {engine!r}."
+            f"mjrec.LocalEngine(), or a name such as 'ray', not {engine!r}."
         )
     if workers is not None:
         raise InvalidArgument(
@@ -56,19 +57,19 @@ def engine_from(
     require_gpu: bool = False,
     options: Mapping[str, str] | None = None,
 ) -> Executor:
-    """Return an engine.
+    """Create an engine.
 
     Args:
         name: `"local"`, `"ray"`, `"slurm"`, or `"dask:ADDRESS"` with the address of a
             Dask scheduler.
         workers: maximum number of workers; None uses the engine's default.
-        address: address of a Ray cluster, or `"auto"` for the one running on this
-            machine. If None, the cluster named by `RAY_ADDRESS` is used; if that is
-            unset, one is started for the run.
+        address: address of a Ray cluster, or `"auto"` for the cluster that runs on this
+            machine. If None, the cluster named by `RAY_ADDRESS` is used. If that
+            variable is unset too, Ray is started for the run.
         gpus: number of GPUs for each worker, which may be a fraction.
         require_gpu: whether a worker that renders in software is an error.
-        options: engine-specific options, as strings. Only `SlurmEngine` has any: its
-            parameters.
+        options: engine-specific options, as strings. Only Slurm has options, which are
+            the parameters of `SlurmEngine`.
 
     Raises:
         UnknownName: the engine or an option does not exist.
@@ -91,8 +92,8 @@ def engine_from(
         )
     if options and name != "slurm":
         raise InvalidArgument(
-            f"The engine {name} has no options of its own, got "
-            f"{', '.join(sorted(options))}. Options of Slurm need --engine slurm."
+            f"The engine {name} has no options of its own, but these were given: "
+            f"{', '.join(sorted(options))}. Slurm's options need --engine slurm."
         )
     if name == "ray":
         return RayEngine(workers, address=address, gpus=gpus, require_gpu=require_gpu)
@@ -121,7 +122,7 @@ def _dask(address: str) -> Executor:
             f"No Dask scheduler answers at {address}. `dask scheduler` starts one and "
             f"prints its address. Dask's error: {error}"
         ) from error
-    # Do not merge jobs that look alike: each one must run.
+    # Do not merge jobs that look alike, because every job must run.
     executor: Executor = client.get_executor(pure=False)
     weakref.finalize(executor, client.close)
     return executor

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The number of workers, and the GPUs that each one gets."""
+"""The number of workers, and the GPUs that each worker gets."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ class GpuShare:
 
     Attributes:
         each: number of GPUs per worker, which may be a fraction: with 0.25, four
-            workers share one. 0 means none.
+            workers share a GPU. 0 means no GPU.
         required: whether a worker that renders in software anyway is an error, not only
             a warning.
 
@@ -33,17 +33,17 @@ class GpuShare:
         if not (number and math.isfinite(self.each) and self.each >= 0):
             raise InvalidArgument(
                 "gpus must be the number of GPUs per worker, such as 1, or 0.25 if "
-                f"four share one, got {self.each!r}."
+                f"four share one, but it is {self.each!r}."
             )
         if self.each > 1 and self.each != int(self.each):
             raise InvalidArgument(
-                "A worker gets part of one GPU or several whole ones, so gpus cannot "
+                "A worker gets part of one GPU or several whole GPUs, so gpus cannot "
                 f"be {self.each:g}."
             )
         if self.required and not self.each:
             raise InvalidArgument(
                 "A GPU is required (require_gpu, --require-gpu): give each worker a "
-                "share of one, such as gpus=0.25 (--gpus 0.25)."
+                "share of a GPU, such as gpus=0.25 (--gpus 0.25)."
             )
 
     @property
@@ -67,7 +67,7 @@ class GpuShare:
             gpus: the available GPUs, as in `CUDA_VISIBLE_DEVICES`.
 
         Returns:
-            None if there are no GPUs, or none were requested.
+            The GPUs, or None if there are none or none were requested.
         """
         if not (gpus and self.asked_for):
             return None
@@ -86,14 +86,14 @@ def check_worker_count(count: int | None, name: str = "workers") -> int | None:
         name: the argument's name, for the error message.
 
     Returns:
-        The number as given.
+        `count`, unchanged.
 
     Raises:
-        InvalidArgument: `count` is neither.
+        InvalidArgument: `count` is anything else.
     """
     whole = isinstance(count, int) and not isinstance(count, bool)
     if count is not None and not (whole and count >= 1):
         raise InvalidArgument(
-            f"{name} must be a whole number of at least 1, got {count!r}."
+            f"{name} must be a whole number of at least 1, not {count!r}."
         )
     return count

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Submitting jobs to an executor, and following them until all are done.
+"""Jobs that are submitted to an executor and followed until they are done.
 
-An engine is a `concurrent.futures.Executor`: ours (`LocalEngine`, `RayEngine`,
-`SlurmEngine`) or any other whose workers see the same directory. It is given
-`worker.do_job` with plain data, which does the job in a child process of the worker. So
-a crash costs only one job, and the executor never notices it.
+An engine is a `concurrent.futures.Executor`: one of ours (`LocalEngine`, `RayEngine`,
+`SlurmEngine`) or any other whose workers see the same directory. The executor calls
+`worker.do_job` with plain data. That function does the job in a child process of the
+worker, so a crash affects only one job, and the executor does not notice it.
 
-Doing a job twice is harmless: if the child dies, the job is submitted again.
+Doing a job twice is harmless, so if the child dies, the job is submitted again.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ TRIES = 3
 _OF_MUJOCO = "simulation.warnings"
 _NUMBERS = re.compile(r"[\d.]+")
 
-# Not from `tempfile`, which imports `random`: a user's script may be named like that.
+# Not from `tempfile`, which imports `random`: a user's script may have that name.
 _TEMPORARY = Path(os.environ.get("TMPDIR") or "/tmp")
 
 
@@ -52,15 +52,16 @@ class Work:
     Attributes:
         entry: `module:name` of a function that creates a handler. It is called once in
             each child, with the settings. The handler is called with the arguments of
-            one job after another, and returns a small JSON object. If it has `leave()`,
-            that is called on another thread when the child has to exit for reasons
-            other than its own failure.
+            one job after another, and returns a small JSON object. If the handler has a
+            method `leave`, it is called on another thread when the child has to exit
+            for reasons other than its own failure.
         settings: settings for all jobs, as JSON.
-        environ: environment variables of the children, in addition to their worker's.
+        environ: environment variables for the children, in addition to their worker's.
         shared_directory: a directory that all workers see under this path; a folder in
-            it is used during the run. None is enough for processes on this machine.
-        payload: bytes for all children; the settings get the path of their file as
-            `payload`.
+            it is used during the run. It may be None if all processes are on this
+            machine.
+        payload: bytes for all children. They are written to a file, and the settings
+            get its path as `payload`.
     """
 
     entry: str
@@ -95,7 +96,9 @@ class _Task:
 
 
 class Run:
-    """The jobs of a `Work` on an executor. Leaving `with` cancels unfinished jobs.
+    """The jobs of a `Work` on an executor.
+
+    Leaving the `with` block cancels unfinished jobs.
 
     Args:
         engine: the executor. It is not shut down.
@@ -167,7 +170,7 @@ class Run:
                 never if `timeout_s` is None.
 
         Raises:
-            Error: no child can start; or the error that creating the handler raised.
+            Error: no child can start, or the handler cannot be created.
         """
         while self._tasks or self._parked:
             outcome = None
@@ -198,7 +201,7 @@ class Run:
                 end_run(str(self._place))
             wait(running)
         finally:
-            # Even if Ctrl-C interrupted the wait.
+            # Clean up even if Ctrl-C interrupted the wait.
             end_idle_children(str(self._place))
             _remove(self._place)
             self._file.close()
@@ -229,7 +232,7 @@ class Run:
         except Error:
             raise
         except Exception as error:
-            # An error of the executor itself: one of its workers was lost.
+            # This is the executor's own error: it has lost one of its workers.
             why = f"{type(error).__name__}: {error}".splitlines()
             how = f"is gone: {why[0]} {why[-1] if why[1:] else ''}"
             answer = {"died": how, "begun": True}
@@ -263,12 +266,12 @@ class Run:
             self._hand_out(task)
             return None
         if not can_any_begin:
-            raise Error(f"No worker can start. The last one {how}")
+            raise Error(f"No worker can start. The last worker {how}")
         failure = f"Its worker died, on try {task.deaths} of {TRIES}: it {how}"
         return JobOutcome(key=task.key, value=None, failure=failure, tries=task.deaths)
 
     def _log(self, lines: Any) -> None:
-        """Log the children's log records here, each text once per run."""
+        """Log the children's log records in this process, each text once per run."""
         for name, level, text in lines:
             # MuJoCo's warnings differ in times and joint numbers; log each kind only
             # once.
@@ -279,7 +282,7 @@ class Run:
 
 
 def _new_place(shared: Path | None) -> Path:
-    """Return a new folder that the children can see."""
+    """Create a folder that the children can see, and return its path."""
     name = os.urandom(8).hex()
     try:
         if shared is None:
@@ -298,7 +301,7 @@ def _end_earlier_runs(folder: Path) -> None:
     """Remove the folders of killed drivers, which ends the children of their runs."""
     for path in folder.glob(f"*/{WORK}"):
         with contextlib.suppress(OSError), path.open("rb") as file:
-            # Raises an error if the driver is alive.
+            # This raises an error if the driver is alive.
             fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
             logger.info("The run in %s has no driver, so it was ended.", path.parent)
             path.unlink()

@@ -22,9 +22,10 @@ class LocalEngine(Executor):
     """An engine that runs jobs on this machine, with a thread and a child per worker.
 
     Args:
-        workers: maximum number of workers. None is one per usable CPU.
-        gpus: part of a GPU for each worker; with 0.25, four share one. Workers get the
-            GPUs in `CUDA_VISIBLE_DEVICES`, otherwise all of the machine's.
+        workers: maximum number of workers. None means one per usable CPU.
+        gpus: number of GPUs for each worker, which may be a fraction: with 0.25, four
+            workers share a GPU. Workers share the GPUs in `CUDA_VISIBLE_DEVICES`, or
+            all of the machine's GPUs if it is not set.
         require_gpu: whether a worker that was given a GPU but renders in software is an
             error, not only a warning.
 
@@ -44,7 +45,7 @@ class LocalEngine(Executor):
         self.share = GpuShare(each=gpus, required=require_gpu)
         self._calls: queue.SimpleQueue[_Call | None] = queue.SimpleQueue()
         self._threads = 0
-        # So that an engine that is garbage-collected leaves no threads.
+        # This ends the threads of an engine that is garbage-collected.
         self._end = weakref.finalize(self, self._calls.put, None)
 
     def __repr__(self) -> str:
@@ -94,7 +95,7 @@ def _work(calls: queue.SimpleQueue[_Call | None], share: GpuShare, number: int) 
                 future.set_result(do())
             except BaseException as error:
                 future.set_exception(error)
-        # Do not keep references to the call until the next one.
+        # Do not keep references to this call while waiting for the next one.
         del call, future, do
     # Pass the end on to the other threads.
     calls.put(None)

@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""An engine for Ray: each job is a Ray task, done in a child of Ray's worker.
+"""An engine for Ray: each job is a Ray task that runs in a child of a Ray worker.
 
 If this process is already connected to Ray, that connection is used and left open.
-Otherwise a connection is made, to a cluster or to a Ray that is started on this
-machine.
+Otherwise the engine connects to a cluster, or starts Ray on this machine.
 """
 
 from __future__ import annotations
@@ -31,7 +30,7 @@ from .gpu_shares import GpuShare, check_worker_count
 
 logger = logging.getLogger(__name__)
 
-# Ray's minimum is 75 MiB; jobs and their outcomes need next to nothing.
+# Ray's minimum is 75 MiB; jobs and their outcomes need hardly any memory.
 _SMALLEST_STORE = 80 << 20
 _SECONDS_TO_REACH = 10.0
 
@@ -40,13 +39,14 @@ class RayEngine(Executor):
     """An engine that runs jobs on a Ray cluster.
 
     Args:
-        workers: maximum number of workers at once. None is as many as the cluster has
-            room for, even as it grows.
-        address: address of the cluster. None is `RAY_ADDRESS`; if that is not set, a
-            Ray is started on this machine, without usage statistics or a dashboard,
-            and stopped with the engine. An existing connection of this process is used
-            and left open.
-        gpus: part of a GPU for each worker; with 0.25, four share one.
+        workers: maximum number of workers at once. None means as many as the cluster
+            has room for, even as it grows.
+        address: address of the cluster. None means `RAY_ADDRESS`. If that is not set
+            either, Ray is started on this machine, without usage statistics or a
+            dashboard, and stopped together with the engine. If this process is already
+            connected to Ray, that connection is used and left open.
+        gpus: number of GPUs for each worker, which may be a fraction: with 0.25, four
+            workers share a GPU.
         require_gpu: whether a worker that was given a GPU but renders in software is an
             error, not only a warning.
 
@@ -87,7 +87,8 @@ class RayEngine(Executor):
 
         Raises:
             ClosedError: the engine was shut down.
-            GLError: a GPU is required, but the Ray that was started has none.
+            GLError: a GPU is required, but Ray was started on this machine and finds
+                none.
             Error: the cluster does not answer, or Ray cannot be started.
         """
         if self._is_shut_down:
@@ -100,7 +101,7 @@ class RayEngine(Executor):
         return future
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        """Accept no more calls; close a connection that was made here. Idempotent."""
+        """Accept no more calls, and close the engine's own connection. Idempotent."""
         del wait, cancel_futures
         self._is_shut_down = True
         if self._disconnect is not None:
@@ -119,7 +120,7 @@ class RayEngine(Executor):
                 logger.warning("%s Workers render in software.", lack)
                 self.share = GpuShare()
         self._task = self._ray.remote(
-            # A lost task is resubmitted by its run, which reports it.
+            # The run itself reports and resubmits lost tasks.
             num_cpus=1,
             num_gpus=self.share.each,
             max_retries=0,
@@ -153,7 +154,7 @@ class RayEngine(Executor):
 def _call(
     version: str, fn: Callable[..., Any], args: tuple[Any, ...], kwargs: dict[str, Any]
 ) -> Any:
-    """Call a function in a Ray worker, if it has the same version of mjrec."""
+    """Call a function in a Ray worker if that worker has the same version of mjrec."""
     if version != mjrec.__version__:
         raise Error(
             f"The driver has mjrec {version}, but a Ray worker has "
@@ -164,7 +165,7 @@ def _call(
 
 def _import_ray() -> Any:
     try:
-        # A heavy and optional import.
+        # This import is slow and optional.
         return importlib.import_module("ray")
     except ModuleNotFoundError as error:
         if error.name != "ray":
@@ -177,7 +178,7 @@ def _import_ray() -> Any:
 def _disconnect(ray: Any) -> None:
     with contextlib.suppress(Exception):
         ray.shutdown()
-    # A later Ray of this process must get a different token than ours. The cache is a
+    # If this process starts Ray again, it must not reuse our token. The cache is a
     # private API, which older versions lack.
     with contextlib.suppress(ImportError, AttributeError):
         raylet = importlib.import_module("ray._raylet")
@@ -210,8 +211,8 @@ def _connect(ray: Any, address: str | None, cpus: int | None) -> bool:
         else:
             why = (
                 f"No Ray cluster answers at {address}. It must be running (ray "
-                "status), be reachable from here, and have the same versions of Ray "
-                f"and Python. Ray's error: {told}"
+                "status), be reachable from this machine, and have the same versions "
+                f"of Ray and Python. Ray's error: {told}"
             )
         raise Error(why) from error
 
@@ -219,7 +220,7 @@ def _connect(ray: Any, address: str | None, cpus: int | None) -> bool:
 def _check_reachable(address: str) -> None:
     """Raise OSError if no cluster is listening; Ray itself would try for minutes."""
     if address == "auto":
-        # Ray's record of a cluster, which may no longer be running; a private API.
+        # This private API returns Ray's record of a cluster, which may have stopped.
         with contextlib.suppress(ImportError, AttributeError):
             services = importlib.import_module("ray._private.services")
             address = services.canonicalize_bootstrap_address(address) or ""

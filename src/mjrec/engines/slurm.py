@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""An engine for Slurm: arrays of Slurm jobs, each doing some of a run's jobs.
+"""An engine for Slurm: arrays of Slurm jobs, each of which does some of a run's jobs.
 
 Outcomes are files in the run's folder, which all machines see, so that nothing depends
-on the life of a single Slurm job. A Slurm job that is requeued does the jobs that it
-has not done, and jobs that an array did not finish are submitted again. The files in
-that folder are::
+on the life of a single Slurm job. A Slurm job that is requeued does only the jobs that
+it has not done yet, and jobs that an array did not finish are submitted again. The
+files in that folder are::
 
     slurm/outcomes/17.json   the return value of `worker.do_job` for job 17
     slurm/logs/              output of the Slurm jobs, and submitit's own files
@@ -52,7 +52,7 @@ DEFAULT_WORKERS = 4
 _CLUSTERS = ("slurm", "local")
 _COMMANDS = ("sbatch", "squeue", "scancel", "srun")
 _SBATCH = "sbatch."
-# Several per worker, so that the last jobs of an array end at about the same time.
+# Several elements per worker, so that the last jobs end at about the same time.
 _ELEMENTS_PER_WORKER = 4
 _SECONDS_BETWEEN_LOOKS = 0.2
 _SECONDS_BETWEEN_QUESTIONS = 10.0
@@ -81,28 +81,29 @@ class SlurmEngine(Executor):
     """An engine that runs jobs in Slurm jobs.
 
     Args:
-        workers: maximum number of workers, in all Slurm jobs together. None is 4, or
-            one per CPU with `cluster="local"`.
-        cluster: None is this machine's Slurm cluster; `"local"` uses processes on this
-            machine instead of Slurm jobs, for trying it out.
-        gpus: part of a GPU for each worker; with 0.25, four share one.
+        workers: maximum number of workers in all Slurm jobs together. None means 4, or
+            one per usable CPU with `cluster="local"`.
+        cluster: None means this machine's Slurm cluster. `"local"` uses processes on
+            this machine instead of Slurm jobs, so that you can try the engine.
+        gpus: number of GPUs for each worker, which may be a fraction: with 0.25, four
+            workers share a GPU.
         require_gpu: whether a worker that was given a GPU but renders in software is an
             error, not only a warning.
         cpus_per_worker: number of CPUs per worker.
-        workers_per_job: number of workers in one Slurm job, on one machine. None is as
-            many as share a GPU, otherwise one.
-        partition: partition for the Slurm jobs. None is the cluster's default, here and
-            below.
+        workers_per_job: number of workers in one Slurm job, on one machine. None means
+            as many as share a GPU, or one if they do not share.
+        partition: partition for the Slurm jobs. Here and below, None means the
+            cluster's default.
         account: account to charge for the jobs.
         qos: quality of service.
         constraint: features that nodes must have.
-        time_min: time limit in minutes. A Slurm job that reaches it is requeued and
-            continues. The longest single job must fit.
-        notice_s: how many seconds before its limit a Slurm job stops. None is 120, or a
-            quarter of a short limit.
+        time_min: time limit for a Slurm job, in minutes. A Slurm job that reaches the
+            limit is requeued and continues. The longest single job must fit into it.
+        notice_s: number of seconds before the time limit at which a Slurm job stops.
+            None means 120, or a quarter of the limit if that is shorter.
         mem_gb: memory per worker, in gigabytes.
         setup: shell lines that run first in a Slurm job.
-        sbatch: other options of `sbatch`, by name, without dashes.
+        sbatch: other options for `sbatch`, by name, without dashes.
 
     Raises:
         InvalidArgument: an argument is invalid.
@@ -134,12 +135,12 @@ class SlurmEngine(Executor):
         check_worker_count(workers_per_job, "workers_per_job")
         self.share = GpuShare(each=gpus, required=require_gpu)
         if mem_gb is not None and not mem_gb > 0:
-            raise InvalidArgument(f"mem_gb must be more than 0, got {mem_gb!r}.")
+            raise InvalidArgument(f"mem_gb must be more than 0, but it is {mem_gb!r}.")
         notice = min(120.0, 60 * time_min / 4) if notice_s is None else notice_s
         if not 0 <= notice < 60 * time_min:
             raise InvalidArgument(
                 f"notice_s must be less than the time limit of {time_min} minutes "
-                f"(time_min), in seconds, got {notice_s!r}."
+                f"(time_min), in seconds, but it is {notice_s!r}."
             )
         self._cluster = cluster or "slurm"
         self._submitit = _submitit(self._cluster)
@@ -173,9 +174,9 @@ class SlurmEngine(Executor):
         }
         self._numbers = itertools.count()
         self._waiting: list[_Task] = []
-        # By the id of the Slurm job that does them.
+        # The tasks, by the id of the Slurm job that does them.
         self._elements: dict[str, list[_Task]] = {}
-        # The processes of `cluster="local"`.
+        # The processes for `cluster="local"`.
         self._processes: dict[str, Any] = {}
         self._last_added = self._last_asked = -math.inf
         self._last_progress = 0.0
@@ -247,7 +248,7 @@ class SlurmEngine(Executor):
         self._is_shut_down = True
 
     def _follow(self) -> None:
-        """Submit jobs and collect their outcomes while there are any."""
+        """Submit jobs and collect their outcomes until no jobs are left."""
         while True:
             time.sleep(_SECONDS_BETWEEN_LOOKS)
             with self._one_at_a_time:
@@ -315,7 +316,7 @@ class SlurmEngine(Executor):
         states = self._states(self._elements)
         over = {job for job, (state, _) in states.items() if state not in _NOT_OVER}
         if over:
-            # Take the outcomes that they wrote before they ended.
+            # Collect the outcomes that these jobs wrote before they ended.
             self._take_outcomes()
         for job in over:
             for task in self._elements.pop(job):
@@ -329,13 +330,13 @@ class SlurmEngine(Executor):
             if {state for state, _ in states.values()} == {"PENDING"}:
                 reasons = {reason for _, reason in states.values() if reason}
                 logger.warning(
-                    "%d Slurm jobs have waited for a minute. Slurm's reason: %s.",
+                    "%d Slurm jobs have been waiting for a minute. Slurm's reason: %s.",
                     len(states),
                     ", ".join(sorted(reasons)) or "none",
                 )
 
     def _states(self, jobs: Collection[str]) -> dict[str, tuple[str, str]]:
-        """Return states and reasons of Slurm jobs; empty if Slurm does not answer."""
+        """Return the jobs' states and reasons, or {} if Slurm does not answer."""
         if self._cluster == "local":
             return {job: (self._processes[job].state, "") for job in jobs}
         if not jobs:
@@ -361,7 +362,7 @@ _is_ending = threading.Event()
 
 @dataclass
 class ArrayElement:
-    """The callable that submitit runs in a Slurm job, and requeues.
+    """The callable that submitit runs in a Slurm job and requeues.
 
     Attributes:
         place: the folder `slurm` in the run's folder.
@@ -374,7 +375,11 @@ class ArrayElement:
     share: GpuShare
 
     def __call__(self, jobs: Mapping[int, Mapping[str, Any]]) -> None:
-        """Do the jobs, keyed by number, that have no outcome yet."""
+        """Do the jobs that have no outcome yet.
+
+        Args:
+            jobs: the jobs, by number.
+        """
         # submitit does not handle SIGTERM. Children end with this process.
         signal.signal(signal.SIGTERM, lambda *_: os._exit(1))
         run = str(self.place.parent)
@@ -402,7 +407,7 @@ class ArrayElement:
 
 
 def slurm_options(texts: Mapping[str, str]) -> dict[str, Any]:
-    """Return parameters of `SlurmEngine` from command-line options.
+    """Convert command-line options to parameters of `SlurmEngine`.
 
     Args:
         texts: values by parameter name; `sbatch.NAME` is an option of `sbatch`, and
@@ -424,7 +429,7 @@ def slurm_options(texts: Mapping[str, str]) -> dict[str, Any]:
                 "Slurm option",
                 name,
                 [*known, f"{_SBATCH}NAME"],
-                hint=f"Any other option of sbatch is {_SBATCH}NAME=VALUE.",
+                hint=f"Give other options of sbatch as {_SBATCH}NAME=VALUE.",
             )
         elif name == "setup":
             options[name] = (text,)
@@ -434,12 +439,12 @@ def slurm_options(texts: Mapping[str, str]) -> dict[str, Any]:
                 options[name] = {"int": int, "float": float, "str": str}[kind](text)
             except ValueError as error:
                 raise InvalidArgument(
-                    f"The Slurm option {name} must be a number, got {text!r}."
+                    f"The Slurm option {name} must be a number, not {text!r}."
                 ) from error
     return {**options, "sbatch": sbatch}
 
 
-# Parameters that the command line has separate options for.
+# Parameters for which the command line has separate options.
 _ELSEWHERE = ("workers", "gpus", "require_gpu", "sbatch")
 
 
@@ -459,15 +464,16 @@ def _end_of_log(place: Path, job: str) -> str:
 def _submitit(cluster: str) -> ModuleType:
     if cluster not in _CLUSTERS:
         raise InvalidArgument(
-            f"cluster must be {' or '.join(map(repr, _CLUSTERS))}, got {cluster!r}."
+            f"cluster must be {' or '.join(map(repr, _CLUSTERS))}, not {cluster!r}."
         )
-    # Otherwise submitit would configure the process's logging, closing handlers on the
-    # way. Slurm jobs do not inherit this, so their logs have submitit's messages.
+    # Without this setting, submitit would reconfigure the process's logging and close
+    # its handlers. Slurm jobs do not inherit the setting, so their logs contain
+    # submitit's messages.
     before = os.environ.get("SUBMITIT_LOG_LEVEL")
     if "submitit" not in sys.modules and before is None:
         os.environ["SUBMITIT_LOG_LEVEL"] = "NOCONFIG"
     try:
-        # An optional import, and slow.
+        # This import is slow and optional.
         import submitit
     except ImportError as error:
         raise MissingDependency(
@@ -481,7 +487,7 @@ def _submitit(cluster: str) -> ModuleType:
         raise Error(
             f"This machine has no {', '.join(missing)} on its PATH. Run mjrec where "
             "Slurm's commands are installed: on the cluster's login node, or in a "
-            'Slurm job. To try it with local processes, use cluster="local" '
+            'Slurm job. To try the engine with local processes, use cluster="local" '
             "(--engine-option cluster=local)."
         )
     return submitit
@@ -489,16 +495,16 @@ def _submitit(cluster: str) -> ModuleType:
 
 @contextlib.contextmanager
 def _as_from_outside() -> Iterator[None]:
-    """Submit from inside a Slurm job as if from outside.
+    """Hide any surrounding Slurm job from commands in the block.
 
-    Otherwise the resources of that job (its CPUs, its memory) would be taken for
+    Otherwise that job's resources (its CPUs and memory) would be mistaken for the
     requested ones.
     """
     inside = "SLURM_JOB_ID" in os.environ
     hidden = {
         name: os.environ.pop(name)
         for name in [*os.environ]
-        # Keep the location of the cluster.
+        # SLURM_CONF is kept, because it locates the cluster.
         if inside and name != "SLURM_CONF"
         if name.startswith(("SLURM_", "SLURMD_", "SRUN_"))
     }
@@ -509,7 +515,7 @@ def _as_from_outside() -> Iterator[None]:
 
 
 def _command(*words: str) -> subprocess.CompletedProcess[str] | None:
-    """Run a Slurm command; return None if it does not answer."""
+    """Run a Slurm command and return the result, or None if it does not answer."""
     try:
         return subprocess.run(
             words,

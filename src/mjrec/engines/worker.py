@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Doing a job in a child process: the function that executors call.
+"""The function that executors call to do a job in a child process.
 
-A child stays for later jobs of its run, so that a policy is loaded once per child. It
-is ended when its run is over, which every machine can see: the file `work.json` in the
-run's folder is gone. It also ends with the process that started it.
+A child stays for later jobs of its run, so that a policy is loaded only once per child.
+The child is ended when its run is over. Every machine can see this, because the file
+`work.json` in the run's folder is then removed. The child also ends if the process that
+started it ends.
 """
 
 from __future__ import annotations
@@ -22,17 +23,17 @@ from ..child_python import Child, wait_for_news
 from ..gl.devices import CUDA_VISIBLE_DEVICES
 from ..parent import Parent
 
-# In a run's folder: describes the work of its children; exists as long as the run.
+# The file in a run's folder that describes the work. It exists as long as the run.
 WORK = "work.json"
-# In a run's folder: exists once a child has started.
+# The file in a run's folder that exists once a child has started.
 BEGUN = "begun"
 
 _SECONDS_BETWEEN_LOOKS = 0.2
 _END_OF_WORDS = 2000
 
-# `seat.gpus`: the GPUs of the thread that does a job, if the engine shares out GPUs.
+# `seat.gpus`: the GPUs that the engine assigned to this thread for its jobs, if any.
 seat = threading.local()
-# In a child: the process that started it.
+# In a child, the connection to the process that started it.
 parent: Parent | None = None
 
 
@@ -41,12 +42,12 @@ def do_job(place: str, job: Mapping[str, Any]) -> dict[str, Any]:
 
     Args:
         place: the run's folder.
-        job: `key` and `arguments`.
+        job: the job's `key` and `arguments`.
 
     Returns:
-        `value` or `failure` if the job is over; `died`, and whether the child had
-        `begun`, if the child died; `error` if the handler could not be created. `log`
-        has the child's log records at warning level and above.
+        `value` or `failure` if the job is over; `died` and `begun` (whether the child
+        had begun) if the child died; `error` if the handler could not be created. `log`
+        contains the child's log records at warning level and above.
     """
     kind = place, getattr(seat, "gpus", None)
     with _one_at_a_time:
@@ -81,7 +82,7 @@ def end_idle_children(place: str) -> None:
 def time_limit(seconds: float | None, file: Path, text: str) -> Iterator[None]:
     """Kill this child if the block takes longer than a limit.
 
-    The process that started it does that, because code that hangs may block the
+    The parent process does the killing, because code that hangs may block the
     interpreter.
 
     Args:
@@ -106,8 +107,8 @@ class _JobChild(Child):
 
     Args:
         place: the run's folder.
-        gpus: the GPUs that it renders on, in the format of `CUDA_VISIBLE_DEVICES`; None
-            is this process's own setting.
+        gpus: the GPUs that the child renders on, in the format of
+            `CUDA_VISIBLE_DEVICES`; None means this process's own setting.
 
     Raises:
         OSError: the process cannot be started, or the run does not exist.
@@ -175,15 +176,15 @@ class _JobChild(Child):
     def end(self) -> None:
         """End the child and the processes that it started. Idempotent."""
         super().end()
-        # Processes that it left may keep the pipe open.
+        # Processes that the child left behind may keep the pipe open.
         self._listener.join(_SECONDS_BETWEEN_LOOKS)
 
     def _pass_on(self, words: int) -> None:
-        # Universal newlines: a progress bar's carriage return ends a line here.
+        # With universal newlines, a progress bar's carriage return ends a line.
         with open(words, errors="replace", newline=None) as lines:
             for line in lines:
                 self._said = (self._said + line)[-_END_OF_WORDS:]
-                # Python's own stream, which a progress bar may have replaced.
+                # A progress bar may have replaced this stream.
                 with contextlib.suppress(OSError, ValueError, AttributeError):
                     sys.stderr.write(line)
                     sys.stderr.flush()

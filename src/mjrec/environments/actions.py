@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The actions of an environment, as a space: sampling, zero and checking."""
+"""The action space of an environment, and functions that sample and check actions."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _ENDLESS = 1e10
 def action_space(environment: Any) -> Space[Any]:
     """Return the space of an environment's actions, for sampling.
 
-    It is a copy, so sampling from it does not affect sampling from the environment's.
+    The space is a copy, so sampling from it does not affect the environment's own.
 
     Args:
         environment: a Gymnasium or dm_env environment. A list of specs becomes a
@@ -48,7 +48,7 @@ def sampler(space: Space[Any]) -> Callable[[], Any]:
     if type(space) is not spaces.Box or not (space.shape and space.is_bounded()):
         return space.sample
     if space.dtype.kind != "f":
-        # Integers are rounded, and include the upper bound.
+        # Integers are rounded and include the upper bound.
         return space.sample
     shape, dtype = space.shape, space.dtype
     low, high = space.low.astype(np.float64), space.high.astype(np.float64)
@@ -89,9 +89,10 @@ def zero(space: Space[Any]) -> Any:
 def checked(space: Space[Any], action: Any) -> Any:
     """Return an action in the form that the environment takes.
 
-    Values of a `Box` may have any numeric type and exceed its bounds, which the
-    environments clip themselves, but must be finite and have its shape. Members of a
-    `Discrete` space may be NumPy arrays with one element, and become `int`.
+    Values for a `Box` may have any numeric type and exceed its bounds, because
+    environments clip them, but they must be finite and have the shape of the `Box`.
+    Members of a `Discrete` space may be NumPy arrays with one element; they become
+    `int`.
 
     Raises:
         PolicyError: the action is invalid.
@@ -101,7 +102,7 @@ def checked(space: Space[Any], action: Any) -> Any:
     # Some spaces raise arbitrary errors for values unlike their members.
     except Exception:
         raise PolicyError(
-            f"The policy must return an action of {space}, got {action!r}."
+            f"The policy must return an action in {space}, not {action!r}."
         ) from None
 
 

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Resetting dm_control environments without OpenGL.
+"""A way to reset dm_control environments without OpenGL.
 
 Some tasks (quadruped-escape, the rodent's bowl) create a new terrain in each reset and
-upload it to the rendering context. Even checking for a context creates one. Without a
-context there is nothing to upload to: one created later starts with the current
-terrain.
+upload it to the rendering context. Even checking for a context creates one. If there is
+no context, the upload can be skipped, because a context that is created later starts
+with the current terrain.
 """
 
 from __future__ import annotations
@@ -22,8 +22,7 @@ class ContextsOnDemand:
     """A guard against contexts that resets would create only to upload to them.
 
     Args:
-        env: an environment with dm_control's `physics`, which may be replaced by each
-            reset.
+        env: an environment with dm_control's `physics`, which each reset may replace.
     """
 
     def __init__(self, env: Any) -> None:
@@ -34,16 +33,16 @@ class ContextsOnDemand:
 
     @contextlib.contextmanager
     def resetting(self) -> Iterator[None]:
-        """Return a context manager to reset the environment in.
+        """Return a context manager for resetting the environment.
 
         In the block, a physics without contexts has a substitute, which creates real
-        ones as soon as anything is drawn. Afterwards, even after an error, the physics
-        is as it was.
+        contexts as soon as anything is drawn. After the block, even if it raised an
+        error, the physics is as it was before.
         """
         self._is_resetting = True
         # If the reset compiles a new physics, this hook gets it in time.
         if not self._hooked and hasattr(self._env, "add_extra_hook"):
-            # Composer cannot remove a hook, but it does nothing outside of resets.
+            # Composer cannot remove a hook, but this hook does nothing outside resets.
             self._env.add_extra_hook("after_compile", self._stand_in)
             self._hooked = True
         self._stand_in(self._env.physics)
@@ -64,7 +63,7 @@ class ContextsOnDemand:
 
 
 class _Contexts:
-    """A substitute for a physics's contexts, and for each of them, until one draws."""
+    """A substitute for a physics's contexts, until something is drawn in them."""
 
     def __init__(self, physics: Any) -> None:
         self._physics = physics
@@ -91,4 +90,4 @@ class _Contexts:
             return context.call(function, *own, **kwargs)
 
     def free(self) -> None:
-        """Do nothing: there is no context."""
+        """Do nothing, because there is no context."""

@@ -34,7 +34,7 @@ def tasks_of(domain: str) -> Sequence[str]:
 
 
 def make_dm_control(domain: str, task: str, options: EnvironmentOptions) -> Any:
-    """Return a task of the suite.
+    """Create a task of the suite.
 
     The camera and the size belong to each frame, not to the environment. Episodes end
     after `max_steps`, or after 1000 steps if the task has no time limit.
@@ -42,7 +42,7 @@ def make_dm_control(domain: str, task: str, options: EnvironmentOptions) -> Any:
     Args:
         domain: for example `cheetah`.
         task: for example `run`.
-        options: the options. `kwargs` are those of `suite.load`, `{"task_kwargs":
+        options: the options. `kwargs` are arguments for `suite.load`: `{"task_kwargs":
             {...}, "environment_kwargs": {...}, "visualize_reward": true}`. `seed` seeds
             random choices made when a task is created, such as the springs of `lqr`,
             unless `task_kwargs` has its own `random`.
@@ -50,7 +50,8 @@ def make_dm_control(domain: str, task: str, options: EnvironmentOptions) -> Any:
     Raises:
         UnknownName: the domain, task or argument does not exist.
         MissingDependency: this dm_control does not work with this mujoco.
-        EnvironmentNotMade: creating it failed for another reason; the cause is kept.
+        EnvironmentNotMade: creating the task failed for another reason, which is
+            chained.
     """
     if domain not in suite.TASKS_BY_DOMAIN:
         raise UnknownName(
@@ -75,14 +76,14 @@ def make_dm_control(domain: str, task: str, options: EnvironmentOptions) -> Any:
 def load_task(
     name: DmControlName, kwargs: Mapping[str, Any] | None, *, limit: int | None = None
 ) -> Any:
-    """Return a task, created by `suite.load`.
+    """Create a task with `suite.load`.
 
     Args:
         name: the task's name.
-        kwargs: arguments for `suite.load`; None if a recording does not have them. Then
-            recordings of the returned environment do not have them either.
+        kwargs: arguments for `suite.load`; None if a recording does not have them. In
+            that case, recordings of the returned environment do not have them either.
         limit: number of steps after which an episode ends as truncated, unless the task
-            ends it before.
+            ends it earlier.
     """
     environment = suite.load(name.domain, name.task, **(kwargs or {}))
     if kwargs is not None:
@@ -102,7 +103,8 @@ class DmControlEnvironment(NamedEnvironment):
         options: the options; the camera and size are passed to the monitor.
 
     Raises:
-        Error: see `make_dm_control`; or the model has no such camera.
+        Error: see `make_dm_control`. This is also raised if the model has no such
+            camera.
     """
 
     def __init__(self, name: DmControlName, options: EnvironmentOptions) -> None:
@@ -126,19 +128,19 @@ class DmControlEnvironment(NamedEnvironment):
 
     @property
     def draws_when_made(self) -> bool:
-        """Whether its model depends on the seed it was created with."""
+        """Whether the model depends on the seed that created the environment."""
         return self._draws_when_made
 
     def begin(self, around: Any, seeds: EpisodeSeeds, seed: int | None) -> Any:
-        """Reset.
+        """Reset, and return the first observation.
 
         dm_env's `reset` takes no seed. dm_control's tasks draw all their random numbers
         from one `RandomState`. It is seeded in place, because other objects share it. A
         monitor gets the seed for its metadata.
 
         If the environment was created with this seed and never reset, it is used just
-        as `suite.load(..., task_kwargs={"random": seed})` created it: random choices
-        made then are kept, and it is not seeded for this episode.
+        as `suite.load(..., task_kwargs={"random": seed})` created it. The random
+        choices made at that time are kept, and no seed is set for this episode.
         """
         if not self._was_reset and seed == self._made_with:
             seed = None
@@ -160,7 +162,7 @@ class DmControlEnvironment(NamedEnvironment):
         )
 
     def scenes(self) -> Scenes:
-        """Return how its states are recorded and its frames drawn."""
+        """Return how to record the environment's states and draw its frames."""
         return dm_control_scenes(self.environment)
 
     def _generator(self) -> Any:
@@ -168,7 +170,7 @@ class DmControlEnvironment(NamedEnvironment):
 
 
 def _is_fresh(generator: Any, seed: Any) -> bool:
-    """Return whether a generator, created with a seed, has not been used yet."""
+    """Return whether a generator that was created with a seed is still unused."""
     states = (each.get_state() for each in (generator, np.random.RandomState(seed)))
     return all(map(np.array_equal, *states))
 

@@ -47,13 +47,13 @@ from .scenes import (
 from .wrapping import around_dm_env
 
 _SUITE = "dm_control/"
-# The attribute of a suite task created here that holds `suite.load`'s other arguments.
+# The attribute in which a suite task created here keeps `suite.load`'s other arguments.
 MADE_WITH = "_mjrec_made_with"
 
 # Read at every captured step. It is dm_control's object, which belongs to one model.
 _DATA = attrgetter("physics.data")
 
-# For frames that `physics.render()` does not draw.
+# The limit for frames that `physics.render()` does not draw.
 _MAX_GEOM = 10000
 
 
@@ -77,8 +77,8 @@ def dm_control_scenes(
 ) -> Scenes:
     """Return how the states of a dm_control environment are recorded.
 
-    The frames are those of `physics.render()`, or, if it cannot draw them (see
-    `_drawn_by_physics`), frames of the same scene.
+    The frames are those of `physics.render()`. If it cannot draw them (see
+    `_drawn_by_physics`), they are other frames of the same scene.
 
     Args:
         env: an environment with dm_control's `physics`.
@@ -124,8 +124,9 @@ def dm_control_frames(
 ) -> PhysicsFrames | NoFrameSource:
     """Return the source of a dm_control environment's live frames.
 
-    The frames are those of `physics.render()`. Frames that it cannot draw, larger than
-    the model's offscreen buffer or from an `MjvCamera`, are not drawn live.
+    The frames are those of `physics.render()`. It cannot draw frames that are larger
+    than the model's offscreen buffer or come from an `MjvCamera`, so these are not
+    drawn live.
 
     Args:
         env: an environment with dm_control's `physics`.
@@ -148,7 +149,7 @@ def dm_control_frames(
 
 def generator_of(env: Any) -> Any:
     """Return the generator of an environment's random numbers, or None."""
-    # The first place is for the suite's tasks, the second for composer's environments.
+    # The suite's tasks use the first place, and composer's environments the second.
     for holder, name in ((getattr(env, "task", None), "random"), (env, "random_state")):
         found = getattr(holder, name, None)
         if isinstance(found, np.random.RandomState):
@@ -199,11 +200,11 @@ class PhysicsFrames:
 def _own_context(physics: Any) -> Iterator[Any]:
     """Make the context that dm_control draws with current, and yield its executor.
 
-    dm_control remembers which context it made current last, and would draw in none if
-    another library had changed that. Nor must its context stay current: a
-    `mujoco.Renderer` that is closed or collected frees in the current context the
-    objects that have the numbers of its own. In both cases, `physics.render()` would
-    return whatever was in memory.
+    dm_control remembers which context it made current last. If another library has
+    changed that, it would draw in no context. Its context must not stay current either:
+    when a `mujoco.Renderer` is closed or collected, it frees those objects in the
+    current context that have the same numbers as its own. In both cases,
+    `physics.render()` would return arbitrary memory.
     """
     with context_kept(or_none=True), collection_paused():
         gl = physics.contexts.gl
@@ -240,7 +241,7 @@ class _PhysicsScene:
         self._start(env.physics.model)
 
     def __call__(self) -> SceneView:
-        """Return the view from now on; `at_frame` keeps it up to date."""
+        """Return the view, which `at_frame` keeps up to date from now on."""
         model = self._env.physics.model
         if raw_model(model) is not self._model:
             self._start(model)
@@ -249,7 +250,7 @@ class _PhysicsScene:
         return self._view
 
     def at_frame(self, capture: Callable[[], None]) -> None:
-        """Call `capture` with the view updated to the current frame's."""
+        """Call `capture` with the view of the current frame."""
         if self._camera == FREE_CAMERA:
             # The free camera moves with the model's fields.
             place_free_camera(self._model, self._view.camera)
@@ -257,10 +258,10 @@ class _PhysicsScene:
         capture()
 
     def is_unmoved(self) -> bool:
-        """Return quickly whether the view is surely the same as at the last frame.
+        """Return quickly whether the view is certainly the same as at the last frame.
 
-        Changes in the model, the camera and the option are not checked. It is true if
-        the simulation is the same as when the view was last requested.
+        Changes in the model, the camera and the option are not checked. The result is
+        True if the simulation is the same as when the view was last requested.
         """
         return self._is_placed and _DATA(self._env) is self._data
 
@@ -298,7 +299,7 @@ def _drawn_by_physics(physics: Any, camera: Any, height: int, width: int) -> boo
 
 
 def _max_geom(model: Any) -> int:
-    # dm_control's own choice can only be found out from its scenes.
+    # Only dm_control's scenes show which number it chose.
     return int(wrapper.MjvScene(model).maxgeom)
 
 
@@ -335,7 +336,7 @@ def _authored_of_suite(task: Any) -> AuthoredModel | None:
     try:
         text, assets = sources()  # type: ignore[misc]  # None raises TypeError, too
     except TypeError:
-        # Some domains have a different model for each number: swimmers, stacks.
+        # Some domains, such as stacks, have a different model for each number.
         return None
     return AuthoredModel("model.xml", {"model.xml": _bytes(text), **_all_bytes(assets)})
 

@@ -7,8 +7,8 @@ To reproduce them by hand::
     environment, actions, policy = (int(word) >> 1 for word in words)
 
 Each word has 32 bits. Its lowest bit is dropped, because some of the generators that
-are seeded with it accept only 31. An episode's seeds depend only on these two numbers,
-so any episode can be reproduced without the ones before it.
+are seeded with it accept only 31 bits. An episode's seeds depend only on `seed` and
+`episode`, so any episode can be reproduced without the episodes before it.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class EpisodeSeeds:
 
 
 def episode_seeds(seed: int, episode: int) -> EpisodeSeeds:
-    """Return the seeds of one episode of a run; the module explains the derivation.
+    """Return the seeds of one episode in a run; the module explains the derivation.
 
     Args:
         seed: the run's seed.
@@ -60,8 +60,9 @@ def episode_seeds(seed: int, episode: int) -> EpisodeSeeds:
 def seed_global_generators(seed: int) -> None:
     """Seed the generators of Python, NumPy and, if it is loaded, PyTorch.
 
-    Policies draw from them (`numpy.random.uniform`, dropout) without knowing about any
-    seed. Only for processes that mjrec starts: a user's process has its own seeds.
+    Policies draw from these generators (`numpy.random.uniform`, dropout) without
+    knowing about any seed. Use this only in processes that mjrec starts, because a
+    user's process has its own seeds.
 
     Args:
         seed: the seed, from 0 to 2**32 - 1.
@@ -77,6 +78,6 @@ def _checked(name: str, number: object) -> int:
     whole = isinstance(number, int | np.integer) and not isinstance(number, bool)
     if not whole or not 0 <= number < _LIMIT:  # type: ignore[operator]  # is a number
         raise InvalidArgument(
-            f"{name} must be a whole number from 0 to {_LIMIT - 1}, got {number!r}."
+            f"{name} must be a whole number from 0 to {_LIMIT - 1}, not {number!r}."
         )
     return int(number)  # type: ignore[call-overload, no-any-return]  # is a number

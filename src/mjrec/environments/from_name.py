@@ -24,7 +24,7 @@ from .names import (
 def environment_from_name(
     name: str | EnvironmentName, options: EnvironmentOptions | None = None
 ) -> NamedEnvironment:
-    """Return the environment with the given name.
+    """Create the environment with the given name.
 
     If it cannot be drawn, it is created without frames, and `not_drawn` says why.
 
@@ -35,7 +35,8 @@ def environment_from_name(
     Raises:
         UnknownName, InvalidArgument: the name or an option is invalid.
         MissingDependency: the framework or another dependency is not installed.
-        EnvironmentNotMade, UnreadableFile: creating it failed; the cause is kept.
+        EnvironmentNotMade, UnreadableFile: creating the environment failed; the cause
+            is chained.
     """
     if isinstance(name, str):
         name = parse_environment_name(name)

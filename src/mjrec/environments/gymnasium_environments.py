@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Gymnasium environments, created by id, with the requested frames."""
+"""Gymnasium environments that are created by id, with the requested frames."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from .scenes import Scenes
 # Render modes for videos, then for text recordings.
 _PREFERRED_MODES = ("rgb_array", "ansi")
 
-# The extra with pygame that each family of Gymnasium's own environments is drawn with.
+# The extra that installs pygame for each family of Gymnasium's own environments.
 _PYGAME_EXTRAS = {
     "gymnasium.envs.box2d": "box2d",
     "gymnasium.envs.classic_control": "classic-control",
@@ -45,28 +45,30 @@ _VIEW_ARGUMENTS = ("camera_name", "camera_id", "default_camera_config")
 
 
 def make_gymnasium(env_id: str, options: EnvironmentOptions) -> gymnasium.Env[Any, Any]:
-    """Return an environment created by `gymnasium.make`, ready to be recorded.
+    """Create an environment with `gymnasium.make` that is ready to be recorded.
 
-    With frames, the render mode is `rgb_array`, or `ansi` if the environment has only
-    text. A MuJoCo environment shows its model's tracking camera, if it has one and no
-    other view was requested. The default camera of Gymnasium 1.4 does not move, so the
-    robot leaves its frame. The environment's own time limit is lowered to
-    `max_steps`; if it has none, its limit is `max_steps`, or 1000 steps by default.
+    If frames are requested, the render mode is `rgb_array`, or `ansi` if the
+    environment has only text. A MuJoCo environment shows its model's tracking camera if
+    there is one and no other view was requested. The default camera of Gymnasium 1.4
+    does not move, so the robot leaves its frame. The environment's own time limit is
+    lowered to `max_steps`. If it has none, its limit is `max_steps`, or 1000 steps by
+    default.
 
     Args:
-        env_id: the id, as `gymnasium.make` takes it: `HalfCheetah-v5`, `HalfCheetah`
-            (the latest version) or `module:Id` (the module is imported first).
-        options: the options; `kwargs` go to `gymnasium.make`.
+        env_id: the id, in the form that `gymnasium.make` takes: `HalfCheetah-v5`,
+            `HalfCheetah` (the latest version) or `module:Id` (the module is imported
+            first).
+        options: the options; `kwargs` are passed to `gymnasium.make`.
 
     Raises:
         UnknownName: the id, camera or render mode does not exist.
         InvalidArgument: a camera or size is given, but the environment takes none.
         NoPictures: the environment draws nothing that can be recorded.
         MissingDependency: a dependency is not installed.
-        EnvironmentNotMade: creating it failed for another reason; the cause is kept.
+        EnvironmentNotMade: creating the environment failed for another reason, which is
+            chained.
     """
-    # The module of `module:Id` may be in the working directory, as a policy's may.
-    # The module of `module:Id` may lie in the working directory, as a policy's may.
+    # The module in `module:Id` may be in the working directory, like a policy's.
     here = working_directory_importable() if ":" in env_id else contextlib.nullcontext()
     with here:
         return _make_known(_spec(env_id), options)
@@ -77,7 +79,8 @@ class GymnasiumEnvironment(NamedEnvironment):
 
     Args:
         environment: an environment from `make_gymnasium`, or an MJCF file's.
-        not_drawn: why it was created without frames although they were requested.
+        not_drawn: why the environment was created without frames although they were
+            requested.
     """
 
     def __init__(
@@ -96,7 +99,10 @@ class GymnasiumEnvironment(NamedEnvironment):
         )
 
     def begin(self, around: Any, seeds: EpisodeSeeds, seed: int | None) -> Any:
-        """Reset. This also seeds the action space: a policy may sample from it."""
+        """Reset, and return the first observation.
+
+        This also seeds the action space, because a policy may sample from it.
+        """
         around.action_space.seed(seeds.actions)
         return around.reset(seed=seed)[0]
 
@@ -105,7 +111,7 @@ class GymnasiumEnvironment(NamedEnvironment):
         return Step(*around.step(action)[:4])
 
     def scenes(self) -> Scenes:
-        """Return how its states are recorded and its frames drawn."""
+        """Return how to record the environment's states and draw its frames."""
         return gymnasium_scenes(self.environment)
 
 
@@ -121,14 +127,14 @@ def _make_known(
 
 
 def _own_limit(spec: registration.EnvSpec, kwargs: Mapping[str, Any]) -> int | None:
-    # gymnasium.make's own argument for the limit; -1 means none.
+    # This is gymnasium.make's own argument for the limit; -1 means no limit.
     limit = kwargs.get("max_episode_steps", spec.max_episode_steps)
     if limit in (None, -1):
         return None
     if isinstance(limit, bool) or not isinstance(limit, int) or limit < 1:
         raise InvalidArgument(
             "max_episode_steps must be a positive whole number, or -1 for no limit, "
-            f"got {limit!r}."
+            f"not {limit!r}."
         )
     return limit
 
@@ -193,7 +199,7 @@ def _missing_dependency(env_id: str, error: Exception) -> Error:
 def _what_was_raised(error: Exception) -> str:
     if str(error):
         return f"{type(error).__name__}: {error}"
-    # A bare assertion has no message, so give its place.
+    # A bare assertion has no message, so give its location.
     place = traceback.extract_tb(error.__traceback__)[-1]
     return f"{type(error).__name__} in {place.filename}, line {place.lineno}"
 
@@ -202,7 +208,7 @@ def _render_mode(spec: registration.EnvSpec, kwargs: Mapping[str, Any]) -> str:
     with _failures_of(spec.id):
         creator: Any = spec.entry_point
         if creator is None:
-            raise EnvironmentNotMade(spec.id, "only its vectorised form is registered")
+            raise EnvironmentNotMade(spec.id, "only its vectorized form is registered")
         if isinstance(creator, str):
             creator = registration.load_env_creator(creator)
     # A function has no metadata, and on a wrapper's class it is a property.
@@ -236,7 +242,7 @@ def _not_drawn(env_id: str, why: str) -> NoPictures:
 
 
 def _check_pygame(env_id: str, extra: str, *, has_text: bool) -> None:
-    """Raise before the first episode if pygame is missing, not at the first frame."""
+    """Raise an error early if pygame is missing, instead of at the first frame."""
     if importlib.util.find_spec("pygame") is None:
         text_instead = ' (or record its text: --env-kwargs \'{"render_mode": "ansi"}\')'
         raise MissingDependency(
@@ -287,9 +293,10 @@ def _choose_camera(
     kwargs: Mapping[str, Any],
     asked: str | int | None,
 ) -> None:
-    """Set a MuJoCo environment's camera to the requested one, or one that tracks.
+    """Set a MuJoCo environment's camera to the requested or the tracking camera.
 
-    It is set on the renderer: Gymnasium-Robotics' environments take no camera argument.
+    The camera is set on the renderer, because Gymnasium-Robotics' environments take no
+    camera argument.
     """
     chosen = [name for name in _VIEW_ARGUMENTS if name in kwargs]
     if asked is None and chosen:

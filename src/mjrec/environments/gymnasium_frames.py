@@ -27,7 +27,7 @@ def gymnasium_frames(
     height: int | None = None,
     width: int | None = None,
 ) -> EnvironmentFrames | NoFrameSource:
-    """Return the source of an environment's live frames, `env.render()`.
+    """Return the source of an environment's live frames, which is `env.render()`.
 
     If camera, height or width is given, there are no live frames: workers draw the
     frames from states.
@@ -80,7 +80,7 @@ class EnvironmentFrames:
         return self._env.render_mode
 
     def render(self) -> Any:
-        """Return the current frame, or a list of the frames not returned before."""
+        """Return the current frame, or a list of frames that were not returned yet."""
         with _own_context(self._env):
             rendered: Any = self._env.render()
         if self._keeps_frames and isinstance(rendered, list):
@@ -121,8 +121,8 @@ def close_environment(env: gymnasium.Env[Any, Any]) -> None:
 def free_viewers(env: gymnasium.Env[Any, Any]) -> None:
     """Free everything in an environment's OpenGL contexts, just before it is closed.
 
-    Gymnasium leaves this to the garbage collector, which frees it in whichever context
-    is current then, and so turns another viewer's frames black.
+    Gymnasium leaves this to the garbage collector, which frees objects in whichever
+    context is then current. That turns another viewer's frames black.
     """
     for viewer in getattr(_renderer(env), "_viewers", {}).values():
         with _current(viewer):
@@ -148,7 +148,7 @@ def _own_context(env: gymnasium.Env[Any, Any]) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _current(viewer: Any) -> Iterator[None]:
-    """Make a viewer's context current, if there is a viewer; restore it afterwards."""
+    """Make a viewer's context, if any, current in the block."""
     from ..simulation.gl_context import collection_paused, context_kept
 
     with context_kept(), collection_paused():
@@ -158,7 +158,7 @@ def _current(viewer: Any) -> Iterator[None]:
 
 
 def _renderer(env: gymnasium.Env[Any, Any]) -> Any:
-    """Return Gymnasium's renderer of a MuJoCo environment; None for others."""
+    """Return Gymnasium's renderer of a MuJoCo environment, or None for others."""
     return getattr(simulation_in(env), "mujoco_renderer", None)
 
 

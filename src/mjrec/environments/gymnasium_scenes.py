@@ -32,8 +32,8 @@ _MUJOCO_ENV = ("gymnasium.envs.mujoco.mujoco_env", "MujocoEnv.render")
 _RENDERING = "gymnasium.envs.mujoco.mujoco_rendering"
 _RENDERER = (_RENDERING, "MujocoRenderer.render")
 
-# A package in Gymnasium-Robotics. It is not imported: its environments exist only if it
-# is already loaded.
+# A package in Gymnasium-Robotics. It is not imported here, because its environments
+# exist only if it is already loaded.
 _MAZES = "gymnasium_robotics.envs.maze"
 
 # Environments whose `render` is that of an inner environment: the module, the function,
@@ -72,9 +72,9 @@ def gymnasium_scenes(
 ) -> Scenes:
     """Return how the states of a Gymnasium environment are recorded.
 
-    Without camera, height and width, the frames are those of `env.render()`, and
-    anything that overrides `render` is an obstacle. If one of them is given, the frames
-    show only the scene, never what a wrapper draws on top.
+    Without a camera, height or width, the frames are those of `env.render()`, and
+    anything that overrides `render` is an obstacle. If any of these is given, the
+    frames show only the scene, without anything that a wrapper draws on top.
 
     Args:
         env: the environment, as the user wrapped it.
@@ -101,9 +101,10 @@ def gymnasium_scenes(
 
 
 def own_camera(env: gymnasium.Env[Any, Any]) -> int | str | None:
-    """Return the camera that an environment itself shows; None for a free one.
+    """Return the camera that an environment itself shows, or None for a free camera.
 
-    It may differ from the environment's arguments, because it can be changed later.
+    The camera may differ from the environment's arguments, because it can be changed
+    later.
     """
     shown = drawn_part(env.unwrapped)
     chosen = getattr(getattr(shown, "mujoco_renderer", shown), "camera_id", None)
@@ -113,7 +114,7 @@ def own_camera(env: gymnasium.Env[Any, Any]) -> int | str | None:
 
 
 def set_own_camera(env: gymnasium.Env[Any, Any], camera: int | str) -> None:
-    """Set the camera that an environment itself shows, as from `own_camera`."""
+    """Set the camera that an environment itself shows to a result of `own_camera`."""
     shown = drawn_part(env.unwrapped)
     if has_own_scenes(shown):
         shown.camera = camera
@@ -151,7 +152,7 @@ def _scenes(env: gymnasium.Env[Any, Any], base: Any, view: dict[str, Any]) -> Sc
 
 
 def _override_above(env: gymnasium.Env[Any, Any]) -> str | None:
-    """Return why a wrapper changes the frames of the environment inside, or None."""
+    """Return the reason why a wrapper changes the environment's frames, or None."""
     mode = env.render_mode
     while isinstance(env, gymnasium.Wrapper):
         if has_own_method(env, "render"):
@@ -165,7 +166,12 @@ def _override_above(env: gymnasium.Env[Any, Any]) -> str | None:
 
 
 def _obstacle(base: Any, shown: Any) -> str | None:
-    """Return why an unwrapped environment shows more than its simulation, or None."""
+    """Return the reason why an environment shows more than its simulation, or None.
+
+    Args:
+        base: the environment without its wrappers.
+        shown: the part of it that is drawn.
+    """
     for part in (base, shown):
         if has_own_method(part, "render"):
             return f"the environment {class_name(type(part))} overrides render()"
@@ -181,7 +187,7 @@ def _wrong_mode(mode: str | None) -> str | None:
     if mode in (None, "rgb_array"):
         return None
     return (
-        f"its render_mode is {mode!r}, and only frames of 'rgb_array' can be drawn "
+        f"its render_mode is {mode!r}, but only frames of 'rgb_array' can be drawn "
         "from states"
     )
 
@@ -229,20 +235,20 @@ def _is_robot(drawn: Any) -> bool:
 
 
 def frame_moment(drawn: Any) -> Callable[[Callable[[], None]], None] | None:
-    """Return a function to capture the moment at which an environment draws itself.
+    """Return a function that captures the moment at which an environment draws itself.
 
-    The Fetch and hand environments move their goal markers, and call `mj_forward`, in
-    each `render`, so a frame affects what happens afterwards. The returned function
-    calls `render`, replacing only the drawing itself, then restores the simulation. So
-    the frame is the one that `render` gives, and the episode is the same as without
+    The Fetch and hand environments move their goal markers and call `mj_forward` in
+    each `render`, so a frame affects the rest of the episode. The returned function
+    calls `render`, replacing only the drawing itself, and then restores the simulation.
+    So the frame is the same as from `render`, and the episode is the same as without
     rendering.
 
     Args:
         drawn: an environment without its wrappers.
 
     Returns:
-        A function that calls its argument at that moment; None if it is not needed,
-        because drawing the environment changes nothing.
+        A function that calls its argument at that moment, or None if drawing the
+        environment changes nothing.
     """
     callback = getattr(type(drawn), "_render_callback", None)
     if not _is_robot(drawn) or is_defined_by(
@@ -267,7 +273,7 @@ def frame_moment(drawn: Any) -> Callable[[Callable[[], None]], None] | None:
 @contextlib.contextmanager
 def _drawing_instead(renderer: Any, capture: Callable[[], None]) -> Iterator[None]:
     """Make `renderer.render` call `capture` in the block, and draw nothing."""
-    # Set on the instance, where it hides the class's method until it is deleted.
+    # The attribute of the instance hides the class's method until it is deleted.
     renderer.render = lambda *_args, **_kwargs: capture()
     try:
         yield
@@ -294,7 +300,7 @@ def _environment(base: gymnasium.Env[Any, Any]) -> dict[str, Any] | None:
 
 
 def random_state(base: Any) -> Any:
-    """Return the state of an environment's generator, and of its inner environment's.
+    """Return the states of an environment's generator and its inner environment's.
 
     Args:
         base: an environment without its wrappers.

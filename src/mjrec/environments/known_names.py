@@ -25,7 +25,7 @@ _VERSION = re.compile(r"-v([0-9]+)$", re.ASCII)
 _SUITE = "dm_control"
 _GYMNASIUM = "gymnasium"
 
-# On a busy machine importing tasks such as `lqr` is slow; anything longer is a hang.
+# Importing tasks such as `lqr` is slow on a busy machine, but never as slow as this.
 _TIMEOUT_S = 300
 
 
@@ -83,7 +83,7 @@ def newest_versions(env_ids: Iterable[str]) -> dict[str, str]:
 
 
 def version_of(env_id: str) -> int:
-    """Return the version at the end of an id; -1 if it has none."""
+    """Return the version at the end of an id, or -1 if it has none."""
     match = _VERSION.search(env_id)
     return int(match[1]) if match else -1
 
@@ -147,7 +147,7 @@ def _names(framework: str, what: str) -> list[str]:
 
     if not what:
         return list(registration.registry)
-    # The module may be in the working directory, as a policy may.
+    # The module may be in the working directory, like a policy's.
     sys.path.append(os.getcwd())  # noqa: PTH109  sys.path holds strings
     found = _ids_registered_by(what)
     # Gymnasium has already loaded its own modules, so their entry points are compared.
@@ -170,7 +170,7 @@ def _ids_registered_by(module: str) -> set[str]:
     def noting(*args: Any, **kwargs: Any) -> None:
         before = dict(registration.registry)
         register(*args, **kwargs)
-        # Ids that are registered by modules that it imports do not count.
+        # Ids that other modules register while they are imported do not count.
         if f"{_module_being_imported()}.".startswith(f"{module}."):
             after = registration.registry.items()
             registered.update(key for key, spec in after if before.get(key) is not spec)

@@ -31,13 +31,13 @@ _SIDE = 480
 def make_mjcf(
     path: Path, options: EnvironmentOptions, model: Any = None
 ) -> gymnasium.Env[Any, Any]:
-    """Return the environment of an MJCF file; episodes end after `max_steps`.
+    """Create an environment from an MJCF file. Episodes end after `max_steps`.
 
     Args:
         path: the file.
         options: the options; `kwargs` must be empty, because the file defines
             everything else.
-        model: the file's compiled model, if available; then the file need not exist.
+        model: the file's compiled model. If it is given, the file need not exist.
 
     Raises:
         UnreadableFile: MuJoCo rejects the file.
@@ -46,8 +46,8 @@ def make_mjcf(
     """
     if options.kwargs:
         raise InvalidArgument(
-            f"An MJCF file takes no more arguments, got {dict(options.kwargs)}. "
-            "The file itself defines the whole simulation."
+            "An MJCF file takes no more arguments, but these were given: "
+            f"{dict(options.kwargs)}. The file itself defines the whole simulation."
         )
     environment = MjcfEnvironment(
         path,
@@ -63,28 +63,28 @@ class MjcfEnvironment(gymnasium.Env[NDArray[np.float64], NDArray[np.float64]]):
     """An environment that simulates an MJCF model, driven by its controls.
 
     An observation is `[qpos, qvel, act]`, `(nq + nv + na,) float64`. An action is
-    `ctrl`, `(nu,) float64`, within the actuators' ranges. MuJoCo clamps values outside,
-    and a model without actuators takes actions of shape `(0,)`. A step advances the
-    simulation to the next sixtieth of a second, see `MjcfSimulation`. Every reset goes
-    to the model's initial state, whatever the seed: nothing here is random. Rewards are
-    0. An episode is terminated only if the simulation becomes unstable. Then
-    `info["unstable"]` gives the reason, and the last frame and observation are those
-    before it happened.
+    `ctrl`, `(nu,) float64`, within the actuators' ranges. MuJoCo clamps values outside
+    the ranges, and a model without actuators takes actions of shape `(0,)`. A step
+    advances the simulation to the next sixtieth of a second (see `MjcfSimulation`).
+    Every reset goes to the model's initial state, whatever the seed, because nothing
+    here is random. Rewards are 0. An episode is terminated only if the simulation
+    becomes unstable. Then `info["unstable"]` gives the reason, and the last frame and
+    observation are from before that moment.
 
-    `metadata["render_fps"]` is the frame rate, 60 unless the timestep is longer than
-    1/60 second, and `control_timestep()` is one over it. The model and its data are
-    `simulation.model` and `simulation.data`. They are not attributes of the environment
-    itself, because the time between two frames, measured by the data's clock, may
-    differ from the duration of a frame by up to one timestep.
+    `metadata["render_fps"]` is the frame rate, which is 60 unless the timestep is
+    longer than 1/60 second. `control_timestep()` is one over the frame rate. The model
+    and its data are `simulation.model` and `simulation.data`. They are not attributes
+    of the environment itself, because the time between two frames, measured by the
+    data's clock, may differ from the duration of a frame by up to one timestep.
 
     Args:
         path: the MJCF file.
         render_mode: `"rgb_array"`, or None for no frames and no OpenGL.
-        camera: a name or number; None for the camera that tracks the robot, or the
-            first one, or the free one.
+        camera: a name or number; None for the default, see
+            `simulation.cameras.default_camera`.
         height: height of the frames in pixels.
         width: width of the frames in pixels.
-        model: the file's compiled model, if available.
+        model: the file's compiled model; None to compile the file.
 
     Raises:
         UnreadableFile: MuJoCo rejects the file.
@@ -93,7 +93,7 @@ class MjcfEnvironment(gymnasium.Env[NDArray[np.float64], NDArray[np.float64]]):
 
     Attributes:
         path: the MJCF file.
-        camera: the camera shown.
+        camera: the camera that the frames show.
         height: height of the frames in pixels.
         width: width of the frames in pixels.
     """
@@ -113,7 +113,7 @@ class MjcfEnvironment(gymnasium.Env[NDArray[np.float64], NDArray[np.float64]]):
         self._renderer: SceneRenderer | None = None
         if render_mode not in (None, "rgb_array"):
             raise InvalidArgument(
-                f'render_mode must be "rgb_array" or None, got {render_mode!r}.'
+                f'render_mode must be "rgb_array" or None, not {render_mode!r}.'
             )
         self.render_mode = render_mode
         self.height, self.width = check_size(height, width)
@@ -184,7 +184,7 @@ class MjcfEnvironment(gymnasium.Env[NDArray[np.float64], NDArray[np.float64]]):
     def mjrec_scenes(
         self, *, camera: Any, height: int | None, width: int | None
     ) -> Scenes:
-        """Return how its states are recorded, from which frames can be drawn."""
+        """Return how to record the states, from which frames can be drawn."""
         simulation = self.simulation
         scene = ViewerScene(
             simulation,
@@ -235,7 +235,7 @@ class MjcfEnvironment(gymnasium.Env[NDArray[np.float64], NDArray[np.float64]]):
         shape = self.action_space.shape
         if ctrl.shape != shape or not np.isfinite(ctrl).all():
             raise InvalidArgument(
-                f"An action must be {shape} finite numbers, got {action!r}."
+                f"An action must be finite numbers of shape {shape}, not {action!r}."
             )
         return ctrl
 
@@ -247,9 +247,10 @@ def _plain(rate: Fraction) -> int | float:
 def _spec(path: Path) -> EnvSpec:
     """Return the spec that names the environment in recordings: `mjcf/<file name>`.
 
-    It is not registered: no environment is created from a name in a recording.
+    The spec is not registered, because no environment is created from a name in a
+    recording.
     """
-    # Characters that Gymnasium's ids cannot have.
+    # Replace characters that Gymnasium does not allow in ids.
     name = re.sub(r"[^\w.-]", "_", path.stem)
     return EnvSpec(
         id=f"mjcf/{name}",

@@ -31,7 +31,7 @@ class EnvironmentOptions:
             environment has its own limit, the smaller one applies. If both are missing,
             the limit is 1000.
         frames: whether the environment will be drawn.
-        seed: the run's seed, for anything drawn when the environment is created.
+        seed: the run's seed, for random choices made when the environment is created.
         kwargs: more arguments, in the form that this kind of environment takes.
 
     Raises:
@@ -47,7 +47,7 @@ class EnvironmentOptions:
     kwargs: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        # A side that is None is the environment's own, and valid.
+        # None is valid, and means the environment's own side.
         check_size(
             1 if self.height is None else self.height,
             1 if self.width is None else self.width,
@@ -56,12 +56,12 @@ class EnvironmentOptions:
         whole = isinstance(steps, int | np.integer) and not isinstance(steps, bool)
         if steps is not None and (not whole or steps < 1):
             raise InvalidArgument(
-                f"max_steps must be a positive whole number, got {steps!r}."
+                f"max_steps must be a positive whole number, not {steps!r}."
             )
 
     @property
     def size(self) -> dict[str, int]:
-        """The requested `height` and `width`, leaving out those that are None."""
+        """The requested `height` and `width`, without values that are None."""
         sides = {"height": self.height, "width": self.width}
         return {name: side for name, side in sides.items() if side is not None}
 
@@ -86,14 +86,15 @@ class Step(NamedTuple):
 
 
 def is_terminated(timestep: Any) -> bool:
-    """Return whether the task itself ended the episode: LAST with discount 0."""
+    """Return whether the task itself ended the episode (LAST with discount 0)."""
     return bool(timestep.last() and not timestep.discount)
 
 
 def is_truncated(timestep: Any) -> bool:
     """Return whether an external limit ended the episode.
 
-    This is LAST with a nonzero discount: more rewards would have followed.
+    The time step is then LAST with a nonzero discount, because more rewards would have
+    followed.
     """
     return bool(timestep.last() and timestep.discount)
 
@@ -105,11 +106,11 @@ class NamedEnvironment(abc.ABC):
 
     Args:
         environment: a `gymnasium.Env` or a `dm_env.Environment`.
-        env_id: its name in recordings.
-        step_limit: number of steps after which its episodes end.
+        env_id: the environment's name in recordings.
+        step_limit: number of steps after which episodes end.
         view: the `camera`, `height` and `width` to pass to the monitor; empty if the
             environment itself shows the requested view.
-        not_drawn: why it cannot be drawn although frames were requested.
+        not_drawn: why the environment cannot be drawn although frames were requested.
     """
 
     def __init__(
@@ -129,7 +130,7 @@ class NamedEnvironment(abc.ABC):
 
     @property
     def draws_when_made(self) -> bool:
-        """Whether its model depends on the seed it was created with."""
+        """Whether the model depends on the seed that created the environment."""
         return False
 
     def begin_episode(self, around: Any, seeds: EpisodeSeeds) -> Any:
@@ -142,9 +143,9 @@ class NamedEnvironment(abc.ABC):
 
         Args:
             around: the environment, or a wrapper of it.
-            seeds: the episode's seeds; its source of actions is seeded with them.
+            seeds: the episode's seeds, which also seed its source of actions.
             seed: the seed for the environment's randomness from now on; None to
-                continue without seeding.
+                continue without setting a seed.
         """
 
     @abc.abstractmethod
@@ -153,9 +154,9 @@ class NamedEnvironment(abc.ABC):
 
     @abc.abstractmethod
     def scenes(self) -> Scenes:
-        """Return how its states are recorded and its frames drawn."""
+        """Return how to record the environment's states and draw its frames."""
 
     def can_be_deferred(self) -> bool:
-        """Return whether its frames can be drawn from its states."""
+        """Return whether the environment's frames can be drawn from its states."""
         scenes = self.scenes()
         return scenes.states is not None and scenes.obstacle is None

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Names that users give: of environments, in three forms, and of local modules."""
+"""The three kinds of environment names, and imports of modules that users name."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class GymnasiumName:
     """An environment in Gymnasium's registry.
 
     Attributes:
-        env_id: the id, as `gymnasium.make` takes it, including `module:Id`.
+        env_id: the id, in any form that `gymnasium.make` takes, including `module:Id`.
     """
 
     env_id: str
@@ -64,15 +64,15 @@ EnvironmentName: TypeAlias = GymnasiumName | DmControlName | MjcfName
 
 
 def parse_environment_name(text: str) -> EnvironmentName:
-    """Return the environment named by `text`, without checking that it can be created.
+    """Parse an environment's name, without checking that it can be created.
 
     `dm_control/<domain>-<task>` is a task of the dm_control suite. A name that ends in
     `.xml` or `.mjcf` is a file, which must exist. Everything else is a Gymnasium id.
 
     Raises:
         UnknownName: the file does not exist.
-        InvalidArgument: the name is empty, lacks its task, or is a file of another
-            type.
+        InvalidArgument: the name is empty, lacks its task, or names another type of
+            file.
     """
     if not text.strip():
         raise InvalidArgument(
@@ -98,7 +98,7 @@ def _dm_control_name(text: str) -> DmControlName:
     if not (domain and hyphen and task):
         raise InvalidArgument(
             "A dm_control environment's name must be dm_control/<domain>-<task>, for "
-            f"example dm_control/cheetah-run, got {text!r}."
+            f"example dm_control/cheetah-run, not {text!r}."
         )
     return DmControlName(domain, task)
 
@@ -118,7 +118,7 @@ def _mjcf_name(path: Path) -> MjcfName:
 
 @contextlib.contextmanager
 def working_directory_importable() -> Iterator[None]:
-    """Make modules in the working directory importable, before installed ones."""
+    """Make modules in the working directory importable, ahead of installed modules."""
     directory = str(Path.cwd())
     sys.path.insert(0, directory)
     try:

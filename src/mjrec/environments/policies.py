@@ -12,9 +12,9 @@
 =================  ==================================================================
 
 A policy is called with the observation (with dm_env, the time step's observation) and
-returns an action. If it has a `reset`, this is called with a seed at the start of each
-episode. The global generators of the process (`random`, `numpy.random`, PyTorch's) are
-seeded with the same seed.
+returns an action. If it has a method `reset`, this is called with a seed at the start
+of each episode. The global generators of the process (`random`, `numpy.random` and
+PyTorch's) are seeded with the same seed.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ class Policy:
         self._space.seed(seeds.actions)
 
     def __call__(self, observation: Any) -> Any:
-        """Return the action for an observation, checked.
+        """Return a checked action for an observation.
 
         Raises:
             PolicyError: the policy raised an exception, or returned an invalid action.
@@ -82,7 +82,7 @@ class Policy:
 
 
 class _ForeignPolicy(Policy):
-    """A user's policy, whose exceptions name it and whose actions are checked."""
+    """A user's policy. Errors give its name, and its actions are checked."""
 
     def __init__(self, environment: Any, name: str, chosen: Any) -> None:
         super().__init__(environment, name)
@@ -113,10 +113,10 @@ class _ForeignPolicy(Policy):
 
 
 class _Predictor:
-    """A function that calls a Stable-Baselines3 `predict`, for one environment.
+    """A function that calls a Stable-Baselines3 policy's `predict` for one environment.
 
-    Recurrent policies receive the state that they returned last, and whether the
-    observation is the first of its episode. Arguments that a `predict` does not accept
+    Recurrent policies receive the last state that they returned, and whether the
+    observation is the first in its episode. Arguments that `predict` does not accept
     are left out.
     """
 
@@ -151,7 +151,7 @@ class _Predictor:
 def load_policy(
     text: str, environment: Any, kwargs: Mapping[str, Any] = _NONE
 ) -> Policy:
-    """Return the policy that `text` names; the module docstring lists the forms.
+    """Load the policy that `text` names; the module docstring lists the forms.
 
     The working directory is importable while this runs. A policy that imports more
     modules from there later must be used inside `working_directory_importable`.
@@ -165,7 +165,7 @@ def load_policy(
         UnknownName: the policy, the module, the name in it or the file does not exist.
         InvalidArgument: `kwargs` is given, but this kind of policy takes no arguments.
         PolicyError: importing, reading or building the policy raised an exception,
-            which is kept as the cause, or the result is not a policy.
+            which is chained, or the result is not a policy.
         MissingDependency: the package that reads such a file is not installed.
     """
     if text in _BUILT_IN:
@@ -186,7 +186,7 @@ def policy_from(
     environment: Any,
     kwargs: Mapping[str, Any] = _NONE,
 ) -> Policy:
-    """Return a policy made from an object, as `load_policy` does for `module:name`.
+    """Create a policy from an object, as `load_policy` does for `module:name`.
 
     Args:
         chosen: an object with `predict`, a function, or a class, which is called with
@@ -197,8 +197,8 @@ def policy_from(
 
     Raises:
         InvalidArgument: `kwargs` is given, but `chosen` is not called.
-        PolicyError: building the policy raised an exception, which is kept as the
-            cause, or the result is not a policy.
+        PolicyError: building the policy raised an exception, which is chained, or the
+            result is not a policy.
     """
     if inspect.isclass(chosen) or name.endswith("()"):
         _check_takes_environment(name, chosen, environment, kwargs)
@@ -231,7 +231,7 @@ def policy_file(text: str) -> Path | None:
         text: the name that was passed to `load_policy`.
 
     Returns:
-        The file; None for built-in policies and for modules without a file.
+        The file, or None for built-in policies and modules without a file.
     """
     if ":" not in text:
         return file_of_policy(text)
@@ -243,8 +243,8 @@ def policy_file(text: str) -> Path | None:
 def _check_no_arguments(name: str, kwargs: Mapping[str, Any]) -> None:
     if kwargs:
         raise InvalidArgument(
-            f"The policy {name} takes no arguments, got {dict(kwargs)}. Only a class, "
-            "module:name() and a file take arguments."
+            f"The policy {name} takes no arguments, but these were given: "
+            f"{dict(kwargs)}. Only a class, module:name() and a file take arguments."
         )
 
 
@@ -267,7 +267,7 @@ def _import(module_name: str, text: str) -> ModuleType:
         try:
             return importlib.import_module(module_name)
         except ModuleNotFoundError as error:
-            # A module that it imports itself may be missing, too.
+            # A module that this module imports may be missing too.
             if not f"{module_name}.".startswith(f"{error.name}."):
                 raise
             raise UnknownName(
@@ -296,21 +296,21 @@ def _offered(module: ModuleType) -> list[str]:
         for name, value in vars(module).items()
         if not name.startswith("_")
         and (callable(value) or hasattr(value, "predict"))
-        # Leave out what it imported itself. Instances of imported classes are its own.
+        # Leave out imported objects, but not the module's own instances of classes.
         and getattr(value, "__module__", module.__name__) == module.__name__
     )
 
 
 @contextlib.contextmanager
 def _failures_named(*what: str) -> Iterator[None]:
-    """Turn exceptions in third-party code into a PolicyError with their place."""
+    """Turn exceptions in third-party code into a PolicyError with their location."""
     try:
         yield
     except Error:
         raise
     except Exception as error:
         text = f"{''.join(what)} raised {type(error).__name__}: {error}"
-        # A syntax error's message includes its place.
+        # A syntax error's message includes its location.
         if not isinstance(error, SyntaxError):
             place = traceback.extract_tb(error.__traceback__)[-1]
             text += f" ({place.filename}, line {place.lineno})"
@@ -322,7 +322,7 @@ _logged: set[tuple[object, ...]] = set()
 
 
 def _log_traceback(error: BaseException, *where: object) -> None:
-    """Log the traceback of an exception in third-party code, once for each place."""
+    """Log the traceback of an exception in third-party code, once for each location."""
     if (type(error), *where) not in _logged:
         _logged.add((type(error), *where))
         own = error.__traceback__

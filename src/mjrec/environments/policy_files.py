@@ -2,9 +2,9 @@
 """Policies in files.
 
 =================  ==================================================================
-`.zip`             written by `model.save()` of Stable-Baselines3. It acts as with
-                   `predict`: without noise, within the bounds of its actions, and
-                   with its state if it is recurrent
+`.zip`             written by `model.save()` of Stable-Baselines3. It acts as in
+                   `predict`: without noise, within the action bounds, and with its
+                   state if it is recurrent
 `.pt` `.pth`       TorchScript, written by `torch.jit.save`: takes a float32 tensor of
 `.torchscript`     shape (1, n); the first row of its output is the action
 `.pt2`             the same, written by `torch.export.save`
@@ -29,7 +29,7 @@ from ..errors import MissingDependency, PolicyError, UnknownName
 
 
 def file_of_policy(text: str) -> Path | None:
-    """Return the file that a policy's name refers to; None if it is not a file name.
+    """Return the file that a policy's name refers to, or None if it is no file name.
 
     Raises:
         UnknownName: the name is a file name, but the file does not exist.
@@ -52,13 +52,13 @@ def policy_in_file(path: Path, environment: Any, **kwargs: Any) -> Any:
     """Return the policy in a file: a function, or an object with `predict`.
 
     Args:
-        path: the file, see `file_of_policy`.
+        path: the file; see `file_of_policy`.
         environment: the environment to act in.
         **kwargs: `device`, for a model.zip or TorchScript; `"cpu"` by default.
 
     Raises:
         MissingDependency: the package that reads such a file is not installed.
-        PolicyError: the file holds something else.
+        PolicyError: the file does not contain a policy.
     """
     return _READERS[path.suffix](path, environment, **kwargs)
 
@@ -87,7 +87,7 @@ class _Model:
 
 def _stable_baselines3(path: Path, _environment: Any, *, device: str = "cpu") -> _Model:
     saving = _library("stable_baselines3.common.save_util", path)
-    # Arguments that only learning uses may be functions pickled by another Python.
+    # Arguments for learning may be functions that another Python version pickled.
     of_learning = {"learning_rate": 0.0, "lr_schedule": None, "clip_range": None}
     data, weights, _ = saving.load_from_zip_file(
         path, device=device, custom_objects=of_learning
@@ -119,9 +119,9 @@ def _torch(
             module = torch.jit.load(path, map_location=device).eval()
     except RuntimeError as error:
         raise PolicyError(
-            f"The policy {path} does not hold a network. Write it with torch.jit.trace("
-            "network, observation).save(path), or torch.export.save: weights alone do "
-            "not define a network."
+            f"The policy {path} does not contain a network. Write it with "
+            "torch.jit.trace(network, observation).save(path), or torch.export.save: "
+            "weights alone do not define a network."
         ) from error
 
     def outputs(row: NDArray[np.float32]) -> Any:

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Recreating the environment of a recording, or refusing to.
+"""Functions that recreate the environment of a recording, or refuse to.
 
-A recording may come from a stranger, and creating an environment runs its code. So
-nothing that a recording names is imported. An environment is created only if its id is
-already in the installed registry, as one of Gymnasium's own, of Gymnasium-Robotics or
-of dm_control's suite. Its arguments must be plain values within bounds and name no
+A recording may be untrusted, and creating an environment runs the environment's code.
+So nothing that a recording names is imported. An environment is created only if its id
+is already in the installed registry and belongs to Gymnasium itself, Gymnasium-Robotics
+or dm_control's suite. Its arguments must be plain values within bounds and name no
 files. Wrappers must be Gymnasium's own, with such arguments. The reader may trust more
 ids, one by one.
 """
@@ -45,14 +45,14 @@ _ROBOTICS = "gymnasium_robotics"
 # Arguments of gymnasium.make itself, not of an environment.
 _MAKE = frozenset(("id", "vector_kwargs", "disable_env_checker", "max_episode_steps"))
 
-# A plain word: not a path or a file name, nothing with an extension.
+# A plain word, which cannot be a path or a file name with an extension.
 _WORD = re.compile(r"[A-Za-z0-9_ -]{0,64}", re.ASCII)
 _FILES = re.compile(r"(xml|model|mesh|asset|file|path|texture)", re.IGNORECASE)
 _RENDER_MODES = (None, "rgb_array", "rgb_array_list", "ansi", "depth_array")
 _MOST_VALUES = 10_000
 _LARGEST = 1e9
-# Limit of a number that takes memory or time: frames, skipped frames, stacks. It does
-# not apply to a suite task's `random`, which is a seed.
+# The limit for numbers that cost memory or time: frames, skipped frames, stacks. It
+# does not apply to a suite task's `random`, which is a seed.
 _LARGEST_COUNT = 10_000
 
 _SUITE_NAME = re.compile(r"dm_control/(\w{1,50})-(\w{1,50})")
@@ -66,7 +66,7 @@ class NotRecreated(Exception):
 
     Args:
         reason: the clause.
-        excuse: "environment" or "wrappers": the part that the reader does not have.
+        excuse: the part that the reader does not have: "environment" or "wrappers".
     """
 
     def __init__(self, reason: str, *, excuse: str = "environment") -> None:
@@ -81,7 +81,8 @@ class Recreated:
     Attributes:
         environment: a `gymnasium.Env` or a `dm_env.Environment`.
         is_dm_env: whether it is a `dm_env.Environment`.
-        stand_in: replays recorded steps if wrappers are not available; otherwise None.
+        stand_in: the wrapper that replays recorded steps if the recorded wrappers are
+            not available; otherwise None.
     """
 
     environment: Any
@@ -89,13 +90,13 @@ class Recreated:
     stand_in: StandIn | None = None
 
     def random_state(self) -> Any:
-        """Return the current state of its random generators, as in recordings."""
+        """Return the state of the environment's generators, in the recorded form."""
         if self.is_dm_env:
             return generator_state(self._dm_generator())
         return random_state(self.environment.unwrapped)
 
     def set_random_state(self, state: Any) -> None:
-        """Set the state of its random generators to a recorded one.
+        """Set the environment's random generators to a recorded state.
 
         Raises:
             NotRecreated: the state does not fit the generators.
@@ -119,7 +120,7 @@ class Recreated:
         self._dm_generator().seed(seed)
 
     def warnings(self) -> dict[str, int]:
-        """Return the number of MuJoCo's warnings since its data was reset, by kind."""
+        """Return the number of MuJoCo's warnings since the last reset, by kind."""
         simulated = simulation_below(self.environment)
         if simulated is None:
             return {}
@@ -128,10 +129,10 @@ class Recreated:
         return warning_counts(simulated)
 
     def seed_behind(self, state: Any) -> int | None:
-        """Return the seed that a generator has just been created with, or None.
+        """Return the seed of a generator that has not been used yet, or None.
 
-        Only for dm_control: NumPy's legacy generator starts with its seed as the first
-        word.
+        This works only for dm_control, because NumPy's legacy generator starts with its
+        seed as the first word.
         """
         key = state.get("state", {}).get("key") if isinstance(state, Mapping) else None
         if not self.is_dm_env or not isinstance(key, list) or not key:
@@ -143,7 +144,7 @@ class Recreated:
         return seed if fresh == state else None
 
     def enter(self, state: NDArray[Any], observation: Any) -> Any:
-        """Set Gymnasium's simulation to a recorded state; return its observation.
+        """Set Gymnasium's simulation to a recorded state, and return the observation.
 
         Args:
             state: a row of a trajectory's states.
@@ -168,7 +169,7 @@ class Recreated:
             enter_state(simulated.model, simulated.data, parts, row)
 
     def turns_by_rk4(self) -> bool:
-        """Return whether MuJoCo 4 deliberately steps its model unlike MuJoCo 3."""
+        """Return whether MuJoCo 4 deliberately steps the model unlike MuJoCo 3."""
         from ..simulation.states import turns_by_rk4  # This loads MuJoCo.
 
         simulated = simulation_below(self.environment)
@@ -187,7 +188,7 @@ def recreate(
     trust: frozenset[str] = frozenset(),
     mjcf: tuple[Path, Any] | None = None,
 ) -> Recreated:
-    """Return the environment of a recording.
+    """Recreate the environment of a recording.
 
     Args:
         recorded: `framework`, `id`, `kwargs`, `wrappers` and so on, from the journal.
@@ -195,7 +196,7 @@ def recreate(
             creation.
         trust: more ids that the reader trusts, `Id` or `module:Id`. The module must
             come from the reader, never from the recording.
-        mjcf: the author's MJCF file and its model, for an environment made from one.
+        mjcf: the author's MJCF file and its model, for an environment made from a file.
 
     Raises:
         NotRecreated: the environment is not trusted, or cannot be created here.
@@ -258,7 +259,7 @@ def _gymnasium(
         )
     if kwargs is None:
         raise NotRecreated(
-            "it was created with arguments that a recording cannot hold, so it cannot "
+            "it was created with arguments that a recording cannot store, so it cannot "
             "be recreated"
         )
     for name, value in kwargs.items():
@@ -279,7 +280,7 @@ def _gymnasium(
 
 
 def _wrapped(env: gymnasium.Env[Any, Any], recorded: Mapping[str, Any]) -> Recreated:
-    """Return an environment inside a recording's wrappers, or inside stand-ins."""
+    """Put an environment inside a recording's wrappers, or inside stand-ins."""
     names = [str(name) for name in recorded.get("wrappers") or ()]
     arguments = recorded.get("wrapper_arguments") or [None] * len(names)
     if len(arguments) != len(names):
@@ -297,7 +298,7 @@ def _wrapped(env: gymnasium.Env[Any, Any], recorded: Mapping[str, Any]) -> Recre
 
 
 def _known_wrapper(name: str, given: Any) -> Callable[..., Any] | None:
-    """Return Gymnasium's wrapper with this name, if its arguments are plain."""
+    """Return Gymnasium's wrapper with this name if its arguments are plain, or None."""
     kind = getattr(gymnasium.wrappers, name.rpartition(".")[2], None)
     if not isinstance(kind, type) or class_name(kind) != name:
         return None
@@ -389,7 +390,7 @@ def _entry_point(env_id: str) -> Any:
     """Return the entry point of an id in the installed registry, or None."""
     spec = registration.registry.get(env_id)
     if spec is None and importlib.util.find_spec(_ROBOTICS) is not None:
-        # It registers its environments on import; this name comes from us.
+        # The package registers its environments on import. Its name comes from us.
         with contextlib.suppress(Exception):
             importlib.import_module(_ROBOTICS)
         spec = registration.registry.get(env_id)
@@ -402,7 +403,7 @@ def _is_below(entry_point: Any, package: str) -> bool:
 
 
 def _suite_name(env_id: str) -> DmControlName | None:
-    """Return the name of a task in the installed suite; None if it has no such task."""
+    """Return the name of a task in the installed suite, or None if it is not there."""
     # If dm_control does not work, none of its tasks counts as installed.
     with contextlib.suppress(Exception):
         from .dm_control_environments import tasks_of
@@ -415,7 +416,7 @@ def _suite_name(env_id: str) -> DmControlName | None:
 
 @contextlib.contextmanager
 def _failures(what: str) -> Iterator[None]:
-    """Turn any exception in an environment's own code into a reason."""
+    """Turn any exception in an environment's own code into `NotRecreated`."""
     try:
         yield
     except NotRecreated:

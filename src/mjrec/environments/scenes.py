@@ -33,16 +33,17 @@ class Scenes:
     """The recording of an environment's states, and whether they determine its frames.
 
     Attributes:
-        states: captures the states; None if no MuJoCo simulation was found.
+        states: the capture of the states; None if no MuJoCo simulation was found.
         obstacle: why frames of the environment cannot be drawn from its states, as a
-            clause that names the overriding class; None if there is no reason apart
-            from missing states.
+            clause that names the overriding class; None if nothing but missing states
+            prevents it.
         environment: the facts needed to recreate the environment: `framework`
             (`"gymnasium"`, `"dm_control"` or `"mjcf"`), `id` and `kwargs` (None if they
-            are unknown, or JSON cannot represent them); None if it has no name.
-        random_state: returns the current state of the environment's random generators,
-            as JSON-compatible values; None if there is no generator yet. It does not
-            create one.
+            are unknown, or JSON cannot represent them); None if the environment has no
+            name.
+        random_state: a function that returns the current state of the environment's
+            random generators as JSON-compatible values, or None if there is no
+            generator yet. It does not create a generator.
     """
 
     states: Capture | None = None
@@ -52,7 +53,7 @@ class Scenes:
 
 
 class NoFrameSource:
-    """The missing frames of an environment that cannot be drawn live.
+    """The source of frames for an environment that cannot be drawn live.
 
     Args:
         missing: what the environment lacks, and a remedy.
@@ -91,12 +92,13 @@ def new_warnings(before: Mapping[str, int], after: Mapping[str, int]) -> dict[st
 def is_defined_by(function: object, module: str, qualified_name: str) -> bool:
     """Return whether a function is the one defined in a module's own source.
 
-    A replacement is not, even if it has the same name, or a decorator copied the name.
+    A replacement does not count, even if it has the same name or a decorator copied the
+    name.
 
     Args:
         function: a function, or any other object.
-        module: the module's full name. It is not imported: if it is in use, it is
-            loaded.
+        module: the module's full name. The module is not imported, because it is
+            already loaded if it is in use.
         qualified_name: the function's qualified name in the module, for example
             `Wrapper.render`.
     """
@@ -112,9 +114,9 @@ def is_defined_by(function: object, module: str, qualified_name: str) -> bool:
 def has_own_method(instance: Any, name: str) -> bool:
     """Return whether an object has its own method in place of its class's.
 
-    This does not use `__dict__`: in CPython 3.11 and 3.12, reading it once makes every
-    later access to the object's attributes several times slower. This adds 2 % to the
-    instructions of a HalfCheetah step.
+    This function does not use `__dict__`: in CPython 3.11 and 3.12, reading it once
+    makes every later access to the object's attributes several times slower. That adds
+    2 % to the instructions of a HalfCheetah step.
     """
     own = getattr(instance, name, None)
     of_class = getattr(instance.__class__, name, None)
@@ -163,7 +165,7 @@ def set_generator_state(generator: Any, state: Any) -> None:
 
 
 def plain_arguments(arguments: Mapping[str, Any]) -> dict[str, Any] | None:
-    """Return arguments as JSON-compatible values; None if that is impossible.
+    """Return arguments as JSON-compatible values, or None if that is impossible.
 
     Tuples become lists, and NumPy scalars become plain numbers.
     """
@@ -180,7 +182,7 @@ def shown_arguments(kwargs: Any) -> str:
         kwargs: the arguments from a recording; any value is accepted.
 
     Returns:
-        The arguments; "" if there are none except those that affect only the view.
+        The arguments, without those that affect only the view; "" if none are left.
     """
     if not isinstance(kwargs, Mapping):
         return ""
@@ -195,10 +197,11 @@ def shown_arguments(kwargs: Any) -> str:
 
 
 def shown_wrappers(environment: Mapping[str, Any]) -> list[str]:
-    """Return `Name(argument=value, ...)` of each wrapper, outermost first.
+    """Return `Name(argument=value, ...)` for each wrapper, starting at the outermost.
 
     Args:
-        environment: as a recording has it; the values may be anything.
+        environment: the facts about the environment in a recording; any values are
+            accepted.
     """
     names, arguments = (
         given if isinstance(given := environment.get(key), list) else []

@@ -2,9 +2,10 @@
 """Substitutes for wrappers that are not available when a recording is replayed.
 
 The simulation underneath is stepped with the recorded controls instead of the wrapper's
-output for an action. Its own rewards and ends of episodes are used, unless the recorded
-ones differ: these may come from the wrapper, so they are passed on and counted. Actions
-that differ from the controls are counted too: nothing proves that they led to them.
+output for an action. If its own rewards and episode ends differ from the recorded ones,
+which may come from the wrapper, the recorded values are passed on and counted. Actions
+that differ from the controls are counted too, because nothing proves that the actions
+led to these controls.
 """
 
 from __future__ import annotations
@@ -40,8 +41,8 @@ class StandIn(gymnasium.Wrapper[Any, Any, Any, Any]):
     """A wrapper that steps an environment with recorded controls.
 
     Attributes:
-        differing: number of steps of this episode whose recorded reward or end differs.
-        translated: number of steps whose action differs from the controls.
+        differing: number of steps in this episode whose recorded reward or end differs.
+        translated: number of steps in it whose action differs from the controls.
     """
 
     differing = translated = 0
@@ -89,7 +90,7 @@ def stand_ins(
         arguments: the recorded arguments of each wrapper.
 
     Returns:
-        The outermost wrapper, and the stand-in to call `begin` on.
+        The outermost wrapper, and the stand-in, whose `begin` must be called.
     """
     around: Any = env
     first: StandIn | None = None
@@ -98,7 +99,7 @@ def stand_ins(
         bases: tuple[type, ...] = (gymnasium.Wrapper,) if first else (StandIn,)
         if given is not None:
             bases = (*bases, RecordConstructorArgs)
-        # The class must have the recorded name, because it will be compared.
+        # The class must have the recorded name, because names will be compared.
         around = type(qualified, bases, {"__module__": module})(around)
         if given is not None:
             around._saved_kwargs = dict(given)

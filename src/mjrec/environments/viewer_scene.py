@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The scene that Gymnasium's off-screen viewer shows, even before it is created.
 
-Imports mujoco through `simulation`, so load this module only if there is a simulation.
+This module imports mujoco through `simulation`, so load it only if there is a
+simulation.
 """
 
 from __future__ import annotations
@@ -29,10 +30,10 @@ _RENDERING = "gymnasium.envs.mujoco.mujoco_rendering"
 # Gymnasium's default, for environments that do not specify a size.
 _SIDE = 480
 
-# Our own renderer's limit, if the environment has no renderer.
+# The limit that our own renderer uses if the environment has no renderer.
 _MAX_GEOM = 10000
 
-# Read at every captured step, with one call each, then compared all at once.
+# These are read at every captured step with one call each, and then compared at once.
 _OF_SIMULATION = attrgetter("mujoco_renderer", "model", "data")
 _OF_RENDERER = attrgetter("model", "camera_id", "_viewers")
 _NO_VIEWERS: dict[str, Any] = {}
@@ -41,9 +42,10 @@ _NO_VIEWERS: dict[str, Any] = {}
 class ViewerScene:
     """The scene shown by an environment's viewer.
 
-    If the environment has a viewer for `rgb_array`, this is the viewer's own camera and
-    options, including the user's changes. Until then it is what a viewer created at the
-    first frame would show, for as long as the environment keeps its renderer.
+    If the environment has a viewer for `rgb_array`, the scene has the viewer's own
+    camera and options, including the user's changes. Before that, it is the scene that
+    a viewer created at the first frame would show, as long as the environment keeps its
+    renderer.
 
     Args:
         simulated: an object with MuJoCo's `model` and `data` and, if it is a Gymnasium
@@ -75,7 +77,7 @@ class ViewerScene:
         self._start()
 
     def __call__(self) -> SceneView:
-        """Return the view from now on; `at_frame` keeps it up to date."""
+        """Return the view, which `at_frame` keeps up to date from now on."""
         self._update()
         self._data = self._simulated.data
         self._note_unmoved()
@@ -90,7 +92,7 @@ class ViewerScene:
         )
 
     def at_frame(self, capture: Callable[[], None]) -> None:
-        """Call `capture` with the view updated to the current frame's."""
+        """Call `capture` with the view of the current frame."""
         self._update()
         self._is_settled = True
         self._note_unmoved()
@@ -99,16 +101,16 @@ class ViewerScene:
     def forget(self) -> None:
         """Treat the next frame as if it were the first.
 
-        A viewer that the environment already has is left as it is.
+        A viewer that the environment already has is not changed.
         """
         self._start()
 
     def is_unmoved(self) -> bool:
-        """Return quickly whether the view is surely the same as at the last frame.
+        """Return quickly whether the view is certainly the same as at the last frame.
 
-        Changes in the model, the camera and the option are not checked. It is true if
-        the simulation is the same as when the view was returned, and there is no viewer
-        that the user could have changed.
+        Changes in the model, the camera and the option are not checked. The result is
+        True if the simulation is the same as when the view was returned, and there is
+        no viewer that the user could have changed.
         """
         unmoved = self._unmoved
         return unmoved is not None and unmoved == (
@@ -117,14 +119,14 @@ class ViewerScene:
         )
 
     def obstacle(self) -> str | None:
-        """Return why the viewer's current frame would show something else, or None."""
+        """Return the reason why the viewer's frame would be different, or None."""
         renderer, viewer = self._renderer, self._viewer()
         if renderer is not None and renderer.model is not self._simulated.model:
             return "the renderer does not draw the model that the environment simulates"
         return None if viewer is None else _addition(viewer, self._new_flags)
 
     def _label(self) -> str | int | dict[str, Any]:
-        """Return the metadata's label for the camera; cached, because it is slow."""
+        """Return the camera's label for the metadata. It is cached, as it is slow."""
         asked = self._camera if self._asked is None else self._asked
         seen = (self._model, asked, *_pose(self._camera))
         if self._labelled is None or self._labelled[0] != seen:
@@ -137,7 +139,7 @@ class ViewerScene:
         self._new_flags = new_scene_flags(self._model)
         self._is_settled = False
         self._camera_id: int | None = None
-        # The values that `is_unmoved` expects; None if it must return false.
+        # The values that `is_unmoved` expects; None if it must return False.
         self._unmoved: tuple[tuple[Any, ...], tuple[Any, ...]] | None = None
         flags = getattr(self._renderer, "_vopt", None)
         copy_members(viewer_option(flags), self._option)
@@ -177,7 +179,7 @@ class ViewerScene:
             data = self._simulated.data
             place_viewer_camera(self._model, data, config, self._camera)
         elif renderer.camera_id == self._camera_id:
-            # The usual case, at every step.
+            # This is the usual case at every step.
             return
         self._camera_id = renderer.camera_id
         select_camera(self._camera, self._camera_id)
@@ -203,7 +205,7 @@ def _own_side(simulated: Any, name: str) -> int:
 
 
 def _addition(viewer: Any, new_flags: bytes) -> str | None:
-    """Return what a viewer shows in addition to the scene, or None."""
+    """Return a description of what a viewer shows beyond the scene, or None."""
     if viewer._markers:
         return "markers were added to the viewer"
     if viewer._overlays:

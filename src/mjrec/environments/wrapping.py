@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The wrappers between a monitor and the environment that it records.
 
-An action recorded above a wrapper may differ from what the environment received, so
-recreating the environment includes recreating its wrappers.
+An action recorded above a wrapper may differ from the action that the environment
+received, so recreating the environment includes recreating its wrappers.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _TRANSPARENT = frozenset(
         "mjrec.monitors.gymnasium_monitor.GymnasiumMonitor",
     }
 )
-# Attributes in which dm_env's and dm_control's wrappers keep what they wrap.
+# Attributes in which dm_env's and dm_control's wrappers keep the inner environment.
 _INSIDE = ("_env", "_environment", "environment")
 
 
@@ -40,10 +40,10 @@ def around_gymnasium(env: gymnasium.Env[Any, Any]) -> dict[str, Any]:
         env: the environment, as the user wrapped it.
 
     Returns:
-        `wrappers`, the full class names of the wrappers that may change what passes
-        through them, outermost first; `wrapper_arguments`, the arguments of each, if
-        there are any wrappers; and `max_episode_steps`, the lowest limit of a
-        `TimeLimit`, or None.
+        `wrappers`, the full class names of the wrappers that may change actions,
+        rewards or episode ends, outermost first; `wrapper_arguments`, the arguments of
+        each wrapper, if there are any wrappers; and `max_episode_steps`, the lowest
+        limit of a `TimeLimit`, or None.
     """
     layers: list[Any] = []
     while isinstance(env, gymnasium.Wrapper):
@@ -58,9 +58,9 @@ def around_gymnasium(env: gymnasium.Env[Any, Any]) -> dict[str, Any]:
 def around_dm_env(env: Any) -> dict[str, Any]:
     """Return the same facts about a dm_env environment. Limits are dm_control's own.
 
-    An inner environment in an attribute of unknown name is not found. Then the wrapper
-    counts as the environment, but is still listed in `wrappers`, because it is not one
-    of dm_control's environments.
+    An inner environment is not found if the name of its attribute is unknown. In that
+    case, the wrapper counts as the environment, but is still listed in `wrappers`,
+    because it is not one of dm_control's environments.
     """
     layers: list[Any] = []
     while not _is_innermost(env):
@@ -85,7 +85,7 @@ def _changing(layers: Iterable[Any]) -> list[Any]:
 
 
 def _arguments_of(wrapper: Any) -> dict[str, Any] | None:
-    """Return the arguments of a Gymnasium wrapper; None if it does not keep them.
+    """Return the arguments of a Gymnasium wrapper, or None if it does not keep them.
 
     The result is also None if JSON cannot represent an argument, such as a function.
     """
@@ -107,9 +107,9 @@ def _is_innermost(env: Any) -> bool:
 
 
 def _own(env: Any, name: str) -> Any:
-    """Return an attribute of an object itself, without consulting what it wraps.
+    """Return an attribute of an object itself, not one of an object that it wraps.
 
-    Its `__dict__` is not used, for the reason given in `has_own_method`.
+    The object's `__dict__` is not used, for the reason given in `has_own_method`.
     """
     try:
         return object.__getattribute__(env, name)

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The file formats: how each kind of file is named, written and read."""
+"""The file formats: names, writers and readers for each kind of file."""

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Appending to files in whole pieces, each handed to the operating system at once.
+"""Functions that append whole pieces to files, with a single system call for each.
 
-A piece is a line of a journal, a row of a table or a TensorBoard record. Half a piece
-would corrupt the one that follows it. Appended data survives the death of the process
-that wrote it.
+A piece is a line of a journal, a row of a table or a TensorBoard record. An incomplete
+piece would corrupt the next one. Appended data survives the death of the process that
+wrote it.
 """
 
 from __future__ import annotations
@@ -31,16 +31,16 @@ def open_for_appending(path: Path, *, new: bool = False) -> int:
 
 
 def append_whole(descriptor: int, piece: bytes, *, torn: bytes = b"") -> None:
-    """Append a piece to a file, whole or not at all.
+    """Append a piece to a file: either the whole piece or nothing.
 
     Args:
         descriptor: a descriptor from `open_for_appending`.
         piece: the bytes to append.
-        torn: written before the piece if the file does not end with a line feed,
-            because its writer was killed in the middle of a line.
+        torn: bytes to write before the piece if the file does not end with a line feed
+            (its last writer was killed in the middle of a line).
 
     Raises:
-        OSError: the disk is full and the file is unchanged, or the file was removed.
+        OSError: the disk is full (then the file is unchanged), or the file was removed.
     """
     status = os.fstat(descriptor)
     if status.st_nlink == 0:
@@ -51,8 +51,8 @@ def append_whole(descriptor: int, piece: bytes, *, torn: bytes = b"") -> None:
         piece = torn * is_torn + piece
     written = os.write(descriptor, piece)
     if written != len(piece):
-        # Only half the piece was written. If another piece already follows it, the half
-        # stays; readers skip it.
+        # Only part of the piece was written. If another piece already follows it, the
+        # part stays, and readers skip it.
         end = os.lseek(descriptor, 0, os.SEEK_CUR)
         if os.fstat(descriptor).st_size == end:
             os.ftruncate(descriptor, end - written)

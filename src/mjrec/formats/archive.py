@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Gym's archive: videos packed for upload.
 
-A gzipped tar file, flat::
+The archive is a gzipped tar file without directories::
 
     <video>, <its metadata>      for each pair, in the order given
     manifest.json                {"version": 0, "videos": [[video, metadata], ...]}
@@ -74,7 +74,7 @@ def _objections(pairs: Sequence[_Pair]) -> Iterator[str]:
     """Yield the reasons why these pairs cannot be archived, in gym's order."""
     if len(pairs) > MAX_VIDEOS:
         yield (
-            f"{len(pairs)} videos were given, and an archive holds at most "
+            f"{len(pairs)} videos were given, but an archive holds at most "
             f"{MAX_VIDEOS}. Write several archives."
         )
     taken: set[str] = set()
@@ -93,10 +93,10 @@ def _objections(pairs: Sequence[_Pair]) -> Iterator[str]:
             if path.name in taken:
                 yield (
                     f"The name {path.name!r} occurs twice (the second time as {path}), "
-                    "and an archive has no directories. Rename one of the files."
+                    "but an archive has no directories. Rename one of the files."
                 )
             taken.add(path.name)
-        plain = "it must be letters, digits, '_', '-' and '.', ending in"
+        plain = "it must consist of letters, digits, '_', '-' and '.', and end in"
         if not _VIDEO_NAME.fullmatch(video.name):
             yield f"{video.name!r} is not a video's name: {plain} .mp4, .avi or .json."
         if video.name.endswith(".meta.json"):

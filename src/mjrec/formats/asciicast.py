@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Recordings of text environments, as asciicast version 1.
+"""Recordings of text environments in the asciicast format, version 1.
 
 The format is asciinema's (https://docs.asciinema.org/manual/asciicast/v1/): one JSON
 object with `version`, `width`, `height`, `duration`, `command`, `title`, `env` and
@@ -24,15 +24,15 @@ from ..json_text import loads
 from ..rates import rate_from_timestep
 from .json_fields import unreadable
 
-# The frames come first, one per line; the fields that depend on all of them follow.
+# The frames come first, one per line. The fields that depend on all frames follow.
 _BEGIN = '{"stdout": [\n'
 _CLEAR_AND_HOME = "\x1b[2J\x1b[1;1H"
-# Control sequences (colours, cursor) take no space on the screen. ECMA-48, 5.4.
+# Control sequences (colours, cursor) take no space on the screen; see ECMA-48, 5.4.
 _CONTROL_SEQUENCE = re.compile(r"\x1b\[[0-?]*[ -/]*[@-~]")
 
 
 def text_of_frame(frame: object) -> str:
-    r"""Return the text that `render()` returned in `ansi` mode.
+    r"""Return the text of a frame that `render()` returned in `ansi` mode.
 
     Raises:
         InvalidFrame: the frame is neither a `str` nor a `StringIO`.
@@ -41,15 +41,15 @@ def text_of_frame(frame: object) -> str:
         frame = frame.getvalue()
     if not isinstance(frame, str):
         raise InvalidFrame(
-            f"A text frame must be a str or a StringIO, got {type(frame).__name__}."
+            f"A text frame must be a str or a StringIO, not {type(frame).__name__}."
         )
     return frame
 
 
 class AsciicastWriter:
-    """A writer of text frames, each shown for the same time, into one file.
+    """A writer that puts text frames into a file; each is shown for the same time.
 
-    Frames go to the disk as they come, into a hidden file that `close` renames to the
+    Each frame is written at once to a hidden file, which `close` renames to the
     recording's name.
 
     Args:
@@ -80,12 +80,12 @@ class AsciicastWriter:
                 self._file = self._part.open("w", encoding="utf-8")
             begin = ",\n" if self.frame_count else _BEGIN
             self._file.write(begin + json.dumps(event))
-            # If the process is killed, only what the operating system has survives.
+            # If the process is killed, only flushed data survives.
             self._file.flush()
         self.frame_count += 1
 
     def close(self) -> None:
-        """Finish the file. Without any frames, no file is created. Idempotent.
+        """Finish the file. If there are no frames, no file is created. Idempotent.
 
         Raises:
             FileNotWritten: the disk is full, or the directory was removed.
@@ -116,7 +116,7 @@ class AsciicastWriter:
             self._part.unlink(missing_ok=True)
 
     def leave(self) -> None:
-        """Close the unfinished file and leave it to be finished elsewhere."""
+        """Close the unfinished file, which another process can finish."""
         if self._file is not None:
             self._file.close()
 
@@ -136,7 +136,7 @@ def unfinished_recording(path: Path) -> tuple[Fraction, list[str]]:
             is ignored.
 
     Raises:
-        UnreadableFile: the file is not such a recording, or holds no frame.
+        UnreadableFile: the file is not such a recording, or contains no frames.
     """
     with unreadable(path):
         if not path.is_file() or path.is_symlink():

@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Bundles: many finished trajectories of one monitor in one HDF5 file.
 
-A finished trajectory is in a file of its own or in a bundle,
-`openaigym.trajectories.<infix>.h5`. In a bundle, the group `episode000027` holds what
-the file `openaigym.trajectory.<infix>.episode000027.h5` would hold at its root. A
+A finished trajectory is stored either in a file of its own or in a bundle,
+`openaigym.trajectories.<infix>.h5`. A bundle's group `episode000027` has the same
+content as the root of the file `openaigym.trajectory.<infix>.episode000027.h5`. A
 trajectory is always identified by the path of its own file, even if it is in a bundle;
 `is_finished` and `file_of` locate it.
 
-A bundle's episodes are listed before its HDF5 part, in what HDF5 calls the user block,
-as ranges of episode numbers::
+A bundle begins with a list of its episodes, as ranges of episode numbers. The list is
+in what HDF5 calls the user block::
 
     {"format": "mjrec trajectories", "version": 1, "episodes": [[0, 23], [25, 25]]}
 
@@ -83,7 +83,7 @@ def finished_trajectories(directory: Path) -> Iterator[Path]:
 def trajectories_in(bundle: Path) -> list[Path]:
     """Return the paths that identify the trajectories in a bundle, sorted.
 
-    The list is empty if the bundle cannot be read; opening it reports the reason.
+    The list is empty if the bundle cannot be read. To get the reason, open the bundle.
     """
     infix = Infix.parse(infix_of(bundle.name) or "")
     if infix is None:
@@ -103,7 +103,7 @@ def index_size(count: int) -> int:
 
 
 def index_of(episodes: Iterable[int]) -> bytes:
-    """Return the index that a bundle's file begins with."""
+    """Return the index at the beginning of a bundle's file."""
     ranges: list[list[int]] = []
     for number in sorted(episodes):
         if ranges and ranges[-1][1] == number - 1:
@@ -136,7 +136,7 @@ def _episodes_in(bundle: Path) -> frozenset[int]:
         return frozenset()
 
 
-# Each trajectory is looked up separately.
+# Cached, because each trajectory is looked up separately.
 @functools.lru_cache(maxsize=64)
 def _read_index(bundle: Path, version: tuple[int, ...]) -> frozenset[int]:
     del version

@@ -41,7 +41,7 @@ _PLAIN: dict[object, _Read] = {
 
 
 def to_json(instance: Any) -> dict[str, Any]:
-    """Return a dataclass as JSON can hold it; `json_text` writes NaN as null."""
+    """Convert a dataclass to a JSON object. NaN is kept; `json_text` makes it null."""
     names = [each.name for each in dataclasses.fields(instance)]
     return {name: _plain(getattr(instance, name)) for name in names}
 
@@ -53,18 +53,18 @@ def _plain(value: Any) -> Any:
         return {key: _plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
         return [_plain(item) for item in value]
-    # Fractions stay exact as strings.
+    # Fractions become strings, which are exact.
     return str(value) if isinstance(value, Path | Fraction) else value
 
 
 def from_json(kind: type[D], value: Any) -> D:
-    """Return a dataclass from the output of `to_json`.
+    """Create a dataclass from the output of `to_json`.
 
     Unknown keys are ignored, and missing keys get the field's default. For a field
     annotated as `Annotated[kind, read]`, `read` converts the value.
 
     Raises:
-        ValueError: `value` is not an object of this kind.
+        ValueError: `value` is not a valid JSON object for this class.
     """
     values = mapping(value)
     given = {
@@ -92,7 +92,7 @@ def _is_needed(each: dataclasses.Field[Any]) -> bool:
 
 
 def _reader(hint: Any) -> _Read:
-    """Return the function that reads a field with this annotation."""
+    """Return a function that reads a field with this annotation."""
     if hint in _PLAIN:
         return _PLAIN[hint]
     if dataclasses.is_dataclass(hint):
@@ -135,7 +135,7 @@ def _tuple(inner: tuple[Any, ...]) -> Callable[[Any], tuple[Any, ...]]:
     def read_so_many(value: Any) -> tuple[Any, ...]:
         items = read(value)
         if len(items) != len(inner):
-            raise ValueError(f"expected {len(inner)} values, got {len(items)}")
+            raise ValueError(f"it must have {len(inner)} values, not {len(items)}")
         return items
 
     return read_so_many

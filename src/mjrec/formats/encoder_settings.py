@@ -2,8 +2,8 @@
 """ffmpeg's encoding settings: codec, quality, colours and container.
 
 The same frames give the same file on any CPU and with any number of cores: the number
-of threads is fixed, x264 uses only what works alike on every CPU (`cpu-independent=1`),
-and colours are converted with exact rounding.
+of threads is fixed, x264 uses only algorithms that give the same result on every CPU
+(`cpu-independent=1`), and colours are converted with exact rounding.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ from .ffmpeg import (
 
 _DEFAULT_CODEC = "libx264"
 _WORST_CRF = 51.0
-# x264's output depends on its number of threads, so this is a constant and does not
-# follow the machine.
+# x264's output depends on its number of threads, so this is a constant that does not
+# depend on the machine.
 _ENCODER_THREADS = 4
 
 # Containers, by file name suffix.
@@ -45,7 +45,7 @@ _RGB_FORMATS = ("rgb24", "bgr24", "gbrp", "bgr0", "rgb0")
 _LOSSLESS_CODECS = frozenset(
     {"ffv1", "libx264rgb", "utvideo", "png", "apng", "qtrle", "ffvhuff", "huffyuv"}
 )
-# For codecs whose default quality in ffmpeg is poor or unexpected.
+# Arguments for codecs whose default quality in ffmpeg is poor or unexpected.
 _QUALITY = {
     _DEFAULT_CODEC: ("-crf", "18"),
     "libx264rgb": ("-crf", "0"),
@@ -55,8 +55,8 @@ _QUALITY = {
 # Exact rounding and chroma averaging: without `bitexact` and `accurate_rnd`, swscale's
 # result depends on the CPU.
 _SCALE_FLAGS = "area+accurate_rnd+full_chroma_int+full_chroma_inp+bitexact"
-# Tag the frames: ffmpeg 8 and later prefer the frames' tags to `-color_primaries` and
-# `-color_trc` given for the encoder, and write "unknown".
+# The filter also tags the frames: ffmpeg 8 and later prefer the frames' tags to the
+# encoder's `-color_primaries` and `-color_trc`, and would write "unknown".
 _TO_BT709 = (
     f"scale=out_color_matrix=bt709:out_range=limited:flags={_SCALE_FLAGS},"
     "format=yuv420p,setparams=range=limited:color_primaries=bt709:color_trc=bt709:"
@@ -75,10 +75,10 @@ class EncoderSettings:
     """Encoder settings that apply to any frame size and rate.
 
     Attributes:
-        codec: ffmpeg's name of the encoder.
+        codec: ffmpeg's name for the encoder.
         pixel_format: pixel format of the encoded video: yuv420p, or one that holds
             rgb24 without loss.
-        muxer: ffmpeg's name of the container.
+        muxer: ffmpeg's name for the container.
         encoding: the arguments between the input and the container.
     """
 
@@ -90,7 +90,7 @@ class EncoderSettings:
     def arguments(
         self, *, height: int, width: int, fps: Fraction, output: str
     ) -> list[str]:
-        """Return ffmpeg's arguments for rgb24 frames from standard input to a file."""
+        """Return ffmpeg's arguments for encoding rgb24 frames from standard input."""
         index = "+faststart"
         if output == _STANDARD_OUTPUT:
             # The beginning of a pipe cannot be rewritten.
@@ -99,8 +99,8 @@ class EncoderSettings:
             *("-hide_banner", "-loglevel", "error", "-nostdin", "-y"),
             *("-f", "rawvideo", "-pixel_format", "rgb24"),
             *("-video_size", f"{width}x{height}"),
-            # Not `-framerate`: ffmpeg would replace it in the file with a common rate
-            # near it, for some rates always, for 125 if there are 3 to 9 frames.
+            # Not `-framerate`: ffmpeg would write a nearby common rate to the file. It
+            # does this for some rates always, and for 125 if there are 3 to 9 frames.
             *("-r", f"{fps.numerator}/{fps.denominator}"),
             *("-i", "pipe:0"),
             *self.encoding,
@@ -125,13 +125,13 @@ def encoder_settings(
     codec = _DEFAULT_CODEC if codec is None else codec
     if not isinstance(codec, str):
         raise InvalidArgument(
-            f"codec must be ffmpeg's name of an encoder, got {codec!r}."
+            f"codec must be ffmpeg's name for an encoder, not {codec!r}."
         )
     if isinstance(encoder_arguments, str) or not all(
         isinstance(each, str) for each in encoder_arguments
     ):
         raise InvalidArgument(
-            "encoder_arguments must be a sequence of strings, got "
+            "encoder_arguments must be a sequence of strings, not "
             f"{encoder_arguments!r}."
         )
     help_text = _encoder_help(codec)
@@ -154,9 +154,9 @@ def encoder_settings(
 
 
 def check_encoding(settings: EncoderSettings, fps: Fraction) -> None:
-    """Try an encoding, so that an impossible one fails before any work is done.
+    """Try an encoding, so that invalid settings fail before any work is done.
 
-    Each encoding is tried once per ffmpeg.
+    Each encoding is tried once for each ffmpeg binary.
 
     Raises:
         EncoderError: ffmpeg cannot encode with these settings.
@@ -175,7 +175,7 @@ def try_encoding(settings: EncoderSettings, fps: Fraction) -> str:
         _trial_arguments(settings, fps),
         standard_input=bytes([128]) * (_TRIAL_SIDE * _TRIAL_SIDE * 3),
         what=f"ffmpeg cannot encode {fps} frames per second with {settings.codec} "
-        f"into a {settings.muxer} file: choose another codec, rate or kind of file.",
+        f"into a {settings.muxer} file: choose another codec, rate or file type.",
     )
     return "it works"
 
@@ -207,13 +207,13 @@ def _quality_arguments(
     is_number = isinstance(crf, numbers.Real) and not isinstance(crf, bool)
     if not is_number or not 0 <= crf <= _WORST_CRF:
         raise InvalidArgument(
-            f"crf must be a number from 0 (largest) to {_WORST_CRF:g} (worst), got "
-            f"{crf!r}."
+            f"crf must be a number from 0 (largest file) to {_WORST_CRF:g} (worst "
+            f"quality), not {crf!r}."
         )
     if " -crf " not in help_text:
         raise InvalidArgument(
-            f"The encoder {codec} does not support crf, got crf={crf:g}: leave it out, "
-            "or use codec='libx264'."
+            f"The encoder {codec} does not support crf={crf:g} or any other crf: leave "
+            "it out, or use codec='libx264'."
         )
     return ("-crf", f"{crf:g}")
 
@@ -226,7 +226,7 @@ def _pixel_format(codec: str, help_text: str) -> str:
         if pixel_format in supported:
             return pixel_format
     raise InvalidArgument(
-        f"The encoder {codec} supports none of {', '.join(wanted)}, only "
+        f"The encoder {codec} must support {' or '.join(wanted)}, but supports only "
         f"{', '.join(supported) or 'unknown formats'}: use codec='libx264', or "
         "codec='ffv1' for a lossless video."
     )
@@ -241,7 +241,7 @@ def _encoder_help(codec: str) -> str:
         " ".join(arguments),
         lambda: run_ffmpeg(arguments).decode("utf-8", errors="replace"),
     )
-    # For a codec's name, ffmpeg shows all encoders of that codec.
+    # If given the name of a codec, ffmpeg shows all encoders for that codec.
     if f"Encoder {codec} [" not in text:
         raise UnknownName(
             "video encoder",

@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Finding ffmpeg, and running it such that no failure goes unnoticed.
+"""Functions that find ffmpeg and run it so that no failure goes unnoticed.
 
-`imageio-ffmpeg` brings the binary (or finds one); this module runs it. If an ffmpeg
-that ran fails, that is always an `EncoderError` with the command, the exit status and
-the end of its error output. If it cannot be started, that is a different error, with
-the reason.
+`imageio-ffmpeg` provides or finds the binary, and this module runs it. If ffmpeg fails,
+an `EncoderError` gives the command, the exit status and the end of the error output. If
+ffmpeg cannot be started, a different error gives the reason.
 """
 
 from __future__ import annotations
@@ -45,7 +44,7 @@ _LIBAVUTIL_OF_FPS_MODE = (57, 28)
 _MOST_BYTES = 1 << 20
 _MOST_PROGRAMS = 8
 
-# The answers of each program, by question.
+# The answers for each program, by question.
 _answers: dict[str, dict[str, str]] = {}
 
 
@@ -59,7 +58,7 @@ def ffmpeg_executable() -> str:
         MissingDependency: no ffmpeg was found.
         InvalidArgument: `IMAGEIO_FFMPEG_EXE` does not name a program.
     """
-    # Not at the top: importing mjrec must not import imageio-ffmpeg.
+    # Imported here because importing mjrec must not import imageio-ffmpeg.
     import imageio_ffmpeg
 
     try:
@@ -86,18 +85,19 @@ def ffmpeg_sha256() -> str:
 
 
 def remembered(program: str, question: str, answer: Callable[[], str]) -> str:
-    """Return the answer to a question about a program, asking only once.
+    """Return the answer to a question about a program, which is asked only once.
 
     Asking ffmpeg three questions and hashing its 80 megabytes takes as long as
     rendering a hundred small frames. So the answers are cached in
     `$XDG_CACHE_HOME/mjrec/programs.json` (`~/.cache/mjrec/programs.json` by default),
     which can be deleted at any time. They are valid only for exactly the same file: the
-    same path, device, inode, size, mtime and ctime. Only the kernel sets ctime.
+    same path, device, inode, size, mtime and ctime (which only the kernel can set).
 
     Args:
         program: the program's path.
         question: a key that identifies the question.
-        answer: asks the program. If it raises, nothing is cached.
+        answer: a function that asks the program. If it raises an error, nothing is
+            cached.
     """
     status = Path(program).stat()
     times = (status.st_mtime_ns, status.st_ctime_ns)
@@ -119,7 +119,7 @@ def remembered(program: str, question: str, answer: Callable[[], str]) -> str:
 
 
 def _read(path: Path) -> dict[str, dict[str, str]]:
-    # An unreadable cache does not matter: the answers can be found again.
+    # An unreadable cache does no harm, because the programs can be asked again.
     with contextlib.suppress(OSError, ValueError, TypeError, AttributeError):
         stored = json.loads(read_regular(path, limit=_MOST_BYTES))
         return {key: dict(value) for key, value in stored.items()}
@@ -134,7 +134,7 @@ def video_encoders() -> list[str]:
 
 
 def every_frame_arguments() -> tuple[str, ...]:
-    """Return the output arguments that keep each frame once, none dropped or repeated.
+    """Return the output arguments that make ffmpeg keep each frame exactly once.
 
     By default, ffmpeg fills gaps with copies and drops early frames to make the rate
     even. When decoding, that hides missing and duplicate frames.
@@ -145,8 +145,8 @@ def every_frame_arguments() -> tuple[str, ...]:
 
 
 def as_file(path: Path) -> str:
-    """Return the argument for a path that ffmpeg always takes as a file."""
-    # Without the prefix, ffmpeg would take a name with a colon for a protocol.
+    """Return the argument that makes ffmpeg treat a path as a file."""
+    # Without the prefix, ffmpeg would mistake the part before a colon for a protocol.
     return f"file:{path}"
 
 
@@ -156,10 +156,10 @@ def run_ffmpeg(
     standard_input: bytes = b"",
     what: str = "ffmpeg failed.",
 ) -> bytes:
-    """Run ffmpeg to its end and return its standard output.
+    """Run ffmpeg until it ends, and return its standard output.
 
     Args:
-        arguments: those after the program's name.
+        arguments: the arguments after the program's name.
         standard_input: bytes to feed to ffmpeg.
         what: the first sentence of the error message if ffmpeg fails.
 
@@ -178,28 +178,28 @@ def run_ffmpeg(
 
 
 class FfmpegProcess:
-    """An ffmpeg process that is fed through a pipe, or read from one.
+    """An ffmpeg process with a pipe for its input, its output or both.
 
-    It runs in a session of its own: Ctrl-C in the terminal reaches only the parent,
-    which decides. When the parent dies, ffmpeg sees the end of its input and finishes
-    its file on its own. Leaving `with` kills the process.
+    The process runs in its own session, so Ctrl-C in the terminal reaches only the
+    parent, which decides what to do. When the parent dies, ffmpeg sees the end of its
+    input and finishes its file on its own. Leaving the `with` block kills the process.
 
-    Each method that waits for ffmpeg kills it if it hangs for `timeout_s`: if it
-    accepts no input, returns no output, or has all its input and its file does not
-    change.
+    Each method that waits for ffmpeg kills it if it hangs for `timeout_s`. It hangs if
+    it accepts no input, returns no output, or has all of its input but does not change
+    its file.
 
     Args:
-        arguments: those after the program's name.
+        arguments: the arguments after the program's name.
         what: the first sentence of the error message if ffmpeg fails.
-        reads: whether ffmpeg is fed through `write`.
+        reads: whether ffmpeg gets its input through `write`.
         writes: whether its output is read through `read`.
-        keeps: the descriptor of a file that ffmpeg holds open.
+        keeps: the descriptor of a file that ffmpeg must keep open.
 
     Attributes:
         command: the program and its arguments.
 
     Raises:
-        Error: ffmpeg could not be started, see `run_ffmpeg`.
+        Error: ffmpeg could not be started; see `run_ffmpeg`.
     """
 
     def __init__(
@@ -216,7 +216,7 @@ class FfmpegProcess:
         self._timeout = Timeout()
         try:
             with contextlib.ExitStack() as on_failure:
-                # A file, not a pipe: it need not be emptied while ffmpeg runs.
+                # A file, because a pipe would have to be emptied while ffmpeg runs.
                 stderr = on_failure.enter_context(tempfile.TemporaryFile())
                 self._process = subprocess.Popen(
                     self.command,
@@ -225,7 +225,7 @@ class FfmpegProcess:
                     stderr=stderr,
                     bufsize=0,
                     start_new_session=True,
-                    # With SIGXFSZ ignored, as Python ignores it, ffmpeg reports a file
+                    # ffmpeg inherits that Python ignores SIGXFSZ, so it reports a file
                     # size limit as an error instead of being killed.
                     restore_signals=False,
                     pass_fds=() if keeps is None else (keeps,),
@@ -237,7 +237,7 @@ class FfmpegProcess:
         pipes = (self._process.stdin, self._process.stdout)
         self._pipes = [pipe for pipe in pipes if pipe is not None]
         for pipe in self._pipes:
-            # Linux's default is 64 KiB: eleven context switches for a 480x480 frame.
+            # Linux's default of 64 KiB costs eleven context switches per 480x480 frame.
             # The kernel may refuse a larger pipe.
             with contextlib.suppress(OSError):
                 fcntl.fcntl(pipe, fcntl.F_SETPIPE_SZ, _PIPE_SIZE)
@@ -261,21 +261,21 @@ class FfmpegProcess:
         rest = memoryview(data if isinstance(data, bytes) else data.data).cast("B")
         try:
             while rest:
-                # None: the pipe is full.
+                # The result is None if the pipe is full.
                 taken = pipe.write(rest)
                 if taken:
                     rest = rest[taken:]
                 else:
                     self._wait_for(pipe, select.POLLOUT)
         except (OSError, ValueError) as error:
-            # ValueError: the pipe was closed before. An ffmpeg that has closed its
-            # input ends on its own; a wrapper script may not.
+            # ValueError means that the pipe was closed before. ffmpeg ends on its own
+            # after closing its input, but a wrapper script may not.
             self._has_ended(_SECONDS_TO_DIE)
             self.kill()
             raise self._error() from error
 
     def read(self, size: int) -> bytes:
-        """Return at most `size` bytes of output, empty at its end.
+        """Return at most `size` bytes of output, or no bytes at its end.
 
         Raises:
             EncoderError: ffmpeg hangs.
@@ -301,20 +301,20 @@ class FfmpegProcess:
             raise self._error()
 
     def kill(self) -> None:
-        """Kill the process at once, with any processes that a wrapper script started.
+        """Kill the process at once, and any processes that a wrapper script started.
 
         The pipes stay open: a thread may be about to write, and a closed descriptor's
         number may already belong to another file.
         """
         if self._process.poll() is None:
-            # It leads its own process group. The process may already have ended.
+            # The process leads its own process group, and may already have ended.
             with contextlib.suppress(ProcessLookupError, PermissionError):
                 os.killpg(self.pid, signal.SIGKILL)
-        # A process whose disk does not answer cannot die, so do not wait forever.
+        # A process that waits for a broken disk cannot die, so do not wait forever.
         self._has_ended(_SECONDS_TO_DIE)
 
     def release(self) -> None:
-        """Close the pipes of a process that has ended, once no thread uses them."""
+        """Close the pipes of a process that has ended. No thread may still use them."""
         self.close_inherited_pipes()
         self._stderr.close()
         _running.discard(self)
@@ -349,9 +349,9 @@ class FfmpegProcess:
         """Wait, and kill the process if there is no progress for too long.
 
         Args:
-            is_ready: waits for at most the given number of seconds, and returns whether
-                the wait is over.
-            state: returns a value that changes as long as there is progress.
+            is_ready: a function that waits for at most the given number of seconds, and
+                returns whether the wait is over.
+            state: a function whose result changes as long as there is progress.
         """
         last = state()
         self._timeout.renew()
@@ -369,7 +369,7 @@ class FfmpegProcess:
         return self._process.returncode is not None
 
     def _state_of_output(self) -> tuple[int, int]:
-        """Return a value that changes while ffmpeg writes its file, if it has one."""
+        """Return a value that changes while ffmpeg writes its file, if there is one."""
         protocol, _, path = self.command[-1].partition(":")
         if protocol == "file":
             with contextlib.suppress(OSError):

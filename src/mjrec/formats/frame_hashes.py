@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The `.framehash` file: the SHA-256 of each rendered frame.
 
-The content is byte for byte what ffmpeg's `framehash` muxer writes for the same frames
-as raw video (`-fflags +bitexact -f rawvideo -pix_fmt rgb24 ... -f framehash`), so tools
-that read ffmpeg's files read it too::
+The content is byte for byte the same as the output of ffmpeg's `framehash` muxer for
+the same frames as raw video (`-fflags +bitexact -f rawvideo -pix_fmt rgb24 ... -f
+framehash`). Tools that read ffmpeg's files can read it too::
 
     #format: frame checksums
     #version: 2
@@ -17,8 +17,8 @@ that read ffmpeg's files read it too::
     0,          0,          0,        1,   691200, 5b1f...
 
 The time base (`tb`) is the duration of a frame in seconds; dimensions are WIDTHxHEIGHT;
-`size` is in bytes. A frame's bytes are its rows from top to bottom, each pixel red,
-green, blue.
+`size` is in bytes. A frame's bytes are its rows from top to bottom, and each pixel is
+its red, green and blue.
 """
 
 from __future__ import annotations
@@ -55,15 +55,15 @@ def frame_hash_line(number: int, frame: Frame) -> str:
 
 
 def cut_frame_hashes(path: Path, count: int) -> None:
-    """Keep only the hashes of the first `count` frames in a file, whole or not at all.
+    """Atomically cut a file down to the hashes of its first `count` frames.
 
     Raises:
         OSError: the file cannot be read or written.
-        ValueError: the file holds fewer hashes, or is not a `.framehash` file.
+        ValueError: the file contains fewer hashes, or is not a `.framehash` file.
     """
     header = frame_hash_header(height=1, width=1, fps=Fraction(1)).count("\n")
     lines = path.read_text(encoding="ascii").splitlines(keepends=True)
-    # The last line may be torn.
+    # The last line may be incomplete.
     kept = [line for line in lines[: header + count] if line.endswith("\n")]
     if len(kept) < header + count:
         raise ValueError(f"it has hashes of fewer than {count} frames")

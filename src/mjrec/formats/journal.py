@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The journal: the events of a run, one line of JSON each.
+"""The journal: the events of a run, with one line of JSON for each event.
 
-`openaigym.episodes.<infix>.jsonl` grows while the monitor runs, so that a killed
-process loses nothing that had ended. Statistics and manifest are derived from it. It
-also records which rows of the logs belong to which recording (`spans`). A completed
-episode is a line::
+`openaigym.episodes.<infix>.jsonl` grows while the monitor runs, so that no completed
+episode is lost if the process is killed. The statistics and the manifest are derived
+from it. It also records which rows of the logs belong to which recording (see `spans`).
+Each completed episode is a line::
 
     {"episode_id": 27, "length": 200, "reward": 12.5, "type": "t",
      "start_time": 1790000000.0, "end_time": 1790000004.0,
@@ -12,14 +12,15 @@ episode is a line::
      "success": null, "chosen": true, "recording": "deferred"}
 
 `chosen` is present if the schedule chose the episode, `recording` (`"live"` or
-`"deferred"`) if it has a video of its own, `evaluation` (seed, number and MuJoCo's
-warnings) if it is part of an evaluation. Every other line is an event, an object with a
-single key: its kind, one of `EVENTS`. The first line is the `run` event.
+`"deferred"`) if the episode has a video of its own, and `evaluation` (seed, number and
+MuJoCo's warnings) if it is part of an evaluation. Every other line is an object with a
+single key, which is the kind of event: one of `EVENTS` or `SPAN_EVENTS`. The first line
+is the `run` event.
 
 Times are seconds since the epoch. Keys that this version does not know are ignored.
 
-A machine that dies can leave half a line at the end, and a failing disk can corrupt any
-line. A reader skips invalid lines, keeps the rest, and reports what it skipped.
+If the machine crashes, the last line may be incomplete, and a failing disk can corrupt
+any line. A reader skips and reports invalid lines, and keeps the rest.
 """
 
 from __future__ import annotations
@@ -42,8 +43,8 @@ from .regular_files import open_regular
 
 logger = logging.getLogger(__name__)
 
-# Limits, so that no file can fill the memory or keep a reader busy forever. They are
-# far beyond what any run writes.
+# Limits, so that no file can fill the memory or keep a reader busy forever. No run
+# comes anywhere near them.
 _LONGEST_LINE = 1 << 24
 _MOST_DAMAGED_LINES = 1000
 _BLOCK = 4096
@@ -51,23 +52,23 @@ MOST_EPISODES = 10**15
 
 # In order: the run's facts; its machine, packages and code; an episode that is not part
 # of the statistics; a finished clip; an action that does not fit into rows; an episode
-# whose video is dropped while its trajectory stays; something that could not be
-# recorded; the videos that were kept; the end; the recovery of the directory by another
-# process; an evaluation's episode that begins, and one that failed.
+# whose video is dropped while its trajectory stays; a failure to record something; the
+# videos that were kept; the end of the run; the recovery of the directory by another
+# process; the beginning of an evaluation's episode; the failure of such an episode.
 EVENTS = (
     *("run", "provenance", "cut", "clip", "action", "dropped"),
     *("fault", "keep", "closed", "recovered", "begun", "failed"),
 )
 
-# About recordings: the layout of rows, a recording begins, more facts about it, it
-# ended, its rows were given up; and a log gets no more rows.
+# Events about recordings, in order: the layout of the rows; the beginning of a
+# recording; more facts about it; its end; the loss of its rows; a log that is full.
 SPAN_EVENTS = ("rows", "begin", "note", "end", "drop", "full")
 _OF_SPANS = tuple(f'{{"{kind}": '.encode() for kind in SPAN_EVENTS)
 
-# Why an episode ended, if its process was killed.
+# The reason why an episode ended if its process was killed.
 KILLED = "killed"
 
-# Seed and options are for people to read; longer ones are truncated.
+# Seeds and options are for people to read, so longer ones are truncated.
 _LONGEST_REPR = 1000
 
 _BEGIN = re.compile(rb'\{"episode_id": (\d{1,15}),')
@@ -78,7 +79,7 @@ class JournalEntry:
     """One completed episode.
 
     Attributes:
-        episode_id: number of the episode in the run, from 0; counts all that began.
+        episode_id: the episode's number; all episodes that began are counted, from 0.
         length: number of steps.
         reward: sum of the rewards.
         type: `"t"` for training, `"e"` for evaluation.
@@ -86,13 +87,14 @@ class JournalEntry:
         end_time: wall clock time after the last step.
         seed: the seed given to `reset`.
         options: the options given to `reset`.
-        terminated: the task ended the episode.
-        truncated: a limit outside the task ended it.
-        success: the success that the environment reported; None if it reported none.
-        chosen: the schedule chose it.
+        terminated: whether the task ended the episode.
+        truncated: whether a limit outside the task ended the episode.
+        success: whether the environment reported a success; None if it did not report
+            either way.
+        chosen: whether the schedule chose the episode.
         recording: `"live"` or `"deferred"`; None if the episode has no video of its
             own.
-        evaluation: `seed`, `episode` and `warnings` of an evaluation's episode.
+        evaluation: `seed`, `episode` and `warnings`, for an episode of an evaluation.
     """
 
     episode_id: Annotated[int, _count]
@@ -123,9 +125,9 @@ class JournalWriter:
         run: the facts of the `run` event, the first line of a new file.
 
     Attributes:
-        path: as given.
+        path: the file.
         lost: number of times that the file was removed. A new file does not repeat the
-            lines of the removed one.
+            lines of the removed file.
     """
 
     def __init__(self, path: Path, *, run: Mapping[str, Any] | None = None) -> None:
@@ -144,8 +146,8 @@ class JournalWriter:
 
         Raises:
             ClosedError: the journal is closed.
-            FileNotWritten: the journal cannot be written now (a full disk), and is
-                unchanged; or it was removed.
+            FileNotWritten: the journal was removed, or cannot be written now and is
+                unchanged (for example, because the disk is full).
         """
         # Not `asdict`, which would deep-copy the options; they may not support that.
         optional_keys = ("chosen", "recording", "evaluation")
@@ -161,7 +163,7 @@ class JournalWriter:
 
         Args:
             kind: one of `EVENTS` or `SPAN_EVENTS`.
-            facts: anything that JSON can hold.
+            facts: the event's facts, as any JSON value.
             later: whether to retry with the next line if the event cannot be written
                 now.
 
@@ -225,16 +227,16 @@ def _shortened(values: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def is_of_spans(line: bytes) -> bool:
-    """Return whether a line of a journal is about rows, which `formats.spans` reads."""
+    """Return whether a journal's line is about rows; `formats.spans` reads these."""
     return line.startswith(_OF_SPANS)
 
 
 class JournalReader:
-    """A reader of a journal's entries, one at a time, in the order written.
+    """A reader that yields a journal's entries in the order in which they were written.
 
-    Iterate over it once. Invalid lines are skipped and counted, and so are episodes
-    whose number occurred before. After a line of 16 MiB or more, or after too many
-    damaged lines, everything that follows is skipped.
+    Iterate over it only once. Invalid lines are skipped and counted, and so are
+    episodes whose number has occurred before. After a line of 16 MiB or more, or after
+    too many damaged lines, the rest of the file is skipped.
 
     Args:
         path: the file.
@@ -251,7 +253,7 @@ class JournalReader:
     ) -> None:
         self._path = path
         self._on_event = on_event
-        # The numbers so far, one bit each: they are dense.
+        # The episode numbers so far. They are dense, so each is stored as one bit.
         self._seen: dict[int, int] = {}
         self._damaged = 0
         self._first_reason = ""
@@ -269,7 +271,7 @@ class JournalReader:
             file = open_regular(self._path)
         with file:
             for index in itertools.count(1):
-                # Disks can fail during reading, too.
+                # A disk can fail at any line.
                 with unreadable(self._path):
                     line = file.readline(_LONGEST_LINE)
                 if not line:
@@ -334,10 +336,10 @@ class JournalReader:
 
 
 def read_journal(path: Path) -> Iterator[JournalEntry]:
-    """Yield the entries of a journal, one at a time, in the order written.
+    """Yield a journal's entries in the order in which they were written.
 
-    Lines that are not valid are skipped, as by `JournalReader`, with one warning at the
-    end.
+    Invalid lines are skipped, as in `JournalReader`, and one warning about them is
+    logged at the end.
 
     Raises:
         UnreadableFile: the file is missing or cannot be read.

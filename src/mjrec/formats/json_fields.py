@@ -20,7 +20,7 @@ from .regular_files import read_regular
 
 T = TypeVar("T")
 
-# The statistics of several million episodes.
+# Enough for the statistics of several million episodes.
 _LONGEST_FILE = 1 << 28
 
 # The largest integer that every language's JSON reader can hold.
@@ -43,7 +43,7 @@ _KINDS = {
 
 @contextlib.contextmanager
 def unreadable(path: Path) -> Iterator[None]:
-    """Turn the block's errors about the content of a file into `UnreadableFile`."""
+    """Turn errors in the block about a file's content into `UnreadableFile`."""
     try:
         yield
     except OSError as error:
@@ -55,12 +55,12 @@ def unreadable(path: Path) -> Iterator[None]:
 
 
 def read_object(path: Path) -> Mapping[str, Any]:
-    """Return the JSON object that a file holds.
+    """Return the JSON object in a file.
 
     Raises:
         OSError: the file does not exist or cannot be read.
-        ValueError: the file is not a regular file of its directory, is too large, or
-            does not hold a JSON object.
+        ValueError: the file is not a regular file in its directory, is too large, or
+            does not contain a JSON object.
     """
     return json_object(read_regular(path, limit=_LONGEST_FILE))
 
@@ -116,12 +116,12 @@ def one_of(*known: str) -> Callable[[Any], str]:
 
 
 def mapping(value: Any) -> Mapping[str, Any]:
-    """Return an object unchanged."""
+    """Return a value unchanged if it is an object."""
     return _checked(value, dict)
 
 
 def text(value: Any) -> str:
-    """Return a string unchanged."""
+    """Return a value unchanged if it is a valid string."""
     try:
         _checked(value, str).encode()
     except UnicodeEncodeError as error:
@@ -130,7 +130,7 @@ def text(value: Any) -> str:
 
 
 def base_name(value: Any) -> str:
-    """Return the name of a file in the same directory."""
+    """Return a value unchanged if it is the name of a file in the same directory."""
     name = text(value)
     if (
         name in ("", ".", "..")
@@ -145,12 +145,12 @@ def base_name(value: Any) -> str:
 
 
 def boolean(value: Any) -> bool:
-    """Return a boolean unchanged."""
+    """Return a value unchanged if it is a boolean."""
     return _checked(value, bool)
 
 
 def integer(value: Any) -> int:
-    """Return an integer, which may be written as a float such as 3.0."""
+    """Return a value as an integer; a float such as 3.0 is accepted."""
     if isinstance(value, float) and value.is_integer():
         value = int(value)
     if abs(_checked(value, int)) > _LARGEST_INTEGER:
@@ -159,7 +159,7 @@ def integer(value: Any) -> int:
 
 
 def positive(value: Any) -> int:
-    """Return an integer that is at least 1."""
+    """Return a value as an integer that is at least 1."""
     count = integer(value)
     if count < 1:
         raise ValueError(f"{count} is less than 1")
@@ -167,7 +167,7 @@ def positive(value: Any) -> int:
 
 
 def number(value: Any) -> float:
-    """Return a number; null means NaN, as `json_text` writes it."""
+    """Return a value as a float. Null becomes NaN, which `json_text` writes as null."""
     if not isinstance(value, float | None):
         _checked(value, int)
     try:
@@ -177,7 +177,7 @@ def number(value: Any) -> float:
 
 
 def rate(value: Any) -> Fraction:
-    """Return a positive rate, given as a string such as "60000/1001"."""
+    """Return a positive rate from a string such as "60000/1001"."""
     if not _RATE.fullmatch(text(value)):
         raise ValueError(f"{value!r:.80} is not a valid rate")
     above, _, below = value.partition("/")

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How an episode ended whose process was killed before it could say so.
+"""The ends of episodes whose process was killed before it could record them.
 
-Its last row shows whether it is complete. If so, only its end is missing from the
-journal, and it counts like any other. Otherwise it has `complete: false` and `reason:
-"killed"`, keeps all rows up to the kill, and is not in the statistics.
+An episode's last row shows whether the episode is complete. If so, only its end is
+missing from the journal, and it counts like any other episode. Otherwise, it has
+`complete: false` and `reason: "killed"`, keeps all rows up to the kill, and is not in
+the statistics.
 """
 
 from __future__ import annotations
@@ -19,11 +20,11 @@ from .trajectory import TrajectoryReader, added_up
 def how_it_ended(
     reader: TrajectoryReader, recording: Recording | None
 ) -> dict[str, Any]:
-    """Return facts about an episode's end from its rows, unless its facts have them.
+    """Derive facts about an episode's end from its rows, if its facts lack them.
 
     Args:
-        reader: the episode's rows.
-        recording: its recording in the row log; None if the log is gone.
+        reader: the reader of the episode's rows.
+        recording: the episode's recording in the row log; None if the log is gone.
     """
     facts = reader.facts
     if "complete" in facts:
@@ -34,8 +35,7 @@ def how_it_ended(
         "reward": added_up(reader.rewards),
     }
     if reader.step_count and (reader.terminated[-1] or reader.truncated[-1]):
-        # All of it is there except the end event, which a kill or a full disk
-        # prevented.
+        # Only the end event is missing, because of a kill or a full disk.
         known |= {
             "complete": True,
             "terminated": bool(reader.terminated[-1]),
@@ -47,7 +47,7 @@ def how_it_ended(
     video = facts.get("video")
     is_deferred = isinstance(video, dict) and video.get("recording") == "deferred"
     if is_deferred and not reader.frame_count:
-        # So that no process waits for a video without frames.
+        # Prevent any process from waiting for a video without frames.
         known["broken_reason"] = "the process was killed before its first frame"
     return known
 
@@ -55,11 +55,11 @@ def how_it_ended(
 def missing_line(
     facts: Mapping[str, Any], choice: Mapping[str, Any]
 ) -> tuple[str, Mapping[str, Any]]:
-    """Return kind and facts of the journal line that a kill prevented.
+    """Return the kind and the facts of the journal line that a kill prevented.
 
     Args:
-        facts: the facts in the episode's trajectory; empty if it has none.
-        choice: `episode_id`, `chosen` and `recording` of the line.
+        facts: the facts in the episode's trajectory; empty if there is no trajectory.
+        choice: the line's `episode_id`, `chosen` and `recording`.
     """
     known = {**facts, **choice}
     try:
@@ -73,7 +73,7 @@ def missing_line(
 
 
 def _end_time(facts: Mapping[str, Any], recording: Recording | None) -> float:
-    """Return about when an episode ended, not before it began.
+    """Return the approximate time when an episode ended, never before its start.
 
     The modification time of a mapped file may be updated late or never.
     """

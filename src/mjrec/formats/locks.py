@@ -1,17 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Lock files: the kernel, not a process id, shows whether their holder is alive.
+"""Lock files. The kernel, not a process id, shows whether the holder is alive.
 
-An open monitor holds `.openaigym.<infix>.lock` locked (`flock`). The kernel drops the
-lock when the process ends, in whatever way, so a lock file that no process holds was
-left by a dead monitor. Process ids are reused, in containers all the time.
+An open monitor keeps `.openaigym.<infix>.lock` locked (with `flock`). The kernel drops
+the lock however the process ends, so a lock file that no process holds was left by a
+dead monitor. A process id would not show this, because ids are reused, and in
+containers all the time.
 
 A monitor's lock is never reused, because its name belongs to that monitor alone. The
-other locks (rendering a video, using a CPU, rewriting a manifest) are reused, and one
-that a dead process left is taken over.
+other locks (for rendering a video, using a CPU or rewriting a manifest) are reused, and
+a lock file that a dead process left is taken over.
 
-A directory may be untrusted. A link, a pipe or a file with a second hard link in the
-place of a lock is never followed, written or waited for. Acquiring that lock raises an
-error that says so.
+A directory may be untrusted. If a link, a pipe or a file with a second hard link is in
+the place of a lock, it is never followed, written to or waited for. Acquiring such a
+lock raises an error that says so.
 """
 
 from __future__ import annotations
@@ -28,11 +29,11 @@ from typing import Self
 
 from ..errors import DirectoryNotWritable
 
-# `is_locked` holds a lock for a moment, which is not a reason to give up.
+# `is_locked` holds the lock for a moment, which is not a reason to give up.
 _MOMENTS = 5
 _MOMENT = 0.002
 
-# Do not block if there is a pipe.
+# Do not follow a link, and do not block if the file is a pipe.
 _CAREFULLY = os.O_NOFOLLOW | os.O_NONBLOCK | os.O_NOCTTY
 # The errors for a link, a directory, and a socket or a device without a driver.
 _OF_OTHER_THINGS = (errno.ELOOP, errno.EISDIR, errno.ENXIO)
@@ -46,12 +47,12 @@ class Lock:
 
     Args:
         path: the file to create; it must not exist.
-        content: what others may read about the lock's holder; it stays when the holder
-            dies.
+        content: information about the lock's holder for others to read; it stays when
+            the holder dies.
         mode: the file's permission bits.
 
     Raises:
-        FileExistsError: the file exists, held or left behind.
+        FileExistsError: the file exists, whether it is held or was left behind.
         OSError: the file cannot be created.
     """
 
@@ -63,7 +64,7 @@ class Lock:
         self._take(path, descriptor)
         try:
             if not self._lock(fcntl.LOCK_EX):
-                # Before it was locked, it looked like a dead monitor's lock.
+                # Until it was locked, the file looked like a dead monitor's lock.
                 raise FileExistsError(f"{path} was removed while it was being locked")
             os.write(descriptor, content.encode())
         except BaseException:
@@ -76,7 +77,7 @@ class Lock:
         _held.add(self)
 
     def _lock(self, operation: int) -> bool:
-        """Lock the file; return False if it has been replaced or removed since."""
+        """Lock the file, and return whether it is still the file at the path."""
         fcntl.flock(self.fileno(), operation)
         return _is_at(self.fileno(), self._path)
 
@@ -114,7 +115,8 @@ class Lock:
 def try_lock(path: Path) -> Lock | None:
     """Return a lock at `path`, or None if another process holds it.
 
-    A file that no process holds is taken over with its content, and created if missing.
+    A file that no process holds is taken over with its content. A missing file is
+    created.
 
     Raises:
         DirectoryNotWritable: the file cannot be created or opened, or is a link or not
@@ -169,7 +171,9 @@ def _opened(path: Path) -> int:
         if stat.S_ISREG(facts.st_mode) and facts.st_nlink <= 1:
             return descriptor
         os.close(descriptor)
-    what = f"{path.name} is a link or not a regular file, so not a lock. Remove it"
+    what = (
+        f"{path.name} is a link or not a regular file, so it is not a lock. Remove it"
+    )
     raise OSError(errno.EINVAL, what)
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Gym's two files of a monitor: the manifest and the statistics.
+"""Gym's two files for each monitor: the manifest and the statistics.
 
 The manifest, `openaigym.manifest.<infix>.manifest.json`, lists the files that belong to
 one monitor. It is written last, so that every file it lists is complete. Names in it
@@ -9,7 +9,7 @@ outside its own directory.
 The statistics, `openaigym.episode_batch.<infix>.stats.json`, have the keys of
 `StatsFile`, in this order. The lists have one item for each completed episode. Gym
 itself wrote one type for each *reset*, so its `episode_types` can be longer than the
-other lists; they are read unchanged.
+other lists. It is read unchanged.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from .json_fields import (
 )
 from .regular_files import read_regular
 
-# What this package writes as gym's version.
+# The version that this package writes in place of gym's version.
 GYM_VERSION = "mjrec-1"
 
 
@@ -45,8 +45,8 @@ class Manifest:
 
     Attributes:
         stats: base name of the statistics file.
-        videos: base names of each finished video and its metadata, in the order of
-            recording.
+        videos: for each finished video, the base names of the video and its metadata,
+            in the order of recording.
         env_info: `gym_version` and `env_id`; some versions of gym omitted one or both.
         mjrec: facts that gym did not write; None in gym's own manifests.
     """
@@ -69,7 +69,7 @@ def read_manifest(path: Path) -> Manifest:
 
 
 def write_manifest(path: Path, manifest: Manifest) -> bool:
-    """Write the manifest atomically; return whether its content changed."""
+    """Write the manifest atomically, and return whether its content changed."""
     content = {key: value for key, value in vars(manifest).items() if value is not None}
     return _write_new(path, dumps(content))
 
@@ -111,12 +111,12 @@ class StatsFile:
     """The content of a statistics file.
 
     Attributes:
-        initial_reset_timestamp: when the first reset began; None before the first
+        initial_reset_timestamp: time when the first reset began; None before the first
             reset.
-        timestamps: when each episode ended.
-        episode_lengths: number of steps of each episode.
-        episode_rewards: sum of the rewards of each episode.
-        episode_types: `"t"` for training, `"e"` for evaluation; None in files of gym
+        timestamps: time when each episode ended.
+        episode_lengths: number of steps in each episode.
+        episode_rewards: sum of the rewards in each episode.
+        episode_types: `"t"` for training, `"e"` for evaluation; None in files from gym
             versions without types.
     """
 
@@ -128,7 +128,7 @@ class StatsFile:
 
 
 def read_stats_file(path: Path) -> StatsFile:
-    """Read a statistics file. Null among the rewards is NaN.
+    """Read a statistics file. A reward that is null becomes NaN.
 
     Raises:
         UnreadableFile: the file is missing or damaged, or its lists differ in length.
@@ -142,7 +142,7 @@ def read_stats_file(path: Path) -> StatsFile:
 
 
 def write_stats_file(path: Path, stats: StatsFile) -> bool:
-    """Write the statistics atomically; return whether the content changed."""
+    """Write the statistics atomically, and return whether the content changed."""
     values = vars(stats)
     if stats.episode_types is None:
         values = {k: v for k, v in values.items() if k != "episode_types"}
@@ -154,7 +154,7 @@ def _check_lengths(stats: StatsFile) -> None:
     counts = {name: len(vars(stats)[name]) for name in names}
     if len(set(counts.values())) > 1:
         each = ", ".join(f"{count} {name}" for name, count in counts.items())
-        raise ValueError(f"its lists must have the same length, but have {each}")
+        raise ValueError(f"its lists must have the same length, but there are {each}")
     types, count = stats.episode_types, counts["timestamps"]
     if types is not None and len(types) < count:
         raise ValueError(f"it has {len(types)} episode_types for {count} episodes")

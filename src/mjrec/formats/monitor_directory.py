@@ -25,28 +25,28 @@
     ├── openaigym.states.<infix>.000000.looks           ... changes of the model
     ├── openaigym.trajectory.<infix>.episode000027.h5   a recorded episode, finished
     ├── openaigym.trajectories.<infix>.h5               ... or many in one file
-    ├── openaigym.model.<16 hex digits>.mjb.gz          its compiled model ...
-    ├── openaigym.model.<16 hex digits>.zip             ... and the model's sources
-    ├── openaigym.results.<infix>.monitor.csv           for Stable-Baselines3, if wanted
+    ├── openaigym.model.<16 hex digits>.mjb.gz          a compiled model ...
+    ├── openaigym.model.<16 hex digits>.zip             ... and its sources
+    ├── openaigym.results.<infix>.monitor.csv           table for Stable-Baselines3
     ├── .openaigym.<infix>.lock                         held while its monitor is open
     ├── .openaigym.video.<infix>.video000027.lock       held while a video is rendered
     ├── .openaigym.clip.<infix>.step000000137.lock      held while a clip is rendered
-    ├── .openaigym.manifest.<infix>.lock                held while it is rewritten
+    ├── .openaigym.manifest.<infix>.lock                held to rewrite a manifest
     └── .openaigym.render.<number>.lock                 held while that CPU is in use
 
-The videos of one episode differ in a part of the name before the suffix. A camera can
-have any name, so its part is an encoded form of the name that cannot be mistaken for
+The names of an episode's videos differ in the part before the suffix. A camera can have
+any name, so its part is an encoded form of the name, which cannot be mistaken for
 another part and never leads out of the directory.
 
-A recording in flight is a span of rows, which the journal names (`spans`). An episode
-has the name of its future trajectory. A clip has a part for each episode,
+A recording in flight is a span of rows, which the journal names (see `spans`). The span
+of an episode has the name of its future trajectory. A clip has a part for each episode,
 `openaigym.clip.<infix>.step000000137.part000000`, named after the number of steps that
 the monitor had recorded when the clip began. A clip's video is named after the episode
 in which it began, with a step (`video000027.step000137.mp4`) if a step triggered it.
 
 `<infix>` is `<monitor id>.<uid or process id>`. It identifies one monitor: no two
-monitors ever share one in a directory. Names that start with a dot and end in `.part`
-are files that are still being written.
+monitors in a directory ever have the same infix. Files whose names start with a dot and
+end in `.part` are still being written.
 """
 
 from __future__ import annotations
@@ -73,17 +73,18 @@ _SHOWN = 5
 _INFIX = re.compile(r"(?P<number>[0-9]{1,18})\.(?P<uid>[^/\n\0]+)")
 _UID = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9_.-]{0,99}", re.ASCII)
 
-# The names that this package and every version of gym wrote; nothing else in a
-# directory is ours. A `~` is gym's temporary name.
+# The names that this package and all versions of gym have used. No other file in a
+# directory is ours. A name that ends in `~` is a temporary name of gym's.
 #
-# Names also occur in files, which may be untrusted: a name with a slash would lead out
-# of the directory, and a number of a million digits takes minutes to parse.
+# Names are also read from files, which may be untrusted: a name with a slash would lead
+# out of the directory, and a number with a million digits takes minutes to parse.
 _INFIX_PART = r"(?P<infix>[^/\n\0]+)"
 _VIDEO = rf"openaigym\.video\.{_INFIX_PART}\.video(?P<episode>[0-9]{{6,18}})"
 _TRAJECTORY = (
     rf"openaigym\.trajectory\.{_INFIX_PART}\.episode(?P<episode>[0-9]{{6,18}})"
 )
-# Not an episode's number, so that no part of a clip is taken for an episode's file.
+# The group is not called `episode`, so that no part of a clip is taken for an episode's
+# file.
 _CLIP = rf"openaigym\.clip\.{_INFIX_PART}\.step(?P<step>[0-9]{{9,18}})"
 _CLIP_PART = re.compile(rf"{_CLIP}\.part(?P<part>[0-9]{{6,18}})")
 _VIDEO_FILE = re.compile(
@@ -93,8 +94,8 @@ _VIDEO_FILE = re.compile(
 _STATES = rf"openaigym\.states\.{_INFIX_PART}\.(?P<log>[0-9]{{6,9}})"
 
 _MANIFEST = re.compile(rf"openaigym\.manifest\.{_INFIX_PART}\.manifest\.json")
-# Keyed by the word after `openaigym.`: a directory may hold a million names, and each
-# is matched against one pattern, not all of them.
+# The key is the word after `openaigym.`. A directory may contain a million names, so
+# each name is matched against only one pattern.
 _VISIBLE = {
     "manifest": re.compile(rf"openaigym\.manifest\.{_INFIX_PART}\.manifest\.json~*"),
     "episode_batch": re.compile(
@@ -117,7 +118,7 @@ _HIDDEN = (
     re.compile(rf"\.openaigym\.{_INFIX_PART}\.lock"),
     re.compile(r"\.openaigym\.[^/\n\0]+\.part"),
 )
-# A note is rewritten like any file, so an unfinished note has both suffixes.
+# A note is rewritten like any other file, so an unfinished note has both suffixes.
 _PART = re.compile(
     r"\.(?P<final>openaigym\..+?)(?P<note>\.note(\.part)?)?(?P<hex>\.[0-9a-f]{8})?\.part"
 )
@@ -125,12 +126,12 @@ _PART = re.compile(
 _MP4 = ".mp4"
 _TILED = "tiled"
 
-# Camera names that would be mistaken for another part of a file's name, or for none.
+# Camera names that are empty or would be mistaken for another part of a file's name.
 _AMBIGUOUS = re.compile(
     r"|full|draft|annotated|plain|tiled|meta|\d*x\d*|.*fps|(video|step)\d+"
     r"|camera(-.*|\d+)"
 )
-# File names have at most 255 bytes, and there are other parts.
+# A file name has at most 255 bytes, and there are other parts.
 _LONGEST_PART = 80
 _DIGEST = 8
 
@@ -158,7 +159,7 @@ class Infix:
 
     @classmethod
     def parse(cls, text: str) -> Infix | None:
-        """Return the infix written as `text`, or None if it is not a valid infix."""
+        """Parse an infix, or return None if `text` is not a valid infix."""
         match = _INFIX.fullmatch(text)
         return None if match is None else cls(int(match["number"]), match["uid"])
 
@@ -179,7 +180,7 @@ class ClipPart:
 
     @classmethod
     def parse(cls, name: str) -> ClipPart | None:
-        """Return the parsed name, or None for other names."""
+        """Parse the name of a clip's part, or return None for any other name."""
         match = _CLIP_PART.fullmatch(name)
         infix = None if match is None else Infix.parse(match["infix"])
         if match is None or infix is None:
@@ -189,7 +190,7 @@ class ClipPart:
 
 @dataclass(frozen=True)
 class VideoName:
-    """The parsed name of a video, or of a file that belongs to one.
+    """The parsed name of a video, or of a file that belongs to a video.
 
     Attributes:
         name: the file's name.
@@ -197,8 +198,8 @@ class VideoName:
         episode_id: the episode that the video shows, or in which a clip began.
         first_step: number of recorded steps at which a clip began; None if no step
             triggered it.
-        view: which of several videos this is; empty for the first camera's, as
-            recorded.
+        view: the part of the name that distinguishes an episode's videos; empty for the
+            first camera's video as it was recorded.
         ending: the kind of file, such as `mp4` or `meta.json`.
     """
 
@@ -211,7 +212,7 @@ class VideoName:
 
     @classmethod
     def parse(cls, name: str) -> VideoName | None:
-        """Return the parsed name, or None for other files."""
+        """Parse a name, or return None if the file does not belong to a video."""
         match = _VIDEO_FILE.fullmatch(name)
         if match is None:
             return None
@@ -228,9 +229,10 @@ class VideoName:
 
     @property
     def is_episodes(self) -> bool:
-        """Whether it belongs to an episode's first video, not to a step-triggered clip.
+        """Whether the file belongs to an episode's first video.
 
-        A clip that began with an episode has such a name, too.
+        This is False for a step-triggered clip, but True for a clip that began with an
+        episode.
         """
         return not self.view and self.first_step is None
 
@@ -244,8 +246,8 @@ def check_uid(uid: object) -> str:
     text = str(uid)
     if not _UID.fullmatch(text):
         raise InvalidArgument(
-            "uid becomes part of file names: it must be 1 to 100 letters, digits, "
-            f"'_', '-' and '.', not starting with '.', got {uid!r}."
+            "uid becomes part of file names. It must consist of 1 to 100 letters, "
+            f"digits, '_', '-' and '.', and not start with '.', but it is {uid!r}."
         )
     return text
 
@@ -301,7 +303,7 @@ def clip_prefix(infix: Infix, first_step: int) -> str:
 
 
 def clip_part_name(infix: Infix, first_step: int, number: int) -> str:
-    """Return the name of a clip's part; there is one per episode, counted from 0."""
+    """Return the name of one of a clip's parts: one per episode, counted from 0."""
     return f"{clip_prefix(infix, first_step)}.part{number:06d}"
 
 
@@ -341,7 +343,7 @@ def lock_name(infix: Infix) -> str:
 def manifest_lock_name(infix: Infix) -> str:
     """Return the name of the lock file held while a manifest is rewritten.
 
-    This is not the monitor's lock: a closed monitor stays closed.
+    This is not the monitor's own lock, because a closed monitor stays closed.
     """
     return f".{MANIFEST_PREFIX}.{infix}.lock"
 
@@ -365,14 +367,14 @@ def episode_of(name: str) -> int | None:
 
 
 def log_number(name: str) -> int | None:
-    """Return the number of the row log that a file belongs to; None for other files."""
+    """Return the number of the row log that a file belongs to, or None."""
     match = _match(name)
     number = None if match is None else match.groupdict().get("log")
     return None if number is None else int(number)
 
 
 def final_name(name: str) -> str | None:
-    """Return the final name of an unfinished file or note; None for other names."""
+    """Return the final name of an unfinished file or note, or None for other names."""
     part = _PART.fullmatch(name)
     return None if part is None else part["final"]
 
@@ -384,7 +386,7 @@ def is_note(name: str) -> bool:
 
 
 def unfinished_files(path: Path) -> list[Path]:
-    """Return the existing hidden files under which `path` is or was being written."""
+    """Return the existing temporary files in which `path` is or was being written."""
     pattern = f".{glob.escape(path.name)}.{8 * '[0-9a-f]'}.part"
     found = sorted(path.parent.glob(pattern))
     # A link may lead anywhere.
@@ -394,12 +396,12 @@ def unfinished_files(path: Path) -> list[Path]:
 def iter_monitor_files(directory: Path, *, hidden: bool = False) -> Iterator[Path]:
     """Yield the monitor files of `directory`, sorted by name.
 
-    Only regular files (and links to them) whose name a monitor gives are included.
-    Other files that start with `openaigym.`, and directories, are ignored.
+    Only regular files (and links to them) that have a monitor file's name are included.
+    Directories, and other files whose names start with `openaigym.`, are ignored.
 
     Args:
-        directory: the directory, without its subdirectories. A missing directory counts
-            as empty.
+        directory: the directory; its subdirectories are not searched. A missing
+            directory counts as empty.
         hidden: whether to include locks and unfinished files.
     """
     if not directory.is_dir():
@@ -411,8 +413,8 @@ def iter_monitor_files(directory: Path, *, hidden: bool = False) -> Iterator[Pat
 def monitor_directories_in(directory: Path) -> list[Path]:
     """Return the subdirectories that hold monitor files, sorted by name.
 
-    Two levels are searched: an evaluation has a folder for each task, with folders in
-    it.
+    Two levels are searched, because an evaluation has a folder for each task, which has
+    folders of its own.
     """
     found: list[Path] = []
     for path in sorted(directory.iterdir()):
@@ -424,7 +426,10 @@ def monitor_directories_in(directory: Path) -> list[Path]:
 
 
 def recording_directories(directory: Path) -> list[Path]:
-    """Return the directory if it has recordings, otherwise those below it that do."""
+    """Return the directory if it has recordings, otherwise its subdirectories that do.
+
+    If there are none, the directory itself is returned.
+    """
     if not directory.is_dir() or any(iter_monitor_files(directory)):
         return [directory]
     return monitor_directories_in(directory) or [directory]
@@ -447,8 +452,8 @@ def where_recordings_are(directory: Path) -> str:
 def names_in(directory: Path) -> Iterator[str]:
     """Yield the names of all entries in a directory, in no particular order.
 
-    For finding a few names among a million, when creating a `Path` for each is too
-    slow.
+    Use this to find a few names among a million, because creating a `Path` for each
+    would be too slow.
     """
     with os.scandir(directory) as entries:
         for entry in entries:
@@ -456,8 +461,8 @@ def names_in(directory: Path) -> Iterator[str]:
 
 
 def _names(directory: Path, *, hidden: bool) -> Iterator[str]:
-    # scandir returns the file type with the name, so a network file system is queried
-    # once for many entries, not once for each.
+    # scandir returns the file type with the name, so a network file system gets one
+    # query for many entries instead of one for each.
     with os.scandir(directory) as entries:
         for entry in entries:
             is_wanted = hidden or not entry.name.startswith(".")
@@ -471,7 +476,7 @@ def _is_file(entry: os.DirEntry[str]) -> bool:
 
 
 def _match(name: str) -> re.Match[str] | None:
-    """Return the match of a monitor file's name; None for other files."""
+    """Return the match of a monitor file's name, or None for other files."""
     if name.startswith("."):
         final = final_name(name)
         if final is not None and (match := _match(final)) is not None:
@@ -488,7 +493,7 @@ def name_part(text: str) -> str:
     """Encode a string as a part of a file's name.
 
     Every character except ASCII letters, digits, `_` and `-` is percent-encoded as
-    UTF-8. If the result is too long for a name, it ends in a digest instead.
+    UTF-8. A result that is too long for a name is cut off and gets a digest at its end.
     """
     quoted = urllib.parse.quote(text, safe="", errors="surrogatepass")
     # The characters that `quote` leaves alone and that are not letters, digits, `_` or
@@ -497,7 +502,7 @@ def name_part(text: str) -> str:
     if len(part) <= _LONGEST_PART:
         return part
     digest = hashlib.sha256(part.encode()).hexdigest()[:_DIGEST]
-    # Do not end in half of an encoded character.
+    # Do not cut an encoded character in half.
     begin = re.sub("%.?$", "", part[: _LONGEST_PART - _DIGEST - 1])
     return f"{begin}-{digest}"
 
@@ -517,11 +522,11 @@ def camera_part(camera: Any) -> str:
 
 
 def further_parts(cameras: Sequence[Any]) -> list[str]:
-    """Return the name parts of all cameras of an episode except the first.
+    """Return the name parts for all cameras of an episode except the first.
 
     A camera without a name is named after its position, such as `camera2` for the
-    second. If two parts would be the same, as for camera 1 and the camera "1", the
-    later one gets `-2`, `-3` and so on.
+    second camera. If two parts would be the same, as for camera 1 and the camera "1",
+    the later part gets `-2`, `-3` and so on.
 
     Args:
         cameras: all cameras, in order.
@@ -564,7 +569,7 @@ def tiled_name(video: str) -> str:
 
 
 def view_of(video: str) -> str:
-    """Return which of an episode's videos this is; empty for the first camera's.
+    """Return the name part of a video's camera, or "" for the first camera's video.
 
     >>> view_of("openaigym.video.0.7.video000027.step000137.side.mp4")
     'side'

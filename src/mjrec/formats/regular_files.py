@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Opening files in an untrusted directory.
+"""Functions that open files in an untrusted directory.
 
-A file with a monitor file's name may be a pipe, which blocks when it is opened, a
-device, which may do anything, or a link to a file of the user who reads the directory.
-Only regular files are opened, and links are followed only inside their directory, so
-that nothing from elsewhere is read, packed or rendered.
+A file with a monitor file's name may be a pipe, which blocks when it is opened. It may
+be a device, which may do anything, or a link to a private file of the user who reads
+the directory. Only regular files are opened, and links are followed only inside their
+directory, so that nothing from elsewhere is read, packed or rendered.
 """
 
 from __future__ import annotations
@@ -14,8 +14,7 @@ import stat
 from pathlib import Path
 from typing import BinaryIO
 
-# If the file is replaced between the check and the opening, do not follow or wait for
-# it.
+# If a link or a pipe replaces the file after the check, do not follow or wait for it.
 _CAREFULLY = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_NOCTTY
 
 
@@ -56,7 +55,7 @@ def read_regular(path: Path, *, limit: int) -> bytes:
 
     Raises:
         OSError: the file cannot be read.
-        ValueError: the file is larger; or see `regular_path`.
+        ValueError: the file is larger than `limit`, or see `regular_path`.
     """
     with open_regular(path) as file:
         size = os.fstat(file.fileno()).st_size

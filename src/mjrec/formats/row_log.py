@@ -1,15 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """An append-only log of fixed-size rows that survives SIGKILL without being flushed.
 
-Row i is at byte `i * row_size` of the log, and before that in slot `i % capacity` of
-the tail, a small file next to the log that is mapped into the writer's memory. Rows are
-filled in place there, in pages that stay hot. One aligned 64-bit counter, incremented
-when a row is complete, is all that a reader needs. A full tail is written to the log
-before a slot is reused, so every row is in one of the two files at any instant.
+New rows go into the tail, a small file next to the log that is mapped into the writer's
+memory. There, row i is filled in place in slot `i % capacity`, in pages that stay hot.
+A reader needs only one aligned 64-bit counter, which is incremented when a row is
+complete. A full tail is written to the log, where row i begins at byte `i * row_size`,
+before a slot is reused. So at any instant, every row is in one of the two files.
 
 The tail file begins with a page of 64-bit words: the counter, the number of words per
-row, and the number of rows that fit. Closing the log writes its last rows and removes
-the tail.
+row, and the number of slots. Closing the log writes its last rows and removes the tail.
 """
 
 from __future__ import annotations
@@ -36,7 +35,7 @@ _TAIL = ".tail"
 
 # The statfs(2) types of ext4, XFS, tmpfs and overlayfs, where the content of a mapped
 # page outlives the process. Some other file systems (network, FUSE, copy-on-write) lose
-# pages, or raise SIGBUS on a full disk, so each row is written as it comes.
+# pages, or raise SIGBUS on a full disk, so there each row is written at once.
 _MAPPABLE = frozenset((0xEF53, 0x58465342, 0x01021994, 0x794C7630))
 
 
@@ -49,7 +48,7 @@ class RowLog:
         tail_bytes: size of the tail in bytes; it holds at least four rows.
 
     Attributes:
-        path: as given.
+        path: the log.
         count: number of rows so far.
         slots: the tail, `(capacity, row_words) uint64`. After `make_room`, fill row
             `count` in `slots[count % capacity]`, then increase `counter[0]` and `count`
@@ -92,7 +91,7 @@ class RowLog:
         return self.count * self.row_size
 
     def make_room(self) -> None:
-        """Write the rows that the log lacks, so that the next slot can be filled.
+        """Write the rows that are not in the log yet, so that the next slot is free.
 
         Raises:
             FileNotWritten: the disk is full; all rows so far are kept.
@@ -101,7 +100,7 @@ class RowLog:
         self.limit = self.count + (self.capacity if self._is_mapped else 0)
 
     def settle(self) -> None:
-        """Write the counted rows if no tail file keeps them.
+        """Write the complete rows to the log if there is no tail file to keep them.
 
         Raises:
             FileNotWritten: the disk is full; the rows stay in memory.
@@ -130,7 +129,7 @@ class RowLog:
         self.write()
         self.release()
         with contextlib.suppress(OSError):
-            # A leftover tail does no harm: it has nothing that the log does not have.
+            # A leftover tail does no harm, because all of its rows are in the log.
             tail_path(self.path).unlink()
 
     def release(self) -> None:
@@ -138,12 +137,11 @@ class RowLog:
         if self.is_open:
             os.close(self._log)
             self._log = -1
-            # A reference to this object must not keep the mapping, and with it a file,
-            # alive.
+            # A reference to this object must not keep the mapping and its file alive.
             del self.slots, self.counter, self.memory
 
     def write(self) -> None:
-        """Write the rows that the log lacks.
+        """Write the rows that are not in the log yet.
 
         Raises:
             FileNotWritten: the disk is full; the rows stay in memory.
@@ -198,7 +196,7 @@ def has_rows(log: Path) -> bool:
 
 
 class RowLogReader:
-    """A reader of a row log, which may still be written or whose writer was killed.
+    """A reader of a row log that may still be in use, or whose writer was killed.
 
     Args:
         path: the log.
@@ -223,21 +221,21 @@ class RowLogReader:
     def count(self) -> int:
         """Number of rows so far."""
         counted, in_log = self._counted(), self._in_log()
-        # A counter beyond the tail's capacity is wrong: a full tail is written first.
+        # The log lacks no more rows than fit into the tail, so a larger count is wrong.
         return max(in_log, min(counted, in_log + self._capacity))
 
     def read(self, start: int, stop: int) -> NDArray[np.uint8]:
         """Return rows `start` to `stop`, `(stop - start, row_size) uint8`.
 
         Raises:
-            ValueError: some of the rows are missing: the log was truncated.
+            ValueError: some of the rows are missing because the log was truncated.
         """
         rows = np.empty((stop - start, self._row_size), np.uint8)
         done = self._read_log(start, rows)
         while done < len(rows):
             first = start + done
             found = self._read_tail(first, rows[done:])
-            # Slots that were reused in the meantime: their rows are in the log now.
+            # The rows of slots that were reused in the meantime are now in the log.
             lost = max(0, self._counted() + 1 - self._capacity - first)
             if lost and self._in_log() > first:
                 done += self._read_log(first, rows[done:])
@@ -252,7 +250,7 @@ class RowLogReader:
         self._opened.close()
 
     def _room_in(self, tail: int) -> int:
-        """Return how many rows a tail can hold; 0 if it does not belong to this log."""
+        """Return the number of slots in a tail, or 0 if it is not this log's tail."""
         page = os.pread(tail, 24, 0)
         words, capacity = (
             struct.unpack_from("=QQ", page, 8) if len(page) == 24 else (0, 0)
@@ -293,7 +291,7 @@ class RowLogReader:
 
 
 def _may_be_mapped(descriptor: int) -> bool:
-    # `os.statvfs` does not have the type; it is the first member of the C struct.
+    # `os.statvfs` does not return the type, which is the C struct's first member.
     found = (ctypes.c_long * 64)()
     failed = ctypes.CDLL(None).fstatfs(descriptor, found)
     return not failed and found[0] in _MAPPABLE

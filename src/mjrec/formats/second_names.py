@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Second names of videos, such as `rl-video-episode-27.mp4`.
 
-The second name is in the metadata of an episode's first video (`also_named`). It is a
-link in the same directory, created last, so that it never refers to an incomplete
-video. The episode's further videos, and the metadata of each video, get second names
-too.
+The metadata of an episode's first video contains its second name (`also_named`). The
+name is a link in the same directory. It is created last, so that it never refers to an
+incomplete video. The episode's further videos, and the metadata of each video, get
+second names too.
 
-A different file with such a name belongs to another program, and is neither replaced
-nor removed.
+If a different file has such a name, it belongs to another program, and is neither
+replaced nor removed.
 """
 
 from __future__ import annotations
@@ -42,9 +42,9 @@ def give_all_second_names(directory: Path) -> None:
 
 
 def give_second_names(video: Path) -> None:
-    """Create the second names of a finished video and its related files, if it has any.
+    """Create any second names of a finished video and its related files.
 
-    If another file has that name, or links cannot be created, a warning is logged.
+    If another file has such a name, or a link cannot be created, a warning is logged.
 
     Args:
         video: the first video of an episode. Further videos have no second name of
@@ -107,14 +107,14 @@ def _link(file: Path, link: Path) -> None:
     if os.path.lexists(link):
         if not _is_same(file, link):
             logger.warning(
-                "%s already exists and is a different file than %s, which was meant to "
-                "have that name too. It is left alone; give each monitor of a "
-                "directory a name_prefix of its own.",
+                "%s already exists and is a different file from %s, which should have "
+                "had that name too. It is left alone; give each monitor in a "
+                "directory its own name_prefix.",
                 link,
                 file.name,
             )
         return
-    # Another process may have created it first.
+    # Another process may have created the link first.
     with contextlib.suppress(FileExistsError):
         try:
             link.hardlink_to(file)

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Writing recordings into a monitor's row logs, one after another.
+"""Writers that put a monitor's recordings into its row logs, one after another.
 
-A log is used for further recordings while their rows have the same layout and the log
-is not too long. The operating system has each line of the journal and each row when the
-call that wrote it returns, so a killed process loses nothing and nothing needs to be
-flushed.
+A log is used for further recordings as long as their rows have the same layout and the
+log is not too long. When a call that writes a row or a line of the journal returns, the
+operating system has the data. So a killed process loses nothing, and nothing needs to
+be flushed.
 """
 
 from __future__ import annotations
@@ -37,26 +37,26 @@ from .trajectory import (
 )
 from .trajectory_log import pack_change
 
-# Above this size, the next recording begins a new log.
+# If the log is larger than this, the next recording begins a new log.
 _LONG = 64 << 20
-# To find one recording, all recordings of its log are read, so limit their number.
+# To find one recording, all recordings in its log are read, so their number is limited.
 _MANY = 256
 
-# The tail of a log with a single recording is smaller by this factor: creating it takes
-# longer than everything else at the start of an episode.
+# The tail of a log with a single recording is smaller by this factor, because creating
+# it takes longer than everything else at the start of an episode.
 _TAILS_OF_ONE = 8
 
 ROW_HEAD = struct.Struct("=qqdQ")
 
 
 class SpanLogs:
-    """The row logs of one monitor, of which one is written at a time.
+    """The row logs of one monitor, which are written one at a time.
 
     Args:
         directory: the monitor directory.
         infix: the monitor's infix.
-        journal: records which rows belong to which recording.
-        numbers: yields the number of each log; shared by all logs of a monitor.
+        journal: the monitor's journal, for the rows that belong to each recording.
+        numbers: an iterator over the logs' numbers, which a monitor's logs share.
         tail_bytes: size of each log's tail in bytes.
     """
 
@@ -78,7 +78,7 @@ class SpanLogs:
         self._said: _Rows | None = None
 
     def path_of(self, name: str) -> Path:
-        """Return the file that an episode's recording with this name becomes."""
+        """Return the path of the file that an episode's recording will become."""
         return self.directory / f"{name}{FINISHED}"
 
     def begin(
@@ -95,8 +95,8 @@ class SpanLogs:
             name: the recording's file name, without suffix.
             facts: the facts known so far.
             dtype: the dtype of its rows, from `row_dtype`.
-            alone: whether the recording gets a log of its own, which is removed with
-                it.
+            alone: whether the recording gets a log of its own, which is removed
+                together with the recording.
 
         Raises:
             FileNotWritten: the disk is full, or the directory was removed.
@@ -124,7 +124,7 @@ class SpanLogs:
         return SpanWriter(log, name, facts)
 
     def close(self) -> None:
-        """Write the rows that the log lacks, and close it. Idempotent.
+        """Write the rows that are not in the log yet, and close the log. Idempotent.
 
         Raises:
             FileNotWritten: the disk is full; the next call tries again.
@@ -134,7 +134,7 @@ class SpanLogs:
             self._log = None
 
     def release(self) -> None:
-        """Close the log's files as they are: a forked child does not own them."""
+        """Close the log's files unchanged, because a forked child does not own them."""
         if self._log is not None:
             self._log.release()
             self._log = None
@@ -142,7 +142,7 @@ class SpanLogs:
     def _say_rows(
         self, number: int, dtype: np.dtype[Any], facts: Mapping[str, Any]
     ) -> _Rows:
-        """Record the layout of rows, unless the journal already has it."""
+        """Record the layout of rows, unless the journal already contains it."""
         said, lost = self._said, self._journal.lost
         if said is not None and said.lost == lost and said.dtype == dtype:
             return said
@@ -164,7 +164,7 @@ class _Rows(NamedTuple):
 def _begin(
     log: OpenLog, name: str, facts: Mapping[str, Any], rows: _Rows
 ) -> dict[str, Any]:
-    """Return the facts of a begin event, without those that the rows event has."""
+    """Return the facts for a begin event, without those in the rows event."""
     known = rows.facts
     own = {
         key: value
@@ -184,14 +184,14 @@ class OpenLog:
     Attributes:
         path: the log.
         number: the log's number.
-        journal: records the content of the log.
+        journal: the monitor's journal.
         rows: the underlying `RowLog`.
         columns: views of the tail's slots by part: `state` as float64, `snapshot` as
-            words, `action` and `observation`. Parts that rows do not have are missing.
+            words, `action` and `observation`. Parts that the rows lack are missing.
         bodies: for each slot, all words after its head.
-        is_alone: whether the log holds a single recording and ends with it.
+        is_alone: whether the log is for a single recording and ends with it.
         look_size: size in bytes of all changes of the model so far.
-        recordings: all recordings that were begun.
+        recordings: all recordings that were begun in this log.
     """
 
     def __init__(
@@ -206,8 +206,8 @@ class OpenLog:
         self.path, self.number, self.journal = path, number, journal
         self.is_alone = False
         self.look_size = 0
-        # There are few, so they are kept here: reading them from the journal would take
-        # time and memory.
+        # There are only a few. Reading them from the journal would take time and
+        # memory.
         self.recordings: list[Recording] = []
         self._dtype = dtype
         self._looks: int | None = None
@@ -247,7 +247,7 @@ class OpenLog:
         self.look_size += len(record)
 
     def close(self) -> None:
-        """Write the last rows; remove the files if nothing is in flight. Idempotent.
+        """Write the last rows, and remove the log if nothing is in flight. Idempotent.
 
         Raises:
             FileNotWritten: the disk is full; the next call tries again.
@@ -265,7 +265,7 @@ class OpenLog:
         self.rows.close()
         self.release()
         if not any(recording.is_in_flight for recording in self.recordings):
-            # Otherwise the finisher removes them.
+            # Otherwise the finisher removes the files.
             self.remove()
 
     def remove(self) -> None:
@@ -275,7 +275,7 @@ class OpenLog:
             remove_log(self.path)
 
     def release(self) -> None:
-        """Close the files as they are. Idempotent."""
+        """Close the files unchanged. Idempotent."""
         self.rows.release()
         self.bodies, self.columns = [], {}
         if self._looks is not None:
@@ -292,10 +292,10 @@ class SpanWriter:
         facts: the facts known so far.
 
     Attributes:
-        log: as given.
-        steps: the number of the last step; 0 before the first.
+        log: the log for the rows.
+        steps: the number of the last step; 0 before the first step.
         frame_count: number of frames so far.
-        last_frame: the step of the last frame; -1 before the first.
+        last_frame: the step of the last frame; -1 before the first frame.
     """
 
     def __init__(self, log: OpenLog, name: str, facts: Mapping[str, Any]) -> None:
@@ -329,15 +329,15 @@ class SpanWriter:
         terminated: bool = False,
         truncated: bool = False,
     ) -> None:
-        """Count the row that was filled.
+        """Mark the row that was just filled as complete.
 
         Args:
-            step: 0 for the reset, which has no reward and no action, then 1, 2, 3 ...
+            step: 0 for the reset, which has no reward and no action; then 1, 2, 3 ...
             reward: the step's reward.
             is_step: whether the row has the step's state, action and observation.
             is_frame: whether the row has a snapshot for a frame.
-            terminated: the task ended the episode.
-            truncated: a limit outside the task ended it.
+            terminated: whether the task ended the episode.
+            truncated: whether a limit outside the task ended the episode.
 
         Raises:
             FileNotWritten: the disk is full, and rows are written one by one. The row
@@ -348,8 +348,8 @@ class SpanWriter:
         flags |= (TERMINATED if terminated else 0) | (TRUNCATED if truncated else 0)
         head = rows.slots[rows.count % rows.capacity, :HEAD_WORDS]
         ROW_HEAD.pack_into(head.data.cast("B"), 0, rows.count, step, reward, flags)
-        # No calls between these statements: a signal handler that raises runs after a
-        # call, and the count must match the rows.
+        # Do not call anything between these statements: a signal handler runs after a
+        # call and may raise, and the count must match the rows.
         rows.counter[0] = rows.count = rows.count + 1
         if is_step:
             self.steps = step
@@ -359,7 +359,7 @@ class SpanWriter:
         rows.settle()
 
     def note(self, facts: Mapping[str, Any]) -> None:
-        """Add facts, even after the end; newer facts replace older ones.
+        """Add facts, even after the recording's end. Newer facts replace older ones.
 
         Raises:
             FileNotWritten: the disk is full; the facts are written before the next
@@ -368,7 +368,7 @@ class SpanWriter:
         self.log.journal.note("note", {"name": self._name, "facts": dict(facts)})
 
     def end(self, facts: Mapping[str, Any]) -> None:
-        """Record how the recording ended. A log of its own is closed.
+        """Record how the recording ended, and close its log if it has its own.
 
         Raises:
             FileNotWritten: the disk is full; the end is written before the next line.
@@ -383,13 +383,13 @@ class SpanWriter:
             self.log.close()
 
     def drop(self) -> None:
-        """Give up the recording's rows. A log of its own is removed.
+        """Give up the recording's rows, and remove its log if it has its own.
 
         Raises:
             FileNotWritten: the disk is full; the event is written before the next line.
         """
         if self.log.is_alone:
-            # Remove it first: the disk may be full.
+            # Remove the log first, because the disk may be full.
             self.log.remove()
         self._recording.is_dropped = True
         self.log.journal.note("drop", self._name)

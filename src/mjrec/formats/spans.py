@@ -16,9 +16,9 @@ episode. The journal has a line for each event::
 `rows` gives the layout of rows, and the facts that all recordings with this layout
 share unless `begin` overrides them or lists them in `without`. A span without an end
 extends to the last row. Log 3 is `openaigym.states.<infix>.000003.log`; the `.looks`
-file next to it has the changes of the model. These files are removed when every
-recording in them was dropped or exists in its final form: an episode as a trajectory,
-or only as a video if its trajectory is not kept.
+file next to it contains the changes of the model. These files are removed once every
+recording in them has been dropped or exists in its final form: an episode as a
+trajectory, or only as a video if its trajectory is not kept.
 
 A recording is identified by the path of the file that it will become.
 """
@@ -61,7 +61,7 @@ from .video_metadata import is_done
 LOG, LOOKS = ".log", ".looks"
 
 _LONGEST_LINE = 1 << 24
-# The last bytes read; they must be unchanged for the next reading to continue there.
+# Reading continues where it ended only if this many bytes before there are unchanged.
 _SEAM = 128
 
 
@@ -74,10 +74,11 @@ class Recording:
         log: its row log.
         rows: the journal's `rows` event for its rows.
         facts: all known facts.
-        row: its first row.
+        row: the number of its first row.
         look: offset of its changes of the model in the `.looks` file.
-        stop: one past its last row; None if it has not ended.
-        following: the first row of the next recording; None if it is the last one.
+        stop: one more than the number of its last row; None if it has not ended.
+        following: the first row of the next recording in the log; None if there is
+            none.
         is_dropped: whether its rows were given up.
     """
 
@@ -93,16 +94,16 @@ class Recording:
 
     @property
     def path(self) -> Path:
-        """The path that identifies it: for an episode, the file that it becomes."""
+        """The recording's path: for an episode, that of the file it will become."""
         is_episode = episode_of(f"{self.name}{FINISHED}") is not None
         return self.log.with_name(f"{self.name}{FINISHED * is_episode}")
 
     @functools.cached_property
     def dtype(self) -> np.dtype[Any]:
-        """The dtype of its rows.
+        """The dtype of the recording's rows.
 
         Raises:
-            UnreadableFile: the journal does not give it, or has a newer version.
+            UnreadableFile: the journal lacks the dtype, or has a newer version.
         """
         with unreadable(_journal_of(self.log)):
             if not self.rows:
@@ -112,10 +113,10 @@ class Recording:
 
     @property
     def is_gone(self) -> bool:
-        """Whether its rows are no longer needed.
+        """Whether the recording's rows are no longer needed.
 
-        True if it was dropped, or if its trajectory is not kept and its video is
-        finished or given up.
+        This is True if the recording was dropped, or if its trajectory is not kept and
+        its video is finished or was given up.
         """
         if self.is_dropped or self.facts.get("kept") is not False:
             return self.is_dropped
@@ -127,25 +128,25 @@ class Recording:
 
     @property
     def is_in_flight(self) -> bool:
-        """Whether it exists only in the log."""
+        """Whether the recording exists only in its log."""
         path = self.path
         return not (path.suffix == FINISHED and is_finished(path)) and not self.is_gone
 
     @property
     def last_write(self) -> float:
-        """When the last row of its log was written, in seconds since the epoch."""
+        """The time when the log's last row was written, in seconds since the epoch."""
         files = (self.log, tail_path(self.log))
         return max((f.stat().st_mtime for f in files if f.exists()), default=0.0)
 
 
 @dataclass
 class _Spans:
-    """The events about rows in a journal, as far as it was read.
+    """The events about rows in the part of a journal that was read.
 
     Attributes:
         journal: the file.
         logs: the recordings of each existing log, in the order of their rows.
-        recordings: the newest of these recordings of each name.
+        recordings: the newest of these recordings, by name.
         full: the logs that get no more rows.
     """
 
@@ -159,7 +160,7 @@ class _Spans:
     _seam: bytes = b""
 
     def goes_on_in(self, file: BinaryIO) -> bool:
-        """Return whether a file is the one that was read, and has only grown."""
+        """Return whether a file is the one read before, and has only grown since."""
         before, now = self._status, os.fstat(file.fileno())
         if before is None or (before.st_dev, before.st_ino) != (now.st_dev, now.st_ino):
             return False
@@ -169,11 +170,11 @@ class _Spans:
         return is_same or (is_longer and file.read(len(self._seam)) == self._seam)
 
     def read_on(self, file: BinaryIO) -> None:
-        """Read the rest of a file, from the end of the last reading."""
+        """Read the rest of a file, from where the last reading ended."""
         self._status = os.fstat(file.fileno())
         file.seek(self._offset)
         began = self._offset
-        # A line without an end is still being written, or its writer was killed.
+        # An incomplete line is still being written, or its writer was killed.
         while (line := file.readline(_LONGEST_LINE)).endswith(b"\n"):
             self._offset += len(line)
             self._seam = line[-_SEAM:]
@@ -222,7 +223,7 @@ class _Spans:
             others[-1].following = recording.row
         others.append(recording)
         if name in self.recordings:
-            # It is begun again.
+            # The recording was begun a second time.
             self.recordings[name].is_dropped = True
         self.recordings[name] = recording
 
@@ -232,25 +233,25 @@ class _Spans:
 
 
 class _Known(threading.local):
-    """This thread's cache. A shared one would need a lock, which a fork could hold."""
+    """This thread's cache. A shared cache would need a lock, which is bad with fork."""
 
     def __init__(self) -> None:
         self.spans: dict[Path, _Spans] = {}
 
 
-# A journal only grows, and recordings are looked up one at a time.
+# Cached because a journal only grows, and recordings are looked up one at a time.
 _known = _Known()
 _MOST_KNOWN = 64
 
 
 def _read(journal: Path) -> _Spans:
-    """Return the current events about rows in a journal; empty if it does not exist.
+    """Return a journal's current events about rows, or none if it does not exist.
 
     Raises:
         UnreadableFile: the journal cannot be read.
     """
     known = _known.spans
-    # Removed from the cache first: an interrupted reading starts anew.
+    # Removed from the cache first, so that an interrupted reading starts over.
     spans = known.pop(journal, None) or _Spans(journal)
     with unreadable(journal):
         try:
@@ -273,7 +274,7 @@ def _journal_of(path: Path) -> Path:
 
 
 def infix_of_recording(name: str) -> str | None:
-    """Return the infix in a recording's name; None if the name is not a recording's."""
+    """Return the infix in a recording's name, or None for any other name."""
     if ClipPart.parse(name) is not None:
         return infix_of(name)
     path = f"{name}{FINISHED}"
@@ -281,9 +282,9 @@ def infix_of_recording(name: str) -> str | None:
 
 
 def log_paths(directory: Path, infix: Infix | str | None = None) -> Iterator[Path]:
-    """Yield the paths of the logs of a directory, or of one monitor in it.
+    """Yield the paths of all logs in a directory, or of one monitor's logs.
 
-    A log is included if any of its files is left.
+    A log is included if any of its files exists.
     """
     logs = {
         directory / log_name(own, number)
@@ -307,13 +308,13 @@ def recordings_in(log: Path) -> list[Recording]:
         if not found and log.exists() and has_rows(log):
             raise ValueError("no journal gives the layout of its rows")
     for recording in found:
-        # Raises if the layout is damaged.
+        # This raises an error if the layout is damaged.
         _ = recording.dtype
     return [*found]
 
 
 def find_recording(path: Path) -> Recording | None:
-    """Return a recording whose rows are still needed, by the path of its file.
+    """Return the recording with this path if its rows are still needed, or None.
 
     Raises:
         UnreadableFile: the journal of its monitor cannot be read.
@@ -362,9 +363,9 @@ def is_in_flight(path: Path) -> bool:
 def recordings_in_flight(
     directory: Path, infix: Infix | str | None = None
 ) -> list[Recording]:
-    """Return the recordings that exist only in logs, of all monitors or one.
+    """Return the recordings of all monitors, or of one, that exist only in logs.
 
-    Unreadable ones are omitted: `recordings_in` reports the reason.
+    Unreadable logs are skipped; `recordings_in` reports the reason.
     """
     found: list[Recording] = []
     for log in log_paths(directory, infix):
@@ -374,12 +375,12 @@ def recordings_in_flight(
 
 
 def remove_if_done(log: Path) -> None:
-    """Remove a log once it gets no more rows and nothing in it is in flight.
+    """Remove a log if it gets no more rows and none of its recordings is in flight.
 
     Raises:
         DirectoryNotWritable: the log cannot be removed.
     """
-    # Checked first: a monitor that is closed begins no more recordings.
+    # Checked first, because a closed monitor begins no more recordings.
     is_open = _is_open(log)
     try:
         recordings = recordings_in(log)
@@ -392,7 +393,7 @@ def remove_if_done(log: Path) -> None:
 
 def files_beside(log: Path) -> tuple[Path, ...]:
     """Return the files of a log, in the order of their removal."""
-    # The log first, so that no reader opens it without the rest.
+    # The log comes first, so that no reader opens it without the other files.
     return log, tail_path(log), log.with_suffix(LOOKS)
 
 
@@ -414,7 +415,7 @@ def _is_open(log: Path) -> bool:
     try:
         return infix is not None and is_locked(log.parent / lock_name(infix))
     except OSError:
-        # Unknown: leave its files alone.
+        # This is unknown, so leave the log's files alone.
         return True
 
 

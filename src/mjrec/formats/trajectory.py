@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The content of a trajectory, independent of its form.
+"""The content of a trajectory, however it is stored.
 
-A recorded episode is first a span of the monitor's row log (`trajectory_log`), then an
-HDF5 file (`trajectory_hdf5`). Both hold facts, rows and changes of the model. A NumPy
-structured dtype describes a row. `docs/reference/trajectories.md` has the file.
+A recorded episode is first a span of the monitor's row log (`trajectory_log`), and then
+an HDF5 file (`trajectory_hdf5`). Both contain facts, rows and changes of the model. A
+NumPy structured dtype describes a row. `docs/reference/trajectories.md` describes the
+file.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ def packed(members: Iterable[tuple[str, Any]]) -> np.dtype[Any]:
     """Return a structured dtype whose members begin at multiples of 8 bytes.
 
     Args:
-        members: names and dtypes, in any form that NumPy accepts.
+        members: pairs of a name and a dtype, in any form that NumPy accepts.
     """
     names, formats, offsets, size = [], [], [], 0
     for name, kind in members:
@@ -58,11 +59,12 @@ def row_dtype(
     action: np.dtype[Any] | None = None,
     observation: np.dtype[Any] | None = None,
 ) -> np.dtype[Any]:
-    """Return the dtype of a row; parts that are None or empty are left out.
+    """Return the dtype of a row, without parts that are None or empty.
 
     Args:
-        state: float64 members, MuJoCo's state components by name.
-        snapshot: the arrays needed to render a frame, by MuJoCo's names.
+        state: dtype of a state, with a float64 member for each of MuJoCo's components.
+        snapshot: dtype of a snapshot, with a member for each of MuJoCo's arrays that
+            are needed to render a frame.
         action: dtype and shape of an action.
         observation: dtype and shape of an observation.
 
@@ -90,7 +92,7 @@ def dtype_from_json(value: Any) -> np.dtype[Any]:
     return _dtype_from_text(json.dumps(value))
 
 
-# All recordings of a log have the same dtype, and parsing it is slow in Python.
+# Cached because all recordings in a log have the same dtype, which is slow to parse.
 @functools.lru_cache(maxsize=16)
 def _dtype_from_text(text: str) -> np.dtype[Any]:
     try:
@@ -99,7 +101,7 @@ def _dtype_from_text(text: str) -> np.dtype[Any]:
         own = row_dtype(**{name: dtype[name] for name in PARTS if name in names})
     # NumPy raises many kinds of errors for an invalid dtype.
     except Exception as error:
-        raise ValueError(f"its rows' layout cannot be read: {error}") from error
+        raise ValueError(f"the layout of its rows cannot be read: {error}") from error
     if dtype != own:
         raise ValueError("its rows have unknown parts or gaps")
     return own
@@ -130,14 +132,15 @@ def columns_of(state: np.dtype[Any]) -> dict[str, slice]:
 
 @dataclass(frozen=True, kw_only=True)
 class ModelChange:
-    """Model fields that changed, effective from a step on.
+    """Model fields that have new values from a certain step on.
 
     Attributes:
         step: the first step that the values apply to; 0 for differences from the stored
             model at the reset.
-        fields: the new values: arrays of `MjModel` by name (`geom_rgba`), members of
-            its structs such as `opt.gravity`, `vis.headlight.ambient`, `stat.extent`;
-            and of the view, such as `camera.lookat`, `option.flags`.
+        fields: the new values by name. The names are those of `MjModel`'s arrays
+            (`geom_rgba`), of members of its structs (`opt.gravity`,
+            `vis.headlight.ambient`, `stat.extent`), and of parts of the view
+            (`camera.lookat`, `option.flags`).
     """
 
     step: int
@@ -148,22 +151,21 @@ def check_version(version: int) -> None:
     """Raise `ValueError` if this code cannot read a format version."""
     if version != FORMAT_VERSION:
         raise ValueError(
-            f"it was written by a newer mjrec, in format version {version}, and this "
-            f"one reads versions up to {FORMAT_VERSION}: update mjrec"
+            f"it was written by a newer mjrec in format version {version}, but this "
+            f"mjrec only reads versions up to {FORMAT_VERSION}: update mjrec"
             if version > FORMAT_VERSION
             else f"format version {version} does not exist"
         )
 
 
 def added_up(rewards: ArrayLike) -> float:
-    """Return the sum of rewards, added one after another as a monitor adds them.
+    """Return the sum of rewards, adding one after another as a monitor does.
 
-    From Python 3.12 on, `sum` compensates for rounding errors, and NumPy's sum adds in
-    pairs.
+    Other functions give different last bits: from Python 3.12 on, `sum` compensates for
+    rounding errors, and NumPy adds in pairs.
     """
     values = np.asarray(rewards, np.float64)
-    # Add to 0.0, as a monitor does: it turns a sum of negative zeros into a positive
-    # zero.
+    # Add the sum to 0.0, as a monitor does, which turns negative zero into zero.
     with np.errstate(all="ignore"):
         return 0.0 + float(np.add.accumulate(values)[-1]) if len(values) else 0.0
 
@@ -173,23 +175,23 @@ class TrajectoryReader:
     """An open trajectory with T steps and F video frames.
 
     Rows are read on demand, in ranges `start, stop` as in Python slices. Use a reader
-    on one thread, in the process that opened it.
+    on only one thread, in the process that opened it.
 
     Attributes:
         path: the file.
         facts: a JSON object; `docs/reference/trajectories.md` lists the keys.
         dtype: the dtype of a row, from `row_dtype`.
-        row_count: number of states: T + 1, the first one after the reset; 0 in the log
-            of an episode that was killed before its first row was written.
+        row_count: number of states: T + 1, including the state after the reset. It is
+            0 in the log of a process that was killed before it wrote the first row.
         rewards: `(T,) float64`.
         terminated: `(T,) bool`.
         truncated: `(T,) bool`.
         frame_steps: `(F,) int64`, the step after which each snapshot was taken.
         change_count: number of changes of the model.
-        dropped: number of rows at the end of the log that were torn or damaged.
-        read: returns one of the `PARTS` for a range of rows.
-        read_change: returns a change of the model by its number.
-        release: closes the files.
+        dropped: number of incomplete or damaged rows at the end of the log.
+        read: a function that returns one of the `PARTS` for a range of rows.
+        read_change: a function that returns a change of the model by its number.
+        release: a function that closes the files.
         is_closed: whether the reader was closed.
     """
 
@@ -240,14 +242,16 @@ class TrajectoryReader:
         return rows.view(np.float64).reshape(len(rows), rows.itemsize // 8)
 
     def actions(self, start: int, stop: int) -> NDArray[Any] | None:
-        """Return a range of the T actions; None if they were not recorded.
+        """Return a range of the T actions, or None if they were not recorded.
 
         The shape is `(stop - start, *shape)`.
         """
         return self._rows("action", start, stop, self.step_count)
 
     def observations(self, start: int, stop: int) -> NDArray[Any] | None:
-        """Return a range of `row_count` observations; None if they were not recorded.
+        """Return a range of the observations, or None if they were not recorded.
+
+        There are `row_count` observations.
 
         The shape is `(stop - start, *shape)`.
         """
@@ -256,7 +260,7 @@ class TrajectoryReader:
     def snapshots(self, start: int, stop: int) -> NDArray[Any]:
         """Return a range of the F snapshots, `(stop - start,)`.
 
-        MuJoCo's arrays are the members of each.
+        The members of each snapshot are MuJoCo's arrays.
         """
         rows = self._rows("snapshot", start, stop, self.frame_count)
         return np.empty(stop - start, []) if rows is None else rows
@@ -269,7 +273,7 @@ class TrajectoryReader:
 
     @functools.cached_property
     def model_changes(self) -> tuple[ModelChange, ...]:
-        """The changes of the model in the order of their steps, read once."""
+        """The changes of the model in the order of their steps, read only once."""
         return tuple(self.iter_model_changes())
 
     def close(self) -> None:

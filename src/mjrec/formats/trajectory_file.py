@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Access to recorded episodes: in flight, in an HDF5 file, or in a bundle."""
+"""Access to recorded episodes in flight, in HDF5 files and in bundles."""
 
 from __future__ import annotations
 
@@ -45,12 +45,12 @@ def open_trajectory(path: Path) -> TrajectoryReader:
 
 
 def finish_trajectory(path: Path) -> Path:
-    """Create the HDF5 file of an ended recording, whose rows are then no longer needed.
+    """Create the HDF5 file of an ended recording, and remove its log if it is done.
 
-    If a recording does not say how it ended, its process was killed or its disk was
-    full; its last row shows whether it is complete. This function can be killed at any
-    point and run again, and two processes can run it at the same time: the rows stay
-    until the file exists.
+    If the end of a recording was not recorded, the process was killed or the disk was
+    full; the last row then shows whether the recording is complete. This function can
+    be killed at any point and run again, and two processes can run it at the same time,
+    because the rows stay until the file exists.
 
     Args:
         path: the trajectory's own file.
@@ -91,12 +91,12 @@ def finish_trajectories(paths: Iterable[Path]) -> dict[Path, Error]:
 
 
 def bundle_trajectories(paths: Iterable[Path]) -> dict[Path, Error]:
-    """Finish recordings into their monitor's bundle, written once, and return errors.
+    """Finish recordings by adding them to their monitor's bundle all at once.
 
     Call this only in the process that holds the monitor's lock.
 
     Args:
-        paths: the trajectories' own files, all of one monitor.
+        paths: the trajectories' own files, all from one monitor.
 
     Returns:
         The error of each trajectory that could not be added, by path.
@@ -125,11 +125,11 @@ def bundle_trajectories(paths: Iterable[Path]) -> dict[Path, Error]:
 def amend_trajectories(changes: Mapping[Path, Callable[[Any], Any]]) -> None:
     """Change the facts of finished trajectories.
 
-    Each file is rewritten, whole or not at all, so use this rarely. Only data that this
-    package writes is kept; the arrays stay the same, bit for bit.
+    Each file is atomically rewritten as a whole, so use this rarely. Only data that
+    this package writes is kept; the arrays stay the same, bit for bit.
 
     Args:
-        changes: functions that take a trajectory's facts and return the new ones, by
+        changes: functions that take a trajectory's facts and return the new facts, by
             the path of the trajectory's own file.
 
     Raises:
@@ -150,7 +150,7 @@ def amend_trajectories(changes: Mapping[Path, Callable[[Any], Any]]) -> None:
 
 
 def _ended(path: Path, recording: Recording | None) -> TrajectoryReader:
-    """Open a recording, adding how it ended to its facts."""
+    """Open a recording, and add facts about how it ended."""
     reader = open_recording(path)
     reader.facts = {**reader.facts, **how_it_ended(reader, recording)}
     return reader

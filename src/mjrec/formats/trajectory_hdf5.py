@@ -1,14 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Recorded episodes in HDF5 files, readable with plain h5py.
+"""Recorded episodes in HDF5 files, which can be read with plain h5py.
 
-An episode has a file of its own, or a group of a bundle (`bundle`).
+An episode has a file of its own, or a group in a bundle (see `bundle`).
 
 `docs/reference/trajectories.md` describes every dataset. States and snapshots are rows
 of a compound type, whose members have MuJoCo's names: `file["states"]["qpos"]` is an
-array. The shuffle filter works on whole rows there: it stores the same byte of
-consecutive rows next to each other, so values that do not change cost nothing.
+array. The shuffle filter works on whole rows: it stores the same byte of consecutive
+rows next to each other, so values that do not change cost nothing.
 
-Nothing here limits the memory or time that reading a file takes: `foreign_files` does.
+This module does not limit the memory or time that reading a file takes, but
+`foreign_files` does.
 """
 
 from __future__ import annotations
@@ -51,8 +52,8 @@ SIGNATURE = b"\x89HDF\r\n\x1a\n"
 _FORMAT = b"mjrec trajectory"
 _BUNDLE = b"mjrec trajectories"
 
-# With these versions, h5py from 2019 on can read the files; `latest` makes files that
-# h5py of 2025 cannot open.
+# With these versions, h5py releases from 2019 on can read the files. With `latest`,
+# even h5py releases from 2025 cannot open them.
 _LIBVER = ("v110", "v110")
 
 _COLUMNS = {
@@ -65,7 +66,7 @@ _COLUMNS = {
 _NO_STATE = np.dtype(("<f8", (0,)))
 
 _CHUNK_BYTES = 1 << 18
-# For snapshots, so that reading one frame does not read most of the others.
+# For snapshots. Few rows per chunk, so that reading a frame does not read most others.
 _ROWS_IN_CHUNK = 32
 # Number of bytes that are buffered while writing.
 _BUFFER_BYTES = 1 << 22
@@ -75,11 +76,11 @@ _FILTERS = frozenset((h5py.h5z.FILTER_DEFLATE, h5py.h5z.FILTER_SHUFFLE))
 
 
 def write_hdf5(reader: TrajectoryReader, path: Path) -> None:
-    """Write all data of `reader` to the HDF5 file `path`, whole or not at all.
+    """Atomically write all data from `reader` to the HDF5 file `path`.
 
     Raises:
         FileNotWritten: the disk is full, or the directory was removed.
-        UnreadableFile: the data that is read turned out to be damaged.
+        UnreadableFile: the data from `reader` is damaged.
     """
     # Stop reading on Ctrl-C, so that writing ends soon.
     with _new_file(path, reader.close) as (file, _):
@@ -91,16 +92,16 @@ def write_bundle(
     added: Mapping[Path, Callable[[], TrajectoryReader]],
     amended: Mapping[Path, Callable[[Any], Any]],
 ) -> dict[Path, UnreadableFile]:
-    """Rewrite a bundle with more trajectories or new facts, whole or not at all.
+    """Atomically rewrite a bundle with more trajectories or new facts.
 
     Existing trajectories are copied in compressed form.
 
     Args:
         bundle: the bundle's file, which need not exist yet.
-        added: functions that open the new trajectories, by the path of each one's own
-            file.
+        added: functions that open the new trajectories, by the path of each
+            trajectory's own file.
         amended: functions that take the facts of existing trajectories and return the
-            new ones, by path.
+            new facts, by path.
 
     Returns:
         The errors of trajectories that could not be read and were not added, by path.
@@ -154,9 +155,9 @@ def _new_file(
     """Yield a new HDF5 file, and the raw file that it is written through.
 
     Args:
-        path: the name that the file gets at the end of the block.
+        path: the path that the file gets at the end of the block.
         on_signal: called immediately if a signal arrives during the block.
-        **options: further options of `h5py.File`.
+        **options: further options for `h5py.File`.
 
     Raises:
         FileNotWritten: the disk is full, or the directory was removed.
@@ -171,7 +172,7 @@ def _new_file(
                 yield file, unfailing
             if unfailing.error is not None:
                 raise unfailing.error
-            # The log is removed next, so its data must not be only in a cache.
+            # The log is removed next, so the data must not be in a cache only.
             os.fsync(output.fileno())
     except OSError as error:
         raise FileNotWritten(path, error.strerror or error) from error
@@ -179,10 +180,10 @@ def _new_file(
 
 @contextlib.contextmanager
 def _signals_waiting(on_signal: Callable[[], object]) -> Iterator[None]:
-    """Handle signals after the block: HDF5 crashes if its file raises an exception.
+    """Delay signals until the end of the block, because HDF5 crashes on exceptions.
 
     Args:
-        on_signal: called immediately, during the block.
+        on_signal: called immediately when a signal arrives.
     """
     came: list[int] = []
 
@@ -255,11 +256,11 @@ def open_hdf5(path: Path) -> TrajectoryReader:
     """Open a finished trajectory.
 
     Args:
-        path: the trajectory's own file; it may be in a bundle instead.
+        path: the trajectory's own file; the trajectory may be in a bundle instead.
 
     Raises:
-        UnreadableFile: the file is missing, damaged, not a trajectory or of a newer
-            version.
+        UnreadableFile: the file is missing or damaged, is not a trajectory, or has a
+            newer version.
     """
     with _reading(path), contextlib.ExitStack() as opened:
         # Do not request locking: HDF5 refuses to open a file that is already open in
@@ -293,7 +294,7 @@ def _reader_of(
     if not all(lengths) or (rows != steps + 1 and (rows, steps) != (0, 0)):
         raise ValueError("its datasets do not have the same number of steps")
     last = max(rows - 1, 0)
-    # Compared, not subtracted: differences of such numbers may overflow.
+    # Compare instead of subtracting: differences of such numbers may overflow.
     bounds = np.concatenate(([0], columns["frame_steps"], [last]))
     if (bounds[1:] < bounds[:-1]).any():
         raise ValueError("its frame steps are out of order or out of range")
@@ -362,12 +363,12 @@ def _group(parent: h5py.Group, name: str) -> h5py.Group:
 
 
 def _dataset(group: h5py.Group, name: str) -> Any:
-    """Return a dataset stored in this file itself, with filters that mjrec uses."""
+    """Return a dataset that is stored in this file itself, with mjrec's filters."""
     dataset = _linked(group, name)
     if not isinstance(dataset, h5py.Dataset):
         raise ValueError(f"its {name} is not a dataset")
-        # Check the storage before anything else, even the shape: for a virtual
-        # dataset's shape, HDF5 opens the other files that it refers to.
+    # Check the storage before anything else, even the shape: to find the shape of a
+    # virtual dataset, HDF5 opens the files that the dataset refers to.
     properties = dataset.id.get_create_plist()
     filters = {
         properties.get_filter(index)[0] for index in range(properties.get_nfilters())
@@ -402,10 +403,10 @@ def _attribute(attributes: Any, name: str, kinds: str) -> Any:
 
 def _write_facts(attributes: Any, facts: Mapping[str, Any]) -> None:
     text = dumps(dict(facts)).encode()
-    # Strings of fixed length: see _attribute.
+    # A string of fixed length; see `_attribute`.
     attributes["facts"] = np.bytes_(text)
-    # HDF5 has checksums for its own metadata, and the deflate filter for compressed
-    # data; long strings have neither.
+    # HDF5 has checksums for its own metadata, and the deflate filter has them for
+    # compressed data, but neither covers long strings.
     attributes["crc32"] = np.int64(zlib.crc32(text))
 
 
@@ -448,7 +449,7 @@ def _store(
     count: int,
     read: Callable[[int, int], NDArray[Any]],
 ) -> None:
-    """Write `count` values of a dtype, which `read(start, stop)` returns."""
+    """Write a dataset of `count` values that `read(start, stop)` returns."""
     shape, size = (count, *kind.shape), kind.itemsize
     if not count * size:
         # There is nothing to split into chunks.

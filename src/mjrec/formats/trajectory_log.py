@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reading a recording in flight as a trajectory, even after its process died.
+"""A reader of recordings in flight, which works even after their process has died.
 
-Rows are valid only if each has its own number: after a machine crash, a log may have
-pages without the data that was written to them.
+A row is valid only if it contains its own number, because after a machine crash, a log
+may have pages without the data that was written to them.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from .trajectory import (
     check_dtype,
 )
 
-# A row has a step, a frame, or both.
+# Every row has a step, a frame, or both.
 _KINDS = STEP | FRAME
 
 # Number of bytes read at once when scanning the rows.
@@ -47,7 +47,7 @@ _LARGEST_CHANGE = 1 << 30
 
 
 def open_recording(path: Path) -> TrajectoryReader:
-    """Open the rows that a log holds of a recording at this moment.
+    """Open a recording with the rows that its log contains at this moment.
 
     Args:
         path: the file that the recording will become.
@@ -64,7 +64,7 @@ def open_recording(path: Path) -> TrajectoryReader:
             contextlib.closing(RowLogReader(recording.log, recording.dtype.itemsize))
         )
         count = rows.count
-        # Look it up again: rows of a recording that has begun since are not its own.
+        # Look it up again, because a later recording may have begun in the meantime.
         recording = find_recording(path) or recording
         if recording.stop is not None:
             # All of its rows were counted before its end was recorded.
@@ -124,7 +124,12 @@ def _reader_of(
 
 
 def _stop_of(recording: Recording, count: int) -> int:
-    """Return one past the last row of a recording, given `count` rows in the log."""
+    """Return the row number at which a recording stops.
+
+    Args:
+        recording: the recording.
+        count: number of rows in its log.
+    """
     stop = recording.stop
     if stop is None:
         # A recording without an end extends to the next one, if there is one.
@@ -135,7 +140,7 @@ def _stop_of(recording: Recording, count: int) -> int:
 def _sound_heads(
     rows: RowLogReader, dtype: np.dtype[Any], first: int, stop: int
 ) -> NDArray[Any]:
-    """Return the heads of the rows from `first` on, up to the first invalid one."""
+    """Return the heads of the rows from `first` on, up to the first invalid row."""
     names = ["row", "step", "reward", "flags"]
     head = np.dtype([(name, dtype[name]) for name in names])
     at_once = max(1, _CHUNK_BYTES // dtype.itemsize)
@@ -166,7 +171,7 @@ def _read_part(
     at_once = max(1, _CHUNK_BYTES // dtype.itemsize)
     start = 0
     while start < len(wanted):
-        # Rows between the wanted ones are read, too.
+        # The rows between the wanted rows are read too.
         stop = int(np.searchsorted(wanted, wanted[start] + at_once))
         chosen = wanted[start:stop]
         first, behind = int(chosen[0]), int(chosen[-1]) + 1
@@ -174,7 +179,7 @@ def _read_part(
         if (found["row"] != np.arange(first, behind)).any():
             raise ValueError("its log was changed while it was read")
         values = found[part][chosen - first]
-        # Copy member by member: the padding contains data between MuJoCo's arrays.
+        # Copy member by member, because the padding between members contains data.
         for name in member.names or ():
             out[name][start:stop] = values[name]
         if member.names is None:
@@ -196,7 +201,7 @@ def _open_looks(recording: Recording, opened: contextlib.ExitStack) -> BinaryIO 
 def _find_changes(
     looks: BinaryIO | None, offset: int, stop: int
 ) -> Iterator[tuple[int, int, int]]:
-    """Yield step, offset and length of each change before row `stop`."""
+    """Yield the step, offset and length of each change before row `stop`."""
     if looks is None:
         return
     size = os.fstat(looks.fileno()).st_size
@@ -211,7 +216,7 @@ def _find_changes(
 
 
 def pack_change(row: int, change: ModelChange) -> bytes:
-    """Return the `.looks` record of a model change that takes effect at `row`.
+    """Return the `.looks` record for a model change that takes effect at `row`.
 
     Raises:
         InvalidArgument: a field is not an array of plain numbers, its name is invalid,
@@ -233,8 +238,8 @@ def pack_change(row: int, change: ModelChange) -> bytes:
     packed = file.getvalue()
     if len(packed) > _LARGEST_CHANGE:
         raise InvalidArgument(
-            f"A change of a model may have at most {_LARGEST_CHANGE} bytes, got "
-            f"{len(packed)}."
+            f"A change of a model may have at most {_LARGEST_CHANGE} bytes, but this "
+            f"one has {len(packed)}."
         )
     return _CHANGE.pack(row, change.step, len(packed)) + packed
 
@@ -247,6 +252,6 @@ def _unpack_fields(packed: bytes) -> dict[str, NDArray[Any]]:
         check_dtype(record.dtype)
         # Copies are writable, and do not keep the whole record alive.
         return {name: record[name].copy() for name in record.dtype.names or ()}
-    # NumPy parses the header as Python, and may raise any error of that.
+    # NumPy parses the header as Python code, which may raise any error.
     except Exception as error:
         raise ValueError(f"a change of the model is damaged ({error})") from error

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Live videos under their hidden names, with notes that let any process finish them.
+"""Unfinished live videos, with notes that let any process finish them.
 
-The note, `.<name of the video>.note.part`, is written before the video. The hidden
-video is locked while it is written, both by the process that feeds ffmpeg and by ffmpeg
-itself, which completes its file if that process dies.
+The note, `.<name of the video>.note.part`, is written before the video. The video has a
+hidden name. While it is being written, it is locked both by the process that feeds
+ffmpeg and by ffmpeg itself, which completes its file if that process dies.
 """
 
 from __future__ import annotations
@@ -38,9 +38,8 @@ class UnfinishedVideo:
 
     Attributes:
         path: the final path of the video.
-        metadata: the video's metadata about the recording, as far as it is known.
-        facts: the video's metadata about the file and its timing; and
-            `frames_per_step`.
+        metadata: the metadata about the recording that is known so far.
+        facts: the metadata about the file and its timing, and `frames_per_step`.
     """
 
     path: Path
@@ -54,12 +53,12 @@ class UnfinishedVideo:
 
     @property
     def hashes(self) -> list[Path]:
-        """The current paths of its frame hashes, if there are any."""
+        """The current paths of the video's frame hashes, if there are any."""
         return unfinished_files(frame_hash_path(self.path))
 
     @property
     def hashed_frames(self) -> int:
-        """Number of frames that the encoder was given, or was about to be given."""
+        """Number of frames that were, or were about to be, passed to the encoder."""
         texts = [path.read_text("ascii", "replace") for path in self.hashes]
         return sum(not line.startswith("#") for t in texts for line in t.splitlines())
 
@@ -104,7 +103,7 @@ def note_path(video: Path) -> Path:
 
 
 def write_note(video: UnfinishedVideo) -> None:
-    """Write or replace a note, whole or not at all.
+    """Atomically write or replace a note.
 
     Raises:
         FileNotWritten: the disk is full, or the directory was removed.
@@ -135,7 +134,7 @@ def read_note(video: Path) -> UnfinishedVideo:
 
 def _finish_hashes(part: Path, final: Path, frame_count: int) -> None:
     try:
-        # Frames that have hashes may not have reached the file.
+        # Some frames that have hashes may not have reached the file.
         cut_frame_hashes(part, frame_count)
     except ValueError:
         # Incomplete hashes are worse than none.

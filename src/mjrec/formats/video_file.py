@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Encoding one video from its first frame to its last, and checking the result."""
+"""The encoding of one video from its first frame to its last, with a final check."""
 
 from __future__ import annotations
 
@@ -35,15 +35,15 @@ class VideoFile:
 
     Attributes:
         path: the file.
-        height: height of a written frame in pixels; that of the file is even.
-        width: width of a written frame in pixels; that of the file is even.
+        height: height of a written frame in pixels; see `padded_height`.
+        width: width of a written frame in pixels; see `padded_width`.
         fps: frames per second.
-        codec: ffmpeg's name of the encoder.
-        pixel_format: ffmpeg's name of the encoded pixels' format.
-        encoder: `ffmpeg` (the binary's base name), `version` (the first line of its
-            version), `sha256` (the binary's) and `arguments` (all of them; the output
-            file is given by its base name, so that they stay true if the directory
-            moves).
+        codec: ffmpeg's name for the encoder.
+        pixel_format: ffmpeg's name for the format of the encoded pixels.
+        encoder: facts about ffmpeg: `ffmpeg` (the binary's base name), `version` (the
+            first line of its version output), `sha256` (of the binary) and `arguments`
+            (all arguments, with only the base name of the output file, so that they
+            stay true if the directory moves).
         frame_hash_path: the `.framehash` file, if requested.
         frame_count: number of frames in the file, counted by decoding it.
         file_sha256: SHA-256 of the file's bytes.
@@ -77,16 +77,16 @@ class VideoFile:
 def content_facts(
     path: Path, *, height: int, width: int, pixel_format: str
 ) -> dict[str, Any]:
-    """Decode a video, and return the metadata of its content.
+    """Decode a video, and return the metadata about its content.
 
-    That is `frame_count`, `file_sha256` and `decoded_sha256`.
+    The keys are `frame_count`, `file_sha256` and `decoded_sha256`.
 
     Args:
         path: the file.
         height: height of a frame in the file, in pixels.
         width: width of a frame in the file, in pixels.
-        pixel_format: pixel format of the file. Frames are decoded as yuv420p if it is
-            yuv420p, otherwise as rgb24.
+        pixel_format: pixel format of the file. A yuv420p file is decoded to yuv420p,
+            and any other file to rgb24.
 
     Raises:
         EncoderError: the video cannot be decoded to its end.
@@ -128,8 +128,8 @@ class Encoding:
         self._hashes: TextIO | None = None
         with contextlib.ExitStack() as on_failure:
             try:
-                # Lock it first: an unlocked file may be cleaned up. The mode is the
-                # usual default for new files.
+                # Lock the file first, because an unlocked file may be cleaned up. The
+                # mode is the usual default for new files.
                 self._lock = Lock(temporary, "", mode=0o666)
             except OSError as error:
                 raise DirectoryNotWritable(file.path.parent, error) from error
@@ -140,16 +140,16 @@ class Encoding:
                     height=file.height, width=file.width, fps=file.fps
                 )
                 with self._naming_the_hashes():
-                    # Line buffering: each line reaches the operating system before the
-                    # next.
+                    # Use line buffering, so that each line reaches the operating system
+                    # before the next one is written.
                     self._hashes = hashes.open("w", encoding="ascii", buffering=1)
                     self._hashes.write(header)
             self._process = FfmpegProcess(
                 [*file.encoder["arguments"][:-1], as_file(temporary)],
                 what=f"The video {file.path} could not be encoded.",
                 reads=True,
-                # ffmpeg shares the lock, and holds it until it ends if this process
-                # dies.
+                # ffmpeg shares the lock. If this process dies, ffmpeg holds the lock
+                # until it ends.
                 keeps=self._lock.fileno(),
             )
             on_failure.callback(self._process.release)
@@ -166,7 +166,7 @@ class Encoding:
     def finish(self) -> VideoFile:
         """Complete the file, check it and rename it to its final name.
 
-        Can be called again if Ctrl-C interrupted it.
+        Can be called again after Ctrl-C has interrupted it.
         """
         self.is_ending = True
         self.thread.close()
@@ -179,7 +179,7 @@ class Encoding:
         else:
             self._hashes.close()
         try:
-            # The hashes first, so that a finished video always has its companion files.
+            # Rename the hashes first, so that a finished video always has its hashes.
             for part, final in reversed(self._parts.items()):
                 if part.exists():
                     part.replace(final)
@@ -198,7 +198,7 @@ class Encoding:
         self._remove_files()
 
     def leave(self) -> None:
-        """Let the encoder finish the frames that it was given, on its own."""
+        """Leave the encoder to finish on its own with the frames that it was given."""
         self._is_left = True
         self.thread.leave()
         if self._input_ended:
@@ -223,7 +223,7 @@ class Encoding:
             self._wait_and_close()
 
     def _wait_and_close(self) -> None:
-        """Wait for ffmpeg, whose input has ended; another process owns its file."""
+        """Wait for ffmpeg after the end of its input. Another process owns its file."""
         if self._hashes is not None:
             self._hashes.close()
         with contextlib.suppress(EncoderError):
@@ -231,10 +231,10 @@ class Encoding:
         self._process.release()
 
     def _checked(self) -> VideoFile:
-        """Decode the temporary file, and return the video's facts with its content's.
+        """Decode the temporary file, and return the video with facts about its content.
 
         Raises:
-            FrameCountError: the file does not hold the frames that were encoded.
+            FrameCountError: the file does not contain exactly the encoded frames.
         """
         file = self._file
         found = content_facts(
@@ -245,8 +245,8 @@ class Encoding:
         )
         if found["frame_count"] != self._encoded:
             raise FrameCountError(
-                f"{file.path} should hold {self._encoded} frames, but decoding gives "
-                f"{found['frame_count']}. It was not kept.",
+                f"{file.path} should contain {self._encoded} frames, but decoding "
+                f"gives {found['frame_count']}. It was not kept.",
                 command=self._process.command,
                 returncode=0,
                 stderr="",

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The metadata file of a video.
 
-Live and deferred videos describe themselves with the same keys, because both take them
-from here. The caller adds what it knows about the episode, the frames and any failures.
+Live and deferred videos have the same keys, because both take them from this module.
+The caller adds facts about the episode, the frames and any failures.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from .json_fields import read_object, unreadable
 from .video_file import VideoFile
 
 _FAILED = ".failed.json"
-# Output of ffmpeg or a driver can be long; its beginning and end matter most.
+# The output of ffmpeg or a driver can be long. Its beginning and end matter most.
 _LONGEST_REASON = 1000
 _CUT = " [...] "
 
-# A part of a file's name, as `camera_part` makes them.
+# A part of a file's name, in the form that `camera_part` returns.
 _PART = re.compile(r"[A-Za-z0-9_%-]{1,200}", re.ASCII)
 
 
@@ -37,8 +37,8 @@ def recording_facts(facts: Mapping[str, Any], *, recording: str) -> dict[str, An
     """Return the metadata about the recording that a video shows.
 
     Args:
-        facts: the known facts of the recording; for a clip, of its first part.
-        recording: when the frames are rendered, "live" or "deferred".
+        facts: the known facts about the recording; for a clip, about its first part.
+        recording: the time when the frames are rendered: "live" or "deferred".
     """
     video = facts.get("video") or {}
     further = {"recording_reason": video.get("reason")} if recording == "live" else {}
@@ -51,7 +51,7 @@ def recording_facts(facts: Mapping[str, Any], *, recording: str) -> dict[str, An
 
 
 class StepRuns:
-    """The step of every frame, as runs, so that memory does not grow with frames.
+    """The step of every frame, stored as runs of frames to save memory.
 
     Args:
         steps: the steps of the frames so far, in order.
@@ -110,7 +110,7 @@ def timing_facts(
 def playback_speed(
     fps: Fraction | None, timestep: Fraction | None, steps_per_frame: Fraction
 ) -> float | None:
-    """Return the simulated seconds per second of video, if known."""
+    """Return the simulated seconds per second of video, or None if unknown."""
     if fps is None or timestep is None:
         return None
     return float(fps * timestep * steps_per_frame)
@@ -167,7 +167,7 @@ def amend_metadata(video: Path, facts: Mapping[str, Any]) -> None:
 
 
 def finished_videos(video: Path) -> list[tuple[str, str]]:
-    """Return the names of an episode's finished videos, each with its metadata file's.
+    """Return the names of an episode's finished videos and of their metadata files.
 
     The first video comes first; it must exist. Its metadata, which is written last,
     lists the videos of further cameras (`further_videos`). The list is untrusted, so
@@ -189,8 +189,8 @@ def finished_videos(video: Path) -> list[tuple[str, str]]:
 def further_live_videos(video: Path) -> list[str]:
     """Return the names of an episode's live videos from further cameras.
 
-    For readers that have only these files. Videos rendered from a trajectory are
-    excluded, because their metadata does not say "live".
+    This is for readers that have nothing but these files. Videos that were rendered
+    from a trajectory are excluded, because their metadata does not say "live".
 
     Args:
         video: the first video of the episode, which need not exist.
@@ -204,7 +204,7 @@ def further_live_videos(video: Path) -> list[str]:
 
 
 def is_done(video: Path) -> bool:
-    """Return whether a video needs no more work: it is finished or was given up."""
+    """Return whether a video needs no more work: it is finished, or was given up."""
     metadata = metadata_path(video)
     return metadata.exists() and (video.exists() or is_broken(metadata))
 
@@ -215,7 +215,7 @@ def is_broken(metadata: Path) -> bool:
 
 
 def metadata_of(video: Path) -> Mapping[str, Any]:
-    """Return the content of a video's metadata file; empty if it cannot be read."""
+    """Return the content of a video's metadata, or {} if it cannot be read."""
     return _read_or_nothing(metadata_path(video))
 
 
@@ -235,8 +235,8 @@ def _is_further(name: str, video: Path) -> bool:
 def failure_path(video: Path) -> Path:
     """Return the path of the file with the reason why a video could not be rendered.
 
-    The file holds `{"reason": "no OpenGL backend works here: ..."}`. It is written when
-    rendering has failed, and removed once the video exists.
+    The file contains `{"reason": "no OpenGL backend works here: ..."}`. It is written
+    when rendering fails, and removed once the video exists.
 
     Args:
         video: the video, or a part of a clip, whose video may not be known.
@@ -245,7 +245,7 @@ def failure_path(video: Path) -> Path:
 
 
 def note_failure(video: Path, reason: str) -> None:
-    """Record why a video could not be rendered, ignoring errors in doing so."""
+    """Record why a video could not be rendered. Errors in recording it are ignored."""
     with contextlib.suppress(Error, OSError):
         text = json_text.dumps({"reason": _shortened(reason)})
         write_text(failure_path(video), text)
@@ -258,7 +258,7 @@ def forget_failure(video: Path) -> None:
 
 
 def reason_of(video: Path) -> str | None:
-    """Return why a video could not be rendered, or None if it has not failed."""
+    """Return the reason why a video could not be rendered, or None if unknown."""
     try:
         reason = read_object(failure_path(video)).get("reason")
     except (OSError, ValueError):

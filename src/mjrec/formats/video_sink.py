@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The sink of all frames, live and deferred: frames in, one finished video out.
+"""The sink for all frames, live and deferred: frames in, one finished video out.
 
-Images become an mp4 with its frame hashes, text an asciicast. The metadata file is
-written last: if it exists, the video is complete.
+Images become an mp4 file with frame hashes, and text becomes an asciicast. The metadata
+file is written last: if it exists, the video is complete.
 """
 
 from __future__ import annotations
@@ -32,16 +32,17 @@ class VideoSink:
         path: the video: `.mp4` for images, `.json` for text.
         fps: frames per second.
         frame_hashes: whether to write the `.framehash` file of images.
-        note: returns the metadata and the timing known so far, for the note about the
-            unfinished mp4, with which another process finishes it if this one is
-            killed. None writes no note, because the video can be rendered again.
+        note: a function that returns the metadata and the timing known so far. They go
+            into the note about the unfinished mp4 file, which another process needs to
+            finish it if this one is killed. If None, no note is written; use this if
+            the video can be rendered again.
 
     Raises:
         Error: see `VideoWriter`.
 
     Attributes:
         path: the video.
-        blank: records whether the frames show anything.
+        blank: the check for whether the frames show anything.
     """
 
     def __init__(
@@ -87,7 +88,7 @@ class VideoSink:
             self._write_note(self._note, *frame.shape[:2])
         self._writer.write(frame if caption is None else annotated(frame, caption))
         self._is_annotated |= caption is not None
-        # Without the caption, which would make a blank frame look non-blank.
+        # Check the frame without the caption, which would hide that it is blank.
         self.blank.add(frame)
 
     def finish(self) -> None:
@@ -96,7 +97,7 @@ class VideoSink:
         Raises:
             Error: see `VideoWriter.close`.
         """
-        # The metadata of an older video would not be true of this one.
+        # The metadata of an older video would be wrong for this one.
         metadata_path(self.path).unlink(missing_ok=True)
         self._writer.close()
         self._is_finished = True
@@ -119,13 +120,13 @@ class VideoSink:
         return described
 
     def discard(self) -> None:
-        """Remove everything of this video. An older video stays unless it was replaced.
+        """Remove this video's files. An older video stays unless it was replaced.
 
         Idempotent.
         """
         self._writer.abort()
         if self._is_finished:
-            # The metadata first: if it exists, the video must exist.
+            # Remove the metadata first: if it exists, the video must exist.
             for path in (
                 metadata_path(self.path),
                 self.path,

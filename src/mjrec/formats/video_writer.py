@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Writing videos: every frame, once, in order, in a file that plays everywhere.
+"""Writers of videos that contain every frame once, in order, and play everywhere.
 
-Frames go through a bounded queue to a thread that feeds ffmpeg; the caller waits if the
-encoder is slower, and no frame is lost. The file has a temporary name until it is
+Frames go through a bounded queue to a thread that feeds ffmpeg. The caller waits if the
+encoder is slower, so no frame is lost. The file has a temporary name until it is
 complete and its frames have been recounted.
 """
 
@@ -37,8 +37,8 @@ from .ffmpeg import ffmpeg_executable, ffmpeg_version
 from .frame_hashes import frame_hash_path
 from .video_file import Encoding, VideoFile
 
-# The largest numerator and denominator of a rate in ffmpeg: it silently replaces larger
-# ones with the nearest fraction that fits.
+# The largest numerator and denominator of a rate in ffmpeg, which silently replaces
+# other rates with the nearest fraction that fits.
 _MAX_RATE_TERM = 10**6
 
 
@@ -51,22 +51,23 @@ class VideoWriter:
             for frame in frames:
                 video.write(frame)
 
-    By default, the video is H.264 High, yuv420p, bt709, which every browser plays. The
-    same frames give the same file, byte for byte, on any CPU, with the same ffmpeg.
+    By default, the video is H.264 (High profile, yuv420p, bt709), which every browser
+    plays. With the same ffmpeg, the same frames give the same file, byte for byte, on
+    any CPU.
 
     An existing file is replaced when the new one is complete. If no frame is written,
-    there is no file and no error. An exception that leaves `with` finishes the file
-    with the frames so far, unless the encoder failed. Use a writer on one thread at a
-    time.
+    there is no file and no error. If an exception leaves the `with` block, the file is
+    finished with the frames so far, unless the encoder failed. Use a writer on one
+    thread at a time.
 
     Args:
         path: the file: `.mp4`, `.mov`, `.mkv`, `.webm` or `.avi`.
-        fps: frames per second. A fraction is exact in the file; a float becomes the
-            simplest fraction within a millionth.
-        crf: quality, from 0 (largest file) to 51 (worst). None is 18, which looks like
-            the original. Below 1, x264 is lossless except for colour conversion, and
-            browsers do not play it.
-        codec: ffmpeg's name of an encoder. None is libx264. Lossless RGB encoders
+        fps: frames per second. A fraction is stored exactly; a float becomes the
+            nearest fraction with a numerator and denominator of at most a million.
+        crf: quality, from 0 (largest file) to 51 (worst). None means 18, which looks
+            like the original. Below 1, x264 is lossless except for colour conversion,
+            but browsers cannot play the file.
+        codec: ffmpeg's name for an encoder. None means libx264. Lossless RGB encoders
             (`ffv1` and `libx264rgb` in `.mkv`) keep every pixel.
         frame_hashes: whether to write the SHA-256 of each frame to a `.framehash` file
             with the video's name.
@@ -75,9 +76,9 @@ class VideoWriter:
     Attributes:
         path: the file.
         fps: the rate as a `Fraction`.
-        frame_count: frames written so far.
+        frame_count: number of frames written so far.
         closed: whether the file is finished or abandoned.
-        result: the finished file, once closed. None without frames.
+        result: the finished file; None before `close`, or if there were no frames.
         temporary: path of the file until it is complete.
         temporary_hashes: path of the `.framehash` file until it is complete, if
             requested.
@@ -121,26 +122,28 @@ class VideoWriter:
         self.closed = False
 
     def write(self, frame: Frame) -> None:
-        """Add a `(height, width, 3) uint8` frame; the first one fixes the size.
+        """Add a `(height, width, 3) uint8` frame; all must have the first one's size.
 
         The frame is copied. The call waits while the encoder is behind.
 
         Raises:
             InvalidFrame: the frame is not such an array, or has a different size. The
                 writer stays usable.
-            ClosedError: the writer was closed or aborted, or this is a forked process.
+            ClosedError: the writer was closed or aborted, or belongs to a process that
+                this one was forked from.
             EncoderError: ffmpeg failed or died. No file is left.
         """
         encoding = self._encoding
         if self.closed or (encoding is not None and encoding.is_ending):
             raise ClosedError(
-                f"The video {self.path} is closed after {self.frame_count} frames, and "
-                "a file cannot be reopened: write to a new one."
+                f"The video {self.path} was closed after {self.frame_count} frames, "
+                "and a video cannot be reopened: create a new VideoWriter."
             )
         if self._was_forked():
             raise ClosedError(
                 f"The video {self.path} belongs to process {self._process_id}, from "
-                "which this one was forked: write it there, or write a new one here."
+                "which this one was forked: write to it there, or create a new "
+                "VideoWriter here."
             )
         checked = check_frame(frame, size=None if encoding is None else encoding.size)
         height, width = check_size(*checked.shape[:2])
@@ -189,14 +192,15 @@ class VideoWriter:
         )
 
     def close(self) -> None:
-        """Finish the file: encode the rest, count the frames, and rename it.
+        """Finish the file: encode the rest, count the frames, and rename the file.
 
-        Idempotent. If Ctrl-C interrupts it, no more frames are accepted, and another
-        call continues.
+        Idempotent. If Ctrl-C interrupts this method, no more frames are accepted, and
+        another call continues.
 
         Raises:
             EncoderError: ffmpeg failed or died. No file is left.
-            FrameCountError: the file does not hold the frames that were written.
+            FrameCountError: the file does not contain exactly the frames that were
+                written.
         """
         if self.closed:
             return
@@ -240,7 +244,7 @@ class VideoWriter:
     def __del__(self) -> None:
         if self.closed or self._encoding is None or self._was_forked():
             return
-        # A finaliser must not wait. The thread encodes the queued frames, and ffmpeg
+        # A finalizer must not wait. The thread encodes the queued frames, and ffmpeg
         # finishes its file under the temporary name.
         self.leave()
         warnings.warn(
@@ -259,7 +263,7 @@ class VideoWriter:
         )
 
     def _was_forked(self) -> bool:
-        """Return whether this is a forked child's copy: the video is the parent's."""
+        """Return whether this is a forked child, whose parent owns the video."""
         return os.getpid() != self._process_id
 
 
@@ -276,26 +280,26 @@ def save_video(
 ) -> None:
     """Write videos of one episode's frames, like Gymnasium's `save_video`.
 
-    `<prefix>-episode-<episode_index>.mp4` holds the episode if `episode_trigger`
+    `<prefix>-episode-<episode_index>.mp4` contains the episode if `episode_trigger`
     selects it. `<prefix>-step-<n>.mp4` starts with the frame of step n if
-    `step_trigger` selects it. The first frame belongs to the reset, the second to step
-    `step_starting_index`. Every frame is in the file.
+    `step_trigger` selects that step. The first frame belongs to the reset, and the
+    second to step `step_starting_index`. No frame is left out of a file.
 
-    `frames` can be any iterable. With only an episode trigger it is streamed, up to
-    `video_length`, and not read if no video is due. With a step trigger, whose videos
-    can overlap, all frames are held in memory. An existing video is replaced when the
-    new one is complete. Without frames, no file is written. If `frames` raises, the
-    frames so far are kept.
+    `frames` can be any iterable. With only an episode trigger, it is streamed up to
+    `video_length`, and it is not read at all if no video is due. With a step trigger,
+    videos can overlap, so all frames are held in memory. An existing video is replaced
+    when the new one is complete. If there are no frames, no file is written. If
+    `frames` raises an error, the frames so far are kept.
 
     Args:
         frames: `(height, width, 3) uint8` arrays.
-        video_folder: the directory; created if necessary.
-        episode_trigger: returns whether the episode with a given number gets a video.
-            If both triggers are None, episodes 0, 1, 8, 27 ... 729 and every 1000th do.
-        step_trigger: returns whether a video starts at a given step.
-        video_length: maximum number of frames in a video. None means all that follow.
-        video_length: most frames of a video. None is all that follow.
-        name_prefix: start of the file names.
+        video_folder: the directory, which is created if necessary.
+        episode_trigger: a function from an episode's number to whether the episode gets
+            a video. If both triggers are None, episodes 0, 1, 8, 27 ... 729 and every
+            1000th episode get one.
+        step_trigger: a function from a step's number to whether a video starts there.
+        video_length: maximum number of frames in a video; None for no limit.
+        name_prefix: the beginning of the file names.
         episode_index: the episode's number.
         step_starting_index: the number of the episode's first step.
         **kwargs: `fps`, which is required, and other options of `VideoWriter`.
@@ -304,7 +308,7 @@ def save_video(
         InvalidArgument: `fps` is missing, an option is unknown, or a value is invalid.
         DirectoryNotWritable: `video_folder` cannot be created or written to.
         InvalidFrame: a frame has the wrong shape or dtype.
-        EncoderError: ffmpeg failed or died, see `VideoWriter`.
+        EncoderError: ffmpeg failed or died; see `VideoWriter`.
     """
     _check_options(kwargs, video_length)
     if episode_trigger is None and step_trigger is None:
@@ -351,7 +355,7 @@ def _check_options(options: dict[str, Any], video_length: object) -> None:
     is_number = isinstance(video_length, int) and not isinstance(video_length, bool)
     if video_length is not None and (not is_number or video_length <= 0):  # type: ignore[operator]  # is_number
         raise InvalidArgument(
-            "video_length must be a positive number of frames, or None for all, got "
+            "video_length must be a positive number of frames, or None for all, not "
             f"{video_length!r}."
         )
 
@@ -361,11 +365,12 @@ def _check_path(path: str | os.PathLike[str]) -> Path:
         checked = Path(os.fspath(path))
     except TypeError as error:
         raise InvalidArgument(
-            f"path must be the name of a file, got {path!r}."
+            f"path must be the name of a file, not {path!r}."
         ) from error
     if checked.suffix.lower() not in MUXERS:
         raise InvalidArgument(
-            f"A video's name must end in {', '.join(MUXERS)}, got {str(path)!r}."
+            f"A video's name must end in {' or '.join(MUXERS)}, but this name is "
+            f"{str(path)!r}."
         )
     if checked.is_dir():
         raise InvalidArgument(f"{checked} is a directory; path must be a file's name.")
@@ -381,7 +386,7 @@ def _check_path(path: str | os.PathLike[str]) -> Path:
 
 
 def _check_fps(fps: float | Fraction) -> Fraction:
-    """Return the rate, rounding a float to the nearest rate that the file can hold."""
+    """Return the rate. A float is rounded to the nearest rate that a file can store."""
     rate = to_rate(fps)
     nearest = (
         rate.limit_denominator(_MAX_RATE_TERM)
@@ -390,7 +395,7 @@ def _check_fps(fps: float | Fraction) -> Fraction:
     )
     if nearest != rate and isinstance(fps, numbers.Rational):
         raise InvalidArgument(
-            f"fps={rate} cannot be stored exactly: numerator and denominator can be at "
-            f"most {_MAX_RATE_TERM}. The nearest valid rate is {nearest}."
+            f"fps={rate} cannot be stored exactly: its numerator and denominator may "
+            f"be at most {_MAX_RATE_TERM}. The nearest valid rate is {nearest}."
         )
     return nearest

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """OpenGL without a screen: choice of the backend, and diagnosis of failures.
 
-Nothing here imports mujoco or OpenGL; tests that need them run in child processes.
+This package imports neither mujoco nor OpenGL; tests that need them run in child
+processes.
 """
 
 from __future__ import annotations

@@ -9,12 +9,12 @@ from collections.abc import Mapping
 from ..errors import GLError, UnknownName
 
 # In the order in which they are tested: EGL needs no display and can use a GPU, OSMesa
-# needs no display, GLFW needs one.
+# needs no display, and GLFW needs one.
 BACKENDS = ("egl", "osmesa", "glfw")
 
 _KIND = "OpenGL backend"
 _SYNONYMS = {"glx": "glfw"}
-# Other values that mujoco accepts. Those of `_ON` do not name a backend.
+# Other values that mujoco accepts. The values in `_ON` do not name a backend.
 _ON = frozenset({"", "enable", "enabled", "on", "true", "1"})
 _OFF = frozenset({"disable", "disabled", "off", "false", "0"})
 
@@ -22,7 +22,7 @@ _OFF = frozenset({"disable", "disabled", "off", "false", "0"})
 def backend_name(text: object) -> str:
     """Return the backend that `text` names, in the spelling that all programs accept.
 
-    Case and surrounding whitespace are ignored: mujoco accepts `EGL`, Gymnasium and
+    Case and surrounding whitespace are ignored: mujoco accepts `EGL`, but Gymnasium and
     dm_control do not.
 
     Raises:
@@ -59,8 +59,8 @@ def backend_in_environment(environ: Mapping[str, str] | None = None) -> str | No
             _KIND,
             text,
             BACKENDS,
-            hint="The environment variable MUJOCO_GL names it: set it to one of "
-            "these, or unset it and let mjrec try them.",
+            hint="This name comes from the environment variable MUJOCO_GL: set it to "
+            "one of these, or unset it and let mjrec try them.",
         )
     return name
 
@@ -82,7 +82,7 @@ def environment_for(backend: str, environ: Mapping[str, str]) -> dict[str, str]:
     if backend in ("egl", "osmesa"):
         changed["PYOPENGL_PLATFORM"] = backend
     elif changed.get("PYOPENGL_PLATFORM", "").lower() == "osmesa":
-        # GLFW's contexts are GLX's or EGL's, never OSMesa's.
+        # GLFW creates its contexts with GLX or EGL, never with OSMesa.
         del changed["PYOPENGL_PLATFORM"]
     return changed
 

@@ -33,9 +33,9 @@ class Choice:
 
     Attributes:
         backend: the backend's name.
-        reason: why it was chosen.
-        probe: the result of its test.
-        rejected: the backends that were considered before, and why they were rejected.
+        reason: why the backend was chosen.
+        probe: the result of the backend's test.
+        rejected: the backends that were tried first, and why they were rejected.
     """
 
     backend: str
@@ -45,17 +45,17 @@ class Choice:
 
 
 def use_gl(backend: str | None = None) -> str:
-    """Choose the OpenGL backend of this process and return its name.
+    """Choose the OpenGL backend for this process and return its name.
 
     The choice is `backend` if given, otherwise the environment variable `MUJOCO_GL` if
     set, otherwise the first of EGL, OSMesa and GLFW that works. A child process first
-    renders a test frame with it, which takes about a second, once per process. So a
-    returned backend works, and a backend that does not work is an error with its cause
-    and fix. To skip the test, set `MUJOCO_GL` and do not call this function.
+    renders a test frame with the backend, which takes about a second, once per process.
+    So if a backend is returned, it works. Otherwise an error gives the cause and the
+    fix. To skip the test, set `MUJOCO_GL` and do not call this function.
 
-    It sets `MUJOCO_GL` and `PYOPENGL_PLATFORM`; after an error both are unchanged. Call
-    it before anything imports mujoco, dm_control or OpenGL. If mujoco is already
-    imported, only the backend that it uses can be chosen.
+    This function sets `MUJOCO_GL` and `PYOPENGL_PLATFORM`, and changes neither if it
+    raises an error. Call it before anything imports mujoco, dm_control or OpenGL. If
+    mujoco is already imported, only the backend that it uses can be chosen.
 
     Args:
         backend: `"egl"`, `"osmesa"` or `"glfw"`, in upper or lower case. If None, mjrec
@@ -64,8 +64,9 @@ def use_gl(backend: str | None = None) -> str:
     Raises:
         UnknownName: `backend` or `MUJOCO_GL` is not the name of a backend.
         GLError: `MUJOCO_GL` turns rendering off; mujoco, dm_control or PyOpenGL was
-            imported with another backend; or neither the requested backend nor, without
-            a request, any backend works. The message has the cause and fix for each.
+            imported with another backend; the requested backend does not work; or no
+            backend was requested and none works. The message gives the cause and fix
+            for each.
     """
     choice = choose(backend)
     _log(choice)
@@ -74,7 +75,7 @@ def use_gl(backend: str | None = None) -> str:
 
 
 def backend_for_children() -> str:
-    """Return the first backend that works, for processes that render for this one.
+    """Return the first working backend, for processes that render for this one.
 
     This process's imports and its `MUJOCO_GL` do not matter.
 
@@ -136,7 +137,7 @@ def _asked_for(backend: str | None) -> tuple[str | None, str]:
 
 
 def conflict_with(backend: str) -> Diagnosis | None:
-    """Return why this process can no longer use `backend`, or None if it can."""
+    """Return the reason why this process cannot use `backend`, or None if it can."""
     for package, taken in _taken().items():
         if taken == backend or (package == "PyOpenGL" and backend == "glfw"):
             continue
@@ -150,10 +151,10 @@ def conflict_with(backend: str) -> Diagnosis | None:
 
 
 def _taken() -> dict[str, str | None]:
-    """Return the backend in use by each of the packages that are imported.
+    """Return the backend that each imported package uses, by package.
 
-    None means that a package was imported without a backend: `MUJOCO_GL` turned
-    rendering off, or importing the backend failed.
+    None means that a package was imported without a backend, because `MUJOCO_GL` turned
+    rendering off or because importing the backend failed.
     """
     taken: dict[str, str | None] = {}
     mujoco = sys.modules.get("mujoco")

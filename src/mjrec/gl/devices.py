@@ -4,8 +4,8 @@
 Schedulers assign GPUs with `CUDA_VISIBLE_DEVICES`, which EGL ignores: by default, all
 workers on a machine render on the same GPU, the first one. The EGL device of the
 assigned GPU cannot be computed, because three numberings are involved. The scheduler's
-entry is CUDA's number or a UUID; EGL has its own order; and `MUJOCO_EGL_DEVICE_ID`
-counts EGL's devices in mujoco 3, but CUDA's, if possible, in mujoco 4. So a child
+entry is CUDA's number or a UUID. EGL has its own order. `MUJOCO_EGL_DEVICE_ID` counts
+EGL's devices in mujoco 3, but CUDA's devices, if possible, in mujoco 4. So a child
 process that sees only the assigned GPU asks the driver which EGL device has a CUDA
 number. Another child process then renders, and its driver reports the device.
 """
@@ -46,7 +46,7 @@ def render_on_given_gpu(
         gpu: one entry as in `CUDA_VISIBLE_DEVICES`: a number ("3"), or the UUID of a
             GPU ("GPU-1a2b...") or of a part of one ("MIG-..."). None means the first
             entry of that variable or, if it is not set, CUDA's first GPU.
-        required: raise an error if the GPU cannot be used.
+        required: whether to raise an error if the GPU cannot be used.
 
     Returns:
         The EGL device, or None if the GPU cannot be used.
@@ -78,10 +78,10 @@ def visible_gpus(
 ) -> list[str]:
     """Return this machine's NVIDIA GPUs that can be assigned to workers.
 
-    Each is an entry for a worker's `CUDA_VISIBLE_DEVICES`. They are this process's own
-    entries or, if the variable is not set, CUDA's numbers of the GPUs whose device
-    files this process may open. A container or a job sees only its own device files,
-    and CUDA counts them from 0.
+    Each is returned as an entry for a worker's `CUDA_VISIBLE_DEVICES`. They are this
+    process's own entries or, if the variable is not set, CUDA's numbers for the GPUs
+    whose device files this process may open. A container or a job sees only its own
+    device files, and CUDA counts them from 0.
 
     Args:
         environ: the environment variables; if None, this process's.
@@ -98,8 +98,8 @@ def device_of_gpu(devices: Sequence[EglDevice], gpu: str) -> EglDevice | None:
     """Return the EGL device of a GPU, or None if it is unknown.
 
     Args:
-        devices: EGL's devices, as seen by a process that CUDA shows only that GPU. So
-            the right device is the one that has a CUDA number, no matter which.
+        devices: EGL's devices in a process in which CUDA sees only that GPU. So the
+            right device is the only one with a CUDA number, whatever the number is.
         gpu: an entry of `CUDA_VISIBLE_DEVICES`. CUDA accepts the beginning of a UUID.
     """
     named = [
@@ -125,12 +125,12 @@ def _entry(gpu: str | None) -> str:
         return entry
     raise InvalidArgument(
         f"gpu must be one entry as in {CUDA_VISIBLE_DEVICES}, a number or a UUID that "
-        f"starts with GPU- or MIG-, got {gpu!r}."
+        f"starts with GPU- or MIG-, not {gpu!r}."
     )
 
 
 def _entries(environ: Mapping[str, str]) -> list[str] | None:
-    """Return the entries of `CUDA_VISIBLE_DEVICES`; None if it is not set."""
+    """Return the entries of `CUDA_VISIBLE_DEVICES`, or None if it is not set."""
     text = environ.get(CUDA_VISIBLE_DEVICES)
     if text is None:
         return None
@@ -144,7 +144,7 @@ def _entries(environ: Mapping[str, str]) -> list[str] | None:
 
 
 def _can_be_opened(file: Path) -> bool:
-    # A cgroup's restriction shows only when opening the file.
+    # A cgroup's restriction shows only when the file is opened.
     try:
         os.close(os.open(file, os.O_RDWR | os.O_CLOEXEC))
     except OSError:
@@ -157,7 +157,8 @@ def _refuse_latecomers() -> None:
     conflict = conflict_with("egl")
     if conflict and not rendering_is_off(os.environ):
         raise GLError(f"{conflict.cause} {conflict.fix}")
-    # mujoco reads the number when it creates its first context, dm_control at import.
+    # mujoco reads the number when it creates its first context, and dm_control reads it
+    # on import.
     mujoco_draws = getattr(sys.modules.get("mujoco.egl"), "EGL_DISPLAY", None)
     dm_control = "dm_control._render.pyopengl.egl_renderer" in sys.modules
     if mujoco_draws is not None or dm_control:
@@ -169,7 +170,7 @@ def _refuse_latecomers() -> None:
 
 
 def _found(gpu: str, environ: Mapping[str, str]) -> tuple[EglDevice, int]:
-    """Return the EGL device of a GPU, and its value of `MUJOCO_EGL_DEVICE_ID`.
+    """Return a GPU's EGL device and the `MUJOCO_EGL_DEVICE_ID` that selects it.
 
     Raises:
         GLError: the GPU cannot be used for rendering.
@@ -197,12 +198,12 @@ def _found(gpu: str, environ: Mapping[str, str]) -> tuple[EglDevice, int]:
                 return used, number
     why = f"it does not work. {tried.cause} {tried.fix}".strip()
     if tried.renders:
-        why = "mujoco uses another device, whatever MUJOCO_EGL_DEVICE_ID is."
+        why = "mujoco uses a different device, whatever MUJOCO_EGL_DEVICE_ID is."
     raise GLError(f"{asked}, which is EGL's {_shown(device)}, but {why} {_DOCTOR}")
 
 
 def _device(gpu: str, environ: Mapping[str, str]) -> tuple[EglDevice | None, Probe]:
-    """Return the EGL device of a GPU, and the probe of a process that sees only it."""
+    """Return the EGL device of a GPU, and a probe that sees only that GPU."""
     alone = probe("egl", environ={**environ, CUDA_VISIBLE_DEVICES: gpu, _CHOSEN: "0"})
     device = device_of_gpu(alone.devices, gpu)
     hardware = [device for device in alone.devices if not device.software]
@@ -221,11 +222,11 @@ def _device(gpu: str, environ: Mapping[str, str]) -> tuple[EglDevice | None, Pro
 def _tries(
     device: EglDevice, gpu: str, alone: Probe, environ: Mapping[str, str]
 ) -> Iterator[tuple[int, Probe]]:
-    """Yield candidate numbers for a device in mujoco, the likeliest first.
+    """Yield mujoco's possible numbers for a device, starting with the most likely.
 
-    Each comes with its probe. For mujoco 3, the number is the index in EGL's list. For
-    mujoco 4, it is an index into `CUDA_VISIBLE_DEVICES`, the CUDA device number, or an
-    index into mujoco's own list.
+    Each number comes with its probe. For mujoco 3, the number is the index in EGL's
+    list. For mujoco 4, it is an index into `CUDA_VISIBLE_DEVICES`, the CUDA device
+    number, or an index into mujoco's own list.
     """
     if environ.get(CUDA_VISIBLE_DEVICES) == gpu:
         yield 0, alone
@@ -234,7 +235,7 @@ def _tries(
 
 
 def _lack_of_device(alone: Probe) -> str:
-    """Return why none of EGL's devices is the assigned GPU."""
+    """Return the reason why none of EGL's devices is the assigned GPU."""
     hardware = [device for device in alone.devices if not device.software]
     if not alone.devices:
         return f"EGL has no device. {alone.cause} {alone.fix}".strip()
@@ -245,7 +246,7 @@ def _lack_of_device(alone: Probe) -> str:
         )
         return f"EGL has only the CPU{on}. {way}"
     return (
-        f"none of EGL's {len(hardware)} GPUs is that one: "
+        f"none of EGL's {len(hardware)} GPUs is that GPU: "
         f"{'; '.join(map(_shown, hardware))}. Parts of a GPU (MIG) usually do not "
         f"support graphics, and GPUs that CUDA does not show cannot be found. {_DOCTOR}"
     )

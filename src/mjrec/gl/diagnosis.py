@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Diagnosis of rendering failures: from an error message to its cause and exact fix.
 
-Messages of MuJoCo and the drivers rarely name either: a missing library shows as
-`'NoneType' object has no attribute 'eglQueryString'`, a wrong environment variable as
-`module 'mujoco' has no attribute 'Renderer'`. Their meanings are listed in one table,
-`diagnosis.toml`.
+Messages from MuJoCo and the drivers rarely name either. A missing library shows up as
+`'NoneType' object has no attribute 'eglQueryString'`, and a wrong environment variable
+as `module 'mujoco' has no attribute 'Renderer'`. Their meanings are listed in one
+table, `diagnosis.toml`.
 """
 
 from __future__ import annotations

@@ -18,7 +18,7 @@ _DRM_DEVICE_FILE = 0x3233
 _DRM_RENDER_NODE_FILE = 0x3377
 _DEVICE_UUID = 0x335C
 _UUID_LENGTH = 16
-# More than enough: mujoco 3 itself asks for ten.
+# This is more than enough: mujoco 3 itself asks for ten.
 _MOST_DEVICES = 256
 
 
@@ -30,8 +30,8 @@ class EglDevice:
         index: position in EGL's list, as in `MUJOCO_EGL_DEVICE_ID` for MuJoCo 3 (and
             for MuJoCo 4 if no device has a CUDA number).
         device_file: the device file, such as `/dev/dri/renderD128`; empty if unknown.
-        cuda_id: CUDA's number of the device; None if it has none, or if
-            `CUDA_VISIBLE_DEVICES` hides it.
+        cuda_id: CUDA's number for the device; None if it has none, or if
+            `CUDA_VISIBLE_DEVICES` hides the device.
         software: whether the device is the CPU.
         in_use: whether the current context renders on the device.
         uuid: the GPU's UUID, as in `nvidia-smi -L`; empty if unknown.
@@ -46,13 +46,13 @@ class EglDevice:
 
 
 def egl_devices(*, with_cuda: bool = True) -> list[EglDevice]:
-    """Return EGL's devices, in the order of its list.
+    """Return EGL's devices, in the order in which EGL lists them.
 
-    The list is empty if EGL is not installed or cannot list its devices.
+    The result is empty if EGL is not installed or cannot list its devices.
 
     Args:
-        with_cuda: ask for CUDA's numbers. For this the driver initializes CUDA, which
-            processes that are forked afterwards can no longer use.
+        with_cuda: whether to ask for CUDA's numbers. The driver then initializes CUDA,
+            so processes that are forked afterwards can no longer use CUDA.
     """
     try:
         address_of = ctypes.CDLL("libEGL.so.1").eglGetProcAddress
@@ -62,7 +62,7 @@ def egl_devices(*, with_cuda: bool = True) -> list[EglDevice]:
     address_of.argtypes = [ctypes.c_char_p]
 
     def call(name: str, *arguments: Any, result: Any = ctypes.c_uint) -> Any:
-        """Call an EGL function; return its result, or None if it does not exist."""
+        """Call an EGL function and return its result, or None if it does not exist."""
         address = address_of(name.encode())
         if not address:
             return None

@@ -34,8 +34,8 @@ class Probe:
         gl_renderer: the renderer's name in OpenGL; empty if unknown.
         gl_vendor: the renderer's vendor.
         gl_version: the version of OpenGL, including the driver's.
-        frames_per_second: speed for a small 480x480 scene at MuJoCo's default quality;
-            None if not measured.
+        frames_per_second: rendering speed for a small scene at 480x480 pixels and
+            MuJoCo's default quality; None if not measured.
         devices: EGL's devices, if known, even if none of them works.
         cause: why the backend does not work.
         fix: what to do; empty if unknown.
@@ -61,13 +61,13 @@ class Probe:
         )
 
     def warning(self) -> str:
-        """Return a warning if the backend uses the CPU despite a GPU; usually empty."""
+        """Return a warning if the backend uses the CPU despite a GPU, otherwise ""."""
         files = gpu_device_files() if self.software else []
         if not files:
             return ""
         closed = [file for file in files if not os.access(file, os.R_OK | os.W_OK)]
         if self.backend == "osmesa":
-            way = "OSMesa always does; EGL can use the GPU."
+            way = "OSMesa always renders on the CPU, but EGL can use the GPU."
         elif closed:
             way = (
                 f"This user has no permission to open {closed[0]}: add the user to the "
@@ -99,7 +99,7 @@ def probe(
     Args:
         backend: the backend's name.
         environ: the environment variables; if None, this process's.
-        measure: measure the speed too.
+        measure: whether to measure the speed too.
         timeout: maximum time to wait for a frame, in seconds.
 
     Raises:
@@ -125,8 +125,8 @@ def probe_environment(
     """Test the backend that `environ` names in `MUJOCO_GL`, with only these variables.
 
     Args:
-        environ: the child's environment variables, none of which is corrected.
-        measure: measure the speed too.
+        environ: the child's environment variables, which are not corrected.
+        measure: whether to measure the speed too.
         timeout: maximum time to wait for a frame, in seconds.
     """
     backend = environ["MUJOCO_GL"]
@@ -135,7 +135,7 @@ def probe_environment(
     devices = tuple(EglDevice(**device) for device in facts.get("devices", ()))
     if known.get("renders"):
         return Probe(backend=backend, devices=devices, **known)
-    # For a failure that is not in the table, the output itself is given as the cause.
+    # If a failure is not in the table, the output itself is given as the cause.
     words = "\n".join(list(filter(str.strip, output.splitlines()))[-3:])
     found = diagnose(output, backend=backend, environ=environ) or Diagnosis(
         words or "The child process printed nothing.", ""
@@ -152,7 +152,7 @@ def probe_environment(
 def _ask_child(
     environ: Mapping[str, str], *, measure: bool, timeout: float
 ) -> tuple[dict[str, Any], str]:
-    """Return the facts from the child, and all text that may explain a failure."""
+    """Return the child's facts, and all text that may explain a failure."""
     facts: dict[str, Any] = {}
     is_silent = False
     try:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reading results: finding, merging and listing the files of monitors.
+"""Functions that find, list and merge the results of monitors.
 
-This needs no simulator, OpenGL or ffmpeg, and reads files of this package and of gym
+They need no simulator, OpenGL or ffmpeg, and read files from this package and from gym
 0.7.4 to 0.22.
 """
 

@@ -22,26 +22,27 @@ class Episode:
     """A completed episode. Facts that gym's files do not contain are None.
 
     Attributes:
-        episode_id: its number in the monitor's run; in gym's files, its index.
+        episode_id: the episode's number in the monitor's run, or its index in gym's
+            files.
         length: number of steps.
         reward: sum of the rewards.
         type: `"t"` for training, `"e"` for evaluation.
         start_time: wall-clock time just before the reset.
-        end_time: time of its end; wall-clock time, except in files of gym 0.21 and
-            0.22.
+        end_time: time when the episode ended; wall-clock time, except in files from gym
+            0.21 and 0.22.
         seed: the seed given to `reset`.
         options: the options given to `reset`.
         terminated: whether the task ended the episode.
         truncated: whether a limit outside the task ended the episode.
-        monitor: infix of its monitor's files.
-        video: its video, if it has one.
-        metadata: its video's metadata, if it has a video.
-        trajectory: its trajectory, if it has one. The file may not exist yet:
+        monitor: the infix of the monitor's files.
+        video: the episode's video, if it has one.
+        metadata: the video's metadata, if there is a video.
+        trajectory: the episode's trajectory, if it has one. The file may not exist yet:
             `load_trajectory` then reads the monitor's log.
-        pending: whether its video must still be rendered (`mjrec render`).
-        success: the success that the environment reported.
-        evaluation: in an evaluation, its `seed` and `episode` there, and MuJoCo's
-            `warnings`.
+        pending: whether the video must still be rendered (`mjrec render`).
+        success: whether the environment reported a success.
+        evaluation: for an episode of an evaluation, its `seed`, its number there
+            (`episode`), and MuJoCo's `warnings`.
     """
 
     episode_id: int
@@ -81,9 +82,9 @@ class Episode:
 def iter_episodes(directory: str | os.PathLike[str]) -> Iterator[Episode]:
     """Yield the completed episodes in a directory, monitor by monitor.
 
-    Monitors are ordered by infix, their episodes by end. Monitors that never closed are
-    included, from their journals. Episodes are read one by one, so memory does not
-    grow.
+    Monitors are ordered by infix, and their episodes by end time. Monitors that never
+    closed are read from their journals. Episodes are read one by one, so memory use
+    does not grow.
 
     If a journal lacks episodes that the statistics file has, the statistics file is
     used, with details from the journal. Damaged lines in a journal are skipped with a
@@ -136,12 +137,13 @@ def episodes_of(results: MonitorResults) -> Iterator[Episode]:
 
 
 def _is_every_one(results: MonitorResults, stats: StatsFile, first: int) -> bool:
-    """Return whether all started episodes were completed (numbers have no gaps)."""
+    """Return whether all episodes were completed, so that numbers have no gaps."""
     count, following = len(stats.timestamps), results.details.get("next_episode_id")
     if results.details:
         return following is not None and following - first == count
-    # gym noted a type at each reset, and numbered videos by resets. One type more than
-    # there are episodes is an unfinished last episode; two more mean resets in a row.
+    # gym noted a type at each reset, and numbered videos by resets. One more type than
+    # episodes means that the last episode is unfinished; two more mean two resets in a
+    # row.
     return len(stats.episode_types or ()) <= count + 1
 
 
@@ -174,7 +176,7 @@ def _files(results: MonitorResults, number: int) -> dict[str, Any]:
     files = results.files
     video, metadata = files.videos.get(number), files.metadata.get(number)
     trajectory = files.trajectories.get(number)
-    # Metadata without a video is left from a video that could not be created.
+    # Metadata without a video belongs to a video that could not be created.
     is_missing = trajectory is not None and video is None and metadata is None
     # A packed run may contain only the actions of an episode that was not chosen.
     packed = results.details.get("packed_episodes")

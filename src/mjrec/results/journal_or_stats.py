@@ -36,7 +36,7 @@ class MonitorResults:
     """The results of one monitor, as far as its files can be read.
 
     The journal replaces a damaged or missing manifest or statistics file, and vice
-    versa. A warning in the log names the file.
+    versa. A warning in the log names the damaged file.
 
     Args:
         files: the monitor's files.
@@ -86,7 +86,7 @@ class MonitorResults:
 
     @functools.cached_property
     def run(self) -> Run:
-        """The run, from the journal or, if the journal's start is lost, the manifest.
+        """The run from the journal, or from the manifest if the journal lost its start.
 
         Raises:
             UnreadableFile: the journal cannot be read, and there are no statistics.
@@ -116,13 +116,13 @@ class MonitorResults:
 
     @property
     def details(self) -> Mapping[str, Any]:
-        """The facts that this package adds to a manifest; empty without a manifest."""
+        """The facts that this package adds to a manifest; empty if it is missing."""
         manifest = self.manifest
         return {} if manifest is None or manifest.mjrec is None else manifest.mjrec
 
     @property
     def env_info(self) -> Mapping[str, Any] | None:
-        """The recorded environment, from manifest, journal or lock; None if unknown."""
+        """The environment in the manifest, journal or lock; None if unknown."""
         with contextlib.suppress(UnreadableFile):
             if self.manifest is not None:
                 return self.manifest.env_info
@@ -147,7 +147,7 @@ class MonitorResults:
         return saved is None or self.run.count > len(saved.timestamps)
 
     def stats(self) -> StatsFile:
-        """Return the statistics from the journal or the file with more episodes.
+        """Return the statistics from the journal or the file, whichever has more.
 
         Raises:
             UnreadableFile: neither can be read.
@@ -169,7 +169,7 @@ class MonitorResults:
 
 
 def locked_run(path: Path) -> Mapping[str, Any]:
-    """Return the facts about a monitor's run in its lock.
+    """Return the facts about a monitor's run that its lock contains.
 
     Raises:
         OSError, ValueError: the lock cannot be read.
@@ -185,7 +185,7 @@ def locked_run(path: Path) -> Mapping[str, Any]:
 
 def _stats_of(entries: list[JournalEntry], saved: StatsFile | None) -> StatsFile:
     """Return the statistics of a journal's episodes."""
-    # Prefer the saved time: the episode of the first reset may never have ended.
+    # Prefer the saved time, because the first episode may never have ended.
     start = None if saved is None else saved.initial_reset_timestamp
     if start is None:
         starts = (entry.start_time for entry in entries)

@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Statistics files and manifests, written from a monitor's journal and files.
+"""Functions that write statistics files and manifests from a monitor's other files.
 
-Both are written only here, and only if their content changes, at these moments:
+Only this module writes them, and only if their content changes, at these moments:
 
 - A monitor closes or, with `write_upon_reset`, begins an episode (`recorder.recorder`).
 - A process has rendered pending videos (`rendering.finish`).
 - A process has recovered a dead monitor's files (`rendering.killed_monitor`).
 - An evaluation has chosen its videos (`rendering.chosen_videos`).
 
-While a monitor is open, no other process writes them.
+While a monitor is open, no other process writes its files.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ class Written:
         stats: the current statistics; None if they cannot be recovered.
         is_new_manifest: whether the manifest had to be written.
         is_new_stats: whether the statistics had to be written; always False for a
-            monitor, which writes its own.
+            monitor, which passes its own statistics.
     """
 
     manifest: Manifest
@@ -99,7 +99,7 @@ def update_manifests(directory: Path) -> None:
         infix = Infix.parse(infix_of(path.name) or "")
         if infix is not None and is_manifest(path.name):
             try:
-                # Other manifests are up to date; gym's do not have this key.
+                # Other manifests are up to date, and gym's manifests lack this key.
                 if (read_manifest(path).mjrec or {}).get("pending"):
                     write_manifest_and_stats(directory, infix)
             except UnreadableFile as error:
@@ -122,13 +122,13 @@ def write_manifest_and_stats(
         directory: the monitor directory.
         infix: the monitor's infix.
         run: the monitor's run; if None, it is read from the journal.
-        stats: the monitor's statistics; if None, those of the journal or of the
+        stats: the monitor's statistics; if None, they are read from the journal or the
             statistics file, whichever has more episodes.
         is_own: whether the caller is the monitor or holds its lock. No other process
             changes the manifest of an open monitor.
 
     Returns:
-        The current manifest and statistics; None if the monitor is open.
+        The current manifest and statistics, or None if the monitor is open.
 
     Raises:
         UnreadableFile: the journal or manifest is damaged, and nothing can replace it.
@@ -143,7 +143,7 @@ def write_manifest_and_stats(
     with contextlib.nullcontext() if run else manifest_lock(directory, infix):
         if not is_own and is_locked(directory / lock_name(infix)):
             return None
-        # By name, because a folder may contain the files of thousands of monitors.
+        # Find files by name, because a folder may contain thousands of monitors' files.
         names = (manifest_name(infix), name, journal_name(infix))
         paths = [directory / each for each in names if (directory / each).exists()]
         results = MonitorResults(MonitorFiles(str(infix), paths))
@@ -165,7 +165,7 @@ def write_manifest_and_stats(
 
 
 def manifest_lock(directory: Path, infix: Infix) -> Lock:
-    """Return the lock for writing a manifest, or a closed monitor's journal.
+    """Wait for the lock to write a manifest or a closed monitor's journal.
 
     Raises:
         DirectoryNotWritable: no lock can be created in the directory.
@@ -179,7 +179,7 @@ def _manifest(directory: Path, infix: Infix, run: Run, *, stats_name: str) -> Ma
     keep, name, chosen = _keep(run), run.facts.get("schedule"), set(run.chosen)
     if keep is not None:
         name = f"keep:{keep.get('rule')}"
-        # A killed process had not made its choice: existing videos are candidates.
+        # A killed process did not make its choice, so existing videos are candidates.
         names = [*(video for video, _ in finished), *broken]
         numbers = [*map(episode_of, names), *(e["episode_id"] for e in pending)]
         chosen.update(number for number in numbers if number is not None)
@@ -207,7 +207,7 @@ def _manifest(directory: Path, infix: Infix, run: Run, *, stats_name: str) -> Ma
 
 
 def _keep(run: Run) -> dict[str, Any] | None:
-    """Return the facts about the choice of kept videos; None if all are kept."""
+    """Return the facts about the choice of videos to keep, or None if all are kept."""
     if run.keep is not None:
         return dict(run.keep)
     if run.facts.get("keep") is None:
@@ -223,10 +223,10 @@ def _keep(run: Run) -> dict[str, Any] | None:
 def finished_and_broken(
     directory: Path, infix: Infix | str, run: Run
 ) -> tuple[list[tuple[str, str]], list[str]]:
-    """Return pairs of finished videos and their metadata, and metadata of broken ones.
+    """Return finished videos with their metadata, and the metadata of broken videos.
 
     Videos from further cameras exist once the first camera's video does, because its
-    metadata is written last. A vector environment's tiled video does not depend on it.
+    metadata is written last. A vector environment's tiled video is independent of that.
     """
     names = {f"{video_prefix(infix, number)}.mp4" for number in run.filmed}
     finished: set[tuple[str, str]] = set()
@@ -283,5 +283,5 @@ def _is_recorded(directory: Path, entry: Mapping[str, Any]) -> bool:
     try:
         return is_finished(path) or is_in_flight(path)
     except UnreadableFile:
-        # The unreadable list may contain it.
+        # The unreadable journal may list this recording.
         return True

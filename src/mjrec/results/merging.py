@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Merging of all monitors' results in a directory by time, as gym does."""
+"""Functions that merge the results of all monitors in a directory, as gym does."""
 
 from __future__ import annotations
 
@@ -35,12 +35,12 @@ class MergedStats(NamedTuple):
         initial_reset_timestamps: start time of each file's first reset; None if there
             was no reset.
         timestamps: end time of each episode.
-        episode_lengths: number of steps of each episode.
-        episode_rewards: sum of the rewards of each episode.
+        episode_lengths: number of steps in each episode.
+        episode_rewards: sum of the rewards in each episode.
         episode_types: `"t"` or `"e"` for each episode; None if no file with episodes
             has types.
-        initial_reset_timestamp: the earliest first reset of the files with episodes; 0
-            if there is none.
+        initial_reset_timestamp: time of the earliest first reset in the files with
+            episodes; 0 if there is none.
     """
 
     data_sources: list[int]
@@ -62,16 +62,17 @@ def load_results(directory: str | os.PathLike[str]) -> dict[str, Any] | None:
     contains pairs of video path and metadata path.
 
     For a monitor that never closed (killed, or still open), the episodes in its journal
-    are used if there are more than in its statistics file. Without a manifest, the
-    journal's path is listed in `manifests`, and videos are those on disk that are not
-    broken. Damaged lines in a journal are skipped with a warning.
+    are used if there are more than in its statistics file. If its manifest is missing,
+    `manifests` lists the journal's path instead, and `videos` lists the videos on disk
+    that are not broken. Damaged lines in a journal are skipped with a warning.
 
-    If monitors recorded different environments or versions, there is a warning, and
-    `env_info` is that of the newest one. Missing videos are left out with a warning.
+    If monitors recorded different environments or versions, a warning is logged, and
+    `env_info` comes from the newest monitor. Missing videos are left out with a
+    warning.
 
     Returns:
-        The results. None, with an error in the log, if the directory does not exist or
-        contains neither a manifest nor a journal.
+        The results, or None if the directory does not exist or contains neither a
+        manifest nor a journal. In that case, an error is logged.
 
     Raises:
         UnreadableFile: a manifest or statistics file is missing or damaged, and there
@@ -151,7 +152,7 @@ def _merge(files: Sequence[StatsFile]) -> MergedStats:
 
 def _rows(source: int, stats: StatsFile) -> Iterable[tuple[Any, ...]]:
     # In files without types, every episode is a training episode. gym noted a type at
-    # each reset, even for episodes that never ended, so there may be more types.
+    # each reset, even for episodes that never ended, so there may be too many types.
     types = (
         itertools.repeat("t") if stats.episode_types is None else stats.episode_types
     )
@@ -166,7 +167,7 @@ def _rows(source: int, stats: StatsFile) -> Iterable[tuple[Any, ...]]:
 
 
 def _env_info(directory: Path, monitors: Sequence[_Kept]) -> dict[str, Any]:
-    # A killed monitor may have left no file that contains it.
+    # A killed monitor may have left no file that contains its environment.
     known = [each for each in monitors if each.env_info is not None]
     if not known:
         return {"gym_version": GYM_VERSION}
@@ -177,7 +178,7 @@ def _env_info(directory: Path, monitors: Sequence[_Kept]) -> dict[str, Any]:
     if len(values) > 1:
         logger.warning(
             "The monitors in %s recorded different environments or versions: %s. Their "
-            "results are merged; env_info is that of %s.",
+            "results are merged, and env_info is taken from %s.",
             directory,
             "; ".join(f"{Path(p[0]).name} has {value}" for value, p in values.items()),
             Path(newest.path).name,
@@ -199,7 +200,7 @@ def _videos(directory: Path, monitors: Sequence[_Kept]) -> list[tuple[str, str]]
     gone = [video.name for video, _ in listed if not video.is_file()]
     if gone:
         logger.warning(
-            "%d of %d videos in the manifests in %s are missing and left out: %s",
+            "%d of the %d videos listed in %s are missing and were left out: %s",
             len(gone),
             len(listed),
             directory,
@@ -209,7 +210,7 @@ def _videos(directory: Path, monitors: Sequence[_Kept]) -> list[tuple[str, str]]
 
 
 def _names_of_videos(results: MonitorResults) -> list[tuple[str, str]]:
-    """Return the videos that the manifest lists or, if outdated, those on disk."""
+    """Return the videos in the manifest, or those on disk if it is outdated."""
     manifest, journal = results.manifest, results.files.journal
     if manifest is not None and not results.is_behind:
         return list(dict.fromkeys(manifest.videos))

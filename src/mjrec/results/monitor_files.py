@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Finding, sorting and removing a directory's files, monitor by monitor."""
+"""Functions that find, sort and remove a directory's files, monitor by monitor."""
 
 from __future__ import annotations
 
@@ -33,9 +33,9 @@ class MonitorFiles:
     """The files of one monitor.
 
     Args:
-        infix: the infix that their names share.
+        infix: the infix that the files' names share.
         paths: the files.
-        in_flight: the files that recordings in progress will become.
+        in_flight: the files that the recordings in flight will become.
 
     Attributes:
         infix: the infix that the files' names share.
@@ -43,11 +43,11 @@ class MonitorFiles:
         manifest: the manifest, if it exists.
         stats: the statistics file, if it exists.
         journal: the journal, if it exists.
-        lock: the lock that claims the infix, if it exists; a killed monitor leaves it.
+        lock: the lock that claims the infix, if it exists; a killed monitor leaves one.
         videos: the videos, by episode number.
         metadata: the videos' metadata, by episode number.
         trajectories: the trajectories, by episode number, including those that are in
-            progress or in a bundle.
+            flight or in a bundle.
         logs: the row logs; a log is included as long as one of its files remains.
         last_episode_id: the highest episode number in a file name, including unfinished
             files; -1 if there is none.
@@ -83,7 +83,7 @@ class MonitorFiles:
 
     def _sort_in(self, path: Path) -> None:
         number = episode_of(path.name)
-        # The name may be a stranger's, with any number of digits.
+        # The name is untrusted and may have any number of digits.
         if number is not None and number < MOST_EPISODES:
             self.last_episode_id = max(self.last_episode_id, number)
         video = VideoName.parse(path.name)
@@ -114,8 +114,8 @@ class MonitorFiles:
 def monitors_of(directory: Path) -> list[MonitorFiles]:
     """Return each monitor's files, including hidden ones, sorted by infix.
 
-    Trajectories include the files that recordings in progress will become. Monitors
-    that have only a lock or an unfinished file are included.
+    Trajectories include the files that recordings in flight will become. Monitors that
+    have only a lock or an unfinished file are included.
     """
     files, in_flight = (
         _by_infix(iter_monitor_files(directory, hidden=True)),
@@ -129,8 +129,8 @@ def monitors_of(directory: Path) -> list[MonitorFiles]:
 
 def files_of(directory: Path, infix: Infix) -> MonitorFiles:
     """Return the current files of one monitor, including hidden ones."""
-    # Test for the infix first: all names in the directory are compared, once for each
-    # dead monitor.
+    # Test for the infix first, because all names in the directory are compared again
+    # for each dead monitor.
     own = f".{infix}."
     names = [n for n in names_in(directory) if own in n and infix_of(n) == str(infix)]
     paths = [path for n in sorted(names) if (path := directory / n).is_file()]
@@ -184,8 +184,8 @@ def detect_monitor_files(directory: str | os.PathLike[str]) -> list[str]:
 def clear_monitor_files(directory: str | os.PathLike[str]) -> None:
     """Remove the files of all monitors in `directory`, including unfinished ones.
 
-    Also removes links to their videos (`rl-video-episode-27.mp4`), but nothing else: no
-    directory, and no other file with a similar name.
+    Links to their videos (`rl-video-episode-27.mp4`) are removed too. Directories and
+    other files with similar names are kept.
 
     Raises:
         DirectoryInUse: a monitor in the directory is open; nothing was removed.
@@ -217,7 +217,7 @@ def _second_names(directory: Path, paths: Iterable[Path]) -> list[Path]:
 
 
 def _file(path: Path, *, follow: bool) -> tuple[int, int] | None:
-    """Return the identity of the file at a path; None if it does not exist."""
+    """Return the identity of the file at a path, or None if it does not exist."""
     try:
         stat = path.stat(follow_symlinks=follow)
     except OSError:

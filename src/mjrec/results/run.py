@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The state of a run, built from the events in its journal.
 
-The monitor adds each event to its `Run` when it writes the event to the journal; other
-processes read the same events from there. So results and manifests are based on the
-same facts, whether they are created during the run or years later.
+The monitor adds each event to its `Run` when it writes the event to the journal, and
+other processes read the same events from the journal. So results and manifests are
+based on the same facts, whether they are created during the run or years later.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class Run:
             name of its first part.
         faults: the parts of the run that could not be recorded.
         keep: the latest choice of the videos to keep; None before the first choice.
-        dropped: episodes whose video was dropped, although their trajectory is kept.
+        dropped: the episodes whose video was dropped but whose trajectory is kept.
         recovered: whether another process has recovered the run.
     """
 
@@ -74,7 +74,7 @@ class Run:
 
     @classmethod
     def of_manifest(cls, manifest: Manifest) -> Run:
-        """Rebuild a run from its manifest, when the journal is lost."""
+        """Rebuild a run from its manifest if the journal is lost."""
         details = manifest.mjrec or {}
         schedule, keep = details.get("schedule") or {}, details.get("keep")
         recorded = schedule.get("recorded") or ()
@@ -124,7 +124,7 @@ class Run:
         self._add(entry.episode_id, entry.chosen, entry.recording)
 
     def note(self, kind: str, facts: Any) -> None:
-        """Add any other event; an invalid event is ignored."""
+        """Add any other event. Invalid events are ignored."""
         match kind, facts:
             case "run", dict():
                 self.facts = facts
@@ -144,7 +144,7 @@ class Run:
             case "keep", dict():
                 self.keep = facts
                 if facts.get("scope") == EVALUATION:
-                    # These were chosen only after they had ended.
+                    # These episodes were chosen only after they had ended.
                     for number in facts.get("recorded") or ():
                         self._add(number, None, facts.get("recording"))
             case "closed", {"next_episode_id": int(following)}:

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Everything that imports mujoco."""
+"""The modules that import mujoco."""

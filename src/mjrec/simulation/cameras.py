@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Cameras, given by name, by number or as an `MjvCamera`, and the cameras of a model.
 
-Every function takes MuJoCo's own objects or wrappers that hold one as `.ptr`, as
-dm_control's do.
+Every function takes MuJoCo's own objects or wrappers of them. A wrapper has the
+original object as `.ptr`, as in dm_control.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _TRAVELLING_JOINTS = (
 
 
 def raw_model(model: Any) -> mujoco.MjModel:
-    """Return the `mujoco.MjModel` that `model` is or holds as `.ptr`.
+    """Return the `mujoco.MjModel` that `model` is or wraps.
 
     Raises:
         InvalidArgument: `model` is neither a model nor a wrapper of one.
@@ -40,7 +40,7 @@ def raw_model(model: Any) -> mujoco.MjModel:
 
 
 def raw_data(data: Any) -> mujoco.MjData:
-    """Return the `mujoco.MjData` that `data` is or holds as `.ptr`.
+    """Return the `mujoco.MjData` that `data` is or wraps.
 
     Raises:
         InvalidArgument: `data` is neither an `MjData` nor a wrapper of one.
@@ -49,14 +49,14 @@ def raw_data(data: Any) -> mujoco.MjData:
 
 
 def camera_names(model: Any) -> list[str]:
-    """Return the names of the model's cameras in order, leaving out unnamed ones."""
+    """Return the names of the model's cameras in order, without unnamed cameras."""
     model = raw_model(model)
     names = (model.camera(index).name for index in range(model.ncam))
     return [name for name in names if name]
 
 
 def resolve_camera(model: Any, camera: Camera | Mapping[str, Any]) -> mujoco.MjvCamera:
-    """Return a camera, ready for `mjv_updateScene`.
+    """Return a camera that is ready for `mjv_updateScene`.
 
     Args:
         model: the model that the camera belongs to.
@@ -66,10 +66,10 @@ def resolve_camera(model: Any, camera: Camera | Mapping[str, Any]) -> mujoco.Mjv
             an `MjvCamera`, which is returned unchanged.
 
     Raises:
-        UnknownName: the model has no camera of that name, or `MjvCamera` has no such
+        UnknownName: the model has no camera with that name, or `MjvCamera` has no such
             member.
-        InvalidArgument: the model has no camera of that number, `camera` has the wrong
-            type, or its members refer to something that is not in the model.
+        InvalidArgument: the model has no camera with that number, `camera` has the
+            wrong type, or its members refer to something that is not in the model.
     """
     model = raw_model(model)
     if isinstance(camera, mujoco.MjvCamera):
@@ -93,7 +93,7 @@ def resolve_camera(model: Any, camera: Camera | Mapping[str, Any]) -> mujoco.Mjv
 
 
 def check_camera(model: mujoco.MjModel, camera: mujoco.MjvCamera) -> None:
-    """Check that the body or camera that a camera is attached to is in the model.
+    """Check that the model has the body or the fixed camera that a camera refers to.
 
     Raises:
         InvalidArgument: the model does not have it, or the camera's type is invalid.
@@ -111,34 +111,34 @@ def check_camera(model: mujoco.MjModel, camera: mujoco.MjvCamera) -> None:
         return
     if kind not in numbered:
         raise InvalidArgument(
-            f"A camera's type is free (0), tracking (1) or fixed (2), got {kind}."
+            f"A camera's type must be free (0), tracking (1) or fixed (2), not {kind}."
         )
     what, count = numbered[kind]
     if not 0 <= (number := getattr(camera, what)) < count:
         raise InvalidArgument(
-            f"A camera's {what} is {number}, but this model has {count} of these. Use "
-            f"0 to {count - 1}."
+            f"A camera's {what} must be from 0 to {count - 1} in this model, but it is "
+            f"{number}."
         )
 
 
 def is_tracking(camera: object) -> bool:
-    """Return whether a camera moves part of the way to a body in each frame."""
+    """Return whether a camera moves part of the way toward a body in each frame."""
     tracking = int(mujoco.mjtCamera.mjCAMERA_TRACKING)
     return isinstance(camera, mujoco.MjvCamera) and int(camera.type) == tracking
 
 
 def tracking_camera(model: Any) -> str | int | None:
-    """Return the camera of the model that follows its robot, if it has one.
+    """Return the camera in the model that follows the robot, if there is one.
 
-    This is the first camera that follows the centre of mass of a body's subtree
-    (`mode="trackcom"`). If there is none, it is the first that follows a body
-    (`mode="track"`) of something that can travel, because a free or sliding joint
+    This is the first camera that follows the center of mass of a body's subtree
+    (`mode="trackcom"`). If there is no such camera, it is the first one that follows a
+    body (`mode="track"`) of a robot that can travel, because a free or sliding joint
     connects it to the world. An arm with a fixed base cannot travel, and a camera that
     follows its hand is a close-up.
 
     Returns:
-        The camera's name, or its number if unnamed; None if no camera follows the
-        robot.
+        The camera's name, or its number if it has no name. None if no camera follows
+        the robot.
     """
     model = raw_model(model)
     modes = model.cam_mode.tolist()
@@ -153,13 +153,15 @@ def tracking_camera(model: Any) -> str | int | None:
 
 
 def default_camera(model: Any) -> str | int:
-    """Return the camera that follows the robot, or the first one, or the free one.
+    """Return the camera to use by default.
 
-    Robots leave the frame of a camera that does not follow them. If no camera follows,
-    the author's first camera suits the scene better than MuJoCo's free one.
+    This is the camera that follows the robot, because robots leave the frame of any
+    other camera. If no camera follows the robot, it is the model's first camera, which
+    suits the scene better than MuJoCo's free camera. If the model has no cameras, it is
+    the free camera.
 
     Returns:
-        The camera's name, or its number if unnamed; -1 is the free camera.
+        The camera's name, or its number if it has no name. -1 means the free camera.
     """
     tracking = tracking_camera(model)
     if tracking is not None:
@@ -200,7 +202,7 @@ def _name_of(model: mujoco.MjModel, number: int) -> str | int:
 
 
 def has_infinite_plane(model: mujoco.MjModel) -> bool:
-    """Return whether the model has an infinite plane, drawn around the cameras."""
+    """Return whether the model has an infinite plane, which follows the cameras."""
     planes = model.geom_size[model.geom_type == _PLANE]
     return bool((planes[:, :2] <= 0).any())
 
@@ -216,7 +218,7 @@ def _unwrapped(holder: object, kind: type) -> Any:
         if isinstance(candidate, kind):
             return candidate
     raise InvalidArgument(
-        f"Expected a mujoco.{kind.__name__} or dm_control's wrapper of one, got "
+        f"This must be a mujoco.{kind.__name__} or dm_control's wrapper of one, not "
         f"{type(holder).__module__}.{type(holder).__qualname__}."
     )
 
@@ -227,12 +229,12 @@ def _camera_index(model: mujoco.MjModel, camera: object) -> int:
         # An empty name would match the first unnamed camera.
         index = mujoco.mj_name2id(model, kind, camera) if camera else -1
         if index < 0:
-            hint = "Or give -1, the free camera."
+            hint = "Or use -1 for the free camera."
             raise UnknownName("camera", camera, camera_names(model), hint=hint)
         return int(index)
     if isinstance(camera, bool) or not isinstance(camera, int | np.integer):
         raise InvalidArgument(
-            "A camera must be a name, a number or a mujoco.MjvCamera, got "
+            "A camera must be a name, a number or a mujoco.MjvCamera, not "
             f"{camera!r} of type {type(camera).__name__}."
         )
     if not FREE_CAMERA <= camera < model.ncam:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Capturing the states of the MuJoCo simulation inside an environment."""
+"""The capture of states from the MuJoCo simulation inside an environment."""
 
 from __future__ import annotations
 
@@ -48,14 +48,15 @@ class EpisodeStart:
         model: the stored model's facts, for the trajectory.
         scene: the scene's facts, for the trajectory; None without snapshots.
         model_fields: the fields that differ from the stored model.
-        refusal: why no frame can be drawn from snapshots of this model; None if frames
-            can be drawn, which has been checked.
-        words: the indices into `raw_memory.WORDS` with which rows of state and snapshot
-            can be gathered while `is_current`; None if each capture must check for
-            changes.
-        is_current: returns whether only the state has changed since the last capture,
-            the usual case. The memory then holds the current state until the
-            environment is called again. This function keeps the memory alive.
+        refusal: the reason why no frame can be drawn from snapshots of this model; None
+            if frames can be drawn, which has been checked.
+        words: the indices into `raw_memory.WORDS` for gathering rows of state and
+            snapshot while `is_current` returns True; None if each capture must check
+            for changes.
+        is_current: a function that returns whether only the state has changed since the
+            last capture, which is the usual case. The memory then contains the current
+            state until the environment is called again. The function keeps the memory
+            alive.
     """
 
     state: np.dtype[Any]
@@ -69,26 +70,31 @@ class EpisodeStart:
 
 
 class Capture:
-    """A recorder of a simulation's states, episode by episode. Needs no OpenGL.
+    """A recorder of a simulation's states, episode by episode.
 
-    The simulation is only read. Whatever does not change between captures is cached, so
-    that a capture takes microseconds. Changes are found by comparing memory.
+    It needs no OpenGL, and only reads the simulation. Everything that does not change
+    between captures is cached, so that a capture takes microseconds. Changes are found
+    by comparing memory.
 
     Args:
-        simulation: returns the current model and data, MuJoCo's own or dm_control's.
-            The model may be a different one after a reset.
-        view: returns the view of the scene; called when an episode begins. Its camera
-            and option are watched for changes: they may be the environment's own.
-        at_frame: calls its argument at the moment at which the environment would draw,
-            then restores everything; None if any moment will do.
-        resetting: returns a context manager to run each reset in.
-        authored: returns the model's sources, or None if unknown.
-        obstacle: returns why the current frame cannot be drawn from the state, or None.
+        simulation: a function that returns the current model and data, which are
+            MuJoCo's own or dm_control's. The model may be a different one after a
+            reset.
+        view: a function that returns the view of the scene, called when an episode
+            begins. The view's camera and option may be the environment's own, so they
+            are watched for changes.
+        at_frame: a function that calls its argument at the moment at which the
+            environment would draw, and then restores everything; None if any moment
+            will do.
+        resetting: a function that returns a context manager for each reset.
+        authored: a function that returns the model's sources, or None if unknown.
+        obstacle: a function that returns the reason why the current frame cannot be
+            drawn from the state, or None.
         is_unmoved: a fast check that the simulation and the view are as they were when
-            `view` was called and that no obstacle exists. If it returns true, the other
-            functions are not called; the model, the camera and the option are still
+            `view` was called and that no obstacle exists. If it returns True, the other
+            functions are not called, but the model, the camera and the option are still
             compared.
-        forget: resets the view as if nothing had been shown yet.
+        forget: a function that resets the view as if nothing had been shown yet.
     """
 
     def __init__(
@@ -116,10 +122,11 @@ class Capture:
         self._frames: _Frames | None = None
         self._refusal: str | None = None
         self._looks_at_everything = False
-        # Whether only the state has changed since the last capture, and how to end it.
+        # Returns whether only the state has changed since the last capture, until
+        # `_look_closely` is called.
         self._is_current: Callable[[], bool] = _never
         self._look_closely: Callable[[], None] = lambda: None
-        # As last returned by `simulation`; they may be dm_control's wrappers.
+        # The last result of `simulation`, which may consist of dm_control's wrappers.
         self._seen: tuple[Any, Any] = (None, None)
 
     def open(self, directory: Path) -> None:
@@ -130,7 +137,7 @@ class Capture:
     def begin_episode(self) -> EpisodeStart:
         """Return the facts about the simulation just after a reset.
 
-        A new model is stored. For a known one, the fields that have changed since it
+        A new model is stored. For a known model, the fields that have changed since it
         was stored are included.
         """
         self._seen = self._simulation()
@@ -199,15 +206,15 @@ class Capture:
         return own or None
 
     def model_changed(self) -> None:
-        """Note that anything in the model may have changed; the next capture checks."""
+        """Make the next capture check everything in the model for changes."""
         self._looks_at_everything = True
         self._look_closely()
 
     def forget_frames(self) -> None:
         """Make the next episode's frames independent of all previous frames.
 
-        Call it between episodes. Cameras that are placed at the first frame, or that
-        each frame moves, are as in a new simulation.
+        Call this between episodes. Cameras that are placed at the first frame, or that
+        each frame moves, will be as in a new simulation.
         """
         self._forget()
         self._frames = None
@@ -215,7 +222,7 @@ class Capture:
             self._stored.scene = None
 
     def settle(self) -> None:
-        """Wait until every model is stored or has failed; `finish` reports failures."""
+        """Wait until no model is left to be stored; `finish` reports any failures."""
         if self._store is not None:
             self._store.settle()
 
@@ -239,7 +246,7 @@ class Capture:
     def _stored_model(
         self, model: mujoco.MjModel
     ) -> tuple[_StoredModel, dict[str, NDArray[Any]]]:
-        """Return the stored model, and the fields that have changed since."""
+        """Return the stored model, and the fields that have changed since then."""
         if self._stored is not None and self._stored.looks.is_of(model):
             fields = self._stored.looks.since_stored()
             if all(map(is_settable, fields)):
@@ -257,13 +264,14 @@ class Capture:
         view: SceneView,
         fields: Iterable[str],
     ) -> _Frames:
-        """Return the episode's source of snapshots, the last one if it still fits."""
+        """Return the last source of snapshots if it still fits, otherwise a new one."""
         stored.looks.follow(view)
         key = (
             *(data._address, id(view.camera), id(view.option), view.max_geom),
             *(view.fresh, view.height, view.width, view.label),
             stored.looks.view_bytes(),
-            # Then a snapshot may need other arrays; a new object never compares equal.
+            # If one of these fields has changed, a snapshot may need other arrays. A
+            # new object never compares equal.
             object() if any(n.startswith(_SETTLING_THE_KIND) for n in fields) else 0,
         )
         if self._frames is None or self._frames.key != key:
@@ -277,7 +285,7 @@ class Capture:
         self._look_closely = seen.clear
 
     def _at_moment(self, do: Callable[[], T]) -> T:
-        """Return the result of `do`, called at the moment a frame would be drawn."""
+        """Call `do` when the environment would draw, and return its result."""
         results: list[T] = []
         self._at_frame(lambda: results.append(do()))
         return results[-1]
@@ -302,13 +310,13 @@ class Capture:
         fixed = [name for name in changed or () if not is_settable(name)]
         if fixed:
             raise _differs(
-                f"{', '.join(fixed)} of the model changed in mid-episode, and with it "
-                "the model's structure"
+                f"{', '.join(fixed)} of the model changed during the episode, and with "
+                "it the model's structure"
             )
         return changed
 
     def _followed(self) -> tuple[_StoredModel, _Frames]:
-        """Return the stored model and its frames, following a change of objects."""
+        """Return the stored model and its frames, even if other objects hold them."""
         model, data = self._simulation()
         stored, frames = self._stored, self._frames
         if stored is None or frames is None:
@@ -323,13 +331,13 @@ class Capture:
 
 
 class _StoredModel:
-    """A stored model and what was found out about it.
+    """A stored model and facts about it.
 
     Attributes:
         scene: a scene with the two cameras as the last frame left them; None before the
             first frame.
-        sound: the visual options (as bytes) and the changed fields with which a
-            snapshot was found to suffice.
+        sound: the visual options (as bytes) and the changed fields for which a snapshot
+            was found to suffice.
     """
 
     def __init__(self, model: mujoco.MjModel, facts: dict[str, Any]) -> None:
@@ -342,7 +350,7 @@ class _StoredModel:
 
 
 class _Frames:
-    """A source of snapshots of one simulation in one view.
+    """A source of snapshots from one simulation in one view.
 
     It checks that the snapshots are enough to redraw the frames.
 
@@ -356,7 +364,7 @@ class _Frames:
         kind: the snapshots' dtype.
         source: the source of the snapshots.
         words: the indices of a row's words; None if a row cannot be gathered.
-        scene: holds the cameras; None if no frame influences the next.
+        scene: the scene with the cameras; None if no frame influences the next.
     """
 
     def __init__(
@@ -378,7 +386,7 @@ class _Frames:
             self.scene = stored.scene or mujoco.MjvScene(model, maxgeom=1)
 
     def facts(self) -> dict[str, Any]:
-        """Return the facts of the scene, including what the last frame left in it."""
+        """Return the facts about the scene, including those left by the last frame."""
         facts = {**self._facts}
         before = self._stored.scene
         if self.scene is not None and not self.view.fresh and before is not None:
@@ -389,7 +397,7 @@ class _Frames:
         return facts
 
     def is_sound(self, fields: Iterable[str]) -> bool:
-        """Return whether a snapshot was found to suffice with these fields changed.
+        """Return whether a snapshot was found to suffice for these changed fields.
 
         This is checked for the first frame, and again for the first frame with a new
         visual option or a newly changed field of the model.
@@ -397,7 +405,7 @@ class _Frames:
         return self._stored.sound.issuperset(self._looks(fields))
 
     def objection(self, fields: Iterable[str], row: Any) -> str | None:
-        """Return why the current frame cannot be drawn from a snapshot, or None.
+        """Return the reason why a snapshot does not suffice, or None if it does.
 
         Args:
             fields: names of the model's and the option's changed fields.
@@ -412,7 +420,7 @@ class _Frames:
         if missing:
             return (
                 f"it now also needs {', '.join(sorted(missing))}, which the "
-                "recording of this episode does not hold"
+                "recording of this episode does not contain"
             )
         found = scene_difference(stored.model, self.data, row, self.view)
         if found is not None:
@@ -423,7 +431,7 @@ class _Frames:
     def drawn(
         self, changed: dict[str, NDArray[Any]] | None
     ) -> dict[str, NDArray[Any]] | None:
-        """Move the cameras as drawing a frame does, and add this to the changes."""
+        """Move the cameras as drawing a frame would, and add that to the changes."""
         if any(name.startswith(VIEW_PREFIXES) for name in changed or ()):
             self._follow_camera()
         if self.scene is None:
@@ -441,7 +449,7 @@ class _Frames:
         return [self._stored.looks.option_bytes(), *fields]
 
     def _follow_camera(self) -> None:
-        # A copy that moves as frames move it; the environment's own stays unchanged.
+        # Frames move this copy. The environment's own camera stays unchanged.
         self._camera = copy.copy(self.view.camera)
         self._lookat = self._camera.lookat.tolist()
 

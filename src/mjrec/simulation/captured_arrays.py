@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The arrays of a simulation that a snapshot holds, from which a frame is drawn.
+"""The arrays of a simulation that a snapshot contains, so that a frame can be drawn.
 
-They are about 20 of the more than 100 arrays of `MjData`. The state (`states`) alone
-does not determine them: after a step they belong to the state before the last substep,
-and environments move things just before they draw.
+They are about 20 of the more than 100 arrays in `MjData`. The state (see `states`) does
+not determine them on its own: after a step, they belong to the state before the last
+substep, and environments move things just before they draw.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from .raw_memory import address_of
 
 _JOINT_WRAP = int(mujoco.mjtWrap.mjWRAP_JOINT)
 
-# Not an array of `MjData`: the colours of the tendons in the frame. They are restored
-# into the model's array of this name.
+# The colours of the tendons in the frame. This is not an array in `MjData`; the colours
+# are restored into the model's array with this name.
 TENDON_RGBA = "tendon_rgba"
 
 # Arrays that any camera may need with MuJoCo's default option, if they are not empty.
@@ -40,10 +40,10 @@ SNAPSHOT_ARRAYS = frozenset(
     (*ALWAYS, *_FOR_SKINS, *_FOR_OPTIONS, "sensordata", "plastic")
 )
 
-# These are drawn from the constraints of a step, which a new `MjData` cannot be given.
+# These are drawn from a step's constraints, which cannot be put into a new `MjData`.
 _CONSTRAINT_FLAGS = ("mjVIS_CONTACTPOINT", "mjVIS_CONTACTFORCE", "mjVIS_CONTACTSPLIT")
 
-# Sensors whose readings are drawn, as rays.
+# Sensors whose readings are drawn as rays.
 _DRAWN_SENSORS = ("mjSENS_RANGEFINDER", "mjSENS_GEOMFROMTO")
 
 
@@ -59,13 +59,13 @@ def snapshot_dtype(
 
     Args:
         model: the model.
-        data: its data.
+        data: the model's data.
         option: the visual options of the frames; None for MuJoCo's default.
     """
     names = set(ALWAYS)
     if model.nskin:
         names.update(_FOR_SKINS)
-    # For tendons whose springs can yield, new in mujoco 4.
+    # For tendons whose springs can yield, which are new in mujoco 4.
     if (getattr(model, "tendon_plasticadr", np.empty(0)) >= 0).any():
         names.add("plastic")
     # Not `np.isin`, whose first call loads numpy's masked arrays (100 ms).
@@ -83,7 +83,7 @@ def snapshot_dtype(
 
 
 def array_kind(holder: Any, name: str) -> np.dtype[Any] | None:
-    """Return the dtype and shape of an array of a model or data; None if empty."""
+    """Return the dtype and shape of a model's or data's array, or None if empty."""
     # Some arrays, such as `bvh_active`, are not in every version.
     array = getattr(holder, name, None)
     if array is None or not array.size:
@@ -101,7 +101,7 @@ def has_limited_tendons(model: mujoco.MjModel) -> bool:
 
 
 def needs_constraints(model: mujoco.MjModel, option: mujoco.MjvOption) -> str | None:
-    """Return why no snapshot can hold what `option` shows; None if snapshots can.
+    """Return the reason why no snapshot suffices for `option`, or None if one does.
 
     Contacts, constraint islands and joints at their limits are drawn from the
     constraints of a step.

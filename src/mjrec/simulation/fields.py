@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The fields of a model and a view, by name: reading, setting and comparing them.
+"""Functions that read, set and compare the fields of a model and a view by name.
 
 The names are those of `MjModel`'s arrays (`geom_rgba`) and of the members of its
 structs (`opt.gravity`, `vis.headlight.ambient`); a view's fields are `camera.lookat`,
@@ -70,7 +70,7 @@ def member_names(struct: object) -> Iterator[str]:
 
 
 def holder_of(struct: Any, name: str) -> tuple[Any, str]:
-    """Return the object that has a member with a dotted name, and its last part."""
+    """Return the object that has the member, and the last part of a dotted name."""
     *parts, last = name.split(".")
     return functools.reduce(getattr, parts, struct), last
 
@@ -89,7 +89,7 @@ def read_fields(
         model: the model.
         names: names of the model's fields, or names that begin with `camera.` or
             `option.`.
-        view: the `camera` and the `option`.
+        **view: the view's `camera` and `option`.
     """
     values = {}
     for name in names:
@@ -111,15 +111,15 @@ def apply_fields(
     Args:
         model: the model to change.
         fields: values by name.
-        camera: the camera to set fields that begin with `camera.` in; if None, they are
-            skipped.
-        option: the option to set fields that begin with `option.` in; if None, they are
-            skipped.
+        camera: the camera that gets the fields that begin with `camera.`; if None,
+            these fields are skipped.
+        option: the option that gets the fields that begin with `option.`; if None,
+            these fields are skipped.
 
     Raises:
         InvalidArgument: a field does not exist, its value has the wrong shape, type or
-            range, or it may not be set (see `is_settable`). Fields before it have then
-            been set.
+            range, or it may not be set (see `is_settable`). Earlier fields have then
+            already been set.
     """
     view = {"camera": camera, "option": option}
     for name, value in fields.items():
@@ -134,7 +134,7 @@ def apply_fields(
 def is_settable(name: str) -> bool:
     """Return whether a model's field may be set to a value from a file.
 
-    MuJoCo trusts types, addresses and most indices in a model: a wrong one makes it
+    MuJoCo trusts types, addresses and most indices in a model: a wrong value makes it
     read out of bounds. Floating-point numbers, flags, texture data and indices that can
     be checked are settable.
     """
@@ -146,7 +146,7 @@ def is_settable(name: str) -> bool:
 _HARMLESS_TYPES = ("<f4", "<f8", "|u1", "|b1")
 _INTEGERS = re.compile(r"\w+_(contype|conaffinity|group|condim|priority)")
 
-# Indices, with the size of the model that bounds them; -1 means none.
+# Indices, with the model's size that limits each; -1 means no index.
 _INDICES = {
     **dict.fromkeys(
         ("geom_matid", "site_matid", "skin_matid", "flex_matid", "tendon_matid"), "nmat"
@@ -155,14 +155,14 @@ _INDICES = {
     "light_texid": "ntex",
 }
 
-# The visualiser uses these as indices into its own tables without checking bounds.
+# The visualizer uses these as indices into its own tables without checking bounds.
 _KINDS = {
     "option.label": int(mujoco.mjtLabel.mjNLABEL),
     "option.frame": int(mujoco.mjtFrame.mjNFRAME),
 }
 
-# The locations of a model's files when it was compiled, and a checksum that nothing
-# here depends on.
+# The locations of a model's files when it was compiled, and a checksum that does not
+# matter here.
 _PLACES = re.compile(r"paths|npaths|nbuffer|signature|\w+_(path|contenttype)adr")
 
 
@@ -171,13 +171,13 @@ def differing_fields(
 ) -> dict[str, NDArray[Any]]:
     """Return the fields of `other` that differ from `model`, for `apply_fields`.
 
-    Environments set fields of a model after compiling it: the size of the frame
-    buffer, the position of a target. The locations of the models' files are not
+    Environments set some fields of a model after compiling it, such as the size of the
+    frame buffer or the position of a target. The locations of the models' files are not
     compared.
 
     Raises:
-        ValueError: the models are structurally different, so that no setting of fields
-            turns one into the other.
+        ValueError: the models are structurally different, so that setting fields cannot
+            turn one into the other.
     """
     for name in dir(model):
         value = None if name.startswith("_") else getattr(model, name)
@@ -202,7 +202,7 @@ def _all_names() -> frozenset[str]:
 
 
 def _check_name(name: str) -> None:
-    # Names may come from a file, so no others are ever looked up or set.
+    # Names may come from a file, so only known names are ever looked up or set.
     if name not in _all_names():
         raise InvalidArgument(
             f"MuJoCo {mujoco.__version__} has no model field {name!r}. Use the version "
@@ -235,14 +235,14 @@ def _set(struct: Any, name: str, value: NDArray[Any], *, field: str) -> None:
         size = getattr(struct, _INDICES[name])
         if value.size and (value.min() < -1 or value.max() >= size):
             raise InvalidArgument(
-                f"The model field {name} must hold indices from -1 to {size - 1} for "
-                f"this model, but the recorded ones range from {value.min()} to "
+                f"The model field {name} must contain indices from -1 to {size - 1} "
+                f"for this model, but the recorded indices range from {value.min()} to "
                 f"{value.max()}."
             )
     if field in _KINDS and value.item() not in range(_KINDS[field]):
         raise InvalidArgument(
             f"The field {field} must be from 0 to {_KINDS[field] - 1} in MuJoCo "
-            f"{mujoco.__version__}, got {value}."
+            f"{mujoco.__version__}, but it is {value}."
         )
     if isinstance(present, np.ndarray):
         present[...] = value

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Finding the MuJoCo simulation inside an environment, by duck typing.
+"""Functions that find the MuJoCo simulation inside an environment, by duck typing.
 
-Nothing is imported: an environment without a simulation must not load MuJoCo, which
-chooses its OpenGL backend on import.
+They import nothing, because an environment without a simulation must not load MuJoCo,
+which chooses its OpenGL backend on import.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ def simulation_in(env: object) -> Any:
         env: a Gymnasium or dm_env environment, wrapped or not.
 
     Returns:
-        The object; None if no simulation can be found.
+        The object, or None if no simulation can be found.
     """
     base = getattr(env, "unwrapped", env)
     for holder in _holders(base):
@@ -40,7 +40,7 @@ def _holders(base: object) -> Iterator[object]:
 
 
 def simulation_time(env: object) -> float | None:
-    """Return the simulation time of `env` in seconds; None without a simulation."""
+    """Return the simulation time in seconds, or None if there is no simulation."""
     simulation = simulation_in(env)
     return None if simulation is None else float(simulation.data.time)
 

@@ -1,16 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A limited process that handles untrusted files. This module is its program.
+"""A process with limits that reads untrusted files, and the program that it runs.
 
 A few kilobytes of HDF5 can claim any amount of memory. The same data under a million
 names can take any amount of time. A damaged file may crash or hang the HDF5 library.
 One line of MJCF can ask for a body replicated a billion times.
 
-So if this user has not recorded into a trajectory's directory (`model_trust`), such a
-process reads the whole trajectory once before it is read here. All model sources are
-compiled in such a process too. This takes half a second; the user's own trajectories
-and models cost nothing.
+So if this user has not recorded into a trajectory's directory (see `model_trust`), such
+a process reads the whole trajectory once before this process does. All model sources
+are compiled in such a process too. This takes half a second. The user's own
+trajectories and models cost nothing.
 
-Logs of recordings in flight are not compressed, so they hold no more than their size.
+Logs of recordings in flight are not compressed, so reading them takes no more memory
+than their size.
 """
 
 from __future__ import annotations
@@ -41,13 +42,13 @@ _LONGEST_REASON = 2000
 _READING_MEMORY = 2 * _GIB
 _MOST_EXPANSION = 64
 # HDF5's compression can pack at most a gigabyte into a megabyte of file. Unpacking it
-# takes some seconds of CPU time; the machine may be busy.
+# takes some seconds of CPU time, and the machine may be busy.
 _CPU_SECONDS = 8
 _CPU_SECONDS_PER_MB = 4
 _SECONDS_PER_CPU_SECOND = 10
 _ROWS_AT_ONCE = 256
 
-# The largest robots and rooms of the field compile in seconds.
+# Even the largest robots and rooms compile in seconds.
 _COMPILING_SECONDS = 300.0
 # Enough for Python, MuJoCo and their threads, with some room to spare.
 _COMPILING_MEMORY = 6 * _GIB
@@ -62,8 +63,8 @@ def open_vetted_trajectory(path: Path) -> TrajectoryReader:
     """Open a trajectory like `open_trajectory`, but safely if it is untrusted.
 
     Raises:
-        UnreadableFile: see `open_trajectory`; or the file is untrusted and harms the
-            process that reads it.
+        UnreadableFile: see `open_trajectory`. This is also raised if the file is
+            untrusted and harms the process that reads it first.
     """
     if is_finished(path) and not (is_inside() or is_own_directory(path.parent)):
         found = file_of(path).stat()
@@ -108,7 +109,7 @@ def compile_sources(
 def _done(
     task: str, path: Path, limits: dict[str, int], seconds: float
 ) -> Iterator[Path]:
-    """Run a task on a file in a process with limits; yield its output directory.
+    """Run a task on a file in a process with limits, and yield its output directory.
 
     Raises:
         UnreadableFile: the task failed or took too long.
@@ -151,7 +152,7 @@ def main() -> int:
 
 
 def _read(path: Path) -> None:
-    """Read everything in a trajectory, the way it is normally read."""
+    """Read everything in a trajectory, in the same way as a normal reader."""
     with open_trajectory(path) as reader:
         together = (
             reader.states(0, reader.row_count),

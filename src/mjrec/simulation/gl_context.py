@@ -30,17 +30,17 @@ _STRINGS = ("GL_VENDOR", "GL_RENDERER", "GL_VERSION")
 # to the offscreen buffer of the `MjrContext`.
 _WINDOW_SIDE = 16
 
-# Mesa's rasteriser has its own threads, which a forked child lacks. The first frame it
-# draws waits for them forever, even if every context was freed before the fork.
+# Mesa's rasterizer has its own threads, which a forked child lacks. The child's first
+# frame waits for them forever, even if every context was freed before the fork.
 _has_made_context = False
 _forked_from_gl = False
 
 
 def new_context() -> Any:
-    """Return a new mujoco context, current on this thread.
+    """Create a mujoco context, and make it current on this thread.
 
-    Only its owner frees it, with `free`. The caller must make the previous context
-    current again, with `context_kept`.
+    Only the context's owner may free it, with `free`. The caller must make the previous
+    context current again, with `context_kept`.
 
     Raises:
         GLError: no context can be created here, or this process was forked from one
@@ -55,7 +55,7 @@ def new_context() -> Any:
         context = kind(_WINDOW_SIDE, _WINDOW_SIDE)
         _has_made_context = True
         context.make_current()
-        # Not every mujoco context imports PyOpenGL, and the facts need it.
+        # Not every mujoco context imports PyOpenGL, which the facts need.
         raw_opengl()
         works = bool(current_gl_facts())
     except Error:
@@ -89,9 +89,9 @@ def gl_error(what: str, reason: object, *, remedy: str = "") -> GLError:
 
 
 def raw_opengl() -> Any:
-    """Return PyOpenGL's functions of OpenGL 1.0. A context must be current.
+    """Return PyOpenGL's functions for OpenGL 1.0. A context must be current.
 
-    Not `OpenGL.GL`, whose import takes longer than drawing a frame.
+    `OpenGL.GL` is not used, because its import takes longer than drawing a frame.
     """
     # PyOpenGL chooses its platform on import, and mujoco sets the platform when it
     # imports its context class. So it must not be imported before a context exists.
@@ -99,16 +99,16 @@ def raw_opengl() -> Any:
 
 
 def current_gl_facts() -> dict[str, Any]:
-    """Return the facts for the metadata about the context current on this thread.
+    """Return metadata about the context that is current on this thread.
 
     These are `gl_vendor`, `gl_renderer`, `gl_version` and, if EGL reports the device it
     draws on, `gl_device`: its `index` in EGL's list and, if a GPU's driver reports
     them, its `file` and `uuid`. The dict is empty if no context is current.
 
-    CUDA's device number is not queried: that would initialise CUDA in a process that
-    may belong to another library and be forked later.
+    CUDA's device number is not queried, because that would initialize CUDA in a process
+    that may belong to another library and be forked later.
     """
-    # Code that has drawn has imported it already; it must not be imported here.
+    # Code that has drawn has already imported PyOpenGL, which must not happen here.
     if "OpenGL.platform" not in sys.modules:
         return {}
     gl = raw_opengl()
@@ -134,14 +134,14 @@ def current_gl_facts() -> dict[str, Any]:
 
 @contextlib.contextmanager
 def context_kept(*, or_none: bool = False) -> Iterator[None]:
-    """Restore the context that was current before the block.
+    """After the block, restore the context that was current before it.
 
     This works only with EGL. The other backends cannot make another library's context
     current: with them, the block's context stays current.
 
     Args:
-        or_none: whether no context is current afterwards if none was before; otherwise
-            the block's stays current.
+        or_none: whether to end without a current context if there was none before. If
+            False, the block's context then stays current.
     """
     before = _current_in_egl()
     try:
@@ -161,8 +161,8 @@ def context_kept(*, or_none: bool = False) -> Iterator[None]:
 def collection_paused() -> Iterator[None]:
     """Pause the garbage collector in the block.
 
-    mujoco's renderers free what they drew with when they are collected, in whichever
-    context is current. A frame drawn there then contains whatever was in memory.
+    When mujoco's renderers are collected, they free their OpenGL objects in whichever
+    context is current. A frame that is drawn there then contains arbitrary memory.
     """
     was_enabled = gc.isenabled()
     gc.disable()
@@ -186,7 +186,7 @@ def refuse_fork_of_gl() -> None:
 
 def _note_fork() -> None:
     global _forked_from_gl
-    # Includes contexts that another library created through mujoco's EGL.
+    # This includes contexts that another library created through mujoco's EGL.
     display = getattr(sys.modules.get("mujoco.egl"), "EGL_DISPLAY", None)
     _forked_from_gl = _forked_from_gl or _has_made_context or display is not None
 
@@ -195,8 +195,8 @@ os.register_at_fork(after_in_child=_note_fork)
 
 
 def _current_in_egl() -> tuple[Any, ...] | None:
-    """Return the arguments to make the current context current again, if any."""
-    # Creating a context has imported it.
+    """Return the arguments that would make the current context current again."""
+    # If there is a context, PyOpenGL has been imported.
     egl = sys.modules.get("OpenGL.EGL")
     if egl is None or not (context := egl.eglGetCurrentContext()):
         return None
@@ -205,10 +205,10 @@ def _current_in_egl() -> tuple[Any, ...] | None:
 
 
 def _context_class() -> Any:
-    """Return the class for the backend that mujoco chose when it was imported."""
+    """Return the context class for the backend that mujoco chose on import."""
     if hasattr(mujoco, "GLContext"):
         return mujoco.GLContext
-    # mujoco hides the reason on import. Importing the failed module again raises it.
+    # mujoco hides the error on import. Importing the failed module again raises it.
     for module in ("mujoco.rendering.classic.gl_context", "mujoco.gl_context"):
         with contextlib.suppress(ModuleNotFoundError, AttributeError):
             return importlib.import_module(module).GLContext

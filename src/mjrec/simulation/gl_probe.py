@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The child process that tries one OpenGL backend: `python -m` this module.
+"""The program of a child process that tests one OpenGL backend.
 
-It imports mujoco with the backend in `MUJOCO_GL`, draws a scene, checks the frame, and
-sends each result to its parent at once. So results already sent stay known if the
-driver crashes afterwards.
+The child imports mujoco with the backend in `MUJOCO_GL`, draws a scene, checks the
+frame, and sends each result to its parent at once. So no result is lost if the driver
+crashes afterwards.
 
 ::
 
     {"notes": [...]}                              possible causes of a failure
-    {"error": "ImportError: ..."}                 it does not render, or
-    {"renders": true, "gl_renderer": ..., ...}    it does
+    {"error": "ImportError: ..."}                 the backend does not render, or
+    {"renders": true, "gl_renderer": ..., ...}    it renders
     {"frames_per_second": 16.2}                   with --measure
     {"devices": [...]}                            always with EGL, if it lists them
 """
@@ -63,7 +63,7 @@ _SCENE = """
 </mujoco>
 """
 
-# The pixel's (row, column) as fractions of height and width, and its expected colour.
+# A pixel's (row, column) as fractions of height and width, and its expected colour.
 _EXPECTED = {
     "red on the left": ((0.62, 0.23), (255, 0, 0)),
     "blue on the right": ((0.62, 0.77), (0, 0, 255)),
@@ -100,22 +100,21 @@ def draw_test_scene(
 ) -> tuple[Callable[[], np.ndarray], dict[str, Any]]:
     """Draw the test scene and check the frame.
 
-    It is drawn at MuJoCo's default quality, or without shadows and multisampling if the
-    frame is smaller than the probe's own.
+    The scene is drawn at MuJoCo's default quality, or without shadows and multisampling
+    if the frame is smaller than the probe's own.
 
     Args:
         side: side of the square frame in pixels.
-        canvas: the canvas to draw with, see `SceneRenderer`.
+        canvas: the canvas to draw with; see `SceneRenderer`.
 
     Returns:
-        A function that draws the scene again, and the facts about the driver for the
-        metadata.
+        A function that draws the scene again, and metadata about the driver.
 
     Raises:
         WrongFrame: the frame does not show what it should.
-        Exception: anything else; drivers raise all kinds of errors.
+        Exception: any other error; drivers raise all kinds of errors.
     """
-    # Not at the top of the module: these imports are part of the test.
+    # Imported here because these imports are part of the test.
     import mujoco
 
     from .renderer import SceneRenderer
@@ -133,7 +132,7 @@ def draw_test_scene(
 
 
 def main() -> None:
-    """Try the backend in `MUJOCO_GL`."""
+    """Test the backend in `MUJOCO_GL`."""
     parent = Parent()
     backend = os.environ.get("MUJOCO_GL", "")
     facts: dict[str, Any] = {}
@@ -144,7 +143,8 @@ def main() -> None:
             parent.send(frames_per_second=_frames_per_second(draw))
     except Exception as error:  # Any error is a result.
         parent.send(notes=list(_notes(backend)), error=_text_of(error))
-    # Last, because querying CUDA's numbers initialises CUDA, which may fail or hang.
+    # This comes last, because querying CUDA's numbers initializes CUDA, which may fail
+    # or hang.
     if backend == "egl":
         used = facts.get("gl_device", {}).get("index")
         devices = [
@@ -177,7 +177,7 @@ _VENDOR_DIRECTORIES = "/etc/glvnd/egl_vendor.d:/usr/share/glvnd/egl_vendor.d"
 
 
 def _notes(backend: str) -> Iterator[str]:
-    """Yield one sentence about each part of a backend that was looked for."""
+    """Yield a note about each file that the backend may need."""
     for library in _LIBRARIES.get(backend, []):
         yield f"library {library}: {_load(library)}"
     if backend == "egl":
@@ -197,7 +197,7 @@ def _load(library: str) -> str:
 
 
 def _vendor_notes() -> Iterator[str]:
-    """Yield the drivers that libEGL finds by its own rules."""
+    """Yield notes about the drivers that libEGL finds by its own rules."""
     names = os.environ.get("__EGL_VENDOR_LIBRARY_FILENAMES", "")
     directories = os.environ.get("__EGL_VENDOR_LIBRARY_DIRS", "") or _VENDOR_DIRECTORIES
     files = (
@@ -225,7 +225,7 @@ def _vendor_library(file: Path) -> str:
 
 
 def _mesa_notes() -> Iterator[str]:
-    """Yield Mesa's version, which is part of a library's name since 24.2."""
+    """Yield Mesa's version, which has been part of a library's name since 24.2."""
     for directory in _LIBRARY_DIRECTORIES:
         for file in Path("/").glob(f"{directory.lstrip('/')}/libgallium-*.so"):
             yield f"Mesa's library: {file.name}"

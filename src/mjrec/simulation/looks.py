@@ -3,8 +3,8 @@
 
 Comparing some 500 arrays one by one takes longer than a simulation step. But all of
 them are in one allocation, and the structs `opt`, `vis` and `stat` follow one another
-in `mjModel` itself. Comparing a few long pieces therefore shows that nothing has
-changed, which is the usual case. Only a piece that differs is examined by name.
+in `mjModel` itself. So comparing a few long pieces is enough to show that nothing has
+changed, which is the usual case. Only a piece that differs is examined field by field.
 """
 
 from __future__ import annotations
@@ -21,27 +21,29 @@ from .fields import array_names, member_names, read_fields, struct_names
 from .raw_memory import address_of, raw_memory
 from .view import SceneView
 
-# The arrays that each frame is drawn from. Whole groups, because a few long pieces are
-# compared faster than the exact arrays. Other arrays are compared at resets.
+# The arrays that each frame is drawn from. These are whole groups, because a few long
+# pieces are compared faster than the exact arrays. Other arrays are compared at resets.
 _DRAWN = (
     *("geom_", "site_", "mat_", "light_", "cam_", "tendon_", "actuator_cranklength"),
     *("skin_matid", "skin_group", "skin_rgba", "skin_inflate"),
     *("flex_matid", "flex_group", "flex_rgba", "flex_radius"),
 )
 
-# Bytes of a camera and an option before their first and after their last array. Memory
-# beyond belongs to other objects and may change at any time, so it is not compared.
+# Numbers of bytes in a camera and an option before the first and after the last array.
+# Memory beyond belongs to other objects and may change at any time, so it is not
+# compared.
 _REACH = {mujoco.MjvCamera: (16, 32), mujoco.MjvOption: (8, 8)}
 
 _Arrays = list[tuple[str, NDArray[Any]]]
 
 
 class Looks:
-    """The remembered fields of a model and a view, to find which have changed.
+    """The remembered fields of a model and a view, for finding those that have changed.
 
-    At a reset all fields of the model are compared. Between resets only those are
-    compared that each frame is drawn from. These exclude textures and meshes, which
-    must be uploaded to the graphics card. The model is only read, and is kept alive.
+    At a reset, all fields of the model are compared. Between resets, only the fields
+    that each frame is drawn from are compared. Textures and meshes are not among them,
+    because they must be uploaded to the graphics card. The model is only read, and is
+    kept alive.
 
     Args:
         model: the model, as it is stored now.
@@ -95,7 +97,7 @@ class Looks:
         return bytes(self._view[1].raw)
 
     def since_stored(self) -> dict[str, NDArray[Any]]:
-        """Return the model's fields that have changed since this was created.
+        """Return the model's fields that have changed since this object was created.
 
         The current values count as seen.
         """
@@ -110,10 +112,11 @@ class Looks:
         """Return the watched fields that have changed since the last look.
 
         Args:
-            anything: also compare textures, meshes and the like.
+            anything: whether to compare textures, meshes and the like too.
 
         Returns:
-            Copies by name; None, within a microsecond, if nothing has changed.
+            Copies by name, or None if nothing has changed, which is found out in less
+            than a microsecond.
         """
         if not anything and self.seen == self.present:
             return None
@@ -123,10 +126,10 @@ class Looks:
 
 
 class _Piece:
-    """A piece of memory, as it was at first (`stored`) and when it was last `seen`.
+    """A piece of memory, as it was at the start (`stored`) and the last look (`seen`).
 
-    For memory that is not watched at each step, which may be large, the two share one
-    copy until something changes.
+    Memory that is not watched at each step may be large, so for such memory, the two
+    are one copy until something changes.
     """
 
     def __init__(self, address: int, size: int, *, is_watched: bool = True) -> None:
@@ -144,7 +147,7 @@ class _Piece:
 
     def look_from_stored(self) -> list[str]:
         """Return the names of the fields that differ from `stored`."""
-        # Compared only once: there may be megabytes of textures.
+        # Compare only once, because there may be megabytes of textures.
         is_same = self.stored == self.raw
         is_one = self.seen is self.stored
         if not (is_one and is_same) and self.seen != self.raw:
@@ -152,7 +155,7 @@ class _Piece:
         return [] if is_same else self.differing(self.stored)
 
     def see(self) -> None:
-        """Remember the current bytes, in place because `Looks` shares `seen`."""
+        """Remember the current bytes. `seen` changes in place, as `Looks` shares it."""
         if self.seen is self.stored:
             self.seen = bytearray(self.raw)
         else:
@@ -184,7 +187,7 @@ class _StructPiece(_Piece):
     """Structs, whose members are compared one by one once any byte has changed.
 
     Args:
-        names: the members' names, as `read_fields` takes them.
+        names: the members' names, in the form that `read_fields` takes.
         holders: the other arguments of `read_fields`.
     """
 
@@ -229,7 +232,7 @@ def _extent(arrays: _Arrays) -> int:
 
 
 def _structs_of(model: mujoco.MjModel) -> _StructPiece:
-    # They follow the sizes; the last member of the last struct is an array.
+    # The structs follow the sizes, and the last member of the last one is an array.
     size = address_of(model.stat.center) + model.stat.center.nbytes - model._address
     return _StructPiece(model._address, size, struct_names(), model=model)
 

@@ -28,7 +28,7 @@ _BAD_STATES = {
 
 
 def load_mjcf(path: Path) -> mujoco.MjModel:
-    """Return the compiled model of an MJCF file.
+    """Compile an MJCF file, and return the model.
 
     Raises:
         UnreadableFile: the file is missing, or MuJoCo rejects it (with its reason).
@@ -48,16 +48,17 @@ class MjcfSimulation:
     """A simulation in whole physics steps, at 60 frames per simulated second.
 
     Frame k is taken after the whole number of steps that comes closest to k/60 seconds.
-    With a timestep of 0.01, frames are 2, 1, 2, 2, 1, 2 ... steps apart, never more
-    than half a step off, and errors do not accumulate. If the timestep is longer than
-    1/60 second, each frame is one step, and the rate is one over the timestep.
+    With a timestep of 0.01, frames are 2, 1, 2, 2, 1, 2 ... steps apart. A frame is
+    never more than half a step off, and errors do not accumulate. If the timestep is
+    longer than 1/60 second, each frame is one step, and the rate is one over the
+    timestep.
 
     Args:
-        model: the compiled model, see `load_mjcf`.
+        model: the compiled model; see `load_mjcf`.
 
     Attributes:
         model: the `mujoco.MjModel`.
-        data: its `mujoco.MjData`.
+        data: the model's `mujoco.MjData`.
         frame_rate: frames per simulated second.
     """
 
@@ -86,7 +87,7 @@ class MjcfSimulation:
                 actuators' ranges.
 
         Returns:
-            A description of the problem; None if there was none.
+            A description of the problem, or None if there was none.
         """
         mujoco.mj_getState(self.model, self.data, self._before, _INTEGRATION)
         self.data.ctrl[:] = ctrl
@@ -130,7 +131,7 @@ class MjcfSimulation:
 
 
 def _meant_timestep(model: mujoco.MjModel) -> Fraction:
-    """Return the timestep that the author meant: 0.0166667 is 1/60, 0.01 is 1/100."""
+    """Return the timestep that the author meant: 1/60 for 0.0166667, for example."""
     exact = Fraction(model.opt.timestep)
     steps_a_second = round(1 / exact)
     if abs(exact * steps_a_second - 1) < _ROUNDING:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The sources of a model: its MJCF and the files that it refers to, in one zip.
+"""The sources of a model: its MJCF and the files that it refers to, in one zip file.
 
 ::
 
@@ -9,7 +9,7 @@
     fields/<name>.npy      the fields in which the stored model differs from the
                            compiled sources, because an environment set them
 
-The same content always gives the same bytes. Compiling reads no files but these.
+The same content always gives the same bytes. Compiling reads no other files.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ _MUJOCO_GAVE_UP = "Caught an unknown exception!"
 
 @dataclass(frozen=True)
 class AuthoredModel:
-    """MJCF with every file that it depends on.
+    """An MJCF file with every file that it depends on.
 
     Attributes:
         main: the name of the MJCF file to compile.
@@ -73,8 +73,9 @@ def authored_from_file(path: Path) -> AuthoredModel | None:
     """Return an MJCF file and everything that it includes and refers to.
 
     Returns:
-        The files; None if they cannot be determined or stored: a file is missing or is
-        given by an absolute path, a plugin is used, or it is not MJCF.
+        The files, or None if they cannot be determined or stored. That is the case if a
+        file is missing or given by an absolute path, if a plugin is used, or if the
+        file is not MJCF.
     """
     try:
         return _gathered(Path(os.path.abspath(path)))  # noqa: PTH100  resolve() would follow links, and names are relative to where a file is named
@@ -112,7 +113,8 @@ def write_authored(path: Path, authored: AuthoredModel, model: mujoco.MjModel) -
 def read_authored(path: Path) -> mujoco.MjModel:
     """Return the model that was passed to `write_authored`, compiled by this MuJoCo.
 
-    Use it only in a sandbox: an untrusted file may take any time and memory.
+    Use this only in a sandbox, because an untrusted file may take any amount of time
+    and memory.
 
     Raises:
         UnreadableFile: the file is damaged or dangerous, or this MuJoCo rejects it.
@@ -132,7 +134,7 @@ def read_authored(path: Path) -> mujoco.MjModel:
             raise ValueError("its format is not known to this version of mjrec")
         model = _compile(AuthoredModel(contents["main"], sources))
         apply_fields(model, fields)
-    # zipfile, NumPy and MuJoCo may raise any error for such a file.
+    # zipfile, NumPy and MuJoCo may raise any error for an untrusted file.
     except Exception as error:
         reason = " ".join(str(error).split())
         if isinstance(error, MemoryError) or reason == _MUJOCO_GAVE_UP:
@@ -142,7 +144,7 @@ def read_authored(path: Path) -> mujoco.MjModel:
 
 
 def with_embedded_files(model: mujoco.MjModel) -> mujoco.MjModel:
-    """Return the model with those textures embedded that it only refers to."""
+    """Return the model with all textures embedded, even those it only refers to."""
     # MuJoCo 3.17 introduced such textures. Their address in the model is negative.
     if not hasattr(mujoco, "mj_embedAssets") or not (model.tex_adr < 0).any():
         return model
@@ -150,17 +152,17 @@ def with_embedded_files(model: mujoco.MjModel) -> mujoco.MjModel:
 
 
 def _compile(authored: AuthoredModel) -> mujoco.MjModel:
-    """Return the compiled model. Only the files of `authored` are read.
+    """Compile a model, reading only the files in `authored`.
 
     Raises:
-        ValueError: MuJoCo rejects the model, a name in it points outside, or it uses a
-            plugin.
+        ValueError: MuJoCo rejects the model, it refers to a file outside its folder, or
+            it uses a plugin.
     """
     by_base_name: dict[str, list[str]] = {}
     for name in authored.files:
         _check_reference(name)
         if any(part in ("", ".", "..") for part in name.split("/")):
-            raise ValueError(f"it holds a file named {name!r}")
+            raise ValueError(f"it contains a file named {name!r}")
         by_base_name.setdefault(PurePosixPath(name).name, []).append(name)
     if _parsed(authored.main, authored.files[authored.main]).tag != "mujoco":
         raise ValueError(f"{authored.main} is not MJCF")
@@ -175,7 +177,7 @@ def _compile(authored: AuthoredModel) -> mujoco.MjModel:
             # Removed, so that no file is checked twice, however often it is named.
             waiting += by_base_name.pop(PurePosixPath(reference).name, [])
     with tempfile.TemporaryDirectory(prefix="mjrec-model-") as directory:
-        # Creating that many folders takes longer than compiling most models.
+        # Only if needed: so many folders take longer than compiling most models.
         root = Path(directory) / _EMPTY if goes_up else Path(directory)
         for name, content in authored.files.items():
             (root / name).parent.mkdir(parents=True, exist_ok=True)
@@ -185,16 +187,16 @@ def _compile(authored: AuthoredModel) -> mujoco.MjModel:
 
 
 class _References:
-    """The files that one MJCF file refers to, as written there.
+    """The files that one MJCF file refers to, by the names in that file.
 
     Attributes:
         xml: other MJCF files.
         assets: all other files.
-        directories: the directories in which they are looked up.
+        directories: the directories in which the other files are looked up.
         go_up: whether a path leaves a folder with `..`.
 
     Raises:
-        ValueError: the file is not plain MJCF, or refers to files outside.
+        ValueError: the file is not plain MJCF, or refers to files outside its folder.
     """
 
     def __init__(self, name: str, content: bytes) -> None:
@@ -224,7 +226,7 @@ def _parsed(name: str, content: bytes) -> ElementTree.Element:
     if "\0" in text or re.search(r"<\s*!\s*(DOCTYPE|ENTITY)", text, re.IGNORECASE):
         raise ValueError(f"{name} is not plain XML")
     if re.search(r"<\s*plugin\b", text):
-        raise ValueError(f"{name} uses a plugin, and plugins are not loaded here")
+        raise ValueError(f"{name} uses a plugin, but plugins are not loaded here")
     try:
         return ElementTree.fromstring(text)
     except ElementTree.ParseError as error:
@@ -232,7 +234,7 @@ def _parsed(name: str, content: bytes) -> ElementTree.Element:
 
 
 def _check_reference(value: str) -> None:
-    # A colon marks a drive, or a resource provider's name.
+    # A colon marks a drive or the name of a resource provider.
     if value.startswith(("/", "~")) or any(c in value for c in "\\:\0"):
         raise ValueError(f"it refers to {value!r}, which is not a plain relative path")
     if value.split("/").count("..") > _MOST_UP:
@@ -262,8 +264,8 @@ def _gathered(main: Path) -> AuthoredModel:
 def _existing(
     bases: Iterable[Path], directories: Iterable[str], reference: str
 ) -> list[Path]:
-    """Return every file that the reference may denote."""
-    # `strippath` strips the directories.
+    """Return every file that the reference may mean."""
+    # MJCF's `strippath` removes the directories from a name.
     names = {reference, PurePosixPath(reference).name}
     candidates = {
         Path(os.path.normpath(base / directory / name))

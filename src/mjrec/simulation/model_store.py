@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The models of a directory's recordings, each stored once.
+"""The models of the recordings in a directory, each of which is stored once.
 
 ::
 
@@ -8,8 +8,8 @@
     └── openaigym.model.<16 hex digits>.zip       its sources, if known
 
 The digits are the beginning of the compiled model's sha256. Only the MuJoCo version
-that compiled a model can load it. The zip is for all other versions, and for all users
-except the one who stored it (`model_trust`).
+that compiled a model can load it. The zip file is for all other versions, and for all
+users except the one who stored the model (see `model_trust`).
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ logger = logging.getLogger(__name__)
 _LEVEL = 3
 _CHUNK = 1 << 20
 
-# No recorded model comes near this; a file that claims more was made to do harm.
+# No recorded model comes near this size; a file that claims more was made to do harm.
 _LARGEST = 1 << 31
 
 _NAME = re.compile(r"openaigym\.model\.[0-9a-f]{16}\.(mjb\.gz|zip)")
@@ -64,8 +64,8 @@ class _Job(NamedTuple):
 class ModelStore:
     """A store of models next to recordings, written in a background thread.
 
-    Files appear complete or not at all, and an existing one is never rewritten. So any
-    number of processes may store into one directory.
+    Files appear complete or not at all, and existing files are never rewritten. So any
+    number of processes may store models in one directory.
 
     Args:
         directory: the recordings' directory, which must exist.
@@ -80,18 +80,18 @@ class ModelStore:
     def add(
         self, model: mujoco.MjModel, authored: AuthoredModel | None = None
     ) -> dict[str, Any]:
-        """Store a model as it is now; it is written in another thread.
+        """Store a model as it is now. It is written on another thread.
 
         Args:
-            model: the model; it is not modified, and not used later.
-            authored: its sources. The model may differ from them in the values of its
-                fields, but not in its structure. If its structure differs, the sources
-                are not stored, and the file that `xml` names will not exist.
+            model: the model; it is not modified, and it is not used after this call.
+            authored: the model's sources. The model may differ from them in the values
+                of its fields, but not in its structure. If its structure differs, the
+                sources are not stored, and the file named by `xml` will not exist.
 
         Returns:
             The facts with which `load_model` finds the model: its `sha256`, its size
-            in `bytes`, the base names `mjb` and `xml` (which may be None), and the
-            `mujoco` version.
+            in `bytes`, the base names of its files `mjb` and `xml` (which may be None),
+            and the `mujoco` version.
         """
         compiled = saved_model(model)
         digest = hashlib.sha256(compiled.data).hexdigest()
@@ -113,7 +113,7 @@ class ModelStore:
         }
 
     def finish(self) -> None:
-        """Wait until every model is stored. More may be added afterwards.
+        """Wait until every model is stored. More models may be added afterwards.
 
         Raises:
             FileNotWritten: a model could not be stored. The next call retries it.
@@ -126,7 +126,7 @@ class ModelStore:
             raise self._failed[0][1]
 
     def settle(self) -> None:
-        """Wait until every model is stored or has failed; `finish` reports failures."""
+        """Wait until no model is left to be stored; `finish` reports any failures."""
         if self._writer is not None:
             self._writer.close()
             self._writer = None
@@ -154,22 +154,22 @@ class ModelStore:
 def load_model(
     directory: Path, facts: Mapping[str, Any], *, trust_models: bool = False
 ) -> mujoco.MjModel:
-    """Return a stored model.
+    """Load a stored model.
 
     The compiled model is loaded if this MuJoCo version compiled it and this user stored
-    it (`model_trust`). Otherwise the model is recompiled from its sources, and no files
-    outside the zip are read.
+    it (see `model_trust`). Otherwise the model is recompiled from its sources, and no
+    files outside the zip file are read.
 
     Args:
         directory: the recording's directory.
         facts: the facts that `ModelStore.add` returned.
         trust_models: whether to load an untrusted compiled model. MuJoCo does not check
-            its content: a crafted one can run any code.
+            its content, so a crafted model can run any code.
 
     Raises:
-        UnreadableFile: the files are missing, damaged or do not match the facts, or
-            another MuJoCo version is needed.
-        UntrustedModel: there is only a compiled model, and it is untrusted.
+        UnreadableFile: the files are missing or damaged, do not match the facts, or
+            need a different MuJoCo version.
+        UntrustedModel: only a compiled model exists, and it is untrusted.
     """
     compiled, source = (_path(directory, facts.get(key)) for key in ("mjb", "xml"))
     try:
@@ -206,20 +206,20 @@ def _write(path: Path, write: Callable[[Path], None]) -> None:
 
 
 def _write_gzip(path: Path, content: NDArray[np.uint8]) -> None:
-    # Without a name and a time, so that the same model always gives the same file.
+    # The header has no name and no time, so the same model always gives the same file.
     with (
         path.open("wb") as file,
         gzip.GzipFile(
             filename="", mode="wb", compresslevel=_LEVEL, fileobj=file, mtime=0
         ) as stream,
     ):
-        # In chunks, because compressing each one releases the interpreter's lock.
+        # Write in chunks, because compressing a chunk releases the interpreter lock.
         for start in range(0, len(content), _CHUNK):
             stream.write(content.data[start : start + _CHUNK])
 
 
 def _path(directory: Path, name: object) -> Path | None:
-    """Return the path of a model's file; None if it does not exist."""
+    """Return the path of a model's file, or None if it does not exist."""
     if name is None:
         return None
     if not isinstance(name, str) or not _NAME.fullmatch(name):
@@ -257,10 +257,10 @@ def _recorded_size(path: Path, facts: Mapping[str, Any]) -> int:
 
 
 def _read_gzip(path: Path, size: int) -> bytes:
-    """Return the `size` bytes compressed in the file, never decompressing more."""
+    """Decompress a file that must contain `size` bytes, and never more than that."""
     with unreadable(path), open_regular(path) as file:
-        # Not with the gzip module, which would parse a header of any length, and any
-        # number of empty streams, byte by byte in Python.
+        # The gzip module would parse a header of any length, and any number of empty
+        # streams, byte by byte in Python.
         stream = zlib.decompressobj(wbits=zlib.MAX_WBITS | 16)
         try:
             content = stream.decompress(file.read(size + _CHUNK), size + 1)
@@ -268,7 +268,7 @@ def _read_gzip(path: Path, size: int) -> bytes:
             raise ValueError(f"it is damaged ({error})") from error
         if len(content) != size or not stream.eof or stream.unused_data:
             there = "more" if len(content) >= size else f"{len(content)} bytes"
-            raise ValueError(f"it holds {there}, not the recorded {size} bytes")
+            raise ValueError(f"it contains {there}, not the recorded {size} bytes")
         return content
 
 
@@ -281,9 +281,9 @@ def _untrusted(compiled: Path, what_of_sources: str) -> UntrustedModel:
         compiled,
         "it was not written by this user on this machine, and a crafted model can run "
         "any code in the process that loads it; its sources "
-        f"{what_of_sources}. If you trust its author: `mjrec render --trust-models`, "
-        "mjrec.load_trajectory(path, trust_models=True), or the environment variable "
-        f"{TRUST_VARIABLE}=1",
+        f"{what_of_sources}. If you trust its author, use `mjrec render "
+        "--trust-models`, mjrec.load_trajectory(path, trust_models=True), or the "
+        f"environment variable {TRUST_VARIABLE}=1",
     )
 
 
@@ -300,7 +300,8 @@ def _not_loadable(directory: Path, facts: Mapping[str, Any]) -> UnreadableFile:
     source = facts.get("xml")
     return UnreadableFile(
         directory / name,
-        f"the model was written by mujoco {version}, this is {mujoco.__version__}, and "
-        "its sources are missing. Install that version: pip install "
-        f"mujoco=={version}" + (f"; or put {source} next to it" if source else ""),
+        f"the model was written by mujoco {version}, but this is mujoco "
+        f"{mujoco.__version__}, and the model's sources are missing. Install that "
+        f"version: pip install mujoco=={version}"
+        + (f"; or put {source} next to it" if source else ""),
     )

@@ -1,24 +1,25 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The compiled models that this user has stored, which are the only ones loaded.
+"""The list of compiled models that this user has stored; no other models are loaded.
 
-MuJoCo trusts the addresses and types in a compiled model, so loading a crafted one can
-run any code. The hashes in a directory prove nothing, because its author wrote them
+MuJoCo trusts the addresses and types in a compiled model, so loading a crafted model
+can run any code. The hashes in a directory prove nothing, because its author wrote them
 too. So the models that this user stores are listed where only this user can write::
 
-    $XDG_STATE_HOME/mjrec/models       their sha256, one per line, and those of the
-                                       paths of the directories they were stored in
+    $XDG_STATE_HOME/mjrec/models       the sha256 of each model and of the path of its
+                                       directory, one per line
     ~/.local/state/mjrec/models        by default
     <temporary directory>/mjrec-<uid>/models       if that is not writable
 
 A list that others can open is neither used nor replaced, because only its owner knows
-what they wrote. Until its permissions are fixed, the other place has a list.
+what they wrote. Until its permissions are fixed, new models are listed in the other
+place.
 
-A list of 65,536 lines becomes `models.old`, replacing the previous one, whose models
-are untrusted from then on.
+A list that reaches 65,536 lines becomes `models.old` and replaces the previous
+`models.old`, whose models are then no longer trusted.
 
-Workers on other machines, whose home directories may differ, are sent the hashes that
-their jobs need and list them as their own. They report the models they store, and the
-machine that sent the job lists them.
+Workers on other machines may have different home directories. They are sent the hashes
+that their jobs need, and list them as their own. They report the models that they
+store, and the machine that sent the job lists these models.
 
 This module needs no simulator.
 """
@@ -48,8 +49,8 @@ ALL_MODELS = "1"
 
 _DIGEST = re.compile("[0-9a-f]{64}")
 _DIGITS_IN_NAME = 16
-# A task may compile a model for each episode. This size, 4.3 MB, is read in
-# milliseconds.
+# A task may compile a model for each episode. A list of this size (4.3 MB) is read
+# within milliseconds.
 _MOST_BYTES = 65_536 * 66
 # Do not follow links, and do not block on a pipe.
 _CAREFULLY = os.O_NOFOLLOW | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC
@@ -59,9 +60,9 @@ _noting: ContextVar[list[str] | None] = ContextVar("noting", default=None)
 
 
 def note_models(digests: Iterable[str]) -> None:
-    """List models as this user's own. Those already listed stay where they are.
+    """List models as this user's own. Models that are already listed are skipped.
 
-    If no list can be written, this is logged as a warning.
+    If no list can be written, a warning is logged.
 
     Args:
         digests: the sha256 of the compiled models, in hex.
@@ -104,7 +105,7 @@ def is_stored(digest: object) -> bool:
 
     Args:
         digest: the SHA-256 of the compiled model, as read from a file. Any value is
-            accepted; a malformed one counts as not stored.
+            accepted; a malformed value counts as not stored.
     """
     if not isinstance(digest, str) or not _DIGEST.fullmatch(digest):
         return False
@@ -114,8 +115,8 @@ def is_stored(digest: object) -> bool:
 def directory_digest(directory: Path) -> str:
     """Return the digest with which `note_models` lists a directory.
 
-    It identifies the directory by its path: one that was moved or copied is untrusted,
-    which costs only a moment.
+    The digest identifies the directory by its path. A directory that was moved or
+    copied is untrusted, which costs only a moment.
     """
     place = f"directory {os.path.realpath(directory)}"
     return hashlib.sha256(place.encode(errors="surrogateescape")).hexdigest()
@@ -140,7 +141,7 @@ def stored_models(directories: Iterable[Path]) -> list[str]:
 
 
 def is_trusted() -> bool:
-    """Return whether the environment variable says to load all models."""
+    """Return whether the environment variable allows loading all models."""
     return os.environ.get(TRUST_VARIABLE, "") not in ("", "0")
 
 
@@ -148,7 +149,8 @@ def is_trusted() -> bool:
 def trusting_models() -> Iterator[None]:
     """Allow this process, and those that it starts in the block, to load all models.
 
-    Use it only in a program's own main thread: environment variables are global.
+    Use this only in a program's own main thread, because environment variables are
+    global.
     """
     before = os.environ.get(TRUST_VARIABLE)
     os.environ[TRUST_VARIABLE] = ALL_MODELS
@@ -166,12 +168,12 @@ def _warn_once(message: str) -> None:
 
 
 def _directories() -> Iterator[Path]:
-    """Yield the possible directories of a list, the best one first."""
+    """Yield the possible directories for a list, starting with the best."""
     state, home = os.environ.get("XDG_STATE_HOME", ""), os.path.expanduser("~")  # noqa: PTH111  `Path.home` raises for users without one
     # The XDG specification says to ignore relative paths.
     if state.startswith("/"):
         yield Path(state, "mjrec")
-    # Root could create a home directory that is only a placeholder, like /nonexistent.
+    # A home directory may be a placeholder like /nonexistent, which root could create.
     elif home.startswith("/") and os.access(home, os.F_OK):
         yield Path(home, ".local", "state", "mjrec")
     yield Path(tempfile.gettempdir(), f"mjrec-{os.geteuid()}")

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Access to the memory of a simulation, to gather or compare many arrays at once.
+"""Access to a simulation's memory, for gathering or comparing many arrays at once.
 
-The arrays of an `MjData` keep their addresses for as long as it lives, and so do our
-own. `WORDS` presents the whole memory of this process as one long array of 64-bit
-words. With it a row is gathered by `WORDS.take(index, None, out, "clip")`, at a tenth
-of the cost of copying each array. Only the words of an index are ever touched.
+The arrays of an `MjData` keep their addresses as long as it lives, and so do our own
+arrays. `WORDS` presents the whole memory of this process as one long array of 64-bit
+words. `WORDS.take(index, None, out, "clip")` gathers a row from it, at a tenth of the
+cost of copying each array. Only the words in an index are ever touched.
 """
 
 from __future__ import annotations
@@ -17,7 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 _WORD = 8
-# Beyond what any process can address. It does not start at 0, a null pointer to NumPy.
+# More than any process can address. The array does not start at address 0, which NumPy
+# would take for a null pointer.
 _COUNT = (1 << 56) // _WORD
 WORDS: NDArray[np.uint64] = np.frombuffer(
     memoryview((ctypes.c_uint64 * _COUNT).from_address(_WORD)), np.uint64
@@ -32,7 +33,7 @@ def address_of(array: NDArray[Any]) -> int:
 def raw_memory(address: int, size: int) -> Any:
     """Return a view of another object's bytes; the caller must keep that object alive.
 
-    Comparing it with a `bytearray` is a `memcmp` and copies nothing.
+    Comparing the view with a `bytearray` is a `memcmp` and copies nothing.
     """
     return (ctypes.c_ubyte * size).from_address(address)
 
@@ -41,8 +42,8 @@ def words_of(arrays: Iterable[NDArray[Any]]) -> NDArray[np.intp]:
     """Return the indices into `WORDS` of all arrays, concatenated.
 
     Args:
-        arrays: arrays for which `can_be_gathered` is true. The caller must keep them
-            alive for as long as the words are read.
+        arrays: arrays for which `can_be_gathered` returns True. The caller must keep
+            them alive as long as the words are read.
     """
     words = [np.empty(0, np.intp)]
     for array in arrays:

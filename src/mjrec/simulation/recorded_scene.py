@@ -29,18 +29,19 @@ _MODEL, _STATES = "model.mjb", "states.npy"
 class RecordedScene:
     """A model and its data, as they were at a frame of a trajectory.
 
-    Only what the visualiser reads is restored into the data, which is for drawing only.
+    Only arrays that the visualizer reads are restored, so use the data only to draw.
 
     Args:
-        reader: the trajectory's reader, used for as long as this object.
+        reader: the trajectory's reader, which must stay open as long as this object is
+            used.
 
     Raises:
         UnreadableFile: the file's facts about the scene are invalid, or its model is
             missing, damaged or from another MuJoCo version.
 
     Attributes:
-        model: the model, as it was at the frame last restored.
-        data: its data at that frame.
+        model: the model as it was at the last restored frame.
+        data: the model's data at that frame.
         view: the environment's view of the scene. Its camera and option change with the
             frames.
         previous_cameras: positions of the two cameras of the environment's scene before
@@ -55,7 +56,7 @@ class RecordedScene:
         try:
             self.view = view_from_facts(facts["scene"])
             self.previous_cameras = _positions(facts["scene"].get("previous_cameras"))
-        # Not everything that NumPy and the bindings reject is checked beforehand.
+        # NumPy and the bindings may reject values that were not checked beforehand.
         except (AttributeError, TypeError, ValueError, OverflowError) as error:
             raise UnreadableFile(reader.path, f"in its scene: {error}") from error
         if not isinstance(facts.get("model"), dict):
@@ -100,13 +101,13 @@ class RecordedScene:
         self._step = -1
 
     def _change_model(self, step: int) -> dict[str, NDArray[Any]]:
-        """Change the model to what it was after `step`; return the changed fields."""
+        """Restore the model as it was after `step`, and return the changed fields."""
         fields: dict[str, NDArray[Any]] = {}
         if step < self._step:
             fields.update(self._originals)
             self._restart()
         self._step = step
-        # Merged one by one: all changes together may not fit into memory.
+        # Merged one by one, because all changes together may not fit into memory.
         while self._next is not None and self._next.step <= step:
             fields.update(self._next.fields)
             self._next = next(self._changes, None)
@@ -144,22 +145,24 @@ def check_states(model: Any, states: ArrayLike, spec: int) -> NDArray[np.float64
         size = int(mujoco.mj_stateSize(raw_model(model), int(spec)))
     except (TypeError, ValueError, mujoco.FatalError) as error:
         raise InvalidArgument(
-            f"spec must be a combination of mujoco.mjtState, got {spec!r}: {error}."
+            f"spec must be a combination of mujoco.mjtState, not {spec!r}: {error}."
         ) from error
     rows = np.asarray(states)
     if rows.dtype.kind not in "iuf":
-        raise InvalidArgument(f"States must be numbers, got an array of {rows.dtype}.")
+        raise InvalidArgument(f"States must be numbers, not an array of {rows.dtype}.")
     if rows.ndim == 3 and rows.shape[2] == size:
         raise InvalidArgument(
-            f"States must have the shape (n, {size}), got {rows.shape}: many runs of "
-            "many steps, as mujoco.rollout returns them. Pass one run, states[k], or "
-            f"all runs one after another, states.reshape(-1, {size})."
+            f"States must have the shape (n, {size}), but this array has the shape "
+            f"{rows.shape}: many runs of many steps, as mujoco.rollout returns them. "
+            "Pass one run, states[k], or all runs one after another, "
+            f"states.reshape(-1, {size})."
         )
     if rows.ndim != 2 or rows.shape[1] != size:
         raise InvalidArgument(
-            f"States must have the shape (n, {size}), got {rows.shape}, because "
-            f"mujoco.mj_stateSize(model, {int(spec)}) is {size}. Pass the spec and the "
-            "model that the rows were made with."
+            f"States must have the shape (n, {size}), because "
+            f"mujoco.mj_stateSize(model, {int(spec)}) is {size}, but this array has "
+            f"the shape {rows.shape}. Pass the spec and the model that produced the "
+            "rows."
         )
     return np.ascontiguousarray(rows, np.float64)
 
@@ -181,8 +184,8 @@ def save_states(directory: Path, model: Any, states: NDArray[np.float64]) -> Non
 class GivenStates:
     """A model and its data in one of the states that `save_states` has written.
 
-    Everything derived from a state is computed, as by `mj_forward`; components that the
-    rows leave out are as in a new `MjData`. So each frame depends only on its row.
+    All quantities derived from a state are computed with `mj_forward`. Components that
+    are not in the rows are as in a new `MjData`. So each frame depends only on its row.
 
     Args:
         directory: the directory that `save_states` wrote to.
@@ -190,7 +193,7 @@ class GivenStates:
 
     Attributes:
         model: the model.
-        data: its data, in the state last set.
+        data: the model's data, in the state that was set last.
         count: number of rows.
     """
 
@@ -205,7 +208,7 @@ class GivenStates:
         self.count = len(self._states)
 
     def bring_to(self, index: int) -> bool:
-        """Set a row in the data; return False, because the model never changes."""
+        """Set a row in the data, and return False because the model never changes."""
         mujoco.mj_resetData(self.model, self.data)
         # Copied, because mujoco 3.3 does not accept a read-only array.
         state = np.array(self._states[index])
@@ -214,7 +217,7 @@ class GivenStates:
         return False
 
     def close(self) -> None:
-        """Do nothing: the files belong to the caller."""
+        """Do nothing, because the files belong to the caller."""
 
 
 def _positions(previous: Any) -> NDArray[np.float64]:

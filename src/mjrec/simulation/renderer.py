@@ -68,15 +68,15 @@ def is_kept_by_context(name: str) -> bool:
 class Canvas:
     """An OpenGL context for a model, size and quality, in which scenes are drawn.
 
-    `prepare` keeps it as it is if all three are the same as before, and the context's
-    copy of the model is up to date.
+    `prepare` does not change the context if all three are the same as before and the
+    context's copy of the model is up to date.
 
     Args:
         is_alone: whether nothing else draws in this process, so that the context can
             stay current on its thread.
 
     Attributes:
-        gl_facts: the facts about the driver for the metadata, see `current_gl_facts`.
+        gl_facts: metadata about the driver; see `current_gl_facts`.
     """
 
     def __init__(self, *, is_alone: bool = False) -> None:
@@ -90,7 +90,7 @@ class Canvas:
         self._kept = b""
 
     def open(self) -> None:
-        """Create the context now, so that the first frame comes sooner. Idempotent.
+        """Create the context now, so that the first frame takes less time. Idempotent.
 
         Raises:
             GLError: see `new_context`.
@@ -107,7 +107,7 @@ class Canvas:
             InvalidArgument: the driver cannot draw frames of this size.
             GLError: see `new_context`.
         """
-        # Not identified by a recording's facts about its model, which may be untrusted.
+        # Hash the model itself, because the facts in a recording may be untrusted.
         buffer = np.empty(mujoco.mj_sizeModel(model), np.uint8)
         mujoco.mj_saveModel(model, None, buffer)
         kind = (hashlib.blake2b(buffer.data).digest(), height, width, quality)
@@ -120,7 +120,7 @@ class Canvas:
         self.update(model)
 
     def update(self, model: mujoco.MjModel) -> None:
-        """Bring the context up to date with changes of its model.
+        """Bring the context up to date with changes to its model.
 
         Args:
             model: the same model, or one loaded from the same file.
@@ -135,7 +135,7 @@ class Canvas:
             self._kept = kept
 
     def draw(self, scene: mujoco.MjvScene) -> Frame:
-        """Return the frame of `scene`, top row first.
+        """Return the frame of `scene`, starting with the top row.
 
         Raises:
             ClosedError: after `close`.
@@ -150,16 +150,16 @@ class Canvas:
         """Free the context and everything in it. Idempotent."""
         self._closed = True
         context, self._context = self._context, None
-        # At exit EGL may have shut down already, and nothing is left to free. A forked
-        # child must not free its parent's context.
+        # At exit, EGL may already have shut down, and then nothing is left to free. A
+        # forked child must not free its parent's context.
         if context is not None and os.getpid() == self._process_id:
             with context_kept(), contextlib.suppress(Exception):
                 context.make_current()
                 self._free_drawing()
                 context.free()
 
-    # If it were dropped without this, MuJoCo would free its context in whichever one is
-    # current then, and delete the objects there that have the same numbers.
+    # Without this, MuJoCo would free its objects in whichever context is then current,
+    # and so delete that context's objects with the same numbers.
     __del__ = close
 
     @contextlib.contextmanager
@@ -179,10 +179,10 @@ class Canvas:
             yield
 
     def _load(self, model: mujoco.MjModel) -> None:
-        """Copy to the context the parts of a model that it keeps."""
+        """Copy the parts of a model that the context keeps to the context."""
         height, width = self._rectangle.height, self._rectangle.width
         with self._current():
-            # Longest side that the driver can draw.
+            # The longest side that the driver can draw.
             limits = np.zeros(1, np.int32)
             raw_opengl().glGetIntegerv(_MAX_RENDERBUFFER_SIZE, limits)
             limit = int(limits[0])
@@ -193,7 +193,7 @@ class Canvas:
                     f"{limit}x{limit}."
                 )
             self._free_drawing()
-            # Only the context needs these settings, and it keeps no reference.
+            # Only the context needs these settings, and it keeps no reference to them.
             for_context = _with_settings(model, height, width, self._quality)
             try:
                 self._drawing = mujoco.MjrContext(
@@ -212,19 +212,19 @@ class Canvas:
 
 
 class SceneRenderer:
-    """A renderer whose frames are those of `mujoco.Renderer`, byte for byte.
+    """A renderer whose frames equal those of `mujoco.Renderer`, byte for byte.
 
     It does not disturb anything else that draws on the caller's thread, and modifies
     neither the model nor the data.
 
     Most changes to the model show in the next frame. Changes to height fields,
     textures, meshes, sizes of planes, textures of materials, fog and rendering quality
-    show after `model_changed`.
+    show only after `model_changed`.
 
-    MuJoCo's visualiser remembers the previous frame: an infinite plane is drawn around
-    the positions that the cameras had in it, and a camera that tracks a body moves part
-    of the way to it in each frame. `begin` and `look` bring the renderer to any frame
-    as if all previous ones had been drawn.
+    MuJoCo's visualizer remembers the previous frame: an infinite plane is drawn around
+    the cameras' positions in that frame, and a camera that tracks a body moves part of
+    the way toward the body in each frame. `begin` and `look` bring the renderer to any
+    frame as if all previous frames had been drawn.
 
     ::
 
@@ -233,19 +233,19 @@ class SceneRenderer:
 
     Args:
         model: the model.
-        height: height in pixels; may exceed the model's offscreen buffer.
-        width: width in pixels; may exceed the model's offscreen buffer.
-        camera: the camera, see `resolve_camera`; an `MjvCamera` is read again for every
+        height: height in pixels, which may exceed the model's offscreen buffer.
+        width: width in pixels, which may exceed the model's offscreen buffer.
+        camera: the camera; see `resolve_camera`. An `MjvCamera` is read again for every
             frame.
         scene_option: the visual options, read again for every frame; None for MuJoCo's
             default. This is not dm_control's default, which draws no range finders.
-        max_geom: maximum number of geoms in the scene; more are not drawn. The
-            environments' own renderers have other limits (Gymnasium's is 1000).
-        quality: `"full"` draws what the model specifies. `"draft"` draws without
+        max_geom: maximum number of geoms in the scene; further geoms are not drawn. The
+            environments' own renderers have different limits (Gymnasium's is 1000).
+        quality: `"full"` uses the model's own settings. `"draft"` draws without
             multisampling and with a shadow map of at most 1024x1024.
         fresh: whether to draw each frame as if it were the first, as dm_control does.
-        canvas: the canvas to draw with, which other renderers of the same model, size
-            and quality may share in turn; None to create one.
+        canvas: the canvas to draw with. Renderers of the same model, size and quality
+            may take turns with it. None means a new canvas.
         begins_at: positions of the scene's two cameras before the first frame,
             `(2, 3)`.
         is_moved: whether the camera is moved from outside before each frame.
@@ -295,18 +295,18 @@ class SceneRenderer:
 
     @property
     def gl_facts(self) -> dict[str, Any]:
-        """The facts about the driver for the metadata, see `current_gl_facts`."""
+        """Metadata about the driver; see `current_gl_facts`."""
         return self._canvas.gl_facts
 
     @property
     def shows_frame_before(self) -> bool:
-        """Whether a frame depends on the cameras' positions in the previous one."""
+        """Whether a frame depends on the cameras' positions in the previous frame."""
         return self.is_following or (
             not self._fresh and has_infinite_plane(self._model)
         )
 
     def begin(self) -> None:
-        """Return to the situation before the first frame."""
+        """Put the cameras back to where they are before the first frame."""
         self._put_cameras(self._begins_at)
         if self.is_following:
             resolve_camera(self._model, self._camera).lookat[:] = (
@@ -324,8 +324,8 @@ class SceneRenderer:
         The first row is at the top.
 
         Args:
-            data: the model's data. Its derived quantities are drawn as they are: after
-                `mj_step` they belong to the state before the last substep.
+            data: the model's data. Its derived quantities are drawn as they are. After
+                `mj_step`, they belong to the state before the last substep.
 
         Raises:
             ClosedError: after `close`.
@@ -343,8 +343,8 @@ class SceneRenderer:
     def model_changed(self) -> None:
         """Bring the canvas up to date with the model.
 
-        This compares the parts of the model that an OpenGL context keeps, which takes
-        milliseconds with large textures, and copies them again if any has changed.
+        This compares the parts of the model that an OpenGL context keeps, and copies
+        them again if any has changed. With large textures, it takes milliseconds.
 
         Raises:
             GLError: see `render`.
@@ -352,7 +352,7 @@ class SceneRenderer:
         self._canvas.update(self._model)
 
     def close(self) -> None:
-        """Close the canvas, if this renderer created it. Idempotent."""
+        """Close the canvas if this renderer created it. Idempotent."""
         if self._owns_canvas:
             self._canvas.close()
 
@@ -382,7 +382,7 @@ def _kept_of(model: mujoco.MjModel) -> bytes:
 def _with_settings(
     model: mujoco.MjModel, height: int, width: int, quality: str
 ) -> mujoco.MjModel:
-    """Return `model`, or a copy with a large enough buffer and this quality."""
+    """Return `model`, or a copy of it with a larger buffer or the draft settings."""
     buffer = model.vis.global_
     is_large_enough = height <= buffer.offheight and width <= buffer.offwidth
     if is_large_enough and quality == "full":

@@ -1,13 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A check, during recording, that a snapshot holds everything the visualiser reads.
+"""A check during recording that a snapshot contains all that the visualizer reads.
 
 MuJoCo may read a field that we do not know about. Building a scene takes microseconds
-and needs no OpenGL. So one scene is built from the live data and one from the restored
-snapshot, and they must be equal.
+and needs no OpenGL. So one scene is built from the live data and another from the
+restored snapshot, and they must be equal.
 
-Checking one scene is not enough for plugins. MuJoCo calls a plugin's `visualize` for
-each scene, which may draw from the plugin's own memory, and only sometimes: a touch
-grid draws nothing until something touches it. So models with plugins are recorded live.
+Checking one scene is not enough for plugins. For each scene, MuJoCo calls a plugin's
+`visualize`, which may draw from the plugin's own memory, and may do so only sometimes:
+a touch grid draws nothing until something touches it. So models with plugins are
+recorded live.
 """
 
 from __future__ import annotations
@@ -26,7 +27,8 @@ from .view import SceneView
 
 _EVERYTHING = int(mujoco.mjtCatBit.mjCAT_ALL)
 
-# Not set by `mjv_updateScene` for every geom, or set later, when it is drawn.
+# Members that `mjv_updateScene` does not set for every geom, or that are set later,
+# when the geom is drawn.
 _NOT_SET = ("camdist", "modelrbound", "transparent")
 
 
@@ -36,18 +38,18 @@ def scene_difference(
     row: Any,
     view: SceneView,
 ) -> str | None:
-    """Return how the frame of a snapshot would differ from one of the live data.
+    """Return how a frame from a snapshot would differ from one of the live data.
 
     Neither the model nor the data is modified.
 
     Args:
         model: the current model.
-        data: its data.
+        data: the model's data.
         row: a snapshot of the current data.
         view: the camera, options and size of the scene.
 
     Returns:
-        The name of the first difference; None if the scenes are equal.
+        The name of the first difference, or None if the scenes are equal.
     """
     if model.nplugin:
         return "its plugins may draw from their own memory"
@@ -67,7 +69,7 @@ def updated_scene(
     """Return a new scene of `data`; the view is not modified."""
     scene = mujoco.MjvScene(model, maxgeom=view.max_geom)
     for name in _shapes():
-        # Arrays of what is not shown are not initialised either.
+        # MuJoCo does not initialize the arrays of shapes that are not shown.
         getattr(scene, name)[...] = 0
     # Updating the scene moves a tracking camera.
     camera = copy.copy(view.camera)
@@ -108,7 +110,7 @@ def _parts(
 
 def _value(struct: Any, name: str) -> Any:
     value = getattr(struct, name)
-    # Compared as bytes: a NaN equals a NaN, and -0.0 differs from 0.0.
+    # Compare bytes, so that NaN equals NaN, and -0.0 differs from 0.0.
     return value.tobytes() if isinstance(value, np.ndarray) else value
 
 
@@ -120,7 +122,7 @@ def _members(kind: Any) -> tuple[str, ...]:
 
 @functools.cache
 def _shapes() -> tuple[str, ...]:
-    """Return the names of the arrays that hold the shapes of skins and flexes."""
+    """Return the names of the arrays with the shapes of skins and flexes."""
     scene = mujoco.MjvScene()
     names = (name for name in dir(scene) if name.startswith(("skin", "flex")))
     values = {name: getattr(scene, name) for name in names}

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Taking snapshots of a simulation as rows of bytes, and restoring them for drawing.
+"""Snapshots of a simulation, taken as rows of bytes and restored for drawing.
 
-A snapshot restored into a new `MjData` gives the same scene, byte for byte.
+A snapshot that is restored into a new `MjData` gives the same scene, byte for byte.
 """
 
 from __future__ import annotations
@@ -16,9 +16,10 @@ from ..errors import InvalidArgument
 from .captured_arrays import ALWAYS, SNAPSHOT_ARRAYS, TENDON_RGBA, array_kind
 from .raw_memory import WORDS, can_be_gathered, words_of
 
-# Indices of geoms and of each other, which the visualiser does not check.
+# Arrays of indices into the geoms and into each other, which the visualizer does not
+# check.
 _PATHS = ("ten_wrapadr", "ten_wrapnum", "wrap_obj")
-# Replaces the index of a geom.
+# This value replaces the index of a geom.
 _PULLEY = -2
 
 _LIMIT_TENDON = int(mujoco.mjtConstraint.mjCNSTR_LIMIT_TENDON)
@@ -27,16 +28,16 @@ _DYNAMIC = int(mujoco.mjtCatBit.mjCAT_DYNAMIC)
 
 
 class SnapshotSource:
-    """A source of snapshots of one `MjData`.
+    """A source of snapshots from one `MjData`.
 
     Args:
-        model: the model; kept alive, like the data.
-        data: its data.
+        model: the model, which is kept alive, like the data.
+        data: the model's data.
         kind: the dtype that `snapshot_dtype` returned for the model.
 
     Attributes:
-        words: the snapshot's indices into `raw_memory.WORDS`; None if it cannot be
-            gathered, or consists of more than the data's own arrays.
+        words: the snapshot's indices into `raw_memory.WORDS`; None if the snapshot
+            cannot be gathered, or if it includes arrays that are not the data's own.
     """
 
     def __init__(
@@ -77,13 +78,14 @@ class SnapshotSource:
 class TendonColours:
     """The colours in which a model's tendons are drawn.
 
-    MuJoCo blends the colour of a spatial tendon at its limit with the colour of
+    If a spatial tendon is at its limit, MuJoCo blends its colour with the colour of
     constraints, weighted by the strength of the limit. Tendons with a material or a
     colour of their own are not blended. The strength is not kept after the step, so the
-    resulting colour is recorded. It is read from a scene that holds only the tendons.
+    resulting colour is recorded. It is read from a scene that contains only the
+    tendons.
 
     Attributes:
-        rgba: `(ntendon, 4) float32`, set by the last `update`; always the same array.
+        rgba: `(ntendon, 4) float32`, set by `update`; always the same array.
     """
 
     def __init__(self, model: mujoco.MjModel, data: mujoco.MjData) -> None:
@@ -120,7 +122,7 @@ def check_layout(
 ) -> None:
     """Check that recorded snapshots belong to this model, before they are restored.
 
-    They must hold at least the arrays that MuJoCo's default option needs.
+    They must contain at least the arrays that MuJoCo's default option needs.
 
     Raises:
         InvalidArgument: the snapshots belong to another model or version of MuJoCo.
@@ -129,7 +131,7 @@ def check_layout(
         is_colour = name == TENDON_RGBA
         if not is_colour and name not in SNAPSHOT_ARRAYS:
             raise InvalidArgument(
-                f"The snapshots hold {name!r:.40}, which is not used for drawing."
+                f"The snapshots contain {name!r:.40}, which is not used for drawing."
             )
         own = array_kind(model if is_colour else data, name)
         if kind[name] != own:
@@ -144,12 +146,12 @@ def check_layout(
 
 
 def restore_snapshot(row: Any, model: mujoco.MjModel, data: mujoco.MjData) -> None:
-    """Restore a snapshot, ready for `mjv_updateScene`.
+    """Restore a snapshot so that `mjv_updateScene` can use the data.
 
     Args:
         row: an element of `TrajectoryReader.snapshots`, whose layout was checked.
-        model: the model; its tendons' colours are set if `row` has them.
-        data: its data.
+        model: the model. Its tendons' colours are set if `row` has them.
+        data: the model's data.
 
     Raises:
         InvalidArgument: a tendon refers to something that is not in the model, which
@@ -164,7 +166,7 @@ def restore_snapshot(row: Any, model: mujoco.MjModel, data: mujoco.MjData) -> No
 
 
 def _check_paths(model: mujoco.MjModel, data: mujoco.MjData) -> None:
-    """Check the indices that the visualiser follows unchecked along a tendon."""
+    """Check the indices along tendons, which the visualizer uses without checks."""
     first, count = data.ten_wrapadr.astype(np.int64), data.ten_wrapnum
     points, wrapped = 2 * model.nwrap, data.wrap_obj
     ends = first + count
@@ -176,6 +178,6 @@ def _check_paths(model: mujoco.MjModel, data: mujoco.MjData) -> None:
     if wrapped.size and (wrapped.min() < _PULLEY or wrapped.max() >= model.ngeom):
         raise InvalidArgument(
             f"The snapshot's wrap_obj must be from {_PULLEY} (a pulley) and -1 (a "
-            f"site) to {model.ngeom - 1} for this model, but it holds values from "
+            f"site) to {model.ngeom - 1} for this model, but its values range from "
             f"{wrapped.min()} to {wrapped.max()}."
         )

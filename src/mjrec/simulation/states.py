@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The state of a simulation: its dtype, its memory, and setting and preserving it.
+"""The state of a simulation, and functions that read, set and preserve it.
 
-The state is `mjSTATE_INTEGRATION`, everything that the next step depends on. MuJoCo
+The state is `mjSTATE_INTEGRATION`: everything that the next step depends on. MuJoCo
 returns it as one vector whose components are identified by bits. The bits have been
 renumbered between releases, so recordings identify components by name.
 """
@@ -25,7 +25,7 @@ STATE_SPEC = int(mujoco.mjtState.mjSTATE_INTEGRATION)
 
 _PREFIX = "mjSTATE_"
 
-# Components whose array in `MjData` has a different name.
+# The components whose arrays in `MjData` have different names.
 _STATE_ARRAYS = {"warmstart": "qacc_warmstart", "plugin": "plugin_state"}
 # The time is not an array but a number in the struct, close to this array.
 _NEIGHBOUR, _REACH = "energy", 16
@@ -59,7 +59,7 @@ STATE_BITS = _elementary_bits()
 def state_dtype(model: mujoco.MjModel) -> np.dtype[Any]:
     """Return the dtype of the state of `model`, in the order of its vector.
 
-    Components that are empty for this model (`act` without activations) are left out.
+    Components that are empty for this model, such as `act`, are left out.
     """
     sizes = {name: mujoco.mj_stateSize(model, bit) for name, bit in STATE_BITS.items()}
     return packed((name, ("<f8", (size,))) for name, size in sizes.items() if size)
@@ -75,11 +75,11 @@ def read_state(model: mujoco.MjModel, data: mujoco.MjData) -> NDArray[np.float64
 def state_words(model: mujoco.MjModel, data: mujoco.MjData) -> NDArray[np.intp] | None:
     """Return the indices into `raw_memory.WORDS` of the state of `data`.
 
-    The caller must keep `data` alive. Whether these words hold what `mj_getState`
-    returns is tested, not assumed from a header.
+    The caller must keep `data` alive. A test ensures that these words equal the result
+    of `mj_getState`, so no header has to be trusted.
 
     Returns:
-        The indices; None if a component is stored with another type than in the state
+        The indices, or None if a component has a different type than in the state
         (`eq_active`), is new in MuJoCo, or cannot be gathered.
     """
     arrays = []
@@ -103,7 +103,7 @@ def _time(data: mujoco.MjData) -> NDArray[np.float64]:
 
 @functools.cache
 def _time_offset() -> int:
-    """Return the offset of the time from its neighbour, found by setting the time."""
+    """Find the offset of the time from its neighbor, by setting the time."""
     data = mujoco.MjData(mujoco.MjModel.from_xml_string("<mujoco/>"))
     start = address_of(getattr(data, _NEIGHBOUR)) - _REACH
     near = np.frombuffer(memoryview(raw_memory(start, 3 * _REACH)), np.float64)
@@ -115,11 +115,11 @@ def _time_offset() -> int:
 def state_columns(
     model: mujoco.MjModel, parts: Mapping[str, slice]
 ) -> NDArray[np.intp]:
-    """Return the columns of a recorded row that make up the state of this MuJoCo.
+    """Return the columns of a recorded row that form a state in this MuJoCo version.
 
     Raises:
-        InvalidArgument: a component is unknown to this MuJoCo, or has a different
-            length in this model.
+        InvalidArgument: this MuJoCo version does not know a component, or the component
+            has a different length in this model.
     """
     own = columns_of(state_dtype(model))
     if _lengths(parts) == _lengths(own):
@@ -127,12 +127,13 @@ def state_columns(
     unknown = sorted(parts.keys() - STATE_BITS.keys())
     if unknown:
         raise InvalidArgument(
-            f"The state holds {', '.join(unknown)}, which MuJoCo {mujoco.__version__} "
-            "does not know. Use the MuJoCo version that recorded it, or a later one."
+            f"The state contains {', '.join(unknown)}, which MuJoCo "
+            f"{mujoco.__version__} does not know. Use the MuJoCo version that recorded "
+            "it, or a later version."
         )
     recorded, here = _lengths(parts), _lengths(own)
     differences = [
-        f"{name} has {recorded.get(name, 0)}, in this model {here.get(name, 0)}"
+        f"{name} has {recorded.get(name, 0)}, but in this model {here.get(name, 0)}"
         for name in STATE_BITS
         if recorded.get(name, 0) != here.get(name, 0)
     ]
@@ -171,8 +172,8 @@ def set_state(
     values = np.asarray(row, np.float64)
     if values.ndim != 1 or len(values) < len(columns):
         raise InvalidArgument(
-            f"A state of this model has {len(columns)} numbers, got an array of shape "
-            f"{values.shape}."
+            f"A state of this model has {len(columns)} numbers, but this array has the "
+            f"shape {values.shape}."
         )
     mujoco.mj_setState(model, data, values[columns], STATE_SPEC)
 
@@ -201,17 +202,17 @@ def enter_state(
 
 
 def turns_by_rk4(model: mujoco.MjModel) -> bool:
-    """Return whether the Runge-Kutta method (RK4) integrates any quaternions."""
+    """Return whether the model uses RK4 (Runge-Kutta) to integrate quaternions."""
     kinds = (mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_BALL)
     is_rk4 = model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4
     return bool(is_rk4 and np.isin(model.jnt_type, [int(k) for k in kinds]).any())
 
 
 class PreservedState:
-    """The state of a simulation, preserved over a block.
+    """The state of a simulation, which is preserved over a block.
 
-    After the block all of the data is restored, and the fields of the model that place,
-    size and colour sites, geoms and bodies. The arrays keep their addresses.
+    After the block, all of the data is restored, and so are the positions, sizes and
+    colours of the model's sites, geoms and bodies. The arrays keep their addresses.
     """
 
     def __init__(self) -> None:
@@ -220,7 +221,7 @@ class PreservedState:
 
     @contextlib.contextmanager
     def around(self, model: mujoco.MjModel, data: mujoco.MjData) -> Iterator[None]:
-        """Preserve `model` and `data` over the block, even if it raises.
+        """Preserve `model` and `data` over the block, even if it raises an error.
 
         Not reentrant.
         """

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Recorded episodes, read back as arrays.
+"""Recorded episodes that are read back as arrays.
 
-Reading needs no simulator: MuJoCo is imported only for a model or its data.
+Reading needs no simulator. MuJoCo is imported only for a model or its data.
 """
 
 from __future__ import annotations
@@ -32,25 +32,25 @@ _SHOWN = 10
 def load_trajectory(
     path: str | os.PathLike[str], *, trust_models: bool = False
 ) -> Trajectory:
-    """Return a recorded episode.
+    """Load a recorded episode.
 
     Args:
-        path: its file, `openaigym.trajectory.*.h5`. While the episode runs, and if its
-            process was killed, this file does not exist yet, and the monitor's log is
-            read instead.
+        path: the episode's file, `openaigym.trajectory.*.h5`. While the episode runs,
+            or if its process was killed, this file does not exist yet, and the
+            monitor's log is read instead.
         trust_models: whether `model()` and `mjrec.render` may load a compiled model
             that another user or machine wrote. A crafted model can run any code. If
-            false, the model is compiled from its sources, if they exist.
-            `MJREC_TRUST_MODELS=1` does the same for all.
+            False, the model is compiled from its sources, if they exist.
+            `MJREC_TRUST_MODELS=1` allows loading all compiled models.
 
     Raises:
-        UnreadableFile: the file is missing, damaged, from a newer format, or hostile.
+        UnreadableFile: the file is missing, damaged or hostile, or has a newer format.
         InvalidArgument: the path is a directory; the message lists its trajectories.
     """
     path = Path(path)
     if path.is_symlink() and infix_of(path.name) is None:
-        # A link such as `latest.h5` is the user's own. A link with the name of a
-        # monitor's file may come with the directory from a stranger.
+        # A link such as `latest.h5` is the user's own. A link that has a monitor file's
+        # name may be part of an untrusted directory.
         path = Path(os.path.realpath(path))
     if path.is_dir() or (path.is_file() and is_bundle(path.name)):
         raise InvalidArgument(_what_is_in(path))
@@ -59,16 +59,16 @@ def load_trajectory(
 
 
 class Trajectory:
-    """A recorded episode of T steps, with F frames, rendered or still to be rendered.
+    """A recorded episode of T steps, with F frames that may still have to be rendered.
 
-    Row `k` of `states`, `time` and `observations` is the value after `k` steps; row 0
-    is the value after the reset. Row `k` of `actions`, `rewards`, `terminated` and
+    Row `k` of `states`, `time` and `observations` is the value after `k` steps, and row
+    0 is the value after the reset. Row `k` of `actions`, `rewards`, `terminated` and
     `truncated` belongs to the step from state `k` to state `k + 1`.
 
     To reproduce a step, set state `k`, set the inputs stored in state `k + 1`, and
-    simulate one control step. With the same MuJoCo on the same machine the result is
-    state `k + 1`, bit for bit, if the environment does nothing but `mj_step`
-    (`substeps` times, `frame_skip` in Gymnasium)::
+    simulate one control step. With the same MuJoCo version on the same machine, the
+    result is state `k + 1`, bit for bit, if the environment does nothing but call
+    `mj_step` (`substeps` times; Gymnasium calls this number `frame_skip`)::
 
         model = trajectory.model()
         data = mujoco.MjData(model)
@@ -80,22 +80,22 @@ class Trajectory:
     `mocap_pos`, `mocap_quat` and `userdata`, for environments that use them. An action
     is the input of the environment, which need not be the input of the actuators.
 
-    Snapshots and changes of the model are read on demand; the rest is in memory.
+    Snapshots and changes of the model are read on demand, and the rest is in memory.
 
     Args:
         reader: the file's reader; it may be closed afterwards.
-        trust_models: whether to load a compiled model that a stranger wrote.
+        trust_models: whether to load an untrusted compiled model.
 
     Attributes:
         path: the file that was read.
-        trust_models: whether to load a compiled model that a stranger wrote.
+        trust_models: whether to load an untrusted compiled model.
         facts: all metadata, as listed in `docs/reference/trajectories.md`.
         states: `(T + 1, n) float64`, the physics states (`mjSTATE_INTEGRATION`, in
-            MuJoCo's units); n is 0 without a simulation. See `component`.
+            MuJoCo's units); n is 0 if there was no simulation. See `component`.
         actions: `(T, *shape)`; None if actions are not plain arrays.
         rewards: `(T,) float64`.
         terminated: `(T,) bool`, whether the task ended the episode.
-        truncated: `(T,) bool`, whether a limit outside the task ended it.
+        truncated: `(T,) bool`, whether a limit outside the task ended the episode.
         observations: `(T + 1, *shape)`; None if they were not recorded.
         frame_steps: `(F,) int64`, the number of steps before each frame.
         dropped: number of rows at the end that were incomplete because the process was
@@ -143,7 +143,7 @@ class Trajectory:
     def _videos(self) -> list[Path]:
         video = self.facts.get("video")
         name = video.get("name") if isinstance(video, Mapping) else None
-        # A stranger's file may name any path.
+        # An untrusted file may name any path.
         if not isinstance(name, str) or Path(name).name != name:
             return []
         path = self.path.parent / name
@@ -156,7 +156,7 @@ class Trajectory:
 
     @property
     def environment(self) -> dict[str, Any] | None:
-        """The framework, id and kwargs to recreate the environment; None if unknown."""
+        """The framework, id and kwargs that recreate the environment, or None."""
         return self.facts.get("environment")
 
     @property
@@ -181,12 +181,12 @@ class Trajectory:
 
     @property
     def time(self) -> NDArray[np.float64] | None:
-        """`(T + 1,)`, the simulation time in seconds; None without a simulation."""
+        """The simulation time in seconds, `(T + 1,)`, or None without a simulation."""
         return self.component("time")[:, 0] if "time" in self.components else None
 
     @functools.cached_property
     def snapshots(self) -> dict[str, NDArray[Any]]:
-        """The arrays that frames are drawn from, keyed by MuJoCo name: `(F, *shape)`.
+        """The arrays that frames are drawn from, `(F, *shape)`, by their MuJoCo names.
 
         Raises:
             UnreadableFile: the file has been removed or is damaged.
@@ -210,15 +210,16 @@ class Trajectory:
         return self.states[:, self._columns[name]]
 
     def model(self, step: int = 0) -> mujoco.MjModel:
-        """Return the model as it was in this episode, a new copy at each call.
+        """Return a new copy of the model as it was in this episode.
 
         Args:
-            step: the number of steps taken, if the environment changes its model during
-                the episode; changes made in the reset are included from step 0.
+            step: the number of steps taken, which matters if the environment changes
+                its model during the episode. Changes made in the reset are included
+                from step 0 on.
 
         Raises:
             UnreadableFile: the model next to this file is missing or damaged, or was
-                written by another MuJoCo version and without its sources.
+                written by another MuJoCo version without its sources.
             UntrustedModel: the model cannot be compiled from its sources, and was
                 compiled by another user.
             InvalidArgument: the step does not exist.
@@ -237,7 +238,8 @@ class Trajectory:
             raise UnreadableFile(self.path, "its facts about its model are invalid")
         model = load_model(self.path.parent, stored, trust_models=self.trust_models)
         try:
-            # One at a time: there may be thousands, each as large as a texture.
+            # Apply one change at a time, because there may be thousands of changes,
+            # each as large as a texture.
             with open_vetted_trajectory(self.path) as reader:
                 for change in reader.iter_model_changes():
                     if change.step <= step:
@@ -250,8 +252,8 @@ class Trajectory:
         """Set a recorded state in `data`, without computing derived quantities.
 
         Args:
-            data: the `mujoco.MjData` of `model()`.
-            step: the number of steps taken; -1 is the last state.
+            data: a `mujoco.MjData` of `model()`.
+            step: the number of steps taken; -1 means the last state.
 
         Raises:
             InvalidArgument: the step does not exist, or the state does not belong to
@@ -266,11 +268,11 @@ class Trajectory:
     def _step(self, step: int) -> int:
         count = len(self.states)
         if isinstance(step, bool) or not isinstance(step, int | np.integer):
-            raise InvalidArgument(f"A step must be a whole number, got {step!r}.")
+            raise InvalidArgument(f"A step must be a whole number, not {step!r}.")
         if not -count <= step < count:
             raise InvalidArgument(
-                f"{self.path.name} holds {count} states, counted from 0; state {step} "
-                "does not exist."
+                f"{self.path.name} contains {count} states, counted from 0, so state "
+                f"{step} does not exist."
             )
         return step % count
 

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The view of a scene in an environment: the camera, the options and the size.
 
-A viewer creates an OpenGL context, but states must be recorded without one. So cameras
-and options are set here the way the frameworks' viewers set theirs.
+A viewer creates an OpenGL context, but states must be recorded without a context. So
+this module sets cameras and options in the same way as the frameworks' viewers.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ _LARGEST = 1 << 16
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SceneView:
-    """Everything except the model and data that a frame depends on.
+    """Everything that a frame depends on, except the model and data.
 
     Attributes:
         camera: the environment's own live camera, or one of ours.
-        option: the visual options, the environment's own or ours. They are not always
-            MuJoCo's defaults.
-        max_geom: maximum number of geoms in the scene; more are not drawn.
+        option: the visual options, which are the environment's own or ours. They are
+            not always MuJoCo's defaults.
+        max_geom: maximum number of geoms in the scene; further geoms are not drawn.
         fresh: whether each frame gets a new scene, as in dm_control. In a reused
             scene, an infinite plane is drawn around the camera of the previous frame.
         height: height of the frames in pixels.
@@ -63,10 +63,10 @@ class SceneView:
 
 
 def view_from_facts(facts: Mapping[str, Any]) -> SceneView:
-    """Return the view described by `SceneView.facts`.
+    """Return the view that `SceneView.facts` described.
 
     Raises:
-        InvalidArgument: a value is missing or invalid; the facts may come from a file.
+        InvalidArgument: a value is missing or invalid. The facts may come from a file.
     """
     structs = {"camera": mujoco.MjvCamera(), "option": mujoco.MjvOption()}
     fields = {}
@@ -74,8 +74,8 @@ def view_from_facts(facts: Mapping[str, Any]) -> SceneView:
         values, names = facts.get(what), _names(struct.__class__)
         if not isinstance(values, Mapping) or values.keys() != {*names}:
             raise InvalidArgument(
-                f"A {what} needs exactly these values: {', '.join(names)}; "
-                f"got {values!r:.200}."
+                f"A {what} needs exactly these values: {', '.join(names)}. It cannot "
+                f"be made from {values!r:.200}."
             )
         fields.update({f"{what}.{name}": np.asarray(values[name]) for name in names})
     apply_fields(empty_model(), fields, **structs)
@@ -103,7 +103,7 @@ def option_without_rangefinder() -> mujoco.MjvOption:
 
 
 def place_free_camera(model: mujoco.MjModel, camera: mujoco.MjvCamera) -> None:
-    """Move a camera to the model's free camera, as the model's fields are now."""
+    """Move a camera to where the model's fields place the free camera now."""
     mujoco.mjv_defaultFreeCamera(model, camera)
 
 
@@ -113,14 +113,14 @@ def place_viewer_camera(
     config: Mapping[str, Any] | None,
     camera: mujoco.MjvCamera,
 ) -> None:
-    """Move a camera to where a viewer that Gymnasium creates now has its own.
+    """Move a camera to where a viewer that Gymnasium created now would put its camera.
 
-    The camera looks at the median of the current geom positions and stays there: a
-    viewer created later shows a different frame of the same state.
+    The camera looks at the median of the current geom positions and stays there. So a
+    viewer that is created later shows a different frame of the same state.
 
     Args:
         model: the model.
-        data: its data.
+        data: the model's data.
         config: values of the camera's members by name, as environments define them
             (`default_camera_config`).
         camera: the camera to move.
@@ -140,8 +140,8 @@ def select_camera(camera: mujoco.MjvCamera, camera_id: int | None) -> None:
 
     Args:
         camera: the viewer's camera.
-        camera_id: the number of one of the model's cameras; -1 for a free camera,
-            wherever it is; None to leave the camera as it is.
+        camera_id: the number of one of the model's cameras; -1 to make the camera free
+            without moving it; None to leave the camera unchanged.
     """
     if camera_id is not None:
         kind = "FREE" if camera_id == -1 else "FIXED"
@@ -150,7 +150,7 @@ def select_camera(camera: mujoco.MjvCamera, camera_id: int | None) -> None:
 
 
 def copy_members(source: Any, target: Any) -> None:
-    """Copy all members of a camera or an option to another one."""
+    """Copy all members of one camera or option to another."""
     for name in _names(target.__class__):
         _assign(target, name, getattr(source, name))
 
@@ -182,7 +182,7 @@ def _whole(facts: Mapping[str, Any], name: str, *, most: int = _LARGEST) -> int:
     value = facts.get(name)
     if type(value) is not int or not 1 <= value <= most:
         raise InvalidArgument(
-            f"The scene's {name} must be a whole number from 1 to {most}, got "
+            f"The scene's {name} must be a whole number from 1 to {most}, not "
             f"{value!r:.100}."
         )
     return value

@@ -18,9 +18,9 @@ _NUMBERS = re.compile(r"[\d.]+")
 def log_mujoco_warnings() -> None:
     """Log each kind of MuJoCo warning once, for the rest of this process.
 
-    MuJoCo itself would write `MUJOCO_LOG.TXT` into the working directory; a full scene,
-    for example, causes a warning at each frame. Only for processes that mjrec starts,
-    because a process can have only one handler.
+    MuJoCo itself would write `MUJOCO_LOG.TXT` to the working directory. A full scene,
+    for example, causes a warning at each frame. Use this only in processes that mjrec
+    starts, because a process can have only one handler.
     """
     warned: set[str] = set()
 
@@ -37,12 +37,12 @@ def log_mujoco_warnings() -> None:
 def warning_counts(simulation: Any) -> dict[str, int]:
     """Return the number of MuJoCo warnings in a simulation since its data was reset.
 
-    When a simulation becomes unstable, MuJoCo resets it together with these counts,
-    then counts the warning that reports it again.
+    When a simulation becomes unstable, MuJoCo resets it together with these counts, and
+    then counts the warning about the instability again.
 
     Args:
-        simulation: an object with the attribute `data`, MuJoCo's own or dm_control's
-            wrapper of it.
+        simulation: an object with the attribute `data`, which is MuJoCo's own object or
+            dm_control's wrapper of it.
 
     Returns:
         The nonzero counts by name, without the prefix `mjWARN_`.

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Experiment trackers, which are notified of finished episodes and videos.
 
-`mjrec.Monitor(..., trackers=...)` takes one or more of these. To support another
+`mjrec.Monitor(..., trackers=...)` takes one or more trackers. To support another
 service, subclass `Tracker` and override the methods for the events you need. Importing
 this package does not import the services' packages.
 """

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""New files that grow by complete pieces."""
+"""New files to which only complete pieces are appended."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from ..formats.appending import append_whole, open_for_appending
 class AppendOnlyFile:
     """A new file to which whole pieces are appended immediately.
 
-    A piece is appended completely or not at all: half a row would be read as a
+    A piece is appended completely or not at all, because half a row would be read as a
     different row, and nothing after half a record would be read. Appended pieces
     survive the end of this process.
 
     Args:
-        names: candidate paths; the first that does not exist is created, together with
-            its directory. It may be an iterator.
+        names: candidate paths, which may come from an iterator. The first path that
+            does not exist is created, together with its directory.
 
     Raises:
         DirectoryNotWritable: the directory cannot be created or written to.
@@ -46,7 +46,7 @@ class AppendOnlyFile:
         """Append `piece`.
 
         Raises:
-            FileNotWritten: there is no room for it; the file is unchanged.
+            FileNotWritten: the disk has no room for the piece. The file is unchanged.
         """
         try:
             append_whole(self._file.fileno(), piece)

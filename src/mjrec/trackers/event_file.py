@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """TensorBoard event files, written with TensorBoard's own package.
 
-Its `EventFileWriter` is not used: it has a thread that a forked process would lack,
-writes only from time to time, and loads TensorFlow if that is installed. Import this
-module only if tensorboard is known to be installed.
+The package's `EventFileWriter` is not used: it has a thread that a forked process would
+lack, writes only from time to time, and loads TensorFlow if that is installed. Import
+this module only if tensorboard is known to be installed.
 """
 
 from __future__ import annotations
@@ -92,7 +92,8 @@ class EventFile:
         self._write(event_pb2.Event(wall_time=wall_time, step=step, summary=summary))
 
     def _write(self, event: event_pb2.Event) -> None:
-        # In memory, outside the lock: the checksum of a large record takes a while.
+        # Prepared outside the lock, because the checksum of a large record takes a
+        # while.
         record = io.BytesIO()
         RecordWriter(record).write(event.SerializeToString())
         with self._lock:

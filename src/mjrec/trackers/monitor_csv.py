@@ -7,8 +7,8 @@
     r,l,t
     21.5,14,0.93
 
-`r` is the sum of the rewards, `l` the number of steps, and `t` the episode's end in
-seconds since `t_start`, which is wall-clock time.
+`r` is the sum of the rewards, and `l` is the number of steps. `t` is the time when the
+episode ended, in seconds since `t_start`, which is a wall-clock time.
 """
 
 from __future__ import annotations
@@ -31,18 +31,18 @@ _ENDING = "monitor.csv"
 class MonitorCsvTracker(Tracker):
     """A tracker that writes files for `stable_baselines3.common.monitor.load_results`.
 
-    Each run has its own file: every sub-environment, and every run that adds to earlier
-    recordings. `load_results` reads all files in a directory and orders episodes by
-    their ends. An existing file is never changed. An episode's complete row is on disk
-    as soon as the episode has ended.
+    Each run has its own file. A sub-environment counts as a run, and so does a run that
+    adds to earlier recordings. `load_results` reads all files in a directory and orders
+    episodes by their end times. An existing file is never changed. An episode's
+    complete row is on disk as soon as the episode has ended.
 
     Args:
         path: an existing directory or a file name. `.monitor.csv` is added to a file
-            name that does not end in `monitor.csv`, and a number if the file exists:
-            `logs/a.monitor.csv`, `logs/a.1.monitor.csv` ... None means the monitor
-            directory. In a directory, the file's name is
+            name that does not end in `monitor.csv`, and a number is added if the file
+            exists: `logs/a.monitor.csv`, `logs/a.1.monitor.csv` ... None means the
+            monitor directory. In a directory, the file's name is
             `openaigym.results.<infix>.monitor.csv`.
-        clock: returns the time, in seconds since the epoch.
+        clock: a function that returns the time in seconds since the epoch.
     """
 
     def __init__(

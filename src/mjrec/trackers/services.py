@@ -27,7 +27,10 @@ def require(package: str, *, purpose: str) -> None:
 
 
 def group_of(episode: FinishedEpisode | None) -> str:
-    """Return the tag's part before the slash; without an episode, it is `training`."""
+    """Return the part of a tag before the slash: `training` or `evaluation`.
+
+    It is `training` if there is no episode.
+    """
     return "evaluation" if episode and episode.type == "e" else "training"
 
 
@@ -40,8 +43,8 @@ def scalars_of(episode: FinishedEpisode) -> dict[str, float]:
 
 
 def name_of(video: FinishedVideo) -> str:
-    """Return the tag's part after the slash.
+    """Return the part of a tag after the slash.
 
-    It is `video`, or `video_<view>` for a further camera or a tiled video.
+    This is `video`, or `video_<view>` for a further camera or a tiled video.
     """
     return f"video_{video.view}" if video.view else "video"

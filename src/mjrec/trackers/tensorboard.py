@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 _MOST_WAITING = 100
 _MOST_BYTES = 2 << 20
 # Lengths of a preview's longer side in pixels, tried in order until the GIF is small
-# enough. With the last one, any 100 frames fit.
+# enough. With the last length, any 100 frames fit.
 _SIDES = (320, 160, 80)
 _MOST_PICTURES = 100
 # The shortest time per frame, in the format's unit of 1/100 s.
@@ -36,7 +36,7 @@ _MANY_FRAMES = 10_000
 class TensorBoardTracker(Tracker):
     """A tracker that writes event files for TensorBoard.
 
-    Scalars are logged over the steps of the run: `training/return`, `training/length`
+    Scalars are logged against the run's steps: `training/return`, `training/length`
     and, if the environment reports it, `training/success`. Evaluation episodes use
     `evaluation/`. TensorBoard cannot play videos (its issue 39), so each mp4 is shown
     as a small animated GIF, `training/video` under Images, with its file name under
@@ -65,7 +65,7 @@ class TensorBoardTracker(Tracker):
         """Create the run's event file.
 
         Raises:
-            DirectoryNotWritable: its directory cannot be created.
+            DirectoryNotWritable: the run's directory cannot be created.
             FileNotWritten: the disk is full.
         """
         self._runs[run] = _TensorBoardRun(self._directory(run))
@@ -92,7 +92,7 @@ class TensorBoardTracker(Tracker):
         """Wait for the previews, and close the run's event file.
 
         Raises:
-            Error: one of the remaining previews failed, see `video`.
+            Error: one of the remaining previews failed; see `video`.
         """
         self._runs.pop(run).close()
 
@@ -100,7 +100,7 @@ class TensorBoardTracker(Tracker):
         name = run.infix if run.env_index is None else f"{run.infix}.env{run.env_index}"
         if self._log_dir is None:
             return run.directory / "tensorboard" / name
-        # Monitors of one process may have the same infix in different directories.
+        # Monitors in one process may have the same infix in different directories.
         return self._log_dir / f"{run.directory.name}.{name}"
 
 
@@ -113,7 +113,8 @@ class _TensorBoardRun:
 
         self._file: EventFile = EventFile(directory)
         self._last_episode: FinishedEpisode | None = None
-        # Started by the first video; most runs of a vector environment have no video.
+        # Started by the first video, because most runs of a vector environment have no
+        # video.
         self._previews: WorkerThread[Callable[[], None]] | None = None
 
     def write_episode(self, episode: FinishedEpisode) -> None:
@@ -161,13 +162,13 @@ class _TensorBoardRun:
 def animated_gif(path: Path, *, frame_count: int, fps: Fraction) -> bytes:
     """Convert a video to a looping GIF of at most 100 frames and two megabytes.
 
-    The GIF has the video's duration, so that of a long video shows few frames per
-    second. Its longer side has at most 320 pixels.
+    The GIF has the video's duration, so if the video is long, the GIF shows few frames
+    per second. Its longer side has at most 320 pixels.
 
     Args:
         path: the video.
-        frame_count: its number of frames.
-        fps: its frames per second.
+        frame_count: number of frames in the video.
+        fps: the video's frames per second.
 
     Raises:
         EncoderError: ffmpeg failed or hangs.
@@ -187,7 +188,7 @@ def _delay(frame_count: int, fps: Fraction) -> int:
 
 def _convert(path: Path, *, side: int, delay: int, frame_count: int) -> bytes:
     skipping = ["-skip_frame", "nokey"] if frame_count >= _MANY_FRAMES else []
-    # With a palette computed from the video; only changes are stored.
+    # Use a palette computed from the video, and store only changes.
     filters = (
         # Rounded up, so that even the shortest video has a frame.
         f"fps=100/{delay}:round=up,"

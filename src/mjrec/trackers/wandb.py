@@ -18,10 +18,11 @@ class WandbTracker(Tracker):
     """A tracker that logs to a Weights & Biases run.
 
     `training/return`, `training/length` and, if the environment reports it,
-    `training/success` are logged over the steps of the run, `training/total_steps`.
-    Evaluation episodes use `evaluation/`, sub-environments `training/env<i>/`. Each mp4
-    is uploaded as `training/video`, over `training/video_total_steps`, because a
-    deferred video is finished after later episodes.
+    `training/success` are logged against the run's steps (`training/total_steps`).
+    Evaluation episodes use `evaluation/`, and sub-environments use `training/env<i>/`.
+    Each mp4 is uploaded as `training/video`. Its steps are in
+    `training/video_total_steps`, because a deferred video is finished after later
+    episodes.
 
     Each call uses W&B's next step. W&B drops data with a lower step, so code that logs
     to the same run with `step=` should use `run.define_metric` instead.
@@ -29,7 +30,8 @@ class WandbTracker(Tracker):
     Args:
         run: a run from `wandb.init`, which stays open. If None and no other arguments
             are given, the run that is active when the first monitor starts is used, if
-            any. Otherwise a new run is created, and finished with the last monitor.
+            there is one. Otherwise a new run is created. It is finished when the last
+            monitor ends.
         project: the new run's project, as in `wandb.init`.
         mode: the new run's mode, as in `wandb.init`, such as `"offline"`.
         **init: other arguments of `wandb.init`.
@@ -53,13 +55,13 @@ class WandbTracker(Tracker):
         self._init = {k: v for k, v in named.items() if v is not None} | init
         if run is not None and self._init:
             raise InvalidArgument(
-                "WandbTracker takes either a run or the arguments for a new one, got a "
+                "WandbTracker takes either a run or the arguments for a new one, not a "
                 f"run and {', '.join(self._init)}."
             )
         if run is not None and not callable(getattr(run, "define_metric", None)):
             raise InvalidArgument(
                 "WandbTracker takes a run from wandb.init, or project= and other "
-                f"arguments for a new one, got {run!r}."
+                f"arguments for a new one, not {run!r}."
             )
         self._given = run
         # W&B's run while monitors are open, and the process that must finish it.
@@ -69,7 +71,7 @@ class WandbTracker(Tracker):
         self._last_episodes: dict[Run, FinishedEpisode | None] = {}
 
     def begin(self, run: Run) -> None:
-        """Start W&B's run, if needed."""
+        """Start W&B's run if necessary."""
         if self._service is None:
             self._open()
         self._last_episodes[run] = None
@@ -82,7 +84,7 @@ class WandbTracker(Tracker):
         self._log(group, {_STEPS: episode.total_steps, **scalars_of(episode)})
 
     def video(self, run: Run, video: FinishedVideo) -> None:
-        """Log the file, which W&B copies."""
+        """Log the video's file, which W&B copies."""
         # Imported late, so that importing this module does not import wandb.
         import wandb
 
@@ -96,7 +98,7 @@ class WandbTracker(Tracker):
         self._log(group, {_VIDEO_STEPS: steps, name: frame})
 
     def end(self, run: Run) -> None:
-        """Finish W&B's run, if it was started here and this was its last monitor."""
+        """Finish W&B's run if the tracker started it and this was its last monitor."""
         del self._last_episodes[run]
         if self._last_episodes:
             return
