@@ -73,7 +73,7 @@ def test_a_free_camera():
     assert camera_label(model, resolve_camera(model, label)) == label
     with pytest.raises(InvalidArgument, match="zoom"):
         resolve_camera(model, {"zoom": 2})
-    with pytest.raises(InvalidArgument, match="has 2"):
+    with pytest.raises(InvalidArgument, match="from 0 to 1 in this model"):
         resolve_camera(model, {"type": 1, "trackbodyid": 9})
 
 

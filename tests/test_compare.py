@@ -215,7 +215,7 @@ def test_equal_runs_are_made_again(packed: Path) -> None:
             "#x",
         ),
         (
-            in_text("README.md", "| 3 | 18 |", "| 3 | 19 |"),
+            in_text("README.md", "| 18 |", "| 19 |"),
             Topic.FILES,
             "line",
         ),

@@ -163,7 +163,7 @@ def leaving():
         (raising, "out of ideas"),
         (leaving, "SystemExit: 3"),
         (lambda: np.full(1, np.nan), "NaN"),
-        (lambda: np.zeros(7), "action of Box"),
+        (lambda: np.zeros(7), "action in Box"),
     ],
 )
 def test_a_policy_that_fails_loses_its_episode_only(tmp_path, wrong, failure):

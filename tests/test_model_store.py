@@ -204,7 +204,7 @@ def test_sources_of_another_model_are_not_stored(directory, other):
     facts = stored(directory, model, authored)
     assert [path.name for path in directory.iterdir()] == [facts["mjb"]]
     assert content_of(load_model(directory, facts)) == content_of(model)
-    with pytest.raises(UnreadableFile, match=r"written by mujoco 3\.1\.4, this is"):
+    with pytest.raises(UnreadableFile, match=r"written by mujoco 3\.1\.4, but this is"):
         from_source(directory, facts)
 
 
@@ -296,7 +296,7 @@ def test_a_bomb_of_a_compiled_model_is_not_unpacked(directory):
     """It is read up to the size that was recorded."""
     facts = stored(directory, sphere())
     (directory / facts["mjb"]).write_bytes(gzip.compress(bytes(1 << 20)))
-    with pytest.raises(UnreadableFile, match="it holds more, not the recorded"):
+    with pytest.raises(UnreadableFile, match="it contains more, not the recorded"):
         load_model(directory, facts)
     with pytest.raises(UnreadableFile, match="recorded size is"):
         load_model(directory, {**facts, "bytes": 1 << 50})

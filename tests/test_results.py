@@ -176,7 +176,7 @@ def test_videos_are_pairs_of_paths_in_order(tmp_path, caplog):
         tuple(str(new / name) for name in pairs[number]) for number in (2, 0)
     ]
     (record,) = caplog.records
-    assert "2 of 4 videos" in record.getMessage()
+    assert "2 of the 4 videos" in record.getMessage()
     assert "v1.mp4, v3.mp4" in record.getMessage()
 
 

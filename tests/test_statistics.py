@@ -218,5 +218,5 @@ def test_coverage(name, is_large, monkeypatch):
 )
 def test_impossible_bootstraps_are_refused(wrong):
     """Before anything is read or run."""
-    with pytest.raises(InvalidArgument, match="got"):
+    with pytest.raises(InvalidArgument, match="but it is"):
         Bootstrap(**wrong)

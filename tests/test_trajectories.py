@@ -182,7 +182,7 @@ def test_the_model_is_that_of_the_step(tmp_path):
     assert data.time == trajectory.time[-1]
     for use in (trajectory.model, lambda step: trajectory.set_state(data, step)):
         for step in (13, -14):
-            with pytest.raises(InvalidArgument, match="holds 13 states"):
+            with pytest.raises(InvalidArgument, match="contains 13 states"):
                 use(step)
 
 

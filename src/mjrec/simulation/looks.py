@@ -101,7 +101,8 @@ class Looks:
 
         The current values count as seen.
         """
-        if self._stored == self._now and self.seen == self.present:
+        is_seen = all(piece.seen is piece.stored for piece in self._others)
+        if is_seen and self._stored == self._now and self.seen == self.present:
             return {}
         names: list[str] = []
         for piece in (*self._watched, *self._others):
