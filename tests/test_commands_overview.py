@@ -38,6 +38,13 @@ def test_help_fits_a_small_terminal(capsys: pytest.CaptureFixture[str]) -> None:
     assert {name for names in GROUPS.values() for name in names} == set(COMMANDS)
 
 
+def help_of(capsys: pytest.CaptureFixture[str], command: str) -> str:
+    """Return the help of a command."""
+    status, text = said(capsys, command, "--help")
+    assert status == 0
+    return text
+
+
 FIRST = {
     "record": "--out --episodes --policy --seed --size",
     "render": "--episode --camera --size --quality --workers",
@@ -52,8 +59,7 @@ def test_what_people_use_comes_first(
     command: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """The five options that are used most lead the list."""
-    status, text = said(capsys, command, "--help")
-    assert status == 0
+    text = help_of(capsys, command)
     # Lines of prose may begin with an option, too: the list is what follows -h.
     listed = text[text.index("-h, --help") :]
     options = re.findall(r"^\W*?(?:-\w(?: [A-Z]+)?, )?(--[\w-]+)", listed, re.MULTILINE)
@@ -65,8 +71,7 @@ def test_help_shows_nothing_of_python(
     command: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """An option that need not be given is shown as `--seed INT`."""
-    status, text = said(capsys, command, "--help")
-    assert status == 0
+    text = help_of(capsys, command)
     assert not re.search(r"\bNone\b|\(default: (False)?\)", text)
 
 

@@ -1,9 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Steps of which nothing but the state is new are recorded as all others are."""
 
-import functools
 import itertools
-import operator
 import signal
 import sys
 
@@ -17,14 +15,10 @@ from recordings import stats_of
 
 import mjrec
 from mjrec import Monitor
+from mjrec.formats.trajectory import added_up
 
 CHEETAH, HOPPER = "HalfCheetah-v5", "Hopper-v5"
 INTEGRATION = mujoco.mjtState.mjSTATE_INTEGRATION
-
-
-def added_up(rewards):
-    """Return the sum, one after the other; since Python 3.12 `sum` is more exact."""
-    return functools.reduce(operator.add, rewards, 0.0)
 
 
 class Rewarding(gymnasium.Wrapper):
