@@ -20,6 +20,7 @@ import ctypes
 import json
 import os
 import runpy
+import struct
 import sys
 from collections.abc import Iterable
 from pathlib import Path
@@ -45,21 +46,6 @@ _SCOPES = 0b11  # abstract sockets and signals
 # Version 4 added TCP, version 6 the scopes.
 _WITH_TCP, _WITH_SCOPES = 4, 6
 
-
-class _Ruleset(ctypes.Structure):
-    _fields_ = (
-        ("files", ctypes.c_uint64),
-        ("network", ctypes.c_uint64),
-        ("scopes", ctypes.c_uint64),
-    )
-
-
-class _PathBeneath(ctypes.Structure):
-    _pack_ = 1
-    _layout_ = "ms"
-    _fields_ = (("rights", ctypes.c_uint64), ("parent", ctypes.c_int32))
-
-
 _libc = ctypes.CDLL(None, use_errno=True)
 
 
@@ -83,16 +69,15 @@ def confine(
     version = _libc.syscall(_CREATE, None, ctypes.c_size_t(0), 1)
     if version < 1:
         return {"files": False, "network": without_network}
-    has_tcp = version >= _WITH_TCP
     files = (1 << _RIGHTS.get(version, 16)) - 1
-    rules = _Ruleset(
-        files,
-        _NO_TCP if has_tcp else 0,
-        _SCOPES if version >= _WITH_SCOPES else 0,
-    )
+    rules = [files]
     # Older kernels expect a shorter structure.
-    size = 8 if not has_tcp else 16 if version < _WITH_SCOPES else 24
-    ruleset = _libc.syscall(_CREATE, ctypes.byref(rules), ctypes.c_size_t(size), 0)
+    if version >= _WITH_TCP:
+        rules.append(_NO_TCP)
+    if version >= _WITH_SCOPES:
+        rules.append(_SCOPES)
+    packed = struct.pack(f"={len(rules)}Q", *rules)
+    ruleset = _libc.syscall(_CREATE, packed, ctypes.c_size_t(len(packed)), 0)
     if ruleset < 0:
         return {"files": False, "network": without_network}
     for path in {*_SYSTEM, *_python(), *readable} - {*hidden}:
@@ -134,8 +119,8 @@ def _allow(ruleset: int, path: str, rights: int) -> None:
     if not Path(path).is_dir():
         # The kernel rejects folder rights for a file.
         rights &= 0b101 | 1 << 1 | 1 << 14 | 1 << 15
-    rule = _PathBeneath(rights, parent)
-    _libc.syscall(_ADD, ruleset, _PATH_BENEATH, ctypes.byref(rule), 0)
+    rule = struct.pack("=Qi", rights, parent)
+    _libc.syscall(_ADD, ruleset, _PATH_BENEATH, rule, 0)
     os.close(parent)
 
 

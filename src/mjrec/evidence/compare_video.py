@@ -186,16 +186,18 @@ def compare_frame_hashes(
     given: Path, made: Path, file: str
 ) -> Iterator[Same | Difference]:
     """Compare two videos' frame hashes; yield differences and equal frames."""
-    differing, first, total = 0, "", -1
-    with unreadable(given), open_regular(made) as other:
-        total = sum(1 for line in other if _HASH_BEGINS.match(line))
-    for number, a, b in _different_lines(given, made):
-        begins_a, begins_b = (_HASH_BEGINS.match(line or b"") for line in (a, b))
-        if not begins_a or not begins_b or begins_a[0] != begins_b[0]:
-            yield _differs(file, f"line {number}", *map(_text, (a, b)))
-        elif a is not None and b is not None:
-            differing += 1
-            first = first or _text(a).split(",")[1].strip()
+    differing, equal, first = 0, 0, ""
+    with unreadable(given), open_regular(given) as one, open_regular(made) as other:
+        pairs = itertools.zip_longest(_lines(one), _lines(other))
+        for number, (a, b) in enumerate(pairs, start=1):
+            begins = [_HASH_BEGINS.match(line or b"") for line in (a, b)]
+            if a == b:
+                equal += begins[0] is not None
+            elif not begins[0] or not begins[1] or begins[0][0] != begins[1][0]:
+                yield _differs(file, f"line {number}", *map(_text, (a, b)))
+            else:
+                differing += 1
+                first = first or _text(a).split(",")[1].strip()
     if differing:
         yield Difference(
             topic=Topic.PICTURES,
@@ -206,9 +208,8 @@ def compare_frame_hashes(
             where=f"frame {first}",
             how="its hash differs",
         )
-    if total > differing:
-        count = total - differing
-        yield Same(topic=Topic.PICTURES, file=file, count=count, unit="frame")
+    if equal:
+        yield Same(topic=Topic.PICTURES, file=file, count=equal, unit="frame")
 
 
 class Worst:
@@ -269,16 +270,6 @@ def _lower(one: Similarity, other: Similarity) -> Similarity:
 
 def _text(line: bytes | None) -> str:
     return "nothing" if line is None else line.decode(errors="replace").rstrip("\n")
-
-
-def _different_lines(
-    given: Path, made: Path
-) -> Iterator[tuple[int, bytes | None, bytes | None]]:
-    with unreadable(given), open_regular(given) as one, open_regular(made) as other:
-        pairs = itertools.zip_longest(_lines(one), _lines(other))
-        for number, pair in enumerate(pairs, start=1):
-            if pair[0] != pair[1]:
-                yield number, *pair
 
 
 def _lines(file: BinaryIO) -> Iterator[bytes]:

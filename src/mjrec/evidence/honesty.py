@@ -244,32 +244,22 @@ def _rule_of(
     episodes: Sequence[EpisodeInputs], given: Sequence[EpisodeInputs], seed: int | None
 ) -> str | None:
     first = episodes[0]
-    if all(each.evaluation is not None for each in episodes):
-        return _rule_of_evaluation(episodes)
-    if len(given) == 1 and given[0] is first:
+    is_evaluation = all(each.evaluation is not None for each in episodes)
+    if not is_evaluation and len(given) == 1 and given[0] is first:
         return f"one seed, {first.seed}, at the first reset"
-    if seed is None or not 0 <= seed < 2**32:
-        return None
-    follows = all(
-        each.seed == episode_seeds(seed, each.episode_id).environment
-        for each in episodes
-    )
-    return f"SeedSequence([{seed}, i]) for episode i" if follows else None
-
-
-def _rule_of_evaluation(episodes: Sequence[EpisodeInputs]) -> str | None:
-    seeds = set()
-    for each in episodes:
-        said = each.evaluation or {}
-        seed, number = said.get("seed"), said.get("episode")
-        if type(seed) is not int or type(number) is not int:
+    pairs: list[tuple[Any, Any]] = [(seed, each.episode_id) for each in episodes]
+    if is_evaluation:
+        said = [each.evaluation or {} for each in episodes]
+        pairs = [(each.get("seed"), each.get("episode")) for each in said]
+    for each, numbers in zip(episodes, pairs, strict=True):
+        if not all(type(n) is int and 0 <= n < 2**32 for n in numbers):
             return None
-        if not (0 <= seed < 2**32 and 0 <= number < 2**32):
+        if each.seed != episode_seeds(*numbers).environment:
             return None
-        if each.seed != episode_seeds(seed, number).environment:
-            return None
-        seeds.add(seed)
-    return f"SeedSequence([S, i]) for episode i, S in {_listed(seeds)}"
+    if is_evaluation:
+        seeds = _listed({seed for seed, _ in pairs})
+        return f"SeedSequence([S, i]) for episode i, S in {seeds}"
+    return f"SeedSequence([{seed}, i]) for episode i"
 
 
 def _repeated(inputs: Inputs, arrays: Mapping[str, NDArray[Any]]) -> Iterator[Finding]:

@@ -8,7 +8,6 @@ default.
 
 from __future__ import annotations
 
-import dataclasses
 import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -20,6 +19,7 @@ from numpy.typing import NDArray
 
 from .. import json_text
 from ..environments.scenes import shown_wrappers
+from ..formats.dataclass_json import from_json, to_json
 from ..formats.monitor_directory import Infix
 
 INPUTS_FILE: Final = "inputs.json"
@@ -225,26 +225,14 @@ class Inputs:
             folder: an empty folder.
             arrays: the arrays that the episodes name.
         """
-        text = json_text.dumps(dataclasses.asdict(self))
+        text = json_text.dumps(to_json(self))
         (folder / INPUTS_FILE).write_text(text)
         np.savez(folder / ARRAYS_FILE, **arrays)  # type: ignore[arg-type]  # its stub takes no mapping
 
     @classmethod
     def read(cls, folder: Path) -> Inputs:
         """Read the inputs that `write` wrote into a folder."""
-        said = json_text.loads((folder / INPUTS_FILE).read_text())
-        recordings = [
-            RecordingInputs(
-                **{
-                    **recording,
-                    "episodes": tuple(
-                        EpisodeInputs(**each) for each in recording["episodes"]
-                    ),
-                }
-            )
-            for recording in said["recordings"]
-        ]
-        return cls(**{**said, "recordings": tuple(recordings)})
+        return from_json(cls, json_text.loads((folder / INPUTS_FILE).read_text()))
 
 
 def given_actions(

@@ -128,15 +128,15 @@ def _any_of(readers: list[_Read]) -> _Read:
 
 
 def _tuple(inner: tuple[Any, ...]) -> Callable[[Any], tuple[Any, ...]]:
-    read = list_of(_reader(inner[0]))
     if inner[1] is Ellipsis:
-        return read
+        return list_of(_reader(inner[0]))
+    readers = [_reader(each) for each in inner]
 
     def read_so_many(value: Any) -> tuple[Any, ...]:
-        items = read(value)
+        items = list_of(_PLAIN[Any])(value)
         if len(items) != len(inner):
             raise ValueError(f"it must have {len(inner)} values, not {len(items)}")
-        return items
+        return tuple(read(item) for read, item in zip(readers, items, strict=True))
 
     return read_so_many
 
