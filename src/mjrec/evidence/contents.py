@@ -69,7 +69,6 @@ class Contents:
 
     Attributes:
         directory: the directory, as given.
-        places: the monitor directories, itself or those below it.
         packed_episodes: the numbers of the chosen episodes. None if all are packed.
         files: files that are packed unchanged, by name.
         manifests: manifests that are packed with changed contents, by name.
@@ -81,7 +80,6 @@ class Contents:
     """
 
     directory: Path
-    places: list[Path]
     packed_episodes: tuple[int, ...] | None
     files: dict[str, Path] = field(default_factory=dict)
     manifests: dict[str, Manifest] = field(default_factory=dict)
@@ -145,7 +143,7 @@ def look_for_contents(directory: Path, episodes: Iterable[int] | None) -> Conten
                 "its own episode numbers. To choose episodes, pack a single one."
             )
         chosen = _chosen(places[0], episodes)
-    contents = Contents(directory=directory, places=places, packed_episodes=chosen)
+    contents = Contents(directory=directory, packed_episodes=chosen)
     infixes: dict[str, Path] = {}
     for place in places:
         _add_all(contents, place, infixes)

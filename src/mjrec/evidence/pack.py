@@ -35,7 +35,6 @@ from ..formats.monitor_directory import FILE_PREFIX
 from ..formats.trajectory import row_dtype
 from ..formats.trajectory_hdf5 import open_hdf5, write_hdf5
 from ..rendering.jobs import Progress
-from ..results import iter_episodes
 from .anonymity import make_anonymous
 from .bag import TRY_AGAIN, make_bag, write_zip
 from .contents import Contents, look_for_contents
@@ -48,7 +47,7 @@ from .layout import (
     RECORDINGS,
     STATES_LEFT_OUT,
 )
-from .packed_run import PackingOptions, planned_episodes, read_run
+from .packed_run import PackedRun, PackingOptions, planned_episodes, read_run
 from .size_limit import archive_within, byte_count
 from .statements import state
 
@@ -144,7 +143,7 @@ def pack(
         identity = identity_of_user(contents.provenance, statements.authors)
     with _folder_beside(target) as folder:
         try:
-            bag = _bag(contents, folder, options, identity, on_progress)
+            bag, run = _bag(contents, folder, options, identity, on_progress)
             finished = folder / _ARCHIVE
             if not finished.exists():
                 write_zip(bag, finished)
@@ -156,15 +155,13 @@ def pack(
         except OSError as error:
             reason = error.strerror or error
             raise FileNotWritten(target, reason, then=TRY_AGAIN) from error
-    if options.planned is not None:
-        complete = sum(1 for place in contents.places for _ in iter_episodes(place))
-        if complete < options.planned:
-            logger.warning(
-                "The archive has %d of %d episodes: the evaluation is not finished, "
-                "or some of its episodes failed.",
-                complete,
-                options.planned,
-            )
+    if run.is_unfinished:
+        logger.warning(
+            "The archive has %d of %d episodes: the evaluation is not finished, "
+            "or some of its episodes failed.",
+            run.episodes,
+            options.planned,
+        )
     return target
 
 
@@ -180,7 +177,8 @@ def pack_folder(directory: Path, folder: Path, options: PackingOptions) -> None:
     contents = look_for_contents(directory, options.episodes)
     identity = Identity() if options.anonymous else None
     with _folder_beside(folder) as temporary:
-        _bag(contents, temporary, options, identity, lambda _: None).rename(folder)
+        bag, _ = _bag(contents, temporary, options, identity, lambda _: None)
+        bag.rename(folder)
 
 
 def _bag(
@@ -189,29 +187,29 @@ def _bag(
     options: PackingOptions,
     identity: Identity | None,
     on_progress: Callable[[Progress], object],
-) -> Path:
+) -> tuple[Path, PackedRun]:
     """Make the bag below `folder`; with a size limit, also make the archive there."""
     _check_count(contents)
     staged, bag = folder / "staged", folder / "whole" / options.name
     _stage(contents, staged)
     if options.max_size is None:
-        _make_bag(staged, bag, options, identity)
-        return bag
+        return bag, _make_bag(staged, bag, options, identity)
+    runs = []
 
     def make() -> Path:
         archive = folder / _ARCHIVE
         archive.unlink(missing_ok=True)
-        _make_bag(staged, bag, options, identity)
+        runs.append(_make_bag(staged, bag, options, identity))
         write_zip(bag, archive)
         return archive
 
     archive_within(options.max_size, staged, make=make, on_progress=on_progress)
-    return bag
+    return bag, runs[-1]
 
 
 def _make_bag(
     staged: Path, bag: Path, options: PackingOptions, identity: Identity | None
-) -> None:
+) -> PackedRun:
     """Make a bag from the staged files; an earlier one is replaced."""
     shutil.rmtree(bag, ignore_errors=True)
     recordings = bag / PAYLOAD / RECORDINGS
@@ -228,6 +226,7 @@ def _make_bag(
     found = [] if identity is None else remaining_identity(bag.parent, identity)
     if found:
         raise IdentityLeft(found)
+    return run
 
 
 def _checked_paths(path: Path, directory: Path) -> tuple[Path, Path]:
