@@ -251,7 +251,7 @@ class Comparison:
     def _compare_file(self, file: str) -> Iterator[Same | Difference | Finding]:
         given, made, kind = self._given / file, self._made / file, _kind(file)
         try:
-            if _is_equal(given, made):
+            if filecmp.cmp(given, made, shallow=False):
                 yield from self._same(file, kind)
             else:
                 yield from self._compare_kind(given, made, file, kind)
@@ -357,7 +357,7 @@ class Comparison:
                 items = {f"recording {infix}", f"episode {number} of {infix}"}
                 if name not in known:
                     if items.isdisjoint(unplayed):
-                        yield _not_made(file)
+                        yield Difference(topic=Topic.PHYSICS, file=file, how=_NOT_MADE)
                     continue
                 try:
                     yield from compare_rewards(given, rewards[name], file)
@@ -409,20 +409,11 @@ def _kind(file: str) -> str:
     return next((kind for end, kind in _KINDS.items() if file.endswith(end)), "")
 
 
-def _is_equal(one: Path, other: Path) -> bool:
-    return filecmp.cmp(one, other, shallow=False)
-
-
 def _damaged(file: str, error: Error) -> Difference:
     # Without the path, which is in a temporary folder.
     reason = error.reason if isinstance(error, UnreadableFile) else str(error)
     topic = _TOPICS.get(_kind(file), Topic.FILES)
     return Difference(topic=topic, file=file, how=f"it cannot be read: {reason}")
-
-
-def _not_made(file: str) -> Difference:
-    topic = _TOPICS.get(_kind(file), Topic.FILES)
-    return Difference(topic=topic, file=file, how=_NOT_MADE)
 
 
 def _other_code() -> Finding:

@@ -23,7 +23,6 @@ from .differences import (
     Difference,
     Same,
     only_in,
-    relative_error,
     stored_differently,
     unlike,
 )
@@ -277,7 +276,7 @@ def _leaf(
 ) -> Difference:
     size = None
     if isinstance(given, int | float) and isinstance(made, int | float):
-        error = relative_error(given, made)
+        error = abs(given - made) / (1 + abs(given))
         size = error if math.isfinite(error) else None
     aspect = rule.aspect
     is_gone = given is ABSENT or made is ABSENT

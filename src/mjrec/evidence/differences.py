@@ -156,11 +156,6 @@ def only_in(is_given: bool, value: Any) -> str:
     return f"only {who} has it: {short(value)}"
 
 
-def relative_error(given: float, made: float) -> float:
-    """Return the `size` of a difference between two numbers."""
-    return abs(given - made) / (1 + abs(given))
-
-
 def short(value: Any) -> str:
     """Return a value as one short, printable line."""
     text = value if isinstance(value, str) else repr(value)

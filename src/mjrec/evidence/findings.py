@@ -28,12 +28,6 @@ class Level(enum.StrEnum):
     PHYSICS = "physics"
     PIXELS = "pixels"
 
-    @property
-    def included(self) -> tuple[Level, ...]:
-        """This level and those before it, in order."""
-        levels = tuple(Level)
-        return levels[: levels.index(self) + 1]
-
 
 class Topic(enum.StrEnum):
     """The topics of a verification, in the order of their lines on the screen."""

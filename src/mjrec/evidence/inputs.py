@@ -142,7 +142,6 @@ class RecordingInputs:
             counting the first.
         was_killed: whether another process recovered the recording.
         has_sources: whether its models' sources had been stored when it was killed.
-        is_closed: whether its monitor closed it.
     """
 
     infix: str
@@ -164,7 +163,6 @@ class RecordingInputs:
     provenance_after: int = 0
     was_killed: bool = False
     has_sources: bool = False
-    is_closed: bool = False
 
     @property
     def is_evaluation(self) -> bool:

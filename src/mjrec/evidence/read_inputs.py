@@ -160,7 +160,6 @@ def _recording(files: MonitorFiles, arrays: dict[str, NDArray[Any]]) -> Recordin
             path.suffix == ".zip"
             for path in (files.journal or Path()).parent.glob("openaigym.model.*")
         ),
-        is_closed=journal.is_closed,
     )
 
 
@@ -192,7 +191,7 @@ class _Journal:
         self.evaluation_keeps: list[Mapping[str, Any]] = []
         self.faults: list[tuple[int, Mapping[str, Any]]] = []
         self.kept: tuple[int, ...] = ()
-        self.was_killed = self.is_closed = False
+        self.was_killed = False
         if path is None:
             return
         for entry in JournalReader(path, on_event=self._note):
@@ -246,8 +245,6 @@ class _Journal:
                 self.faults.append((self._lines, _known(facts, _FAULT)))
             case "recovered", _:
                 self.was_killed = True
-            case "closed", _:
-                self.is_closed = True
             case _:
                 pass
 
@@ -330,35 +327,31 @@ def _with_trajectory(
     is_wrapped: bool,
     arrays: dict[str, NDArray[Any]],
 ) -> EpisodeInputs:
+    found: dict[str, NDArray[Any] | None] = {}
     with open_hdf5(path) as reader:
         facts, steps = reader.facts, reader.step_count
-        given = reader.actions(0, steps)
-        first = None
-        if facts.get("seed") is None and facts.get("random_state") is None:
-            first = reader.read("state", 0, 1) if reader.kind("state") else None
+        found[name] = reader.actions(0, steps)
+        if reader.kind("state") is not None:
+            if facts.get("seed") is None and facts.get("random_state") is None:
+                found[f"{name}.state"] = reader.read("state", 0, 1)
+            if _is_elsewhere(facts):
+                found[f"{name}.states"] = reader.read("state", 0, reader.row_count)
         taken = _steps_taken(reader) if is_wrapped else {}
-        states = None
-        if _is_elsewhere(facts) and reader.kind("state") is not None:
-            states = reader.read("state", 0, reader.row_count)
-    arrays.update({f"{name}.{part}": values for part, values in taken.items()})
-    if given is not None:
-        arrays[name] = given
-    if first is not None:
-        arrays[f"{name}.state"] = first
-    if states is not None:
-        arrays[f"{name}.states"] = states
+        found |= {f"{name}.{part}": values for part, values in taken.items()}
+    known = {key: values for key, values in found.items() if values is not None}
+    arrays |= known
     parts = facts.get("action_parts")
     exception = facts.get("exception")
     # If no action fits into an array, all of them are in the journal.
-    is_whole = given is not None or len(irregular) == steps
+    is_whole = name in known or len(irregular) == steps
     return dataclasses.replace(
         episode,
         type=str(facts.get("type")),
         seed=facts.get("seed"),
         options=facts.get("options"),
         random_state=facts.get("random_state"),
-        first_state=None if first is None else f"{name}.state",
-        states=None if states is None else f"{name}.states",
+        first_state=f"{name}.state" if f"{name}.state" in known else None,
+        states=f"{name}.states" if f"{name}.states" in known else None,
         steps=steps,
         steps_taken=name if taken else None,
         actions=name if is_whole else None,

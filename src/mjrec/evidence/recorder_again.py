@@ -119,14 +119,7 @@ def _schedule(recording: RecordingInputs, notes: Notes) -> Schedule | None:
     if name in _SCHEDULES or _SCHEDULE.fullmatch(name):
         return schedule_from_text(_SCHEDULES.get(name, name))
     chosen = {each.episode_id for each in recording.episodes if each.is_chosen}
-    notes.add(
-        recording.name,
-        "schedule",
-        f"the schedule {name!r:.80} is the author's own function; that it chose these "
-        "episodes is believed",
-        count=len(recording.episodes),
-        unit="episode",
-    )
+    _believe_choice(recording, notes, "schedule", f"the schedule {name!r:.80}")
     return _named(name, chosen.__contains__)
 
 
@@ -138,16 +131,8 @@ def _rule(
         return None
     with contextlib.suppress(InvalidArgument):
         return keep_rule(name, RULES).name
-    notes.add(
-        recording.name,
-        "rule",
-        f"the rule {name!r:.80} is the author's own function; that it chose these "
-        "episodes is believed",
-        count=len(recording.episodes),
-        unit="episode",
-    )
-    kept = recording.kept
-    return _named(name, lambda _: kept)
+    _believe_choice(recording, notes, "rule", f"the rule {name!r:.80}")
+    return _named(name, lambda _: recording.kept)
 
 
 def _trajectories(recording: RecordingInputs) -> Callable[[int], bool] | bool | None:
@@ -164,15 +149,32 @@ def _step_trigger(
     name = recording.options.get("step_trigger")
     if name is None:
         return None
-    notes.add(
-        recording.name,
+    starts = set(recording.clip_starts)
+    _believe_choice(
+        recording,
+        notes,
         "schedule",
-        f"{name!r:.80}, which started clips, is the author's own function; that it "
-        "chose these steps is believed",
+        f"{name!r:.80}, which started clips,",
+        what="steps",
         count=len(recording.clip_starts),
         unit="clip",
     )
-    return _named(name, set(recording.clip_starts).__contains__)
+    return _named(name, starts.__contains__)
+
+
+def _believe_choice(
+    recording: RecordingInputs,
+    notes: Notes,
+    excuse: str,
+    chooser: str,
+    *,
+    what: str = "episodes",
+    **counted: Any,
+) -> None:
+    """Note that a choice by a function of the author is believed."""
+    counted = counted or {"count": len(recording.episodes)}
+    reason = f"{chooser} is the author's own function; that it chose these {what} is "
+    notes.add(recording.name, excuse, f"{reason}believed", **counted)
 
 
 def _trackers(recording: RecordingInputs) -> Sequence[Tracker]:
