@@ -360,6 +360,26 @@ def entry_of(values: Mapping[str, Any]) -> JournalEntry:
     return from_json(JournalEntry, {"seed": None, "options": None, **values})
 
 
+def missing_line(
+    facts: Mapping[str, Any], choice: Mapping[str, Any]
+) -> tuple[str, Mapping[str, Any]]:
+    """Return the kind and the facts of the journal line that a kill prevented.
+
+    Args:
+        facts: the facts in the episode's trajectory; empty if there is no trajectory.
+        choice: the line's `episode_id`, `chosen` and `recording`.
+    """
+    known = {**facts, **choice}
+    try:
+        entry_of(known)
+        is_complete = facts.get("complete") is True
+    except ValueError:
+        is_complete = False
+    if is_complete:
+        return "episode", known
+    return "cut", {**choice, "reason": facts.get("reason", KILLED)}
+
+
 def _count(value: Any) -> int:
     count = integer(value)
     if not 0 <= count < MOST_EPISODES:

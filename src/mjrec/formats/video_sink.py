@@ -3,6 +3,11 @@
 
 Images become an mp4 file with frame hashes, and text becomes an asciicast. The metadata
 file is written last: if it exists, the video is complete.
+
+A live mp4 file has a note, `.<name of the video>.note.part`, that lets any process
+finish it. The note is written before the video. While the video is being written, under
+a hidden name, it is locked both by the process that feeds ffmpeg and by ffmpeg itself,
+which completes its file if that process dies.
 """
 
 from __future__ import annotations
@@ -13,11 +18,12 @@ from pathlib import Path
 from typing import Any
 
 from ..annotation import Caption, annotated, pillow_version
+from ..atomic_files import write_text
 from ..blank_frames import BlankFrames
 from ..frames import Frame
+from ..json_text import dumps
 from .asciicast import AsciicastWriter
 from .frame_hashes import frame_hash_path
-from .unfinished_video import UnfinishedVideo, note_path, write_note
 from .video_file import VideoFile
 from .video_metadata import file_facts, metadata_path, write_metadata
 from .video_writer import VideoWriter
@@ -151,14 +157,14 @@ class VideoSink:
         assert isinstance(self._writer, VideoWriter)
         file = self._writer.file_of(height, width)
         metadata, timing = note()
-        write_note(
-            UnfinishedVideo(
-                path=self.path,
-                metadata=metadata,
-                facts={**timing, **file_facts(file)},
-            )
-        )
+        content = {"metadata": metadata, "facts": {**timing, **file_facts(file)}}
+        write_text(note_path(self.path), dumps(content))
 
     def _forget_note(self) -> None:
         if self._note is not None:
             note_path(self.path).unlink(missing_ok=True)
+
+
+def note_path(video: Path) -> Path:
+    """Return the path of the note about an unfinished video."""
+    return video.with_name(f".{video.name}.note.part")

@@ -25,8 +25,8 @@ from ..formats.journal import (
     JournalReader,
     JournalWriter,
     entry_of,
+    missing_line,
 )
-from ..formats.killed_episodes import missing_line
 from ..formats.locks import try_lock
 from ..formats.monitor_directory import (
     Infix,

@@ -14,12 +14,24 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from ..errors import EncoderError, Error, UnreadableFile
+from ..errors import DirectoryNotWritable, EncoderError, Error, UnreadableFile
 from ..formats.asciicast import unfinished_recording
+from ..formats.ffmpeg import ffmpeg_sha256, ffmpeg_version
+from ..formats.frame_hashes import cut_frame_hashes, frame_hash_path
 from ..formats.journal import KILLED
+from ..formats.json_fields import (
+    field,
+    mapping,
+    optional,
+    positive,
+    rate,
+    read_object,
+    text,
+    unreadable,
+)
 from ..formats.locks import is_locked
-from ..formats.monitor_directory import episode_of
-from ..formats.unfinished_video import UnfinishedVideo, note_path, read_note
+from ..formats.monitor_directory import episode_of, unfinished_files
+from ..formats.video_file import content_facts
 from ..formats.video_metadata import (
     StepRuns,
     further_live_videos,
@@ -28,7 +40,7 @@ from ..formats.video_metadata import (
     timing_facts,
     write_metadata,
 )
-from ..formats.video_sink import VideoSink
+from ..formats.video_sink import VideoSink, note_path
 from ..plain_text import counted
 
 # Only the metadata of clips has this key.
@@ -58,39 +70,104 @@ def finish_video(path: Path, known: Mapping[str, Any]) -> Iterator[tuple[str, st
         Error: the encoder is still running, or the files cannot be written.
     """
     try:
-        video = read_note(path)
+        about, facts = _read_note(note_path(path))
     except UnreadableFile:
         # A note is written before there is a video.
         note_path(path).unlink(missing_ok=True)
         return
-    if is_locked(video.temporary):
+    part = next(iter(unfinished_files(path)), path)
+    if is_locked(part):
         raise Error(
             f"The encoder of {path.name} is still finishing its file. To wait longer: "
             f"mjrec recover --timeout 60 {path.parent}"
         )
     if not metadata_path(path).exists():
-        if _FIRST_STEP in video.metadata:
+        if _FIRST_STEP in about:
             # A clip spans episodes: facts about one do not describe the clip's end.
             known = {}
         try:
-            metadata = _metadata(video, video.finish(), known)
+            found = _finish_files(part, path, facts)
+            metadata = _metadata(path, about, {**facts, **found}, known)
             done = path.name, _counted(metadata["frame_count"], metadata)
         except EncoderError as error:
             ending = known if "complete" in known else {**known, **_CUT}
-            metadata = {**video.metadata, **ending, "empty": True, "recovered": True}
+            metadata = {**about, **ending, "empty": True, "recovered": True}
             done = metadata_path(path).name, "there was no frame yet"
             # Frames are hashed before they are encoded, so the encoder may never have
             # received the last one.
-            if video.hashed_frames > 1:
+            if _hashed_frames(path) > 1:
                 why = (error.stderr.strip().splitlines() or [str(error)])[-1]
                 metadata |= {"broken": True, "broken_reason": f"{_BROKEN}: {why}"}
                 write_metadata(path, metadata)
-                kept = f"its data is in {video.temporary.name}"
-                yield path.name, f"broken ({why}); {kept}"
+                yield path.name, f"broken ({why}); its data is in {part.name}"
                 return
         write_metadata(path, metadata)
         yield done
-    video.forget()
+    # The note is needed as long as one of the other files exists.
+    for left in (*unfinished_files(path), *_hashes(path), note_path(path)):
+        left.unlink(missing_ok=True)
+
+
+def _read_note(path: Path) -> tuple[Mapping[str, Any], Mapping[str, Any]]:
+    """Return the metadata about a recording, and the facts about its file and timing.
+
+    Raises:
+        UnreadableFile: the note is missing or damaged.
+    """
+    with unreadable(path):
+        values = read_object(path)
+        facts = field(values, "facts", mapping)
+        for key in ("padded_height", "padded_width", "stride", "frames_per_step"):
+            field(facts, key, positive)
+        field(facts, "fps", rate)
+        field(facts, "timestep", optional(rate))
+        field(facts, "pixel_format", text)
+        field(facts, "encoder_version", mapping)
+        return field(values, "metadata", mapping), facts
+
+
+def _hashes(video: Path) -> list[Path]:
+    return unfinished_files(frame_hash_path(video))
+
+
+def _hashed_frames(video: Path) -> int:
+    """Return the number of frames that were, or soon would be, given to the encoder."""
+    texts = [path.read_text("ascii", "replace") for path in _hashes(video)]
+    return sum(not line.startswith("#") for t in texts for line in t.splitlines())
+
+
+def _finish_files(part: Path, video: Path, facts: Mapping[str, Any]) -> dict[str, Any]:
+    """Rename a video and its frame hashes, and return facts about their content.
+
+    Raises:
+        EncoderError: the video cannot be decoded to its end.
+        DirectoryNotWritable: the files cannot be renamed.
+    """
+    found = content_facts(
+        part,
+        height=facts["padded_height"],
+        width=facts["padded_width"],
+        pixel_format=facts["pixel_format"],
+    )
+    is_same_ffmpeg = facts["encoder_version"].get("version") == ffmpeg_version()
+    try:
+        for hashes in _hashes(video):
+            _finish_hashes(hashes, frame_hash_path(video), found["frame_count"])
+        part.replace(video)
+    except OSError as error:
+        raise DirectoryNotWritable(video.parent, error) from error
+    return {**found, "ffmpeg_sha256": ffmpeg_sha256() if is_same_ffmpeg else None}
+
+
+def _finish_hashes(part: Path, final: Path, frame_count: int) -> None:
+    try:
+        # Some frames that have hashes may not have reached the file.
+        cut_frame_hashes(part, frame_count)
+    except ValueError:
+        # Incomplete hashes are worse than none.
+        part.unlink()
+    else:
+        part.replace(final)
 
 
 def _counted(count: int, metadata: Mapping[str, Any]) -> str:
@@ -99,7 +176,10 @@ def _counted(count: int, metadata: Mapping[str, Any]) -> str:
 
 
 def _metadata(
-    video: UnfinishedVideo, facts: dict[str, Any], known: Mapping[str, Any]
+    video: Path,
+    about: Mapping[str, Any],
+    facts: dict[str, Any],
+    known: Mapping[str, Any],
 ) -> dict[str, Any]:
     frame_count, stride = facts["frame_count"], facts["stride"]
     frames_per_step = facts.pop("frames_per_step")
@@ -113,9 +193,9 @@ def _metadata(
         known = {**_sums(known), **_CUT}
     # The step of each frame is known only if there is one frame per step.
     is_known = frames_per_step == 1
-    further = further_live_videos(video.path)
+    further = further_live_videos(video)
     return {
-        **video.metadata,
+        **about,
         **facts,
         **known,
         "frame_steps": StepRuns(steps, stride=stride).ranges if is_known else None,

@@ -22,8 +22,8 @@ from ..formats.monitor_directory import (
     unfinished_files,
 )
 from ..formats.spans import recordings_in
-from ..formats.unfinished_video import note_path
 from ..formats.video_metadata import is_broken, metadata_path
+from ..formats.video_sink import note_path
 from ..results.journal_or_stats import MonitorResults
 from ..results.monitor_files import MonitorFiles, files_of, monitors_of
 
