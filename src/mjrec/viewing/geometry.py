@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Meshes for MuJoCo geoms, sites, skins and flexes, with colours or textures.
+"""A scene of meshes: MuJoCo's geoms, sites, skins and flexes, with their colours.
 
 mjviser creates the meshes of primitives, height fields and sites. This module adds the
 rest: normals and texture coordinates of meshes, cube textures, planes of the model's
@@ -8,6 +8,8 @@ size, and colours as mixed by MuJoCo's visualiser.
 
 from __future__ import annotations
 
+import contextlib
+import io
 from typing import Any
 
 import mujoco
@@ -15,10 +17,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import MissingDependency
-from .motion import Shape
+from .motion import Motion, Shape, Stage
 
 try:
     import trimesh
+    import viser
     from mjviser.conversions import create_primitive_mesh, create_site_mesh
     from PIL import Image
     from trimesh.visual import TextureVisuals
@@ -42,6 +45,8 @@ _COLOUR_ROLES = (
 _HORIZON = 30.0
 _SHARP = 0.6  # radians between faces that make an edge
 _GAMMA = 2.2
+_LIGHT = 1.6
+_TRANSPARENT = 0.999
 
 # For each side of a cube texture, in OpenGL's order: the axis that points at it, and
 # the axes of s and t, each with its sign.
@@ -53,6 +58,43 @@ _SIDES = (
     ((2, 1), (0, 1), (1, -1)),
     ((2, -1), (0, -1), (1, -1)),
 )
+
+
+def scene_page(stage: Stage, motion: Motion) -> str:
+    """Return an HTML page with all shapes of a stage, in the motion's first state."""
+    # viser prints a report about its server, which nothing ever connects to.
+    with contextlib.redirect_stdout(io.StringIO()):
+        server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
+        try:
+            _fill(server.scene, stage, motion)
+            return server.get_scene_serializer().as_html()
+        finally:
+            server.stop()
+
+
+def _fill(scene: viser.SceneApi, stage: Stage, motion: Motion) -> None:
+    model = stage.model
+    scene.configure_environment_map(None)
+    scene.add_light_ambient("/light", intensity=_LIGHT)
+    scene.set_background_image(sky(model))
+    for shape in stage.soft:
+        mesh = soft_mesh(model, shape)
+        # Without MuJoCo's normals, its own shadow would show as stripes on it.
+        scene.add_mesh_trimesh(shape.name, mesh, receive_shadow=False)
+    for shape in (*stage.shapes, *stage.passing.values()):
+        pose = motion.poses[shape.name][0]
+        scene.add_mesh_trimesh(
+            shape.name,
+            mesh_of(model, shape),
+            position=pose[:3],
+            wxyz=pose[3:],
+            cast_shadow=_casts_shadow(shape),
+        )
+
+
+def _casts_shadow(shape: Shape) -> bool:
+    is_plane = shape.geom_type == _PLANE
+    return shape.object_type == _GEOM and not is_plane and shape.rgba[3] > _TRANSPARENT
 
 
 def mesh_of(model: mujoco.MjModel, shape: Shape) -> trimesh.Trimesh:

@@ -25,9 +25,8 @@ from numpy.typing import NDArray
 from ..atomic_files import write_text
 from ..rates import rate_from_timestep, stride_for
 from ..simulation.trajectories import Trajectory
-from .geometry import linear, skin_weights
+from .geometry import linear, scene_page, skin_weights
 from .motion import Motion, Shape, Stage
-from .scene import scene_page
 
 _LOG = logging.getLogger(__name__)
 _COMPRESSION = 6
