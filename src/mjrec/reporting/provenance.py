@@ -56,26 +56,20 @@ _LONGEST_TEXT: Final = 1000
 _MOST_LISTED: Final = 20
 
 
-class Provenance:
-    """Facts about recordings, by label, with each different value once."""
+def joined(pairs: Pairs) -> list[tuple[str, str]]:
+    """Return each label with its different values, in the order of the page.
 
-    def __init__(self, pairs: Pairs = ()) -> None:
-        self._values: dict[str, dict[str, None]] = {label: {} for label in _LABELS}
-        self.add(pairs)
-
-    def add(self, pairs: Pairs) -> None:
-        """Add pairs of label and value, in this order. Empty values are left out."""
-        for label, value in pairs:
-            if value:
-                self._values[label][value[:_LONGEST_TEXT]] = None
-
-    def pairs(self) -> list[tuple[str, str]]:
-        """Return pairs of label and joined values, in the order of the page."""
-        return [
-            (label, _some(values, "; " if label != "Monitors" else ", "))
-            for label, values in self._values.items()
-            if values
-        ]
+    Empty values are left out.
+    """
+    values: dict[str, dict[str, None]] = {label: {} for label in _LABELS}
+    for label, value in pairs:
+        if value:
+            values[label][value[:_LONGEST_TEXT]] = None
+    return [
+        (label, _some(found, "; " if label != "Monitors" else ", "))
+        for label, found in values.items()
+        if found
+    ]
 
 
 def machine_of(monitor: MonitorResults) -> tuple[str, str]:
