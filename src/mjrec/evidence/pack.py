@@ -32,7 +32,7 @@ from .bag import TRY_AGAIN, make_bag, write_zip
 from .contents import Contents, link_or_copy, look_for_contents
 from .descriptions import descriptions, packed_with
 from .identity import Identity, identity_of_user
-from .identity_traces import remaining_identity
+from .identity_matching import remaining_identity
 from .layout import (
     MOST_ENTRIES,
     PAYLOAD,

@@ -35,8 +35,11 @@ from ..formats.monitor_directory import monitor_directories_in
 from ..results.episodes import Episode, episodes_of
 from ..results.journal_or_stats import MonitorResults
 from ..results.monitor_files import MonitorFiles, monitors_of
-from .contents import ReportContents, ReportTask, ReportVideo, Verdict
-from .episode_rows import (
+from .contents import (
+    ReportContents,
+    ReportTask,
+    ReportVideo,
+    Verdict,
     episodes_with_roles,
     in_time,
     rows_of_monitor,

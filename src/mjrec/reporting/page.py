@@ -27,9 +27,8 @@ from ..errors import MissingDependency
 from ..evaluation.statistics import PERCENTILE_BOOTSTRAP, Bootstrap, Interval
 from ..evaluation.summaries import TaskSummary
 from ..plain_text import counted, spelled_out
-from .contents import FAILED, ReportContents, ReportTask, ReportVideo
+from .contents import FAILED, ROLES, ReportContents, ReportTask, ReportVideo
 from .curves import SERIES, evaluation_curve, learning_curve, profile_curve
-from .episode_rows import ROLES
 from .page_text import (
     NOTHING,
     address,
