@@ -40,7 +40,7 @@ from typing import Any
 from xml.etree import ElementTree
 
 from ..atomic_files import replacing
-from ..errors import FileNotWritten, InvalidArgument
+from ..errors import FileNotWritten, InvalidArgument, UnreadableFile
 from ..formats.json_fields import unreadable
 from ..formats.monitor_directory import FILE_PREFIX, Infix, infix_of, is_second_name
 from ..formats.trajectory_file import amend_trajectories
@@ -175,9 +175,15 @@ def _make_file_anonymous(path: Path, texts: _Texts, matcher: IdentityMatcher) ->
             amend_trajectories({path: texts.value})
     elif name.startswith(_MODEL) and name.endswith(".zip"):
         _rewrite(path, lambda data: anonymous_sources(data, matcher))
-    elif name.startswith(_MODEL) and matcher.found_in_bytes(compiled_model(path)):
-        logger.info("Leaving out %s: it names who compiled it.", name)
-        path.unlink()
+    elif name.startswith(_MODEL):
+        try:
+            with unreadable(path):
+                model = gzip.decompress(path.read_bytes())
+        except (EOFError, zlib.error) as error:
+            raise UnreadableFile(path, f"it is damaged ({error})") from error
+        if matcher.found_in_bytes(model):
+            logger.info("Leaving out %s: it names who compiled it.", name)
+            path.unlink()
 
 
 def _rewrite(path: Path, change: Callable[[bytes], bytes]) -> None:
@@ -298,7 +304,7 @@ def anonymous_sources(content: bytes, matcher: IdentityMatcher) -> bytes:
         ):
             for info in archive.infolist():
                 old = archive.read(info)
-                new = _file(old, matcher)
+                new = _source_file(old, matcher)
                 is_same = is_same and new == old
                 changed.writestr(info, new)
     except _DAMAGE as error:
@@ -306,20 +312,7 @@ def anonymous_sources(content: bytes, matcher: IdentityMatcher) -> bytes:
     return content if is_same else image.getvalue()
 
 
-def compiled_model(path: Path) -> bytes:
-    """Return the uncompressed bytes of a gzipped compiled model.
-
-    Raises:
-        UnreadableFile: the file is damaged.
-    """
-    with unreadable(path):
-        try:
-            return gzip.decompress(path.read_bytes())
-        except (EOFError, zlib.error) as error:
-            raise ValueError(f"it is damaged ({error})") from error
-
-
-def _file(content: bytes, matcher: IdentityMatcher) -> bytes:
+def _source_file(content: bytes, matcher: IdentityMatcher) -> bytes:
     if content.startswith(_PNG):
         return b"".join(_png_parts(content))
     # MJCF files may have any name.
