@@ -33,11 +33,7 @@ from .contents import Contents, link_or_copy, look_for_contents
 from .descriptions import descriptions, packed_with
 from .identity import Identity, identity_of_user
 from .identity_matching import remaining_identity
-from .layout import (
-    MOST_ENTRIES,
-    PAYLOAD,
-    RECORDINGS,
-)
+from .layout import MOST_ENTRIES, PAYLOAD, RECORDINGS
 from .packed_run import PackingOptions, planned_episodes, read_run
 from .size_limit import archive_within, byte_count
 from .statements import state

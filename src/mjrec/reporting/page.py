@@ -29,14 +29,7 @@ from ..evaluation.summaries import TaskSummary
 from ..plain_text import counted, spelled_out
 from .contents import FAILED, ROLES, ReportContents, ReportTask, ReportVideo
 from .curves import SERIES, evaluation_curve, learning_curve, profile_curve
-from .page_text import (
-    NOTHING,
-    address,
-    decimals_for,
-    interval_text,
-    number,
-    page_json,
-)
+from .page_text import NOTHING, address, decimals_for, interval_text, number, page_json
 from .provenance import SELECTION
 
 _LONGEST_NAME: Final = 120
