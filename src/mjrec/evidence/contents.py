@@ -46,7 +46,6 @@ from ..formats.monitor_directory import (
     episode_of,
     infix_of,
     is_bundle,
-    is_manifest,
     iter_monitor_files,
     recording_directories,
     where_recordings_are,
@@ -58,7 +57,7 @@ from ..rendering.leftovers import has_leftovers
 from ..rendering.recorded_facts import open_for_rendering
 from ..rendering.recordings import look_at, recordings
 from ..results import iter_episodes
-from ..results.monitor_files import monitors_of
+from ..results.monitor_files import MonitorFiles, monitors_of
 from .bag import TRY_AGAIN
 from .layout import PACKED_EPISODES, STATES_LEFT_OUT
 from .portable_names import portable_parts
@@ -176,9 +175,6 @@ def look_for_contents(directory: Path, episodes: Iterable[int] | None) -> Conten
 
 def _add_all(contents: Contents, place: Path, infixes: dict[str, Path]) -> None:
     """Add a directory's monitors, whose infixes must differ from all earlier ones."""
-    of_infix: dict[str, list[Path]] = {}
-    for path in iter_monitor_files(place):
-        of_infix.setdefault(infix_of(path.name) or "", []).append(path)
     for monitor in monitors_of(place):
         if monitor.manifest is None:
             continue
@@ -187,7 +183,12 @@ def _add_all(contents: Contents, place: Path, infixes: dict[str, Path]) -> None:
                 f"{other} and {place} have files of the same names, with "
                 f"{monitor.infix} in them. Pack each directory separately."
             )
-        _add_monitor(contents, monitor.manifest, of_infix[monitor.infix])
+        _add_monitor(contents, monitor.manifest, _visible(monitor))
+
+
+def _visible(monitor: MonitorFiles) -> list[Path]:
+    """Return a monitor's files without locks and unfinished files."""
+    return [path for path in monitor.paths if not path.name.startswith(".")]
 
 
 def _check_is_idle(directory: Path) -> None:
@@ -209,15 +210,12 @@ def _check_is_idle(directory: Path) -> None:
 
 
 def _check_all_is_done(directory: Path) -> None:
-    closed = [files for files in monitors_of(directory) if not files.is_open]
-    killed = [each.infix for each in closed if has_leftovers(each)]
+    monitors = monitors_of(directory)
+    killed = [each.infix for each in monitors if has_leftovers(each)]
     if killed:
         raise UnfinishedRecordings(directory, killed, advice=_RECOVER.format(directory))
-    visible = [
-        [path.name for path in files.paths if not path.name.startswith(".")]
-        for files in closed
-    ]
-    strays = [name for own in visible if not any(map(is_manifest, own)) for name in own]
+    lost = [each for each in monitors if each.manifest is None]
+    strays = [path.name for each in lost for path in _visible(each)]
     if strays:
         raise UnfinishedRecordings(directory, strays, advice=_STRAY)
     pending = [
