@@ -38,7 +38,7 @@ from ..errors import (
 from ..formats.bundle import file_of, finished_trajectories, trajectories_in
 from ..formats.frame_hashes import frame_hash_path
 from ..formats.journal import is_of_spans
-from ..formats.json_fields import base_name, unreadable
+from ..formats.json_fields import base_name, facts_in, unreadable
 from ..formats.locks import is_locked
 from ..formats.manifest import Manifest, read_manifest, write_manifest
 from ..formats.monitor_directory import (
@@ -279,9 +279,7 @@ def _add_monitor(contents: Contents, path: Path, files: list[Path]) -> None:
 
 def _add_manifest(contents: Contents, path: Path, manifest: Manifest) -> None:
     details = manifest.mjrec
-    provenance = (details or {}).get("provenance")
-    if isinstance(provenance, Mapping):
-        contents.provenance.append(provenance)
+    contents.provenance.append(facts_in((details or {}).get("provenance")))
     if contents.packed_episodes is None:
         contents.add(path)
         return

@@ -24,7 +24,7 @@ from typing import Any
 
 from .. import json_text
 from ..errors import MissingDependency
-from ..formats.json_fields import read_object, unreadable
+from ..formats.json_fields import facts_in, read_object, unreadable
 from ..formats.monitor_directory import episode_of
 from ..results import Episode, iter_episodes
 from .layout import (
@@ -38,7 +38,7 @@ from .layout import (
     STATISTICS,
     STATISTICS_COLUMNS,
 )
-from .packed_run import PackedRun, Session, facts_in
+from .packed_run import PackedRun, Session
 from .statements import Author
 
 # Maximum number of rows in the table of videos. The statistics list all videos.

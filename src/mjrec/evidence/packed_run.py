@@ -12,7 +12,7 @@ from typing import Any
 
 from ..environments.scenes import shown_arguments, shown_wrappers
 from ..formats import json_fields
-from ..formats.json_fields import read_object, unreadable
+from ..formats.json_fields import facts_in, read_object, unreadable
 from ..formats.trajectory_hdf5 import open_hdf5
 from ..plain_text import counted
 from ..results import Episode, iter_episodes
@@ -241,11 +241,6 @@ def planned_episodes(directory: Path) -> int | None:
         plan = json_fields.field(read_object(path), "plan", json_fields.mapping)
         tasks, seeds = (len(plan[name]) for name in ("tasks", "seeds"))
         return tasks * seeds * json_fields.field(plan, "episodes", json_fields.integer)
-
-
-def facts_in(value: object) -> Mapping[str, Any]:
-    """Return a mapping unchanged, or an empty one for any other value."""
-    return value if isinstance(value, Mapping) else {}
 
 
 def _session(monitor: MonitorFiles, tally: Tally) -> Session:
