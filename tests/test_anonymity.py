@@ -25,7 +25,7 @@ from PIL import Image, PngImagePlugin
 import mjrec
 from mjrec.evidence.anonymity import make_anonymous
 from mjrec.evidence.identity import Identity
-from mjrec.evidence.identity_traces import remaining_identity
+from mjrec.evidence.identity_matching import remaining_identity
 from mjrec.json_text import loads
 
 WORDS = (
@@ -43,7 +43,7 @@ WORDS = (
 _ANONYMOUS = """
 import sys, pathlib
 from mjrec.evidence.anonymity import make_anonymous
-from mjrec.evidence.identity_traces import remaining_identity
+from mjrec.evidence.identity_matching import remaining_identity
 from mjrec.evidence.identity import identity_of_user
 from mjrec.evidence.statements import state
 from mjrec.formats.manifest import read_manifest

@@ -10,7 +10,7 @@ from collections.abc import Mapping
 import pytest
 from PIL import Image, PngImagePlugin
 
-from mjrec.evidence.anonymous_models import anonymous_sources
+from mjrec.evidence.anonymity import anonymous_sources
 from mjrec.evidence.identity import Identity
 from mjrec.evidence.identity_matching import IdentityMatcher
 

@@ -21,8 +21,7 @@ from mjrec.errors import InvalidArgument, UnreadableFile
 from mjrec.evaluation.evaluation import read_results
 from mjrec.formats.monitor_directory import infix_of
 from mjrec.recorder.keep_rules import keep_rule
-from mjrec.reporting.contents import EPISODE
-from mjrec.reporting.episode_rows import episodes_with_roles
+from mjrec.reporting.contents import EPISODE, episodes_with_roles
 from mjrec.reporting.gathering import gather
 from report_recordings import GYM, entry, record, write_journal
 

@@ -14,7 +14,7 @@ import secrets
 from collections.abc import Iterator
 from pathlib import Path
 
-from .errors import FileNotWritten
+from .errors import DirectoryNotWritable, FileNotWritten
 
 
 def temporary_path(path: Path) -> Path:
@@ -53,6 +53,18 @@ def write_text(path: Path, text: str) -> None:
             temporary.write_text(text, encoding="utf-8")
     except OSError as error:
         raise FileNotWritten(path, error.strerror) from error
+
+
+def make_directory(directory: Path) -> None:
+    """Create a directory and its parents, if they do not exist.
+
+    Raises:
+        DirectoryNotWritable: the directory cannot be created.
+    """
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise DirectoryNotWritable(directory, error.strerror) from error
 
 
 def file_sha256(path: Path) -> str:

@@ -18,12 +18,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from ..atomic_files import make_directory
 from ..engines.choice import given_engine
 from ..engines.jobs import WORK_FOLDER, Run, Work
 from ..engines.local import LocalEngine
 from ..errors import (
     DirectoryInUse,
-    DirectoryNotWritable,
     GLError,
     InvalidArgument,
     PolicyError,
@@ -250,7 +250,7 @@ def evaluate(
             needed = min(local.workers, len(plan.tasks) * len(plan.chunks))
             plan, velocities = check_tasks(home, plan, workers=needed if is_here else 1)
             if begun is None:
-                _make(place)
+                make_directory(place)
                 stack.enter_context(_held(place))
                 _clear(place)
             write_plan(place, plan)
@@ -368,13 +368,6 @@ def _environ_of_workers(plan: EvaluationPlan, *, is_elsewhere: bool) -> dict[str
         except GLError as error:
             logger.warning(NO_GL, error)
     return {name: value for name, value in wanted.items() if name not in os.environ}
-
-
-def _make(directory: Path) -> None:
-    try:
-        directory.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise DirectoryNotWritable(directory, error.strerror) from error
 
 
 def _clear(directory: Path) -> None:

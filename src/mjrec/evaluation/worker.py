@@ -27,8 +27,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from ..atomic_files import make_directory
 from ..environments.scenes import simulation_below
-from ..errors import DirectoryNotWritable, Error, GLError
+from ..errors import Error, GLError
 from ..formats.dataclass_json import from_json
 from ..formats.locks import wait_for_lock
 from ..gl import use_gl
@@ -103,10 +104,7 @@ class EvaluationWorker:
 
     def _run(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
         folder = self._directory / arguments["folder"]
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise DirectoryNotWritable(folder, error.strerror) from error
+        make_directory(folder)
         # If an earlier evaluation was killed, its workers may still be running.
         with wait_for_lock(folder / _LOCK), noting_models() as models:
             recover(folder, bundle=True)

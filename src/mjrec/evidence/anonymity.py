@@ -12,34 +12,39 @@ In a staged monitor directory, whose files are copies or links:
   `<gpu>`, because each identifies a single card;
 - file names that contain the identity in a uid, a camera or a prefix get `user` or
   `host` instead, and references to them are changed to match;
-- sources of models lose their comments, and their images the metadata
-  (`anonymous_models`);
+- sources of models lose their comments, and their images the metadata. No element or
+  attribute changes, so the model compiles to the same result, and names stay;
 - a compiled model that contains the identity is removed. Only its author could have
   loaded it.
 
 `identity_matching` defines the matching. Times and numbers stay, including the process
 id in a default uid. Any other trace of the identity stays too, for example in a body's
-name; `identity_traces` finds it.
+name; `remaining_identity` finds it.
 """
 
 from __future__ import annotations
 
 import contextlib
+import gzip
+import io
 import logging
 import os
 import re
+import struct
+import zipfile
+import zlib
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 from ..atomic_files import replacing
-from ..errors import FileNotWritten, InvalidArgument
+from ..errors import FileNotWritten, InvalidArgument, UnreadableFile
 from ..formats.json_fields import unreadable
 from ..formats.monitor_directory import FILE_PREFIX, Infix, infix_of, is_second_name
 from ..formats.trajectory_file import amend_trajectories
 from ..json_text import dumps, loads
-from .anonymous_models import anonymous_sources, compiled_model
 from .identity import Identity
 from .identity_matching import IdentityMatcher
 
@@ -59,6 +64,20 @@ _PATH_OF_FILE = re.compile(
 _GPU = re.compile(r"(?<![\w-])(?:GPU|MIG)-[0-9a-fA-F][0-9a-fA-F/-]*")
 # A commit can be found with a search engine.
 _CODE = {"remote": None, "root": "<path>", "commit": "<commit>"}
+
+# Inside CDATA, `<!--` does not begin a comment.
+_BESIDE_THE_MODEL = re.compile(
+    r"(?P<cdata><!\[CDATA\[.*?\]\]>)|<!--(?P<comment>.*?)-->", re.DOTALL
+)
+# Licences require that these comments be kept.
+_LICENCE = re.compile(r"copyright|licen[cs]e|\(c\)|©", re.IGNORECASE)
+_MAIL = re.compile(r"@[\w-]+\.\w")
+
+_PNG = b"\x89PNG\r\n\x1a\n"
+# Text, modification time and EXIF.
+_PNG_METADATA = (b"tEXt", b"zTXt", b"iTXt", b"tIME", b"eXIf")
+
+_DAMAGE = (zipfile.BadZipFile, zlib.error, struct.error, EOFError, RuntimeError)
 
 
 def make_anonymous(recordings: Path, *, identity: Identity) -> None:
@@ -156,9 +175,15 @@ def _make_file_anonymous(path: Path, texts: _Texts, matcher: IdentityMatcher) ->
             amend_trajectories({path: texts.value})
     elif name.startswith(_MODEL) and name.endswith(".zip"):
         _rewrite(path, lambda data: anonymous_sources(data, matcher))
-    elif name.startswith(_MODEL) and matcher.found_in_bytes(compiled_model(path)):
-        logger.info("Leaving out %s: it names who compiled it.", name)
-        path.unlink()
+    elif name.startswith(_MODEL):
+        try:
+            with unreadable(path):
+                model = gzip.decompress(path.read_bytes())
+        except (EOFError, zlib.error) as error:
+            raise UnreadableFile(path, f"it is damaged ({error})") from error
+        if matcher.found_in_bytes(model):
+            logger.info("Leaving out %s: it names who compiled it.", name)
+            path.unlink()
 
 
 def _rewrite(path: Path, change: Callable[[bytes], bytes]) -> None:
@@ -252,3 +277,81 @@ def _renamed_infixes(matcher: IdentityMatcher, names: list[str]) -> Mapping[str,
         new[infix] = str(candidate)
         taken.add(new[infix])
     return new
+
+
+def anonymous_sources(content: bytes, matcher: IdentityMatcher) -> bytes:
+    """Return the zip file of a model's sources, without its authors' remarks.
+
+    Comments that mention a licence stay, unless they contain the identity or an email
+    address.
+
+    Args:
+        content: the bytes of the zip file.
+        matcher: finds the identity.
+
+    Returns:
+        The same bytes if there is nothing to remove.
+
+    Raises:
+        ValueError: the zip file or a file in it is damaged.
+    """
+    image = io.BytesIO()
+    is_same = True
+    try:
+        with (
+            zipfile.ZipFile(io.BytesIO(content)) as archive,
+            zipfile.ZipFile(image, "w") as changed,
+        ):
+            for info in archive.infolist():
+                old = archive.read(info)
+                new = _source_file(old, matcher)
+                is_same = is_same and new == old
+                changed.writestr(info, new)
+    except _DAMAGE as error:
+        raise ValueError(f"it is damaged ({error})") from error
+    return content if is_same else image.getvalue()
+
+
+def _source_file(content: bytes, matcher: IdentityMatcher) -> bytes:
+    if content.startswith(_PNG):
+        return b"".join(_png_parts(content))
+    # MJCF files may have any name.
+    if content.lstrip(b"\xef\xbb\xbf \t\r\n").startswith(b"<"):
+        return _xml(content, matcher)
+    return content
+
+
+def _xml(content: bytes, matcher: IdentityMatcher) -> bytes:
+    def kept(match: re.Match[str]) -> str:
+        comment = match["comment"]
+        may_stay = comment is None or (
+            _LICENCE.search(comment) is not None
+            and _MAIL.search(comment) is None
+            and not matcher.found_in(comment)
+        )
+        return match[0] if may_stay else ""
+
+    text = content.decode("utf-8")
+    new = _BESIDE_THE_MODEL.sub(kept, text)
+    if _elements(new) != _elements(text):
+        raise ValueError("removing the comments of its XML would change the model")
+    return new.encode()
+
+
+def _elements(text: str) -> str:
+    """Return the canonical form of XML, which leaves out comments."""
+    try:
+        return ElementTree.canonicalize(text.removeprefix("\ufeff"), strip_text=True)
+    except ElementTree.ParseError as error:
+        raise ValueError(f"it is not valid XML: {error}") from error
+
+
+def _png_parts(content: bytes) -> Iterator[bytes]:
+    yield _PNG
+    start = len(_PNG)
+    while start < len(content):
+        (length,) = struct.unpack_from(">I", content, start)
+        end = start + 12 + length
+        if content[start + 4 : start + 8] not in _PNG_METADATA:
+            yield content[start:end]
+        start = end

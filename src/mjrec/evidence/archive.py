@@ -7,7 +7,6 @@ inside the sandbox, laid out like a packed run; only regular files are accepted.
 
 from __future__ import annotations
 
-import enum
 import hashlib
 import os
 import shutil
@@ -30,7 +29,7 @@ from ..formats.regular_files import open_regular
 from ..formats.trajectory_hdf5 import open_hdf5, write_hdf5
 from .layout import PAYLOAD, RECORDINGS
 from .portable_names import check_distinct, portable_parts
-from .zip_contents import ZipContents, check_table, zip_contents
+from .zip_contents import in_order, open_plain_zip, top_folder
 
 # A folder that contains this file is a bag.
 BAG_DECLARATION = "bagit.txt"
@@ -45,14 +44,6 @@ _NOT_READ = (
     *(ValueError, zipfile.BadZipFile, zlib.error, EOFError),
     *(RuntimeError, NotImplementedError, MemoryError),
 )
-
-
-class Kind(enum.StrEnum):
-    """The kind of input to verify."""
-
-    ZIP = "packed run"
-    BAG = "unpacked run"
-    DIRECTORY = "monitor directory"
 
 
 def bring_in(path: Path, into: Path) -> Mapping[str, Any]:
@@ -71,17 +62,25 @@ def bring_in(path: Path, into: Path) -> Mapping[str, Any]:
         FileNotWritten: there is too little disk space.
     """
     try:
+        facts: dict[str, Any]
         if path.is_dir():
-            return _of_folder(path, into)
-        facts = {"kind": Kind.ZIP, **_hashed(path)}
-        _unpack(path, into)
+            facts = {"kind": _copy_in(path, into)}
+        else:
+            digest, size = digest_of(path, "sha256"), path.stat().st_size
+            facts = {"kind": "packed run", "sha256": digest, "bytes": size}
+            _unpack(path, into)
     except FileNotWritten:
         raise
     except OSError as error:
         raise UnreadableArchive(path, error.strerror or error) from error
     except _NOT_READ as error:
         raise UnreadableArchive(path, error) from error
-    _check_recordings(into, path)
+    if not (into / PAYLOAD / RECORDINGS).is_dir():
+        raise UnreadableArchive(
+            path,
+            f"it has no folder {PAYLOAD}/{RECORDINGS}, so it does not come from "
+            "`mjrec pack`",
+        )
     return facts
 
 
@@ -92,25 +91,18 @@ def digest_of(path: Path, algorithm: str) -> str:
         OSError: the file cannot be read.
         ValueError: the path is not a regular file.
     """
-    digest = hashlib.new(algorithm)
     with open_regular(path) as file:
-        while chunk := file.read(_CHUNK):
-            digest.update(chunk)
-    return digest.hexdigest()
+        return hashlib.file_digest(file, algorithm).hexdigest()
 
 
-def _hashed(path: Path) -> dict[str, Any]:
-    return {"sha256": digest_of(path, "sha256"), "bytes": path.stat().st_size}
-
-
-def _of_folder(path: Path, into: Path) -> Mapping[str, Any]:
+def _copy_in(path: Path, into: Path) -> str:
+    """Copy a bag or the files of monitor directories; return the kind of the folder."""
     bag = _bag_in(path)
     if bag is not None:
         files = {each.relative_to(bag).as_posix(): each for each in _files_below(bag)}
         _check_folders(bag)
         _copy_files(files, into, given=path)
-        _check_recordings(into, path)
-        return {"kind": Kind.BAG}
+        return "unpacked run"
     recordings: dict[str, Path] = {}
     for place in recording_directories(path):
         for file in iter_monitor_files(place):
@@ -125,7 +117,7 @@ def _of_folder(path: Path, into: Path) -> Mapping[str, Any]:
         )
     _copy_files(recordings, into / PAYLOAD / RECORDINGS, given=path)
     _unbundle(into / PAYLOAD / RECORDINGS)
-    return {"kind": Kind.DIRECTORY}
+    return "monitor directory"
 
 
 def _bag_in(path: Path) -> Path | None:
@@ -165,20 +157,8 @@ def _copy_files(files: Mapping[str, Path], into: Path, *, given: Path) -> None:
     into.mkdir(parents=True)
     _check_room(sum(path.lstat().st_size for path in files.values()), into, given)
     for name, path in files.items():
-        target = into.joinpath(*portable_parts(name))
-        target.parent.mkdir(parents=True, exist_ok=True)
-        with open_regular(path) as source, target.open("xb") as output:
-            size = os.fstat(source.fileno()).st_size
-            _copy(source, output, target, size)
-
-
-def _check_recordings(bag: Path, given: Path) -> None:
-    if not (bag / PAYLOAD / RECORDINGS).is_dir():
-        raise UnreadableArchive(
-            given,
-            f"it has no folder {PAYLOAD}/{RECORDINGS}, so it does not come from "
-            "`mjrec pack`",
-        )
+        with open_regular(path) as source:
+            _write(into, name, source, os.fstat(source.fileno()).st_size)
 
 
 def _unpack(path: Path, into: Path) -> None:
@@ -187,15 +167,21 @@ def _unpack(path: Path, into: Path) -> None:
     Files are streamed to the disk and counted on the way: an archive that contains more
     than it declares is refused at the first extra byte.
     """
-    check_table(path)
-    with open_regular(path) as file, zipfile.ZipFile(file) as archive:
-        contents = zip_contents(archive)
+    with open_plain_zip(path) as archive:
+        top, infos = top_folder(archive), in_order(archive)
         unpacked = into.with_name(f"{into.name}.unpacked")
         unpacked.mkdir()
-        _check_room(contents.size, unpacked, path)
-        _write_all(archive, contents, unpacked)
+        _check_room(sum(info.file_size for info in infos), unpacked, path)
+        for info in infos:
+            name = info.filename
+            if info.is_dir():
+                parts = portable_parts(name.removesuffix("/"))
+                unpacked.joinpath(*parts).mkdir(parents=True, exist_ok=True)
+                continue
+            with archive.open(info) as packed:
+                _write(unpacked, name, packed, info.file_size)
     _check_folders(unpacked)
-    (unpacked / contents.top).rename(into)
+    (unpacked / top).rename(into)
 
 
 def _check_folders(folder: Path) -> None:
@@ -215,32 +201,22 @@ def _check_room(size: int, into: Path, path: Path) -> None:
         )
 
 
-def _write_all(archive: zipfile.ZipFile, contents: ZipContents, into: Path) -> None:
-    for name in contents.folders:
-        into.joinpath(*portable_parts(name.removesuffix("/"))).mkdir(
-            parents=True, exist_ok=True
-        )
-    for info in contents.files:
-        target = into.joinpath(*portable_parts(info.filename))
-        try:
-            target.parent.mkdir(parents=True, exist_ok=True)
-            output = target.open("xb")
-        except OSError as error:
-            raise FileNotWritten(target, error.strerror) from error
-        with archive.open(info) as packed, output:
-            _copy(packed, output, target, info.file_size)
-
-
-def _copy(source: IO[bytes], output: IO[bytes], target: Path, size: int) -> None:
-    """Copy a file of exactly `size` bytes."""
-    left = size
-    while chunk := source.read(_CHUNK):
-        left -= len(chunk)
-        if left < 0:
-            break
-        try:
-            output.write(chunk)
-        except OSError as error:
-            raise FileNotWritten(target, error.strerror) from error
+def _write(folder: Path, name: str, source: IO[bytes], size: int) -> None:
+    """Copy a file of exactly `size` bytes into a folder."""
+    target, left = folder.joinpath(*portable_parts(name)), size
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        output = target.open("xb")
+    except OSError as error:
+        raise FileNotWritten(target, error.strerror) from error
+    with output:
+        while chunk := source.read(_CHUNK):
+            left -= len(chunk)
+            if left < 0:
+                break
+            try:
+                output.write(chunk)
+            except OSError as error:
+                raise FileNotWritten(target, error.strerror) from error
     if left:
         raise ValueError(f"{target.name!r} does not have the declared size")

@@ -49,6 +49,7 @@ _MANIFESTS = ("manifest-sha512.txt", "tagmanifest-sha512.txt")
 _DECLARATION = re.compile(
     r"BagIt-Version: (1\.0|0\.97)\r?\nTag-File-Character-Encoding: UTF-8(\r?\n)?"
 )
+_VERSION = re.compile(rf"^[ \t]*{FORMAT_KEY}[ \t]*:(.*)", re.MULTILINE)
 _LINE = re.compile(r"(?P<digest>[0-9a-fA-F]{128})[ \t]+\*?(?P<name>.+)")
 # RFC 8493: the characters that would end a line, and the percent sign itself.
 _ENCODED = re.compile("%(0[AaDd]|25)")
@@ -195,7 +196,14 @@ def _objections(
     try:
         if not _DECLARATION.fullmatch(_text_of(bag / BAG_DECLARATION)):
             yield BAG_DECLARATION, "it does not declare BagIt 1.0 or 0.97"
-        yield from ((_INFO, reason) for reason in _objections_to_info(bag))
+        versions = [found.strip() for found in _VERSION.findall(_text_of(bag / _INFO))]
+        if versions != [str(FORMAT_VERSION)]:
+            said = ", ".join(versions)[:80] or "(missing)"
+            yield (
+                _INFO,
+                f"its {FORMAT_KEY} is {said}, but this version of mjrec reads "
+                f"{FORMAT_VERSION}",
+            )
         listed = {
             **_said_in(bag, _MANIFESTS[0], is_payload=True),
             **_said_in(bag, _MANIFESTS[1], is_payload=False),
@@ -216,23 +224,10 @@ def _objections(
         yield name, "no manifest lists it"
     total, done = sum(there.values()), 0
     for name in sorted(listed.keys() & there.keys()):
-        if digest_of(bag / name, "sha512") != listed[name]:
+        if digest_of(bag / name, _ALGORITHM) != listed[name]:
             yield name, "it was changed: its SHA-512 differs from the listed one"
         done += there[name]
         on_progress(done, total)
-
-
-def _objections_to_info(bag: Path) -> Iterator[str]:
-    lines = _text_of(bag / _INFO).splitlines()
-    fields = [
-        (key.strip(), v.strip()) for key, _, v in (x.partition(":") for x in lines)
-    ]
-    versions = [value for key, value in fields if key == FORMAT_KEY]
-    if versions != [str(FORMAT_VERSION)]:
-        yield (
-            f"its {FORMAT_KEY} is {', '.join(versions)[:80] or '(missing)'}, but this "
-            f"version of mjrec reads {FORMAT_VERSION}"
-        )
 
 
 def _said_in(bag: Path, manifest: str, *, is_payload: bool) -> dict[str, str]:

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from ..errors import Error
-from ..formats.json_fields import json_object, read_object
+from ..formats.json_fields import facts_in, json_object, read_object
 from ..formats.monitor_directory import infix_of
 from ..formats.regular_files import open_regular
 from ..formats.trajectory_file import open_trajectory
@@ -83,7 +83,7 @@ def _models(recordings: Path, infix: str) -> tuple[str, ...]:
     names: dict[str, None] = {}
     for path in recordings.glob(f"openaigym.trajectory.{glob.escape(infix)}.*.h5"):
         with contextlib.suppress(Error), open_trajectory(path) as reader:
-            names[str(_mapping(reader.facts.get("model")).get("mjb"))] = None
+            names[str(facts_in(reader.facts.get("model")).get("mjb"))] = None
     return tuple(names)
 
 
@@ -91,7 +91,7 @@ def _claims(given: Path, made: Path, recording: str) -> Iterator[Excuse]:
     name = given.name
     if name.endswith(".jsonl"):
         runs = [_first_line(path).get("run") for path in (given, made)]
-        one, other = (_mapping(run).get("versions") for run in runs)
+        one, other = (facts_in(run).get("versions") for run in runs)
         yield from _versions(one, other, recording)
     elif name.endswith(".h5"):
         with open_trajectory(given) as a, open_trajectory(made) as b:
@@ -110,7 +110,7 @@ def _claims(given: Path, made: Path, recording: str) -> Iterator[Excuse]:
 
 
 def _versions(given: Any, made: Any, *items: str) -> Iterator[Excuse]:
-    one, other = _mapping(given), _mapping(made)
+    one, other = facts_in(given), facts_in(made)
     for package in dict.fromkeys((*one, *other)):
         if package in _PACKAGES:
             claimed, here = (str(each.get(package, "none")) for each in (one, other))
@@ -123,7 +123,7 @@ def _machine(
 ) -> Iterator[Excuse]:
     values = []
     for facts in (given, made):
-        machine = _mapping(facts.get("machine"))
+        machine = facts_in(facts.get("machine"))
         # The beginning is enough to distinguish the flags of CPUs.
         values.append(" ".join(str(v)[:16] for v in machine.values()).strip())
     yield from _claim("machine", *values, *items)
@@ -139,12 +139,8 @@ def _joined(metadata: Mapping[str, Any]) -> str:
 
 
 def _encoder(metadata: Mapping[str, Any]) -> str:
-    version = _mapping(metadata.get("encoder_version")).get("version")
+    version = facts_in(metadata.get("encoder_version")).get("version")
     return str(version)[:60]
-
-
-def _mapping(value: Any) -> Mapping[str, Any]:
-    return value if isinstance(value, Mapping) else {}
 
 
 def _first_line(path: Path) -> Mapping[str, Any]:

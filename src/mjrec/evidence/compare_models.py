@@ -22,7 +22,7 @@ from ..errors import UnreadableFile
 from ..formats.json_fields import json_object
 from .differences import Aspect, Difference, Same, stored_differently
 from .findings import Topic
-from .zip_contents import check_entries, check_table
+from .zip_contents import open_plain_zip
 
 _MODEL: Final = re.compile(r"openaigym\.model\.[0-9a-f]{16}")
 # Four numbers, the last of which is the version. No real model reaches 1 GiB.
@@ -104,9 +104,7 @@ def _sources(path: Path) -> str:
     """
     digest = hashlib.sha256()
     try:
-        check_table(path)
-        with zipfile.ZipFile(path) as sources:
-            check_entries(sources)
+        with open_plain_zip(path) as sources:
             if sum(each.file_size for each in sources.infolist()) > _LARGEST_MODEL:
                 raise ValueError("its sources are too large")
             contents = json_object(sources.read(_CONTENTS))

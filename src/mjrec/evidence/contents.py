@@ -13,15 +13,22 @@ recreated.
 
 from __future__ import annotations
 
+import functools
 import operator
-from collections.abc import Iterable, Iterator, Mapping
+import os
+import shutil
+import stat
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from ..errors import (
     DirectoryInUse,
     DirectoryNotWritable,
+    FileNotWritten,
     InvalidArgument,
     PackError,
     UnfinishedRecordings,
@@ -30,26 +37,30 @@ from ..errors import (
 )
 from ..formats.bundle import file_of, finished_trajectories, trajectories_in
 from ..formats.frame_hashes import frame_hash_path
-from ..formats.json_fields import base_name, unreadable
+from ..formats.journal import is_of_spans
+from ..formats.json_fields import base_name, facts_in, unreadable
 from ..formats.locks import is_locked
-from ..formats.manifest import Manifest, read_manifest
+from ..formats.manifest import Manifest, read_manifest, write_manifest
 from ..formats.monitor_directory import (
     FILE_PREFIX,
     episode_of,
     infix_of,
     is_bundle,
-    is_manifest,
     iter_monitor_files,
     recording_directories,
     where_recordings_are,
 )
 from ..formats.regular_files import regular_path
+from ..formats.trajectory import row_dtype
+from ..formats.trajectory_hdf5 import open_hdf5, write_hdf5
 from ..rendering.leftovers import has_leftovers
 from ..rendering.recorded_facts import open_for_rendering
 from ..rendering.recordings import look_at, recordings
 from ..results import iter_episodes
-from ..results.monitor_files import monitors_of
-from .layout import PACKED_EPISODES
+from ..results.monitor_files import MonitorFiles, monitors_of
+from .bag import TRY_AGAIN
+from .layout import PACKED_EPISODES, STATES_LEFT_OUT
+from .portable_names import portable_parts
 
 _RENDER = "Render the pending videos with: mjrec render {}"
 _STRAY = (
@@ -60,6 +71,8 @@ _RECOVER = (
     "Their process was killed, or results are missing. Recover them with: mjrec "
     "recover {}"
 )
+# Facts that are left out of the trajectories of episodes that were not chosen.
+_OF_STATES = ("model", "video")
 _OF_BROKEN_VIDEO = (".mp4", ".avi", ".json", ".framehash")
 
 
@@ -70,21 +83,13 @@ class Contents:
     Attributes:
         directory: the directory, as given.
         packed_episodes: the numbers of the chosen episodes. None if all are packed.
-        files: files that are packed unchanged, by name.
-        manifests: manifests that are packed with changed contents, by name.
-        bundled: trajectories that are extracted from bundles, by the name of their new
-            file.
-        without_states: trajectories that are packed without states and snapshots, by
-            name.
+        files: how to write each packed file to a path, by name.
         provenance: the provenance in each manifest.
     """
 
     directory: Path
     packed_episodes: tuple[int, ...] | None
-    files: dict[str, Path] = field(default_factory=dict)
-    manifests: dict[str, Manifest] = field(default_factory=dict)
-    bundled: dict[str, Path] = field(default_factory=dict)
-    without_states: dict[str, Path] = field(default_factory=dict)
+    files: dict[str, Callable[[Path], object]] = field(default_factory=dict)
     provenance: list[Mapping[str, Any]] = field(default_factory=list)
 
     def is_chosen(self, name: str) -> bool:
@@ -93,10 +98,9 @@ class Contents:
 
     def add(self, path: Path, *, of: str | None = None) -> None:
         """Add a file, which the file named `of` refers to."""
-        _check_name(path)
         try:
             with unreadable(path):
-                self.files[path.name] = regular_path(path)
+                source = regular_path(path)
         except UnreadableFile:
             if of is None or path.exists():
                 raise
@@ -104,6 +108,23 @@ class Contents:
                 f"{of} names {path.name}, which is missing from {self.directory}. Put "
                 "it back: a run with missing files cannot be verified."
             ) from None
+        write = _write_without_rows if path.suffix == ".jsonl" else link_or_copy
+        self.put(path, functools.partial(write, source))
+
+    def put(self, path: Path, write: Callable[[Path], object]) -> None:
+        """Let `write` write the packed file of a path.
+
+        Raises:
+            PackError: the name is not valid on all systems.
+        """
+        try:
+            portable_parts(path.name)
+        except ValueError:
+            raise PackError(
+                f"{path.name!r} cannot be packed: it is not a valid file name on some "
+                "systems. Record with a different uid."
+            ) from None
+        self.files[path.name] = write
 
 
 def look_for_contents(directory: Path, episodes: Iterable[int] | None) -> Contents:
@@ -152,9 +173,6 @@ def look_for_contents(directory: Path, episodes: Iterable[int] | None) -> Conten
 
 def _add_all(contents: Contents, place: Path, infixes: dict[str, Path]) -> None:
     """Add a directory's monitors, whose infixes must differ from all earlier ones."""
-    of_infix: dict[str, list[Path]] = {}
-    for path in iter_monitor_files(place):
-        of_infix.setdefault(infix_of(path.name) or "", []).append(path)
     for monitor in monitors_of(place):
         if monitor.manifest is None:
             continue
@@ -163,7 +181,12 @@ def _add_all(contents: Contents, place: Path, infixes: dict[str, Path]) -> None:
                 f"{other} and {place} have files of the same names, with "
                 f"{monitor.infix} in them. Pack each directory separately."
             )
-        _add_monitor(contents, monitor.manifest, of_infix[monitor.infix])
+        _add_monitor(contents, monitor.manifest, _visible(monitor))
+
+
+def _visible(monitor: MonitorFiles) -> list[Path]:
+    """Return a monitor's files without locks and unfinished files."""
+    return [path for path in monitor.paths if not path.name.startswith(".")]
 
 
 def _check_is_idle(directory: Path) -> None:
@@ -185,15 +208,12 @@ def _check_is_idle(directory: Path) -> None:
 
 
 def _check_all_is_done(directory: Path) -> None:
-    closed = [files for files in monitors_of(directory) if not files.is_open]
-    killed = [each.infix for each in closed if has_leftovers(each)]
+    monitors = monitors_of(directory)
+    killed = [each.infix for each in monitors if has_leftovers(each)]
     if killed:
         raise UnfinishedRecordings(directory, killed, advice=_RECOVER.format(directory))
-    visible = [
-        [path.name for path in files.paths if not path.name.startswith(".")]
-        for files in closed
-    ]
-    strays = [name for own in visible if not any(map(is_manifest, own)) for name in own]
+    lost = [each for each in monitors if each.manifest is None]
+    strays = [path.name for each in lost for path in _visible(each)]
     if strays:
         raise UnfinishedRecordings(directory, strays, advice=_STRAY)
     pending = [
@@ -257,9 +277,7 @@ def _add_monitor(contents: Contents, path: Path, files: list[Path]) -> None:
 
 def _add_manifest(contents: Contents, path: Path, manifest: Manifest) -> None:
     details = manifest.mjrec
-    provenance = (details or {}).get("provenance")
-    if isinstance(provenance, Mapping):
-        contents.provenance.append(provenance)
+    contents.provenance.append(facts_in((details or {}).get("provenance")))
     if contents.packed_episodes is None:
         contents.add(path)
         return
@@ -268,23 +286,21 @@ def _add_manifest(contents: Contents, path: Path, manifest: Manifest) -> None:
             f"{path.name} is gym's own manifest, whose videos do not state their "
             "episodes, so none can be chosen. Pack all episodes."
         )
-    _check_name(path)
     details = {**details, PACKED_EPISODES: list(contents.packed_episodes)}
     if "broken" in details:
         broken = _broken_of(manifest)
         details["broken"] = [name for name in broken if contents.is_chosen(name)]
     videos = tuple(pair for pair in manifest.videos if contents.is_chosen(pair[0]))
-    contents.manifests[path.name] = replace(manifest, videos=videos, mjrec=details)
+    chosen = replace(manifest, videos=videos, mjrec=details)
+    contents.put(path, functools.partial(write_manifest, manifest=chosen))
 
 
 def _add_trajectory(contents: Contents, path: Path) -> None:
     if not contents.is_chosen(path.name):
-        _check_name(path)
-        contents.without_states[path.name] = path
+        contents.put(path, functools.partial(_write_without_states, path))
         return
     if is_bundle(file_of(path).name):
-        _check_name(path)
-        contents.bundled[path.name] = path
+        contents.put(path, functools.partial(_write_unbundled, path))
     else:
         contents.add(path)
     with open_for_rendering(path) as reader:
@@ -301,15 +317,56 @@ def _broken_of(manifest: Manifest) -> Iterator[str]:
         yield base_name(name)
 
 
-def _check_name(path: Path) -> None:
-    """Check that a file name is valid on all systems."""
-    try:
-        path.name.encode()
-        is_portable = path.name.isprintable() and "\\" not in path.name
-    except UnicodeEncodeError:
-        is_portable = False
-    if not is_portable:
-        raise PackError(
-            f"{path.name!r} cannot be packed: it is not a valid file name on some "
-            "systems. Record with a different uid."
+def _write_without_rows(source: Path, target: Path) -> None:
+    """Write a journal without its lines about row logs, which are not packed."""
+    link_or_copy(source, target)
+    lines = target.read_bytes().splitlines(keepends=True)
+    rest = [line for line in lines if not is_of_spans(line)]
+    if len(rest) < len(lines):
+        # It may be a link to the original.
+        target.unlink()
+        target.write_bytes(b"".join(rest))
+
+
+def _write_unbundled(source: Path, target: Path) -> None:
+    with open_hdf5(source) as reader:
+        write_hdf5(reader, target)
+
+
+def _write_without_states(source: Path, target: Path) -> None:
+    """Write a trajectory's actions, rewards and facts, without states to render."""
+    with open_hdf5(source) as reader:
+        facts = {k: v for k, v in reader.facts.items() if k not in _OF_STATES}
+        kept = replace(
+            reader,
+            facts={**facts, STATES_LEFT_OUT: True},
+            dtype=row_dtype(action=reader.kind("action")),
+            frame_steps=np.empty(0, np.int64),
+            change_count=0,
         )
+        write_hdf5(kept, target)
+
+
+def link_or_copy(source: Path, target: Path) -> None:
+    """Make a file with the same content, if possible a second name of it."""
+    try:
+        os.link(source, target, follow_symlinks=False)
+    except OSError:
+        # A different file system, one without links, or a different user's file.
+        _copy(source, target)
+    if not stat.S_ISREG(target.lstat().st_mode):
+        raise UnreadableFile(source, "it is no longer a regular file")
+    if not os.access(target, os.R_OK):
+        raise UnreadableFile(source, "permission denied")
+
+
+def _copy(source: Path, target: Path) -> None:
+    try:
+        file = source.open("rb")
+    except OSError as error:
+        raise UnreadableFile(source, error.strerror) from error
+    try:
+        with file, target.open("xb") as copy:
+            shutil.copyfileobj(file, copy)
+    except OSError as error:
+        raise FileNotWritten(target, error.strerror, then=TRY_AGAIN) from error

@@ -24,7 +24,7 @@ from typing import Any
 
 from .. import json_text
 from ..errors import MissingDependency
-from ..formats.json_fields import read_object, unreadable
+from ..formats.json_fields import facts_in, read_object, unreadable
 from ..formats.monitor_directory import episode_of
 from ..results import Episode, iter_episodes
 from .layout import (
@@ -38,7 +38,7 @@ from .layout import (
     STATISTICS,
     STATISTICS_COLUMNS,
 )
-from .packed_run import PackedRun, Session, facts_in
+from .packed_run import PackedRun, Session
 from .statements import Author
 
 # Maximum number of rows in the table of videos. The statistics list all videos.
@@ -98,9 +98,22 @@ def descriptions(
         ENVIRONMENT: _json_text(_environment(run, packed_with)),
         STATISTICS: _statistics(recordings),
     }
-    facts = _crate_facts(recordings, texts)
-    crate = _finished_crate(_rendered(f"{CRATE}.jinja", run, finalize=_json, **facts))
-    return {**texts, CRATE: _json_text(crate)}
+    files = [_file(name, name, len(text.encode())) for name, text in texts.items()]
+    recorded = [
+        _file(path.name, _recording_id(path.name), path.stat().st_size)
+        for path in sorted(recordings.iterdir())
+    ]
+    crate: dict[str, Any] = json.loads(
+        _rendered(
+            f"{CRATE}.jinja", run, finalize=_json, files=files, recordings=recorded
+        )
+    )
+    # Each entity once, and without unknown values.
+    graph: dict[str, Any] = {}
+    for entity in crate["@graph"]:
+        known = {key: value for key, value in entity.items() if value is not None}
+        graph.setdefault(entity["@id"], known)
+    return {**texts, CRATE: _json_text({**crate, "@graph": list(graph.values())})}
 
 
 def packed_with() -> dict[str, str]:
@@ -124,7 +137,9 @@ def _statistics(recordings: Path) -> str:
     writer.writerow(STATISTICS_COLUMNS)
     for episode in iter_episodes(recordings):
         cells = _cells(episode)
-        writer.writerow(_cell(cells[column]) for column in STATISTICS_COLUMNS)
+        row = [cells[column] for column in STATISTICS_COLUMNS]
+        # `csv` writes None as an empty cell, and floats exactly.
+        writer.writerow(str(c).lower() if isinstance(c, bool) else c for c in row)
     return file.getvalue()
 
 
@@ -147,9 +162,7 @@ def _made_with(session: Session) -> dict[str, Any]:
     frames = ("gl_vendor", "gl_renderer", "gl_version", "rendered_with")
     encoders = [
         {
-            "version": facts["encoder_version"].get("version")
-            if isinstance(facts["encoder_version"], dict)
-            else None,
+            "version": facts_in(facts["encoder_version"]).get("version"),
             "ffmpeg_sha256": facts["ffmpeg_sha256"],
         }
         for facts in session.different("encoder_version", "ffmpeg_sha256")
@@ -225,18 +238,6 @@ def _cells(episode: Episode) -> dict[str, Any]:
     }
 
 
-def _cell(value: object) -> str:
-    match value:
-        case None:
-            return ""
-        case bool():
-            return "true" if value else "false"
-        case float():
-            return repr(value)
-        case _:
-            return str(value)
-
-
 def _rendered(
     name: str, run: PackedRun, *, finalize: Callable[[Any], str], **facts: Any
 ) -> str:
@@ -258,7 +259,14 @@ def _rendered(
         keep_trailing_newline=True,
     )
     templates.filters.update(
-        _crate_filters(),
+        release=_release,
+        author_id=_author_id,
+        action_id=_action_id,
+        environment_id=_environment_id,
+        policy_id=_policy_id,
+        recording_id=_recording_id,
+        instruments=_instruments,
+        objects=_objects,
         episode=episode_of,
         shell=lambda text: _Verbatim(shlex.quote(text)),
     )
@@ -269,6 +277,8 @@ def _rendered(
         most_videos=_MOST_VIDEOS,
         made_with=_made_with_rows(run.sessions),
         unknown=_UNKNOWN,
+        homes=_HOMES,
+        references=_references,
         **facts,
     )
 
@@ -297,49 +307,6 @@ def _json(value: object) -> str:
 
 def _json_text(content: Any) -> str:
     return json_text.dumps(content, indent=2) + "\n"
-
-
-def _crate_facts(recordings: Path, texts: Mapping[str, str]) -> dict[str, Any]:
-    """Return the template's variables other than the run.
-
-    Args:
-        recordings: the folder of the recordings.
-        texts: the other descriptions, by file name.
-    """
-    files = sorted(recordings.iterdir())
-    return {
-        "files": [_file(n, n, len(text.encode())) for n, text in texts.items()],
-        "recordings": [
-            _file(path.name, _recording_id(path.name), path.stat().st_size)
-            for path in files
-        ],
-        "homes": _HOMES,
-        "references": _references,
-    }
-
-
-def _crate_filters() -> Mapping[str, Callable[..., Any]]:
-    """Return the template's filters."""
-    return {
-        "release": _release,
-        "author_id": _author_id,
-        "action_id": _action_id,
-        "environment_id": _environment_id,
-        "policy_id": _policy_id,
-        "recording_id": _recording_id,
-        "instruments": _instruments,
-        "objects": _objects,
-    }
-
-
-def _finished_crate(text: str) -> dict[str, Any]:
-    """Return the crate with each entity once, and without unknown values."""
-    crate: dict[str, Any] = json.loads(text)
-    graph: dict[str, Any] = {}
-    for entity in crate["@graph"]:
-        known = {key: value for key, value in entity.items() if value is not None}
-        graph.setdefault(entity["@id"], known)
-    return {**crate, "@graph": list(graph.values())}
 
 
 def _file(name: str, entity_id: str, size: int) -> dict[str, Any]:
@@ -377,8 +344,7 @@ def _environment_id(session: Session) -> str:
 
 
 def _policy_id(session: Session) -> str | None:
-    policy = session.provenance.get("policy")
-    digest = policy.get("sha256") if isinstance(policy, Mapping) else None
+    digest = facts_in(session.provenance.get("policy")).get("sha256")
     return f"#policy-{_uuid('policy', str(digest))}" if digest else None
 
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from .packed_run import facts_in
+from ..formats.json_fields import facts_in
 from .statements import Author
 
 logger = logging.getLogger(__name__)

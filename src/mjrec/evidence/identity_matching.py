@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Finding and replacing an identity in strings, file names and bytes.
+"""Finding and replacing an identity in strings, file names, bytes and files.
 
 Matching ignores case. The rules are:
 
@@ -15,14 +15,28 @@ Matching ignores case. The rules are:
 - Shorter ones, and those that are ordinary words here (`root`, `user`, `hopper`): only
   as a whole part of a path, before `@` and a host name, or after it. HalfCheetah has
   joints called `rootx`, which do not name an account.
+
+In files, archives are opened, compressed files are decompressed, and every name,
+attribute and string in HDF5 files is checked.
 """
 
 from __future__ import annotations
 
+import gzip
 import importlib.resources
+import io
 import re
+import zipfile
+import zlib
 from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
 
+import h5py
+import numpy as np
+
+from ..errors import UnreadableFile
+from ..formats.trajectory_hdf5 import SIGNATURE
 from .identity import HOME_OF_ANYBODY, Identity
 
 _ORDINARY_WORDS = frozenset(
@@ -53,6 +67,29 @@ _UTF16_RUNS = {
 _LONG_RUN = 12
 
 _ESCAPED = re.compile(r"\\u([0-9a-fA-F]{4})")
+
+_GZIP = b"\x1f\x8b"
+_ZIP = b"PK\3\4"
+_FILM = re.compile(rb"....ftyp|RIFF....AVI ", re.DOTALL)
+# Maximum depth of archives inside archives.
+_DEEPEST = 8
+_PIECE = 1 << 24
+_LONGEST_NAME = 1 << 12
+
+# A place, its content (a name or bytes), and whether the bytes may contain short
+# strings by chance.
+_Place = tuple[str, str | bytes, bool]
+
+_DAMAGE = (
+    OSError,
+    EOFError,
+    RuntimeError,
+    LookupError,
+    ValueError,
+    TypeError,
+    zlib.error,
+    zipfile.BadZipFile,
+)
 
 
 class IdentityMatcher:
@@ -214,3 +251,99 @@ def _longest_first(texts: Iterable[str]) -> list[str]:
 
 def _unique(found: Iterable[str]) -> list[str]:
     return list(dict.fromkeys(found))
+
+
+def remaining_identity(stage: Path, identity: Identity) -> list[tuple[str, str]]:
+    """Return the names of people and machines that remain below a directory.
+
+    Args:
+        stage: the directory; its own name and path are not searched.
+        identity: the identity to look for.
+
+    Returns:
+        Pairs of a place and the string found there, each once, sorted. A place is a
+        file's path relative to `stage`, followed by the place inside the file.
+
+    Raises:
+        UnreadableFile: a file cannot be unpacked.
+    """
+    matcher = IdentityMatcher(identity)
+    found: set[tuple[str, str]] = set()
+    for path in sorted(stage.rglob("*")):
+        where = path.relative_to(stage).as_posix()
+        found.update((where, what) for what in matcher.found_in_name(path.name))
+        if not path.is_file():
+            continue
+        try:
+            for place, content, by_chance in _places_in_file(path, where):
+                whats = (
+                    matcher.found_in_name(content)
+                    if isinstance(content, str)
+                    else matcher.found_in_bytes(content, by_chance=by_chance)
+                )
+                found.update((place, what) for what in whats)
+        except _DAMAGE as error:
+            raise UnreadableFile(path, f"it cannot be unpacked ({error})") from error
+    return sorted(found)
+
+
+def _places_in_file(path: Path, where: str) -> Iterator[_Place]:
+    with path.open("rb") as file:
+        piece = file.read(_PIECE)
+        if not _FILM.match(piece):
+            yield from _places(where, piece + file.read(), 0)
+            return
+        # Videos are large and contain nothing packed that could name a person.
+        while piece:
+            following = file.read(_PIECE)
+            yield where, piece + following[:_LONGEST_NAME], True
+            piece = following
+
+
+def _places(where: str, content: bytes, depth: int) -> Iterator[_Place]:
+    if depth > _DEEPEST:
+        raise ValueError(f"it contains archives more than {_DEEPEST} levels deep")
+    is_packed = content.startswith((SIGNATURE, _ZIP, _GZIP))
+    # Packed data too: a header may contain a file's name.
+    yield where, content, is_packed
+    if content.startswith(SIGNATURE):
+        yield from _places_in_hdf5(where, content)
+    elif content.startswith(_ZIP):
+        yield from _places_in_zip(where, content, depth)
+    elif content.startswith(_GZIP):
+        yield from _places(f"{where}, unpacked", gzip.decompress(content), depth + 1)
+
+
+def _places_in_zip(where: str, content: bytes, depth: int) -> Iterator[_Place]:
+    with zipfile.ZipFile(io.BytesIO(content)) as archive:
+        yield where, archive.comment, False
+        for info in archive.infolist():
+            inside = f"{where}: {info.filename}"
+            yield inside, info.filename, False
+            yield inside, info.comment + info.extra, False
+            yield from _places(inside, archive.read(info), depth + 1)
+
+
+def _places_in_hdf5(where: str, content: bytes) -> Iterator[_Place]:
+    """Yield the strings in an HDF5 file; its places are `/group/dataset@attribute`."""
+    found: list[tuple[str, Any]] = []
+    with h5py.File(io.BytesIO(content), "r") as file:
+        file.visititems(lambda name, item: found.append((name, item)))
+        for name, item in [("", file), *found]:
+            inside = f"{where}: /{name}"
+            yield inside, name, False
+            for key in item.attrs:
+                yield inside, key, False
+                yield from _texts(f"{inside}@{key}", item.attrs[key])
+            if isinstance(item, h5py.Dataset):
+                for member in item.dtype.names or ():
+                    yield inside, member, False
+                if item.dtype.kind in "OUS":
+                    yield from _texts(inside, item[()])
+
+
+def _texts(where: str, value: Any) -> Iterator[_Place]:
+    array = np.asarray(value)
+    for item in array.reshape(-1).tolist() if array.dtype.kind in "OUS" else ():
+        text = item if isinstance(item, bytes) else str(item).encode(errors="replace")
+        yield where, text, False

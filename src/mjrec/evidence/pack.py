@@ -9,15 +9,11 @@ written in place: a changed file is written under a temporary name and renamed.
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import logging
 import os
 import shutil
-import stat
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-
-import numpy as np
 
 from ..atomic_files import temporary_path
 from ..errors import (
@@ -27,26 +23,16 @@ from ..errors import (
     IdentityLeft,
     InvalidArgument,
     PackError,
-    UnreadableFile,
 )
-from ..formats.journal import is_of_spans
-from ..formats.manifest import write_manifest
 from ..formats.monitor_directory import FILE_PREFIX
-from ..formats.trajectory import row_dtype
-from ..formats.trajectory_hdf5 import open_hdf5, write_hdf5
 from ..rendering.jobs import Progress
 from .anonymity import make_anonymous
 from .bag import TRY_AGAIN, make_bag, write_zip
-from .contents import Contents, look_for_contents
+from .contents import Contents, link_or_copy, look_for_contents
 from .descriptions import descriptions, packed_with
 from .identity import Identity, identity_of_user
-from .identity_traces import remaining_identity
-from .layout import (
-    MOST_ENTRIES,
-    PAYLOAD,
-    RECORDINGS,
-    STATES_LEFT_OUT,
-)
+from .identity_matching import remaining_identity
+from .layout import MOST_ENTRIES, PAYLOAD, RECORDINGS
 from .packed_run import PackedRun, PackingOptions, planned_episodes, read_run
 from .size_limit import archive_within, byte_count
 from .statements import state
@@ -58,8 +44,6 @@ _ENDING = ".zip"
 _ARCHIVE = "archive.zip"
 # Number of files in addition to the recordings: the bag's own and the descriptions.
 _DESCRIPTIONS = 9
-# Facts that are left out of the trajectories of episodes that were not chosen.
-_OF_STATES = ("model", "video")
 
 
 def pack(
@@ -215,7 +199,7 @@ def _make_bag(
     recordings = bag / PAYLOAD / RECORDINGS
     recordings.mkdir(parents=True)
     for path in sorted(staged.iterdir()):
-        _link_or_copy(path, recordings / path.name)
+        link_or_copy(path, recordings / path.name)
     if identity is not None:
         make_anonymous(recordings, identity=identity)
     run = read_run(recordings, options=options)
@@ -257,9 +241,7 @@ def _exists(path: Path) -> InvalidArgument:
 
 
 def _check_count(contents: Contents) -> None:
-    kinds = (contents.files, contents.manifests)
-    trajectories = (contents.bundled, contents.without_states)
-    count = sum(len(files) for files in (*kinds, *trajectories))
+    count = len(contents.files)
     if count > MOST_ENTRIES - _DESCRIPTIONS:
         raise PackError(
             f"The archive would contain {count} recorded files, but mjrec verify "
@@ -285,41 +267,8 @@ def _folder_beside(archive: Path) -> Iterator[Path]:
 def _stage(contents: Contents, folder: Path) -> None:
     """Put the files to pack into a new folder."""
     folder.mkdir()
-    for name, path in contents.files.items():
-        _link_or_copy(path, folder / name)
-        if name == path.name and path.suffix == ".jsonl":
-            _leave_rows_out(folder / name)
-    for name, manifest in contents.manifests.items():
-        write_manifest(folder / name, manifest)
-    for name, path in contents.bundled.items():
-        with open_hdf5(path) as reader:
-            write_hdf5(reader, folder / name)
-    for name, path in contents.without_states.items():
-        _write_without_states(path, folder / name)
-
-
-def _leave_rows_out(journal: Path) -> None:
-    """Remove the lines about row logs, which are not packed, from a journal's copy."""
-    lines = journal.read_bytes().splitlines(keepends=True)
-    rest = [line for line in lines if not is_of_spans(line)]
-    if len(rest) < len(lines):
-        # The copy may be a link to the original.
-        journal.unlink()
-        journal.write_bytes(b"".join(rest))
-
-
-def _write_without_states(source: Path, target: Path) -> None:
-    """Write a trajectory's actions, rewards and facts, without states to render."""
-    with open_hdf5(source) as reader:
-        facts = {k: v for k, v in reader.facts.items() if k not in _OF_STATES}
-        kept = dataclasses.replace(
-            reader,
-            facts={**facts, STATES_LEFT_OUT: True},
-            dtype=row_dtype(action=reader.kind("action")),
-            frame_steps=np.empty(0, np.int64),
-            change_count=0,
-        )
-        write_hdf5(kept, target)
+    for name, write in contents.files.items():
+        write(folder / name)
 
 
 def _publish(finished: Path, path: Path) -> None:
@@ -333,27 +282,3 @@ def _publish(finished: Path, path: Path) -> None:
         if os.path.lexists(path):
             raise FileExistsError(path) from None
         finished.rename(path)
-
-
-def _link_or_copy(source: Path, target: Path) -> None:
-    try:
-        os.link(source, target, follow_symlinks=False)
-    except OSError:
-        # A different file system, one without links, or a different user's file.
-        _copy(source, target)
-    if not stat.S_ISREG(target.lstat().st_mode):
-        raise UnreadableFile(source, "it is no longer a regular file")
-    if not os.access(target, os.R_OK):
-        raise UnreadableFile(source, "permission denied")
-
-
-def _copy(source: Path, target: Path) -> None:
-    try:
-        file = source.open("rb")
-    except OSError as error:
-        raise UnreadableFile(source, error.strerror) from error
-    try:
-        with file, target.open("xb") as copy:
-            shutil.copyfileobj(file, copy)
-    except OSError as error:
-        raise FileNotWritten(target, error.strerror, then=TRY_AGAIN) from error

@@ -12,8 +12,7 @@ from typing import Any
 
 from ..environments.scenes import shown_arguments, shown_wrappers
 from ..formats import json_fields
-from ..formats.json_fields import read_object, unreadable
-from ..formats.monitor_directory import infix_of, iter_monitor_files
+from ..formats.json_fields import facts_in, read_object, unreadable
 from ..formats.trajectory_hdf5 import open_hdf5
 from ..plain_text import counted
 from ..results import Episode, iter_episodes
@@ -215,19 +214,11 @@ def read_run(recordings: Path, *, options: PackingOptions) -> PackedRun:
     tallies: dict[str, Tally] = {}
     for episode in iter_episodes(recordings):
         tallies.setdefault(episode.monitor, Tally()).add(episode)
-    files: dict[str, list[str]] = {}
-    for path in iter_monitor_files(recordings):
-        files.setdefault(infix_of(path.name) or "", []).append(path.name)
     return PackedRun(
         options=options,
         statements=statements,
         sessions=tuple(
-            _session(
-                recordings,
-                monitor,
-                files.get(monitor.infix, []),
-                tallies.get(monitor.infix, Tally()),
-            )
+            _session(monitor, tallies.get(monitor.infix, Tally()))
             for monitor in monitors_of(recordings)
             # Recordings without a manifest are not packed.
             if monitor.manifest is not None
@@ -252,18 +243,14 @@ def planned_episodes(directory: Path) -> int | None:
         return tasks * seeds * json_fields.field(plan, "episodes", json_fields.integer)
 
 
-def facts_in(value: object) -> Mapping[str, Any]:
-    """Return a mapping unchanged, or an empty one for any other value."""
-    return value if isinstance(value, Mapping) else {}
-
-
-def _session(
-    recordings: Path, monitor: MonitorFiles, files: list[str], tally: Tally
-) -> Session:
+def _session(monitor: MonitorFiles, tally: Tally) -> Session:
     results = MonitorResults(monitor)
     manifest, details = results.manifest, results.details
+    assert monitor.manifest is not None
     assert manifest is not None
-    facts = [_facts(recordings / name) for name in files if name.endswith(".h5")]
+    recordings = monitor.manifest.parent
+    visible = [path for path in monitor.paths if not path.name.startswith(".")]
+    facts = [_facts(path) for path in visible if path.suffix == ".h5"]
     with_states = [each for each in facts if not each.get(STATES_LEFT_OUT)]
     named = [facts_in(each.get("model")) for each in facts]
     models = {n for m in named for n in (m.get("xml"), m.get("mjb")) if n}
@@ -280,7 +267,7 @@ def _session(
         provenance=facts_in(details.get("provenance")),
         rule=rule if isinstance(rule, str) else None,
         was_killed=details.get("recovered") is True,
-        files=tuple(files),
+        files=tuple(path.name for path in visible),
         models=tuple(sorted(name for name in models if (recordings / name).exists())),
         videos=tuple(
             (video, _read(recordings / metadata)) for video, metadata in manifest.videos

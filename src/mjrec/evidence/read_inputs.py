@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from .. import json_text
 from ..errors import Error, UnreadableFile
+from ..formats.dataclass_json import from_json
 from ..formats.journal import JournalEntry, JournalReader
 from ..formats.json_fields import base_name, read_object, unreadable
 from ..formats.manifest import read_manifest
@@ -113,20 +114,12 @@ def packing_options(said: Mapping[str, Any]) -> PackingOptions:
     Raises:
         ValueError: an option is invalid.
     """
-    name, episodes = said.get("name"), said.get("episodes")
-    if not isinstance(name, str) or len(portable_parts(name)) != 1:
-        raise ValueError(f"{name!r:.80} is not a valid name for an archive")
     try:
-        chosen = None if episodes is None else tuple(map(_count, episodes))
-        lists = {"authors": tuple(said.get("authors", ())), "episodes": chosen}
-        options = PackingOptions(**{**said, **lists})
-    except TypeError as error:
+        options = from_json(PackingOptions, said)
+    except ValueError as error:
         raise ValueError(f"its packing options are invalid: {error}") from error
-    numbers = (options.max_size, options.planned)
-    if type(options.anonymous) is not bool or not all(
-        isinstance(number, int | None) for number in numbers
-    ):
-        raise ValueError(f"its packing options are invalid: {said!r:.200}")
+    if len(portable_parts(options.name)) != 1:
+        raise ValueError(f"{options.name!r:.80} is not a valid name for an archive")
     return options
 
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 import operator
 import re
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -38,6 +38,9 @@ _LARGEST = 10
 
 _SIZE = re.compile(r"(\d{1,15}(?:\.\d{1,6})?)\s*(?:([KMGT])(i?))?B?", re.IGNORECASE)
 _UNITS = ("", "K", "M", "G", "T")
+
+# A video that can be re-rendered: its file, its states and its metadata.
+_Redrawable = tuple[Path, Path, dict[str, Any]]
 
 
 def byte_count(size: int | str) -> int:
@@ -82,15 +85,6 @@ def shown_size(size: int) -> str:
     return f"{size} bytes"
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Redrawable:
-    """A video that can be re-rendered: its file, its states and its metadata."""
-
-    video: Path
-    trajectory: Path
-    said: dict[str, Any]
-
-
 def archive_within(
     limit: int,
     staged: Path,
@@ -124,7 +118,7 @@ def archive_within(
     if archive is not None:
         return archive
     videos = _redrawable(staged)
-    drawn = sum(each.video.stat().st_size for each in videos)
+    drawn = sum(video.stat().st_size for video, _, _ in videos)
     rest = size - drawn
     with WorkerPool(usable_cpus()) as workers:
         for scale in _SCALES if videos and rest < limit else ():
@@ -136,7 +130,14 @@ def archive_within(
             if archive is not None:
                 return archive
     largest = sorted(_sizes(staged), key=lambda item: (-item[1], item[0]))[:_LARGEST]
-    reason = _why_too_large(bool(videos), rest, limit)
+    reason = "This is with videos at a quarter of their width and height."
+    if not videos:
+        reason = (
+            "None of its videos can be re-rendered smaller: they have no recorded "
+            "states, and encoded videos are never re-encoded."
+        )
+    elif rest >= limit:
+        reason = f"The files that cannot be made smaller already have {rest} bytes."
     raise ArchiveTooLarge(size, limit, largest, reason=reason)
 
 
@@ -144,24 +145,12 @@ def _sizes(staged: Path) -> list[tuple[str, int]]:
     return [(path.name, path.stat().st_size) for path in staged.iterdir()]
 
 
-def _why_too_large(can_draw: bool, rest: int, limit: int) -> str:
-    if not can_draw:
-        return (
-            "None of its videos can be re-rendered smaller: they have no recorded "
-            "states, and encoded videos are never re-encoded."
-        )
-    if rest >= limit:
-        return f"The files that cannot be made smaller already have {rest} bytes."
-    return "This is with videos at a quarter of their width and height."
-
-
 def _redrawable(staged: Path) -> list[_Redrawable]:
     """Return the videos that can be re-rendered from recorded states."""
     found = []
     manifests = [path for path in sorted(staged.iterdir()) if is_manifest(path.name)]
-    for video, metadata in (
-        v for path in manifests for v in read_manifest(path).videos
-    ):
+    videos = [pair for path in manifests for pair in read_manifest(path).videos]
+    for video, metadata in videos:
         with unreadable(staged / metadata):
             said = dict(read_object(staged / metadata))
         infix, number = Infix.parse(infix_of(video) or ""), episode_of(video)
@@ -171,9 +160,7 @@ def _redrawable(staged: Path) -> list[_Redrawable]:
             assert number is not None
             trajectory = find_trajectory(staged, infix, number)
             if trajectory is not None:
-                found.append(
-                    _Redrawable(video=staged / video, trajectory=trajectory, said=said)
-                )
+                found.append((staged / video, trajectory, said))
     return found
 
 
@@ -185,7 +172,7 @@ def _draw_all(
     on_progress: Callable[[Progress], object],
 ) -> None:
     """Replace videos and their metadata with smaller ones."""
-    frames = sum(int(each.said["frame_count"]) for each in videos)
+    frames = sum(int(said["frame_count"]) for _, _, said in videos)
     now = Progress(videos=len(videos), frames=frames)
 
     def count_frame() -> None:
@@ -194,27 +181,21 @@ def _draw_all(
         on_progress(now)
 
     on_progress(now)
-    for number, video in enumerate(videos, 1):
-        _draw(video, scale, workers=workers, on_frame=count_frame)
+    for number, (video, trajectory, said) in enumerate(videos, 1):
+        render_video(
+            [trajectory],
+            Variant(view=_view(said, scale)),
+            workers=workers,
+            out=video,
+            on_frame=count_frame,
+        )
+        _amend(video, said)
         now = replace(now, videos_done=number)
         on_progress(now)
 
 
-def _draw(
-    redrawn: _Redrawable,
-    scale: Fraction,
-    *,
-    workers: WorkerPool,
-    on_frame: Callable[[], object],
-) -> None:
-    video, said = redrawn.video, redrawn.said
-    render_video(
-        [redrawn.trajectory],
-        Variant(view=_view(said, scale)),
-        workers=workers,
-        out=video,
-        on_frame=on_frame,
-    )
+def _amend(video: Path, said: dict[str, Any]) -> None:
+    """Complete a smaller video's metadata with those of the recorded one."""
     with unreadable(metadata_path(video)):
         drawn = read_object(metadata_path(video))
     for key in ("frame_count", "frame_steps", "fps"):
@@ -238,13 +219,7 @@ def _view(said: dict[str, Any], scale: Fraction) -> View:
     height, width = int(said["height"]), int(said["width"])
     if said.get("tiled"):
         height, width = height // int(said["rows"]), width // int(said["columns"])
-    return View(
-        # The first camera and tiled videos are rendered with the recorded cameras.
-        camera=said.get("camera") if "first_video" in said else None,
-        height=_even(height * scale),
-        width=_even(width * scale),
-    )
-
-
-def _even(side: Fraction) -> int:
-    return max(2, 2 * round(side / 2))
+    height, width = (max(2, 2 * round(side * scale / 2)) for side in (height, width))
+    # The first camera and tiled videos are rendered with the recorded cameras.
+    camera = said.get("camera") if "first_video" in said else None
+    return View(camera=camera, height=height, width=width)

@@ -24,23 +24,26 @@ class Sums:
 
     def same(self, found: Same) -> None:
         """Count items that are equal."""
-        self._add(
+        self.add(
             Finding(
                 topic=found.topic,
                 item=found.item,
                 outcome=Outcome.RECREATED,
                 count=found.count,
                 unit=found.unit,
-            ),
-            reason="",
+            )
         )
 
     def add(self, finding: Finding) -> None:
         """Merge a finding with those for the same excuse, and keep the worst."""
-        alike = (
-            finding.reason if finding.outcome is not Outcome.WITHIN_TOLERANCE else ""
-        )
-        self._add(finding, reason=alike)
+        is_within = finding.outcome is Outcome.WITHIN_TOLERANCE
+        reason = "" if is_within else finding.reason
+        key = (finding.topic, finding.outcome, finding.excuse, finding.unit, reason)
+        self._counts[key] += finding.count
+        known = self._sums.setdefault(key, finding)
+        worst = max(known, finding, key=lambda each: each.figures.get("maximum", 0.0))
+        is_one = known.item == finding.item
+        self._sums[key] = worst if is_one else dataclasses.replace(worst, item="")
 
     def fail(self, finding: Finding) -> bool:
         """Count a difference, and return whether to list it separately."""
@@ -60,18 +63,3 @@ class Sums:
                     count=count - _MOST_FAILURES,
                     unit="place",
                 )
-
-    def _add(self, finding: Finding, *, reason: str) -> None:
-        key = (finding.topic, finding.outcome, finding.excuse, finding.unit, reason)
-        self._counts[key] += finding.count
-        known = self._sums.get(key)
-        if known is None:
-            self._sums[key] = finding
-            return
-        worst = max(known, finding, key=_size)
-        is_one = known.item == finding.item
-        self._sums[key] = worst if is_one else dataclasses.replace(worst, item="")
-
-
-def _size(finding: Finding) -> float:
-    return float(finding.figures.get("maximum", 0.0))

@@ -9,11 +9,11 @@ same bytes) and others do not, so that two readers would check different things.
 
 from __future__ import annotations
 
+import contextlib
 import stat
 import struct
 import zipfile
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO
 
@@ -45,83 +45,64 @@ _ALWAYS_FINE = 1 << 26
 _MOST_EXPANSION = 100
 
 
-@dataclass(frozen=True)
-class ZipContents:
-    """The checked content of a zip file.
-
-    Attributes:
-        top: the one folder that contains everything.
-        files: the files, in the order of their positions in the archive.
-        folders: the names of the folders that have their own entries.
-        size: stated total size of all files, in bytes.
-    """
-
-    top: str
-    files: tuple[zipfile.ZipInfo, ...]
-    folders: tuple[str, ...]
-    size: int
-
-
-def check_table(path: Path) -> None:
-    """Check the end of a zip file, which locates its table of contents.
-
-    Call this before anything reads the table, because it limits the table's length.
+@contextlib.contextmanager
+def open_plain_zip(path: Path) -> Iterator[zipfile.ZipFile]:
+    """Open a zip file after checking that all programs agree on its entries.
 
     Raises:
-        OSError: the file cannot be read.
         ValueError: the file is not a zip file, or not a plain one.
+        OSError: the file cannot be read.
     """
     with open_regular(path) as file:
-        size = file.seek(0, 2)
-        table_size, table_offset, entries, end = _table_of(file, size)
+        # First, because it limits the length of what `zipfile` reads.
+        _check_table(file)
+        with zipfile.ZipFile(file) as archive:
+            for info in archive.infolist():
+                _check_entry(info)
+            _check_places(archive)
+            # Two names may be one file on some systems; a folder may be listed twice.
+            names = (i.filename for i in archive.infolist() if not i.is_dir())
+            check_distinct(names)
+            yield archive
+
+
+def in_order(archive: zipfile.ZipFile) -> list[zipfile.ZipInfo]:
+    """Return the entries in the order of their positions in the archive."""
+    return sorted(archive.infolist(), key=lambda info: info.header_offset)
+
+
+def top_folder(archive: zipfile.ZipFile) -> str:
+    """Return the one folder that contains everything in an archive.
+
+    Raises:
+        ValueError: there is no such folder, or the archive is a zip bomb.
+    """
+    infos = archive.infolist()
+    tops = {portable_parts(info.filename.rstrip("/"))[0] for info in infos}
+    if len(tops) != 1 or any("/" not in info.filename for info in infos):
+        raise ValueError(
+            "its content is not in one folder: a packed run has a single folder at the "
+            f"top, but this has {len(tops)}"
+        )
+    size = sum(info.file_size for info in infos)
+    packed = sum(info.compress_size for info in infos)
+    if size > max(_ALWAYS_FINE, _MOST_EXPANSION * packed):
+        raise ValueError(f"its {packed} bytes would expand to {size}, as in a zip bomb")
+    return tops.pop()
+
+
+def _check_table(file: BinaryIO) -> None:
+    """Check the end of a zip file, which locates its table of contents."""
+    table_size, offset, entries, end = _table_of(file, file.seek(0, 2))
     if entries > MOST_ENTRIES or table_size > _LONGEST_TABLE:
         raise ValueError(
             f"it claims to contain {entries} files, more than the limit of "
             f"{MOST_ENTRIES}"
         )
-    if table_offset + table_size != end:
+    if offset + table_size != end:
         raise ValueError(
             "it has extra bytes before its first file or after its table of contents"
         )
-
-
-def zip_contents(archive: zipfile.ZipFile) -> ZipContents:
-    """Check the content of an archive and return it.
-
-    Raises:
-        ValueError: the archive is not a plain one, or is a zip bomb.
-        OSError: the archive cannot be read.
-    """
-    infos = check_entries(archive)
-    files = tuple(info for info in infos if not info.is_dir())
-    tops = {portable_parts(info.filename.rstrip("/"))[0] for info in infos}
-    if len(tops) != 1 or any("/" not in info.filename for info in files):
-        raise ValueError(
-            "its content is not in one folder: a packed run has a single folder at the "
-            f"top, but this has {len(tops)}"
-        )
-    return ZipContents(
-        top=tops.pop(),
-        files=tuple(sorted(files, key=lambda info: info.header_offset)),
-        folders=tuple(info.filename for info in infos if info.is_dir()),
-        size=_checked_size(files),
-    )
-
-
-def check_entries(archive: zipfile.ZipFile) -> Sequence[zipfile.ZipInfo]:
-    """Return the entries of an archive after checking that all programs agree on them.
-
-    Raises:
-        ValueError: the archive is not a plain one.
-        OSError: the archive cannot be read.
-    """
-    infos = archive.infolist()
-    for info in infos:
-        _check_entry(info)
-    _check_places(archive, infos)
-    # Two names may be one file on some systems; a folder may be listed twice.
-    check_distinct(info.filename for info in infos if not info.is_dir())
-    return infos
 
 
 def _table_of(file: BinaryIO, size: int) -> tuple[int, int, int, int]:
@@ -196,10 +177,10 @@ def _check_extra(name: str, extra: bytes) -> None:
         extra = extra[4 + size :]
 
 
-def _check_places(archive: zipfile.ZipFile, infos: Sequence[zipfile.ZipInfo]) -> None:
+def _check_places(archive: zipfile.ZipFile) -> None:
     """Check that the entries follow one another with nothing between them."""
     end, may_have_descriptor = 0, False
-    for info in sorted(infos, key=lambda info: info.header_offset):
+    for info in in_order(archive):
         _check_gap(info.header_offset - end, may_have_descriptor, info.filename)
         end = _end_of(archive, info)
         may_have_descriptor = bool(info.flag_bits & _DESCRIPTOR)
@@ -233,11 +214,3 @@ def _end_of(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> int:
     _check_extra(info.filename, archive.fp.read(extra_size))
     begin = info.header_offset + _LOCAL.size + name_size + extra_size
     return begin + info.compress_size
-
-
-def _checked_size(files: Sequence[zipfile.ZipInfo]) -> int:
-    size = sum(info.file_size for info in files)
-    packed = sum(info.compress_size for info in files)
-    if size > max(_ALWAYS_FINE, _MOST_EXPANSION * packed):
-        raise ValueError(f"its {packed} bytes would expand to {size}, as in a zip bomb")
-    return size

@@ -120,6 +120,11 @@ def mapping(value: Any) -> Mapping[str, Any]:
     return _checked(value, dict)
 
 
+def facts_in(value: object) -> Mapping[str, Any]:
+    """Return a mapping unchanged, or an empty one for any other value."""
+    return value if isinstance(value, Mapping) else {}
+
+
 def text(value: Any) -> str:
     """Return a value unchanged if it is a valid string."""
     try:

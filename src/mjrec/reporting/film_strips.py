@@ -92,6 +92,7 @@ def film_strip(
     _check_count("frames", frames)
     if columns is not None:
         _check_count("columns", columns)
+    columns = columns or math.ceil(frames / math.ceil(frames / _MOST_IN_A_ROW))
     check_annotation()
     if path.suffix != _TRAJECTORY:
         if any(option is not None for option in (camera, height, width, quality)):
@@ -100,7 +101,7 @@ def film_strip(
                 "change them, give the trajectory instead "
                 "(openaigym.trajectory.*.h5)."
             )
-        return _laid_out(*_of_video(path, frames), columns or _usual_columns(frames))
+        return _laid_out(*_of_video(path, frames), columns)
     with open_for_rendering(path) as reader:
         check_has_frames(reader)
         warn_of_other_frames(path.name, reader.facts)
@@ -109,7 +110,7 @@ def film_strip(
     view = View(camera=camera, height=height, width=width, quality=quality)
     with contextlib.closing(WorkerPool(1)) as workers:
         drawn = workers.frames(path, indices, view)
-        return _laid_out(drawn, times, columns or _usual_columns(frames))
+        return _laid_out(drawn, times, columns)
 
 
 def write_film_strip(path: str | os.PathLike[str], strip: Frame) -> None:
@@ -145,14 +146,11 @@ def _of_video(path: Path, count: int) -> tuple[Iterator[Frame], Sequence[float]]
     indices = _spread(len(stream), count, path)
     times: Sequence[float] = stream.times.tolist()
     height, width = stream.height, stream.width
-    try:
+    with contextlib.suppress(OSError, ValueError):
         metadata = read_object(metadata_path(path))
         # The size before the encoder's padding to even numbers.
         own_height, own_width = (field(metadata, key, integer) for key in _SIZE)
         simulated = _simulated_times(metadata)
-    except (OSError, ValueError):
-        pass
-    else:
         if 0 <= height - own_height <= 1 and 0 <= width - own_width <= 1:
             height, width = own_height, own_width
             times = simulated if len(simulated) == len(stream) else times
@@ -190,11 +188,6 @@ def _spread(available: int, count: int, path: Path) -> list[int]:
             f"{available} (frames, --frames)."
         )
     return [int(index) for index in np.linspace(0, available - 1, count).round()]
-
-
-def _usual_columns(count: int) -> int:
-    rows = math.ceil(count / _MOST_IN_A_ROW)
-    return math.ceil(count / rows)
 
 
 def _check_count(name: str, count: object) -> None:

@@ -35,8 +35,11 @@ from ..formats.monitor_directory import monitor_directories_in
 from ..results.episodes import Episode, episodes_of
 from ..results.journal_or_stats import MonitorResults
 from ..results.monitor_files import MonitorFiles, monitors_of
-from .contents import ReportContents, ReportTask, ReportVideo, Verdict
-from .episode_rows import (
+from .contents import (
+    ReportContents,
+    ReportTask,
+    ReportVideo,
+    Verdict,
     episodes_with_roles,
     in_time,
     rows_of_monitor,
@@ -44,7 +47,7 @@ from .episode_rows import (
     summary_of_rows,
 )
 from .provenance import (
-    Provenance,
+    joined,
     machine_of,
     pairs_of_monitor,
     pairs_of_results,
@@ -101,6 +104,7 @@ def gather(
     contents.title = title or _title(contents.tasks, found)
     names = Counter(task.name for task in contents.tasks)
     for task in contents.tasks:
+        _complete(task)
         if names[task.name] > 1:
             task.name = f"{task.name} ({task.source})"
     return contents
@@ -171,7 +175,8 @@ def _has_episodes(files: MonitorFiles) -> bool:
 class _Recorded:
     """The recordings of one environment by all monitors, in compact form."""
 
-    provenance: Provenance = field(default_factory=Provenance)
+    # Each different pair once, in order: there may be thousands of monitors.
+    provenance: dict[tuple[str, str], None] = field(default_factory=dict)
     videos: list[ReportVideo] = field(default_factory=list)
     runs: list[str] = field(default_factory=list)
     rows: list[NDArray[np.void]] = field(default_factory=list)
@@ -202,8 +207,6 @@ def _add_monitors(
         for video in recorded.videos:
             if video.index is not None:
                 video.index = int(now_at[video.index])
-        recorded.provenance.add([("Environment", name)])
-        recorded.provenance.add([("Recorded", recorded_when(rows))])
         contents.tasks.append(
             ReportTask(
                 name=name,
@@ -212,8 +215,8 @@ def _add_monitors(
                 summary=summary_of_rows(name, rows, bootstrap=contents.bootstrap),
                 episodes=rows,
                 runs=recorded.runs,
-                videos=_in_order(recorded.videos, rows),
-                provenance=recorded.provenance.pairs(),
+                videos=recorded.videos,
+                provenance=[*recorded.provenance, ("Environment", name)],
             )
         )
     if len(by_name) > 1:
@@ -258,8 +261,7 @@ def _add_monitor(
     recorded.runs.append(monitor.files.infix)
     recorded.rows.append(rows)
     recorded.videos += videos
-    recorded.provenance.add(pairs_of_monitor(monitor))
-    recorded.provenance.add(_renderers(videos))
+    recorded.provenance |= dict.fromkeys(pairs_of_monitor(monitor))
 
 
 def _readable_episodes(
@@ -275,21 +277,17 @@ def _readable_episodes(
         contents.problems.append(f"{error}{kept}")
 
 
-def _renderers(videos: Iterable[ReportVideo]) -> list[tuple[str, str]]:
-    return [("OpenGL renderer", video.renderer or "") for video in videos]
-
-
-def _in_order(
-    videos: Iterable[ReportVideo], rows: NDArray[np.void]
-) -> list[ReportVideo]:
-    """Return videos in the order of their episodes, and set their roles."""
-    roles = episodes_with_roles(rows)
+def _complete(task: ReportTask) -> None:
+    """Join a task's provenance, order its videos by episode, and set their roles."""
+    renderers = [("OpenGL renderer", video.renderer or "") for video in task.videos]
+    when = ("Recorded", recorded_when(task.episodes))
+    task.provenance = joined([*task.provenance, *renderers, when])
+    roles = episodes_with_roles(task.episodes)
     # Sorting is stable, so the order of cameras stays.
-    ordered = sorted(videos, key=lambda video: (video.index is None, video.index or 0))
-    for video in ordered:
+    task.videos = sorted(task.videos, key=lambda v: (v.index is None, v.index or 0))
+    for video in task.videos:
         if video.index is not None:
             video.roles = roles.get(video.index, ())
-    return ordered
 
 
 # --- Evaluations ------------------------------------------------------------------
@@ -317,20 +315,18 @@ def _add_evaluation(contents: ReportContents, directory: Path) -> None:
         contents.across[str(directory)] = results.across
     for summary in results.summaries:
         task = summary.task
-        rows = rows_of_results(results.by_task[task])
-        provenance = Provenance(pairs_of_results(results, task))
+        provenance = [*pairs_of_results(results, task)]
         videos = _videos_of_task(contents, results, task, provenance)
-        provenance.add([("Recorded", recorded_when(rows))])
         contents.tasks.append(
             ReportTask(
                 name=task[:_LONGEST_NAME],
                 source=str(directory),
                 is_evaluation=True,
                 summary=summary,
-                episodes=rows,
+                episodes=rows_of_results(results.by_task[task]),
                 failures=results.by_task[task].failures,
-                videos=_in_order(videos, rows),
-                provenance=provenance.pairs(),
+                videos=videos,
+                provenance=provenance,
             )
         )
 
@@ -340,7 +336,10 @@ def _places_of_task(folder: Path) -> list[Path]:
 
 
 def _videos_of_task(
-    contents: ReportContents, results: Evaluation, task: str, provenance: Provenance
+    contents: ReportContents,
+    results: Evaluation,
+    task: str,
+    provenance: list[tuple[str, str]],
 ) -> list[ReportVideo]:
     """Return the videos of a task's episodes, with the indices of these.
 
@@ -351,8 +350,7 @@ def _videos_of_task(
     videos: list[ReportVideo] = []
     for place, monitor in _monitors(contents, _places_of_task(folder)):
         videos += recorded_videos(monitor, place, contents.problems)
-        provenance.add([machine_of(monitor)])
-    provenance.add(_renderers(videos))
+        provenance.append(machine_of(monitor))
     number = {infix: index for index, infix in enumerate(columns.monitors)}
     for video in videos:
         given = columns.rows

@@ -8,10 +8,9 @@ get new names, which do not depend on the recorded ones.
 from __future__ import annotations
 
 import base64
-import contextlib
 import hashlib
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -123,11 +122,8 @@ def copy_videos(
     Raises:
         OSError: the disk is full.
     """
-    names = [task.name for task in contents.tasks for _ in task.videos]
-    total = len(names)
-    for index, (video, name) in enumerate(zip(contents.videos, names, strict=True)):
-        stem = f"{index:04d}-{_slug(name)}"
-        poster = posters[index]
+    named = zip(_named(contents), posters, strict=True)
+    for number, ((stem, video), poster) in enumerate(named, 1):
         try:
             file = f"{VIDEOS}/{stem}{_ending(video.path)}"
             _put(contents, video, file, _copy(video.path, folder / file))
@@ -136,7 +132,16 @@ def copy_videos(
         if poster is not None:
             video.poster = f"{POSTERS}/{stem}.jpg"
             (folder / video.poster).write_bytes(poster)
-        on_progress(ReportProgress(VIDEOS, index + 1, total))
+        on_progress(ReportProgress(VIDEOS, number, len(posters)))
+
+
+def _named(contents: ReportContents) -> Iterator[tuple[str, ReportVideo]]:
+    """Yield each video with the stem of its files' names in the report."""
+    pairs = ((task, video) for task in contents.tasks for video in task.videos)
+    for index, (task, video) in enumerate(pairs):
+        slug = re.sub(r"[^a-z0-9]+", "-", task.name.lower()).strip("-")
+        slug = slug[:_LONGEST_SLUG].strip("-") or "video"
+        yield f"{index:04d}-{slug}", video
 
 
 def write_replays(
@@ -158,10 +163,8 @@ def write_replays(
     from ..viewing.replay import write_replay
 
     wanted = [
-        (f"{index:04d}-{_slug(task.name)}", video, video.trajectory)
-        for index, (task, video) in enumerate(
-            (task, video) for task in contents.tasks for video in task.videos
-        )
+        (stem, video, video.trajectory)
+        for stem, video in _named(contents)
         if video.roles and video.trajectory is not None
     ]
     done: dict[Path, str] = {}
@@ -246,10 +249,9 @@ def _put(contents: ReportContents, video: ReportVideo, file: str, sha256: str) -
 def _copy(source: Path, target: Path) -> str:
     """Copy a file, and return its SHA-256."""
     digest = hashlib.sha256()
-    with contextlib.ExitStack() as stack:
-        with unreadable(source):
-            file = stack.enter_context(open_regular(source))
-        copy = stack.enter_context(target.open("xb"))
+    with unreadable(source):
+        file = open_regular(source)
+    with file, target.open("xb") as copy:
         while block := _read(file, source):
             digest.update(block)
             copy.write(block)
@@ -279,11 +281,6 @@ def _ending(path: Path) -> str:
     if kind is None:
         raise UnreadableFile(path, "it is not a video in a supported format")
     return kind
-
-
-def _slug(name: str) -> str:
-    slug = re.sub(r"[^a-z0-9]+", "-", name.lower()).strip("-")[:_LONGEST_SLUG]
-    return slug.strip("-") or "video"
 
 
 def _length_of_url(size: int) -> int:

@@ -15,7 +15,7 @@ import math
 import platform
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache
 from importlib.metadata import version
 from typing import Any, Final
@@ -27,16 +27,9 @@ from ..errors import MissingDependency
 from ..evaluation.statistics import PERCENTILE_BOOTSTRAP, Bootstrap, Interval
 from ..evaluation.summaries import TaskSummary
 from ..plain_text import counted, spelled_out
-from .contents import FAILED, ReportContents, ReportTask, ReportVideo
+from .contents import FAILED, ROLES, ReportContents, ReportTask, ReportVideo
 from .curves import SERIES, evaluation_curve, learning_curve, profile_curve
-from .page_text import (
-    NOTHING,
-    address,
-    decimals_for,
-    interval_text,
-    number,
-    page_json,
-)
+from .page_text import NOTHING, address, decimals_for, interval_text, number, page_json
 from .provenance import SELECTION
 
 _LONGEST_NAME: Final = 120
@@ -50,7 +43,6 @@ _MOST_PLAYERS: Final = 300
 _MOST_FIGURES: Final = 120
 _MOST_PROBLEMS: Final = 200
 
-_ROLES: Final = ("best", "median", "worst")
 # By the number in `outcome`: none, TERMINATED, TRUNCATED, both, FAILED.
 _OUTCOMES: Final = (
     "",
@@ -78,7 +70,7 @@ def page_of(contents: ReportContents) -> str:
     style, _, _ = environment.loader.get_source(environment, "report.css")
     script, _, _ = environment.loader.get_source(environment, "report.js")
     cards = _cards(contents)
-    shown = {id(card.video) for card in cards}
+    shown = {id(card["video"]) for card in cards}
     common, differing = _provenance(contents.tasks)
     how = contents.bootstrap
     methods = [_method(task.summary, how) for task in contents.tasks]
@@ -114,7 +106,7 @@ def page_of(contents: ReportContents) -> str:
         figures_left_out=len(contents.tasks[_MOST_FIGURES:]),
         cards=cards,
         players_left_out=len(contents.videos) - len(cards),
-        roles=[role for role in _ROLES if any(role in c.video.roles for c in cards)],
+        roles=[role for role in ROLES if any(role in c["video"].roles for c in cards)],
         selection=_selection(contents.tasks),
         episodes=page_json(_episodes(contents, shown)),
         num_episodes=count,
@@ -268,21 +260,7 @@ def _figures(tasks: Sequence[ReportTask]) -> Iterator[tuple[str, str]]:
 # --- The gallery ------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class _Card:
-    """A video in the gallery, with the facts about its episode."""
-
-    number: int
-    task: int
-    task_name: str
-    video: ReportVideo
-    label: str
-    total_reward: str
-    facts: _Pairs
-    failure: str | None
-
-
-def _cards(contents: ReportContents) -> list[_Card]:
+def _cards(contents: ReportContents) -> list[dict[str, Any]]:
     """Return the cards of the videos that are shown.
 
     They are ordered by task, then best, median, worst, and all others.
@@ -299,12 +277,13 @@ def _cards(contents: ReportContents) -> list[_Card]:
 
 
 def _place_of(roles: Sequence[str]) -> int:
-    return min(map(_ROLES.index, roles), default=len(_ROLES))
+    return min(map(ROLES.index, roles), default=len(ROLES))
 
 
 def _card(
     index: int, video: ReportVideo, number_of_task: int, task: ReportTask
-) -> _Card:
+) -> dict[str, Any]:
+    """Return a video in the gallery, with the facts about its episode."""
     which, reward = "", None
     facts: list[tuple[str, str]] = []
     if video.index is not None:
@@ -328,16 +307,16 @@ def _card(
         ("Camera", video.camera or ""),
         ("Video", ", ".join(filter(None, (size, plays)))),
     ]
-    return _Card(
-        number=index,
-        task=number_of_task,
-        task_name=task.name,
-        video=video,
-        label=", ".join(filter(None, (task.name, which, video.camera))),
-        total_reward=number(reward, _decimals_of(task)),
-        facts=[(label, value) for label, value in facts if value],
-        failure=None if video.index is None else task.failures.get(video.index),
-    )
+    return {
+        "number": index,
+        "task": number_of_task,
+        "task_name": task.name,
+        "video": video,
+        "label": ", ".join(filter(None, (task.name, which, video.camera))),
+        "total_reward": number(reward, _decimals_of(task)),
+        "facts": [(label, value) for label, value in facts if value],
+        "failure": None if video.index is None else task.failures.get(video.index),
+    }
 
 
 def _selection(tasks: Iterable[ReportTask]) -> list[str]:

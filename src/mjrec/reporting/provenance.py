@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from ..errors import UnreadableFile
 from ..evaluation.evaluation import Evaluation
 from ..evaluation.plan import SEEDED
+from ..formats.json_fields import facts_in
 from ..formats.manifest import GYM_VERSION
 from ..results.journal_or_stats import MonitorResults
 
@@ -56,32 +57,26 @@ _LONGEST_TEXT: Final = 1000
 _MOST_LISTED: Final = 20
 
 
-class Provenance:
-    """Facts about recordings, by label, with each different value once."""
+def joined(pairs: Pairs) -> list[tuple[str, str]]:
+    """Return each label with its different values, in the order of the page.
 
-    def __init__(self, pairs: Pairs = ()) -> None:
-        self._values: dict[str, dict[str, None]] = {label: {} for label in _LABELS}
-        self.add(pairs)
-
-    def add(self, pairs: Pairs) -> None:
-        """Add pairs of label and value, in this order. Empty values are left out."""
-        for label, value in pairs:
-            if value:
-                self._values[label][value[:_LONGEST_TEXT]] = None
-
-    def pairs(self) -> list[tuple[str, str]]:
-        """Return pairs of label and joined values, in the order of the page."""
-        return [
-            (label, _some(values, "; " if label != "Monitors" else ", "))
-            for label, values in self._values.items()
-            if values
-        ]
+    Empty values are left out.
+    """
+    values: dict[str, dict[str, None]] = {label: {} for label in _LABELS}
+    for label, value in pairs:
+        if value:
+            values[label][value[:_LONGEST_TEXT]] = None
+    return [
+        (label, _some(found, "; " if label != "Monitors" else ", "))
+        for label, found in values.items()
+        if found
+    ]
 
 
 def machine_of(monitor: MonitorResults) -> tuple[str, str]:
     """Return the label and value for the machine that a monitor recorded on."""
-    provenance = _mapping(_details(monitor).get("provenance"))
-    cpu = _mapping(provenance.get("cpu")).get("model")
+    provenance = facts_in(_details(monitor).get("provenance"))
+    cpu = facts_in(provenance.get("cpu")).get("model")
     return "Recorded on", _joined(cpu, provenance.get("system"))
 
 
@@ -90,7 +85,7 @@ def pairs_of_monitor(monitor: MonitorResults) -> Pairs:
     details = _details(monitor)
     yield machine_of(monitor)
     yield "Monitors", monitor.files.infix
-    policy = _mapping(_mapping(details.get("provenance")).get("policy"))
+    policy = facts_in(facts_in(details.get("provenance")).get("policy"))
     sha256 = policy.get("sha256")
     if isinstance(policy.get("file"), str):
         yield "Policy", _joined(policy["file"], f"sha256 {sha256}" if sha256 else None)
@@ -157,13 +152,13 @@ def _some(values: Iterable[str], between: str) -> str:
 
 
 def _versions(versions: Any) -> str:
-    by_package = _mapping(versions)
+    by_package = facts_in(versions)
     known = [(shown, by_package.get(package)) for package, shown in _PACKAGES.items()]
     return ", ".join(f"{name} {of}" for name, of in known if isinstance(of, str))
 
 
 def _schedule(details: Mapping[str, Any]) -> str:
-    name = _mapping(details.get("schedule")).get("name")
+    name = facts_in(details.get("schedule")).get("name")
     if not isinstance(name, str):
         return "" if details else "chosen by a schedule that gym did not record"
     if name.startswith(_KEPT):
@@ -174,7 +169,3 @@ def _schedule(details: Mapping[str, Any]) -> str:
 
 def _joined(*texts: Any) -> str:
     return ", ".join(text for text in texts if isinstance(text, str))
-
-
-def _mapping(value: Any) -> Mapping[str, Any]:
-    return value if isinstance(value, Mapping) else {}

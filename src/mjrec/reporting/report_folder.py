@@ -24,7 +24,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Final
 
-from ..atomic_files import temporary_path, write_text
+from ..atomic_files import make_directory, temporary_path, write_text
 from ..errors import DirectoryNotWritable, FileNotWritten, InvalidArgument
 from ..formats.regular_files import open_regular
 from .contents import ReportContents
@@ -111,7 +111,7 @@ def write_report(
     if single_file:
         page = _single_page(contents, posters, max_single_file_bytes)
         if is_page:
-            _make_parents(target)
+            make_directory(target.parent)
             write_text(target, page)
             return Path(path)
     with _replacing_folder(target) as folder:
@@ -187,20 +187,13 @@ def _is_own_page(path: Path) -> bool:
         return False
 
 
-def _make_parents(target: Path) -> None:
-    try:
-        target.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise DirectoryNotWritable(target.parent, error.strerror) from error
-
-
 @contextlib.contextmanager
 def _replacing_folder(target: Path) -> Iterator[Path]:
     """Yield a new folder next to `target`; replace `target` with it after the block.
 
     If the block raises, the new folder is removed, and an existing one is unchanged.
     """
-    _make_parents(target)
+    make_directory(target.parent)
     folder, before = temporary_path(target), temporary_path(target)
     try:
         for name in ("", *_FOLDERS):

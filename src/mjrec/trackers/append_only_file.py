@@ -7,6 +7,7 @@ import os
 from collections.abc import Iterable
 from pathlib import Path
 
+from ..atomic_files import make_directory
 from ..errors import DirectoryNotWritable, FileNotWritten
 from ..formats.appending import append_whole, open_for_appending
 
@@ -56,15 +57,3 @@ class AppendOnlyFile:
     def close(self) -> None:
         """Close the file."""
         self._file.close()
-
-
-def make_directory(directory: Path) -> None:
-    """Create a directory and its parents, if they do not exist.
-
-    Raises:
-        DirectoryNotWritable: the directory cannot be created.
-    """
-    try:
-        directory.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise DirectoryNotWritable(directory, error.strerror) from error

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Meshes for MuJoCo geoms, sites, skins and flexes, with colours or textures.
+"""A scene of meshes: MuJoCo's geoms, sites, skins and flexes, with their colours.
 
 mjviser creates the meshes of primitives, height fields and sites. This module adds the
 rest: normals and texture coordinates of meshes, cube textures, planes of the model's
@@ -8,6 +8,8 @@ size, and colours as mixed by MuJoCo's visualiser.
 
 from __future__ import annotations
 
+import contextlib
+import io
 from typing import Any
 
 import mujoco
@@ -15,10 +17,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import MissingDependency
-from .motion import Shape
+from .motion import Motion, Shape, Stage
 
 try:
     import trimesh
+    import viser
     from mjviser.conversions import create_primitive_mesh, create_site_mesh
     from PIL import Image
     from trimesh.visual import TextureVisuals
@@ -42,6 +45,8 @@ _COLOUR_ROLES = (
 _HORIZON = 30.0
 _SHARP = 0.6  # radians between faces that make an edge
 _GAMMA = 2.2
+_LIGHT = 1.6
+_TRANSPARENT = 0.999
 
 # For each side of a cube texture, in OpenGL's order: the axis that points at it, and
 # the axes of s and t, each with its sign.
@@ -55,6 +60,43 @@ _SIDES = (
 )
 
 
+def scene_page(stage: Stage, motion: Motion) -> str:
+    """Return an HTML page with all shapes of a stage, in the motion's first state."""
+    # viser prints a report about its server, which nothing ever connects to.
+    with contextlib.redirect_stdout(io.StringIO()):
+        server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
+        try:
+            _fill(server.scene, stage, motion)
+            return server.get_scene_serializer().as_html()
+        finally:
+            server.stop()
+
+
+def _fill(scene: viser.SceneApi, stage: Stage, motion: Motion) -> None:
+    model = stage.model
+    scene.configure_environment_map(None)
+    scene.add_light_ambient("/light", intensity=_LIGHT)
+    scene.set_background_image(sky(model))
+    for shape in stage.soft:
+        mesh = soft_mesh(model, shape)
+        # Without MuJoCo's normals, its own shadow would show as stripes on it.
+        scene.add_mesh_trimesh(shape.name, mesh, receive_shadow=False)
+    for shape in (*stage.shapes, *stage.passing.values()):
+        pose = motion.poses[shape.name][0]
+        scene.add_mesh_trimesh(
+            shape.name,
+            mesh_of(model, shape),
+            position=pose[:3],
+            wxyz=pose[3:],
+            cast_shadow=_casts_shadow(shape),
+        )
+
+
+def _casts_shadow(shape: Shape) -> bool:
+    is_plane = shape.geom_type == _PLANE
+    return shape.object_type == _GEOM and not is_plane and shape.rgba[3] > _TRANSPARENT
+
+
 def mesh_of(model: mujoco.MjModel, shape: Shape) -> trimesh.Trimesh:
     """Return a shape's mesh in its own frame, with its colour or texture.
 
@@ -65,10 +107,11 @@ def mesh_of(model: mujoco.MjModel, shape: Shape) -> trimesh.Trimesh:
             cylinder of radius 1 and half length 1.
     """
     if shape.object_type == _SITE:
-        return _coloured(_smoothed(create_site_mesh(model, shape.object_id)), shape)
+        return _finished(_smoothed(create_site_mesh(model, shape.object_id)), shape)
     if shape.object_type != _GEOM:
-        return _coloured(_unit_mesh(shape.geom_type), shape)
-    geom, texture = shape.object_id, _texture_of(model, shape.object_id)
+        return _finished(_unit_mesh(shape.geom_type), shape)
+    geom = shape.object_id
+    texture = _texture_of(model, int(model.geom_matid[geom]))
     if shape.geom_type == _PLANE:
         return _plane(model, shape, texture)
     if shape.geom_type == _MESH:
@@ -78,14 +121,14 @@ def mesh_of(model: mujoco.MjModel, shape: Shape) -> trimesh.Trimesh:
         if shape.geom_type != _FIELD:
             mesh = _smoothed(mesh)
     if texture is None:
-        return _coloured(mesh, shape)
+        return _finished(mesh, shape)
     if int(model.tex_type[texture]) != _TEXTURE_2D:
         # If all sides are equal, there is only one.
         sides = int(model.tex_height[texture]) // int(model.tex_width[texture])
         mesh, uv = _on_cube(mesh, sides)
     elif uv is None:
         mesh, uv = _repeated(model, shape, mesh)
-    return _textured(mesh, uv, _image(model, texture), shape)
+    return _finished(mesh, shape, uv, _image(model, texture))
 
 
 def soft_mesh(model: mujoco.MjModel, shape: Shape) -> trimesh.Trimesh:
@@ -95,38 +138,16 @@ def soft_mesh(model: mujoco.MjModel, shape: Shape) -> trimesh.Trimesh:
     """
     index = shape.object_id
     if shape.geom_type == _FLEX:
-        return _coloured(_flex_mesh(model, index), shape)
+        return _finished(_flex_mesh(model, index), shape)
     vertices = _part(model.skin_vert, model.skin_vertadr, model.skin_vertnum, index)
     faces = _part(model.skin_face, model.skin_faceadr, model.skin_facenum, index)
     mesh = trimesh.Trimesh(vertices, faces, process=False)
-    material, first = int(model.skin_matid[index]), int(model.skin_texcoordadr[index])
-    texture = None if material < 0 else _texture_of_material(model, material)
+    first = int(model.skin_texcoordadr[index])
+    texture = _texture_of(model, int(model.skin_matid[index]))
     if texture is None or first < 0:
-        return _coloured(mesh, shape)
+        return _finished(mesh, shape)
     uv = model.skin_texcoord[first : first + len(vertices)]
-    return _textured(mesh, uv, _image(model, texture), shape)
-
-
-def skin_weights(model: mujoco.MjModel, skin: int) -> dict[str, NDArray[Any]]:
-    """Return the weights with which bones move a skin's vertices.
-
-    Returns:
-        `bind`, `(bones, 7)`, each bone's resting pose; `counts`, the number of vertices
-        that each bone moves; `ids` and `weights` of these vertices, bone after bone.
-    """
-    bones = slice(
-        model.skin_boneadr[skin], model.skin_boneadr[skin] + model.skin_bonenum[skin]
-    )
-    first = model.skin_bonevertadr[bones.start]
-    counts = model.skin_bonevertnum[bones]
-    moved = slice(first, first + counts.sum())
-    bind = (model.skin_bonebindpos[bones], model.skin_bonebindquat[bones])
-    return {
-        "bind": np.hstack(bind),
-        "counts": counts,
-        "ids": model.skin_bonevertid[moved],
-        "weights": model.skin_bonevertweight[moved],
-    }
+    return _finished(mesh, shape, uv, _image(model, texture))
 
 
 def linear(rgba: Any) -> list[float]:
@@ -149,43 +170,34 @@ def sky(model: mujoco.MjModel) -> NDArray[np.uint8]:
     return np.repeat(column, 2, axis=1)
 
 
-def _coloured(mesh: trimesh.Trimesh, shape: Shape) -> trimesh.Trimesh:
-    return _with_visual(mesh, TextureVisuals(material=_material(np.array(shape.rgba))))
-
-
-def _textured(
-    mesh: trimesh.Trimesh, uv: NDArray[Any], image: Image.Image, shape: Shape
+def _finished(
+    mesh: trimesh.Trimesh,
+    shape: Shape,
+    uv: NDArray[Any] | None = None,
+    image: Image.Image | None = None,
 ) -> trimesh.Trimesh:
-    # glTF's texture origin is the top of the image, trimesh's is the bottom.
-    flipped = image.transpose(Image.Transpose.FLIP_TOP_BOTTOM)
-    material = _material(np.array(shape.rgba), baseColorTexture=flipped)
-    return _with_visual(mesh, TextureVisuals(uv=uv, material=material))
-
-
-def _with_visual(mesh: trimesh.Trimesh, visual: TextureVisuals) -> trimesh.Trimesh:
-    mesh.visual = visual
+    """Return a mesh with its colour, and its texture if there is one."""
+    rgba, texture = shape.rgba, None
+    if image is not None:
+        # glTF's texture origin is the top of the image, trimesh's is the bottom.
+        texture = image.transpose(Image.Transpose.FLIP_TOP_BOTTOM)
+    material = PBRMaterial(
+        baseColorFactor=linear(rgba),
+        baseColorTexture=texture,
+        metallicFactor=0.0,
+        roughnessFactor=1.0,
+        alphaMode="BLEND" if rgba[3] < 1 else "OPAQUE",
+    )
+    mesh.visual = TextureVisuals(uv=uv, material=material)
     # trimesh exports normals only if they are known. Without them, the page would show
     # every triangle flat.
     mesh.vertex_normals = mesh.vertex_normals
     return mesh
 
 
-def _material(rgba: NDArray[Any], **options: Any) -> PBRMaterial:
-    return PBRMaterial(
-        baseColorFactor=linear(rgba),
-        metallicFactor=0.0,
-        roughnessFactor=1.0,
-        alphaMode="BLEND" if rgba[3] < 1 else "OPAQUE",
-        **options,
-    )
-
-
-def _texture_of(model: mujoco.MjModel, geom: int) -> int | None:
-    material = int(model.geom_matid[geom])
-    return None if material < 0 else _texture_of_material(model, material)
-
-
-def _texture_of_material(model: mujoco.MjModel, material: int) -> int | None:
+def _texture_of(model: mujoco.MjModel, material: int) -> int | None:
+    if material < 0:
+        return None
     ids = (int(model.mat_texid[material, int(role)]) for role in _COLOUR_ROLES)
     return next((texture for texture in ids if texture >= 0), None)
 
@@ -231,16 +243,16 @@ def _asset_mesh(
 
 def _flex_mesh(model: mujoco.MjModel, flex: int) -> trimesh.Trimesh:
     """Return the triangles of a 2D flex, or of a 3D flex's shell."""
-    first, count = model.flex_vertadr[flex], model.flex_vertnum[flex]
-    if model.flex_dim[flex] == 2:
-        begin, size = model.flex_elemdataadr[flex], 3 * model.flex_elemnum[flex]
-        faces = model.flex_elem[begin : begin + size].reshape(-1, 3)
+    vertices = _part(model.flex_vert, model.flex_vertadr, model.flex_vertnum, flex)
+    is_cloth = model.flex_dim[flex] == 2
+    if is_cloth:
+        lists = (model.flex_elem, model.flex_elemdataadr, 3 * model.flex_elemnum)
     else:
-        begin, size = model.flex_shelldataadr[flex], 3 * model.flex_shellnum[flex]
-        faces = model.flex_shell[begin : begin + size].reshape(-1, 3)
-    # A cloth is visible from both sides.
-    faces = np.vstack([faces, faces[:, ::-1]]) if model.flex_dim[flex] == 2 else faces
-    vertices = model.flex_vert[first : first + count]
+        lists = (model.flex_shell, model.flex_shelldataadr, 3 * model.flex_shellnum)
+    faces = _part(*lists, flex).reshape(-1, 3)
+    if is_cloth:
+        # It is visible from both sides.
+        faces = np.vstack([faces, faces[:, ::-1]])
     return trimesh.Trimesh(vertices, faces, process=False)
 
 
@@ -253,7 +265,7 @@ def _plane(model: mujoco.MjModel, shape: Shape, texture: int | None) -> trimesh.
     vertices = np.column_stack([corners * half, np.zeros(4)])
     mesh = trimesh.Trimesh(vertices, [[0, 1, 2], [0, 2, 3]], process=False)
     if texture is None or int(model.tex_type[texture]) != _TEXTURE_2D:
-        return _coloured(mesh, shape)
+        return _finished(mesh, shape)
     material = int(model.geom_matid[shape.object_id])
     repeat = model.mat_texrepeat[material].astype(float)
     # Half of the texture spans half of the plane, or one unit of length. It starts at
@@ -262,7 +274,7 @@ def _plane(model: mujoco.MjModel, shape: Shape, texture: int | None) -> trimesh.
     length = np.where(per_length, 1.0, half)
     begin = np.where(is_infinite, 0.0, half * [-1, 1])
     uv = 0.5 * repeat * (vertices[:, :2] - begin) * [1, -1] / length
-    return _textured(mesh, uv, _image(model, texture), shape)
+    return _finished(mesh, shape, uv, _image(model, texture))
 
 
 def _smoothed(mesh: trimesh.Trimesh) -> trimesh.Trimesh:

@@ -15,7 +15,6 @@ import json
 import os
 import secrets
 import threading
-from collections.abc import Callable
 from dataclasses import dataclass
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -40,6 +39,15 @@ _NICENESS = 10
 _MOST_STATES = 500
 _MOST_EPISODES = 200
 _MOST_POINTS = 1000
+
+
+@dataclass
+class _Shown:
+    """The episode that was requested last, and the next state of its stage."""
+
+    path: Path
+    stage: Stage
+    next: int = 0
 
 
 class LiveView:
@@ -74,7 +82,11 @@ class LiveView:
         if not path.is_dir():
             raise InvalidArgument(f"The directory {path} does not exist.")
         self._token = secrets.token_urlsafe(24)
-        self._answers = _Answers(path, trust_models=trust_models)
+        self._directory = path
+        self._trust_models = trust_models
+        self._shown: _Shown | None = None
+        # Only one thread at a time may use MuJoCo's objects.
+        self._lock = threading.Lock()
         try:
             self._server = ThreadingHTTPServer((_ADDRESS, port), self._handler())
         except OSError as error:
@@ -106,19 +118,19 @@ class LiveView:
         self.close()
 
     def _handler(self) -> type[BaseHTTPRequestHandler]:
-        token, answers = self._token, self._answers
+        view = self
 
         class Handler(BaseHTTPRequestHandler):
             def do_GET(self) -> None:
                 address = urlsplit(self.path)
                 asked = {k: v[-1] for k, v in parse_qs(address.query).items()}
-                if not secrets.compare_digest(
-                    asked.get("token", "").encode(), token.encode()
-                ):
+                token = asked.get("token", "").encode()
+                if not secrets.compare_digest(token, view._token.encode()):
                     self.send_error(HTTPStatus.FORBIDDEN)
                     return
+                kind = "text/html" if address.path == "/" else "application/json"
                 try:
-                    kind, body = answers.to(address.path, asked)
+                    body = view._answer(address.path, asked)
                 except (KeyError, ValueError):
                     self.send_error(HTTPStatus.NOT_FOUND)
                     return
@@ -144,51 +156,26 @@ class LiveView:
 
         return Handler
 
-
-def be_nice() -> None:
-    """Lower this process's priority below everything else on this machine."""
-    os.nice(_NICENESS)
-
-
-@dataclass
-class _Shown:
-    """The episode that was requested last, and the next state of its stage."""
-
-    path: Path
-    stage: Stage
-    next: int = 0
-
-
-class _Answers:
-    """Answers to the pages' requests.
-
-    A lock ensures that only one thread at a time uses MuJoCo's objects.
-    """
-
-    def __init__(self, directory: Path, *, trust_models: bool) -> None:
-        self._directory = directory
-        self._trust_models = trust_models
-        self._shown: _Shown | None = None
-        self._lock = threading.Lock()
-        self._pages: dict[str, Callable[[dict[str, str]], tuple[str, str]]] = {
-            "/": self._page,
-            "/episodes": self._episodes,
-            "/motion": self._motion,
-        }
-
-    def to(self, path: str, asked: dict[str, str]) -> tuple[str, str]:
-        """Return the media type and the body of an answer.
+    def _answer(self, page: str, asked: dict[str, str]) -> str:
+        """Return the answer to a page's request.
 
         Raises:
             KeyError: the page or episode does not exist.
         """
-        answer = self._pages[path]
         with self._lock:
-            return answer(asked)
+            match page:
+                case "/":
+                    return self._page(asked.get("episode"))
+                case "/episodes":
+                    return json.dumps(self._episodes())
+                case "/motion":
+                    first = int(asked.get("from", "0"))
+                    return json.dumps(self._motion(asked["episode"], first))
+        raise KeyError(page)
 
-    def _page(self, asked: dict[str, str]) -> tuple[str, str]:
-        known = {self._name(path): path for path in recorded_episodes(self._directory)}
-        path = known[asked["episode"]] if "episode" in asked else None
+    def _page(self, name: str | None) -> str:
+        known = self._known()
+        path = None if name is None else known[name]
         try:
             if not known:
                 raise InvalidArgument("No episode has been recorded yet.")
@@ -196,16 +183,13 @@ class _Answers:
             trajectory, stage = self._load(path)
         except Error as error:
             # An episode that has just begun has no state yet.
-            return "text/html", _WAITING.format(html.escape(str(error)))
+            return _WAITING.format(html.escape(str(error)))
         motion = stage.motion(trajectory, np.arange(1))
-        live = {
-            "live": True,
-            "episode": self._name(path),
-            "scene": _scene_id(trajectory, stage),
-        }
-        return "text/html", replay_page(trajectory, stage, motion, additions=live)
+        scene = _scene_id(trajectory, stage)
+        live = {"live": True, "episode": self._name(path), "scene": scene}
+        return replay_page(trajectory, stage, motion, additions=live)
 
-    def _episodes(self, asked: dict[str, str]) -> tuple[str, str]:
+    def _episodes(self) -> dict[str, Any]:
         ended = {}
         returns = []
         for place in recording_directories(self._directory):
@@ -225,12 +209,10 @@ class _Answers:
             listed.append(entry)
         stride = max(1, -(-len(returns) // _MOST_POINTS))
         curve = [_number(each) for each in returns[::stride]]
-        told = {"episodes": listed, "count": len(returns), "returns": curve}
-        return "application/json", json.dumps(told)
+        return {"episodes": listed, "count": len(returns), "returns": curve}
 
-    def _motion(self, asked: dict[str, str]) -> tuple[str, str]:
-        path, first = self._path(asked["episode"]), int(asked.get("from", "0"))
-        trajectory, stage = self._load(path, first)
+    def _motion(self, name: str, first: int) -> dict[str, Any]:
+        trajectory, stage = self._load(self._known()[name], first)
         last = min(len(trajectory.states), first + _MOST_STATES)
         told: dict[str, Any] = {
             "scene": _scene_id(trajectory, stage),
@@ -244,14 +226,13 @@ class _Answers:
             motion = stage.motion(trajectory, np.arange(first, last))
             told["start"] = motion.target[0].tolist()
             told["chunk"] = motion_chunk(motion, keep_all=True)
-        return "application/json", json.dumps(told)
+        return told
 
     def _name(self, path: Path) -> str:
         return str(path.relative_to(self._directory))
 
-    def _path(self, name: str) -> Path:
-        known = {self._name(path): path for path in recorded_episodes(self._directory)}
-        return known[name]
+    def _known(self) -> dict[str, Path]:
+        return {self._name(path): path for path in recorded_episodes(self._directory)}
 
     def _load(self, path: Path, first: int = 0) -> tuple[Trajectory, Stage]:
         """Return a trajectory, and a stage for its states starting at `first`."""
@@ -262,6 +243,11 @@ class _Answers:
         self._shown = shown or _Shown(path, Stage(trajectory))
         self._shown.next = first + 1
         return trajectory, self._shown.stage
+
+
+def be_nice() -> None:
+    """Lower this process's priority below everything else on this machine."""
+    os.nice(_NICENESS)
 
 
 def _scene_id(trajectory: Trajectory, stage: Stage) -> str:

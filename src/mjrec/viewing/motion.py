@@ -8,7 +8,7 @@ the same groups, tendons and sites are hidden as in its videos.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import mujoco
@@ -87,16 +87,6 @@ class Motion:
     colours: list[tuple[int, str, list[float]]]
 
 
-@dataclass
-class _Frames:
-    geoms: list[NDArray[np.float64]] = field(default_factory=list)
-    others: list[dict[str, NDArray[np.float64]]] = field(default_factory=list)
-    cameras: list[NDArray[np.float64]] = field(default_factory=list)
-    target: list[NDArray[np.float64]] = field(default_factory=list)
-    vertices: dict[str, list[NDArray[np.float64]]] = field(default_factory=dict)
-    colours: list[tuple[int, str, list[float]]] = field(default_factory=list)
-
-
 class Stage:
     """A model that is moved through recorded states, and its drawn shapes.
 
@@ -136,14 +126,17 @@ class Stage:
         self.view = self._view()
         self.soft = [_shape(geom) for geom in drawn if geom.type in (_SKIN, _FLEX)]
         self.shapes = [_shape(geom) for geom in drawn if _is_fixed_size(geom)]
+        self._names, self._moving = self._moving_objects()
         self._rgba = {shape.name: shape.rgba for shape in self.shapes}
         self._has_passing = self.model.ntendon > 0 or any(
             not _is_fixed_size(geom) and geom.type not in (_SKIN, _FLEX)
             for geom in drawn
         )
-        lines = [s for s in self.soft if s.geom_type == _FLEX and self._is_line(s)]
-        if lines:
-            self.soft = [shape for shape in self.soft if shape not in lines]
+        shown = [
+            s for s in self.soft if s.is_skin or self.model.flex_dim[s.object_id] != 1
+        ]
+        if len(shown) < len(self.soft):
+            self.soft = shown
             self.notes.append("One-dimensional flexible bodies are not shown.")
         if self._scene.ngeom > len(drawn):
             self.notes.append("Labels, contacts and other marks are not shown.")
@@ -166,11 +159,6 @@ class Stage:
         target = position + distance * np.array(cameras[0].forward)
         return position.tolist(), target.tolist(), float(fovy)
 
-    @property
-    def everything(self) -> list[Shape]:
-        """All shapes seen so far."""
-        return [*self.shapes, *self.passing.values(), *self.soft]
-
     def bones_of(self, skin: int) -> list[int]:
         """Return the bodies that are a skin's bones, in the skin's order."""
         first, count = self.model.skin_boneadr[skin], self.model.skin_bonenum[skin]
@@ -189,54 +177,34 @@ class Stage:
         Raises:
             UnreadableFile: the file is missing or damaged.
         """
-        frames, model, data = _Frames(), self.model, self.data
-        geoms = [s.object_id for s in self.shapes if s.object_type == _GEOM]
-        sites = [s.object_id for s in self.shapes if s.object_type == _SITE]
-        skins = [s.object_id for s in self.soft if s.geom_type == _SKIN]
-        flexes = [s for s in self.soft if s.geom_type == _FLEX]
-        bones = sorted({body for skin in skins for body in self.bones_of(skin)})
+        placed, target = [], []
+        colours: list[tuple[int, str, list[float]]] = []
+        passing: list[dict[str, NDArray[np.float64]]] = []
+        first, number = self.model.flex_vertadr, self.model.flex_vertnum
+        flexes = {
+            s.name: slice(first[s.object_id], first[s.object_id] + number[s.object_id])
+            for s in self.soft
+            if not s.is_skin
+        }
+        vertices: dict[str, list[NDArray[np.float64]]] = {name: [] for name in flexes}
         with open_vetted_trajectory(trajectory.path) as reader:
-            for index, step in enumerate(steps):
-                if self._change_model(reader, int(step)):
-                    frames.colours += self._new_colours(trajectory, int(step), index)
-                self._enter(trajectory, int(step))
-                frames.geoms.append(
-                    np.vstack(
-                        [
-                            _places(data.geom_xpos, data.geom_xmat, geoms),
-                            _places(data.site_xpos, data.site_xmat, sites),
-                            _places(data.xpos, data.xmat, bones),
-                        ]
-                    )
-                )
-                cameras = list(range(model.ncam))
-                frames.cameras.append(_places(data.cam_xpos, data.cam_xmat, cameras))
-                for flex in flexes:
-                    first = self.model.flex_vertadr[flex.object_id]
-                    count = self.model.flex_vertnum[flex.object_id]
-                    places = data.flexvert_xpos[first : first + count].copy()
-                    frames.vertices.setdefault(flex.name, []).append(places)
-                frames.target.append(data.subtree_com[self._tracked].copy())
-                frames.others.append(self._passing_now() if self._has_passing else {})
-        names = [s.name for s in self.shapes if s.object_type == _GEOM]
-        names += [s.name for s in self.shapes if s.object_type == _SITE]
-        names += [f"bone/{body}" for body in bones]
-        return self._motion(trajectory, steps, frames, names)
-
-    def _motion(
-        self,
-        trajectory: Trajectory,
-        steps: NDArray[np.int64],
-        frames: _Frames,
-        names: list[str],
-    ) -> Motion:
-        count = len(steps)
-        placed = np.reshape(frames.geoms, (count, len(names), 12))
-        poses = dict(zip(names, np.moveaxis(_quaternions(placed), 1, 0), strict=True))
+            for index, step in enumerate(map(int, steps)):
+                if self._change_model(reader, step):
+                    colours += self._new_colours(trajectory, step, index)
+                self._enter(trajectory, step)
+                placed.append(np.vstack([_places(*each) for each in self._moving]))
+                target.append(self.data.subtree_com[self._tracked].copy())
+                for name, own in flexes.items():
+                    vertices[name].append(self.data.flexvert_xpos[own].copy())
+                passing.append(self._passing_now() if self._has_passing else {})
+        named = len(self._names)
+        shape = len(steps), named + self.model.ncam, 12
+        every_pose = _quaternions(np.reshape(placed, shape))
+        poses = dict(zip(self._names, np.moveaxis(every_pose, 1, 0), strict=False))
         scales = {}
         nowhere = np.concatenate([np.zeros(3), np.eye(3).ravel(), np.zeros(3)])
         for name in self.passing:
-            rows = np.array([each.get(name, nowhere) for each in frames.others])
+            rows = np.array([each.get(name, nowhere) for each in passing])
             poses[name] = _quaternions(rows[:, :12])
             scales[name] = rows[:, 12:]
         rewards = np.concatenate([[0.0], trajectory.rewards])
@@ -246,15 +214,33 @@ class Stage:
             time=steps.astype(float) if time is None else time[steps],
             rewards=rewards[steps],
             returns=np.cumsum(rewards)[steps],
-            vertices={name: np.array(each) for name, each in frames.vertices.items()},
+            vertices={name: np.array(each) for name, each in vertices.items()},
             poses=poses,
             scales=scales,
-            cameras=_quaternions(
-                np.reshape(frames.cameras, (count, self.model.ncam, 12))
-            ),
-            target=np.reshape(frames.target, (count, 3)),
-            colours=frames.colours,
+            cameras=every_pose[:, named:],
+            target=np.reshape(target, (len(steps), 3)),
+            colours=colours,
         )
+
+    def _moving_objects(self) -> tuple[list[str], list[tuple[Any, Any, list[int]]]]:
+        """Return names, and the arrays of positions and rotations with own indices.
+
+        Cameras come last and have no names.
+        """
+        data = self.data
+        geoms, sites = (
+            [shape for shape in self.shapes if shape.object_type == kind]
+            for kind in (_GEOM, _SITE)
+        )
+        skins = [shape.object_id for shape in self.soft if shape.is_skin]
+        bones = sorted({body for skin in skins for body in self.bones_of(skin)})
+        names = [shape.name for shape in (*geoms, *sites)]
+        return [*names, *(f"bone/{body}" for body in bones)], [
+            (data.geom_xpos, data.geom_xmat, [shape.object_id for shape in geoms]),
+            (data.site_xpos, data.site_xmat, [shape.object_id for shape in sites]),
+            (data.xpos, data.xmat, bones),
+            (data.cam_xpos, data.cam_xmat, [*range(self.model.ncam)]),
+        ]
 
     def _enter(self, trajectory: Trajectory, step: int) -> None:
         try:
@@ -294,9 +280,6 @@ class Stage:
             if rgba != before:
                 self._rgba[name] = rgba
                 yield index, name, list(rgba)
-
-    def _is_line(self, flex: Shape) -> bool:
-        return bool(self.model.flex_dim[flex.object_id] == 1)
 
     def _drawn(self) -> Iterator[Any]:
         mujoco.mjv_updateScene(

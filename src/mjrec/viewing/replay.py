@@ -25,9 +25,8 @@ from numpy.typing import NDArray
 from ..atomic_files import write_text
 from ..rates import rate_from_timestep, stride_for
 from ..simulation.trajectories import Trajectory
-from .geometry import linear, skin_weights
-from .motion import Motion, Shape, Stage
-from .scene import scene_page
+from .geometry import linear, scene_page
+from .motion import Motion, Stage
 
 _LOG = logging.getLogger(__name__)
 _COMPRESSION = 6
@@ -201,14 +200,25 @@ def _packed(array: NDArray[Any], kind: str = "<f4") -> str:
     return base64.b64encode(zlib.compress(raw, _COMPRESSION)).decode()
 
 
-def _skin(stage: Stage, shape: Shape) -> dict[str, Any]:
-    weights = skin_weights(stage.model, shape.object_id)
+def _skin(stage: Stage, skin: int) -> dict[str, Any]:
+    """Return the weights with which bones move a skin's vertices.
+
+    `bind` is each bone's resting pose, and `counts` the number of vertices that each
+    bone moves; `ids` and `weights` are of these vertices, bone after bone.
+    """
+    model = stage.model
+    first, count = model.skin_boneadr[skin], model.skin_bonenum[skin]
+    bones = slice(first, first + count)
+    counts = model.skin_bonevertnum[bones]
+    begin = model.skin_bonevertadr[first]
+    moved = slice(begin, begin + counts.sum())
+    bind = (model.skin_bonebindpos[bones], model.skin_bonebindquat[bones])
     return {
-        "bones": [f"bone/{body}" for body in stage.bones_of(shape.object_id)],
-        "counts": weights["counts"].tolist(),
-        "bind": _packed(weights["bind"]),
-        "ids": _packed(weights["ids"], "<i4"),
-        "weights": _packed(weights["weights"]),
+        "bones": [f"bone/{body}" for body in stage.bones_of(skin)],
+        "counts": counts.tolist(),
+        "bind": _packed(np.hstack(bind)),
+        "ids": _packed(model.skin_bonevertid[moved], "<i4"),
+        "weights": _packed(model.skin_bonevertweight[moved]),
     }
 
 
@@ -234,7 +244,7 @@ def _about(trajectory: Trajectory, stage: Stage, motion: Motion) -> dict[str, An
             s.name for s in (*stage.shapes, *stage.passing.values(), *stage.soft)
         ],
         "rgba": {s.name: linear(s.rgba) for s in stage.shapes},
-        "skins": {s.name: _skin(stage, s) for s in stage.soft if s.is_skin},
+        "skins": {s.name: _skin(stage, s.object_id) for s in stage.soft if s.is_skin},
         "still": {
             name: poses[0].tolist()
             for name, poses in motion.poses.items()
