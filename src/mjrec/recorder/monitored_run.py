@@ -8,7 +8,6 @@ import functools
 import itertools
 import logging
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -34,34 +33,11 @@ from .video_recorder import VideoRecorder
 
 if TYPE_CHECKING:
     from ..simulation.capture import EpisodeStart
+    from .recording import EpisodeRecording
 
 logger = logging.getLogger(__name__)
 
 What = Literal["video", "trajectory", "statistics", "journal", "model", "tracker"]
-
-
-@dataclass(frozen=True, kw_only=True)
-class BegunEpisode:
-    """The facts that are known when an episode begins.
-
-    Attributes:
-        episode_id: the episode's number.
-        type: `"t"` for training, `"e"` for evaluation.
-        start_time: time just before the reset, in seconds since the Unix epoch.
-        seed: the seed given to `reset`.
-        options: the options given to `reset`.
-        random_state: state of the environment's random generator before the reset, as
-            JSON values; None if unknown or not needed.
-        reset_clock: simulated time of the reset, if frames show the time.
-    """
-
-    episode_id: int
-    type: str
-    start_time: float
-    seed: Any
-    options: Any
-    random_state: Any = None
-    reset_clock: float | None = None
 
 
 class MonitoredRun:
@@ -158,7 +134,7 @@ class MonitoredRun:
         # Functions to call when the run closes, because the disk was full.
         self._late: list[Callable[[], None]] = []
         self.no_video = VideoRecorder(env.frames, enabled=False)
-        self._episode: BegunEpisode | None = None
+        self._episode: EpisodeRecording | None = None
         # The reasons for drawing videos live that have been logged so far.
         self._said: set[str] = set()
 
@@ -171,10 +147,8 @@ class MonitoredRun:
             FileNotWritten: the disk is full.
         """
         self.events.add(entry)
-        self._lines += 1
-        self._write(lambda: self._journal.append(entry))
+        self._write(self._journal.append, entry)
         self.note_provenance()
-        self._note_stated_faults()
 
     def note(self, kind: str, facts: Any) -> None:
         """Write an event to the journal.
@@ -187,9 +161,7 @@ class MonitoredRun:
             FileNotWritten: the disk is full.
         """
         self.events.note(kind, facts)
-        self._lines += 1
-        self._write(lambda: self._journal.note(kind, facts))
-        self._note_stated_faults()
+        self._write(self._journal.note, kind, facts)
 
     def note_provenance(self, *, wait: bool = False) -> None:
         """Write the run's provenance to the journal if it is known by now.
@@ -219,6 +191,24 @@ class MonitoredRun:
             of = "" if episode_id is None else f" of episode {episode_id}"
             logger.warning("Not completely recorded: %s%s. %s", what, of, error)
         return is_warned
+
+    def ask(self, what: What, choose: Callable[..., Any], *about: Any) -> bool:
+        """Return the choice of a user's function, which may raise anything.
+
+        Args:
+            what: the part of the recording that is lost if the function raises.
+            choose: the function.
+            *about: the function's arguments.
+
+        Returns:
+            The choice; False if the function raised and `on_error` tolerates that.
+        """
+        try:
+            return bool(choose(*about))
+        except Exception as error:
+            if not self.tolerates(what, error):
+                raise
+            return False
 
     @contextlib.contextmanager
     def tolerating(
@@ -287,22 +277,24 @@ class MonitoredRun:
                 self.note("fault", facts)
                 return
 
-    def _write(self, write: Callable[[], None]) -> None:
+    def _write(self, write: Callable[..., None], *line: Any) -> None:
+        self._lines += 1
         try:
-            write()
+            write(*line)
         except FileNotWritten as error:
             if not self.tolerates("journal", error):
                 raise
+        self._note_stated_faults()
 
     # --- facts -----------------------------------------------------------------------
 
     @property
-    def episode(self) -> BegunEpisode:
+    def episode(self) -> EpisodeRecording:
         """The running episode."""
         assert self._episode is not None, "there was no reset"
         return self._episode
 
-    def begin(self, episode: BegunEpisode) -> None:
+    def begin(self, episode: EpisodeRecording) -> None:
         """Begin an episode. From now on, faults are attributed to it."""
         self._episode = episode
         self.events.begin(episode.episode_id, chosen=False)

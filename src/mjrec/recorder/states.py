@@ -102,11 +102,13 @@ class StateRecorder:
         self._first_state = np.empty(_words(self._state))
         self._first_snapshot = np.empty(_words(self._snapshot), np.uint64)
         self._first_change: Mapping[str, NDArray[Any]] | None = None
-        self._first_time = run.env.clock()
         if capture is None:
             self._first_state.fill(np.nan)
+            self._first_time = run.env.clock()
         else:
             capture.capture_state(self._first_state)
+            # A state begins with the time.
+            self._first_time = float(self._first_state[0])
             if self._takes_frames:
                 self._first_change = capture.capture_snapshot(self._first_snapshot)
         self._pace = run.paces.get(logs)
@@ -119,11 +121,6 @@ class StateRecorder:
             # cannot be written, the first step reports it.
             with contextlib.suppress(FileNotWritten):
                 self._begin(self._pace)
-
-    @property
-    def path(self) -> Path:
-        """The resulting file."""
-        return self._logs.path_of(self._name)
 
     @property
     def is_there(self) -> bool:
@@ -275,16 +272,6 @@ class StateRecorder:
             if not self._run.tolerates(self._what, error):
                 raise
 
-    def submit(self, recording: Path | None = None) -> None:
-        """Submit the ended recording to the finisher.
-
-        Args:
-            recording: the clip that this is the last part of, if any.
-        """
-        # Without a span the disk was too full for a single row: no video will come.
-        if self._span is not None or recording is not None:
-            self._run.submit(recording or self.path)
-
     def drop(self) -> None:
         """Discard its rows, even after the recording has ended.
 
@@ -330,7 +317,7 @@ class StateRecorder:
             layout.words,
             set_action=action.set,
             is_current=start.is_current,
-            is_on_pace=lambda: self._measured_pace() == self._pace,
+            is_on_pace=lambda now: self._measured_pace(now) == self._pace,
             stride=self._stride,
         )
 
@@ -338,7 +325,7 @@ class StateRecorder:
         """Return the span for the next row, begun or corrected at the first step."""
         if self._span is not None and self.steps:
             return self._span
-        pace = self._measured_pace()
+        pace = self._measured_pace(self._run.env.clock())
         if self._span is None:
             self._begin(pace)
         elif pace != self._pace:
@@ -479,14 +466,18 @@ class StateRecorder:
             logger.warning(
                 "%s: from step %d on, the %s have a different type or shape and are "
                 "recorded as zeros.",
-                self.path.name,
+                self._logs.path_of(self._name).name,
                 self.steps,
                 what,
             )
 
-    def _measured_pace(self) -> Mapping[str, Any]:
-        """Return the rate, the first step's measured time, and the frame stride."""
-        began, now = self._first_time, self._run.env.clock()
+    def _measured_pace(self, now: float | None) -> Mapping[str, Any]:
+        """Return the rate, the first step's measured time, and the frame stride.
+
+        Args:
+            now: the simulated time after the first step.
+        """
+        began = self._first_time
         if began is None or now is None or now <= began:
             return _pace(self._run.env.declared(), None, self._max_fps)
         return _measured(now - began, self._max_fps)
