@@ -27,7 +27,7 @@ from .opening import OpenDirectory
 from .options import LIVE, WARN, RecorderOptions
 from .recorded_environment import RecordedEnvironment, check_refusal
 from .stats_recorder import StatsRecorder
-from .step_arrays import RowLayout
+from .step_arrays import StepArray
 from .tracking import Trackers
 from .video_recorder import VideoRecorder
 
@@ -70,7 +70,8 @@ class MonitoredRun:
         trackers: the trackers, which are notified of episodes and finished videos.
         logs: logs for the rows of episodes.
         clip_logs: logs for the rows of clips.
-        layouts: for each of the two kinds of logs, the layout of the last recording.
+        actions: for each of the two kinds of logs, the buffer for actions that the last
+            recording used.
         paces: for each of the two kinds of logs, the rate, timestep and stride of the
             last recording.
         no_video: a disabled recorder for episodes without a video.
@@ -129,7 +130,7 @@ class MonitoredRun:
             )
             for _ in range(2)
         )
-        self.layouts: dict[SpanLogs, RowLayout] = {}
+        self.actions: dict[SpanLogs, StepArray | None] = {}
         self.paces: dict[SpanLogs, Mapping[str, Any]] = {}
         # Functions to call when the run closes, because the disk was full.
         self._late: list[Callable[[], None]] = []
