@@ -7,6 +7,7 @@ import contextlib
 import functools
 import itertools
 import logging
+import os
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -15,16 +16,17 @@ from ..annotation import Caption
 from ..atomic_files import file_sha256
 from ..errors import FileNotWritten
 from ..formats.journal import JournalEntry, JournalWriter
-from ..formats.monitor_directory import journal_name
+from ..formats.manifest import GYM_VERSION
+from ..formats.monitor_directory import journal_name, stats_prefix
 from ..formats.span_writer import SpanLogs
 from ..formats.video_metadata import recording_facts
 from ..machine import machine_fingerprint
 from ..provenance import look_around, versions
 from ..results.run import Run
 from . import tracking
-from .finishers import Finisher
-from .opening import OpenDirectory
-from .options import LIVE, WARN, RecorderOptions
+from .finishers import Finisher, LaterFinisher
+from .opening import open_directory
+from .options import LIVE, WARN, RecorderOptions, type_of_mode
 from .recorded_environment import RecordedEnvironment, check_refusal
 from .stats_recorder import StatsRecorder
 from .step_arrays import StepArray
@@ -48,22 +50,28 @@ class MonitoredRun:
     manifest, and the simulation continues.
 
     Args:
-        place: the open directory.
+        directory: the monitor directory, in which the run claims an infix.
         env: the recorded environment.
         options: the user's options.
-        stats: the recorder that counts steps and rewards.
-        finisher: the finisher that processes ended recordings.
-        selection: facts for videos that are chosen after their episodes have ended;
-            empty if videos are chosen before.
+        finisher: creates the finisher that processes ended recordings; None if nothing
+            will be rendered now.
+        schedule: the name of the schedule.
+        rule: the rule that chooses videos after their episodes have ended; None if
+            videos are chosen before.
+
+    Raises:
+        See `open_directory`.
 
     Attributes:
         env: the recorded environment.
         options: the user's options.
         stats: the recorder that counts steps and rewards.
         finisher: the finisher that processes ended recordings.
-        selection: facts for videos that are chosen after their episodes have ended.
-        directory: the monitor directory.
+        selection: facts for videos that are chosen after their episodes have ended;
+            empty if videos are chosen before.
+        directory: the monitor directory, absolute.
         infix: the middle part of the monitor's file names.
+        first_episode_id: the number of the first episode.
         clock: function that returns the time in seconds since the Unix epoch.
         events: the journal's content so far, including events that could not be written
             because the disk was full.
@@ -79,18 +87,43 @@ class MonitoredRun:
 
     def __init__(
         self,
-        place: OpenDirectory,
+        directory: str | os.PathLike[str],
         *,
         env: RecordedEnvironment,
         options: RecorderOptions,
-        stats: StatsRecorder,
-        finisher: Finisher,
-        selection: Mapping[str, Any],
+        finisher: Callable[[Path], Finisher] | None,
+        schedule: str,
+        rule: str | None,
     ) -> None:
-        self.directory, self.infix = place.path, place.infix
-        self.env, self.options, self.stats = env, options, stats
-        self.clock = options.clock
-        self.finisher, self.selection = finisher, selection
+        self.env, self.options, self.clock = env, options, options.clock
+        place = open_directory(
+            directory,
+            force=options.force,
+            resume=options.resume,
+            uid=options.uid,
+            env_info={"gym_version": GYM_VERSION, "env_id": env.env_id},
+            facts={
+                "schedule": schedule,
+                "keep": None if rule is None else {"rule": rule},
+                "versions": dict(versions()),
+                "views": [*env.further_views],
+                "environment": env.environment,
+                "options": {**options.recorded(), **env.view},
+            },
+            statements=options.statements,
+        )
+        self.directory, self.infix, self._lock = place.path, place.infix, place.lock
+        self.first_episode_id = place.first_episode_id
+        self.stats = StatsRecorder(
+            self.directory,
+            stats_prefix(self.infix),
+            env_id=env.env_id,
+            allow_early_reset=options.allow_early_reset,
+        )
+        self.stats.type = type_of_mode(options.mode)
+        self.stats.clock = self.clock
+        self.finisher = LaterFinisher() if finisher is None else finisher(place.path)
+        self.selection = {} if rule is None else {"rule": rule, "decided": False}
         self.events = Run(place.run)
         path = self.directory / journal_name(self.infix)
         self._journal = JournalWriter(path, run=place.run)
@@ -259,10 +292,11 @@ class MonitoredRun:
             self._late += late
 
     def leave(self) -> None:
-        """Release the journal and the logs as they are. Idempotent."""
+        """Release the journal, the logs and the lock as they are. Idempotent."""
         for logs in (self.logs, self.clip_logs):
             logs.release()
         self._journal.close()
+        self._lock.release()
 
     def _found(self, *, wait: bool) -> Mapping[str, Any] | None:
         if (stated := self._statements) is not None:

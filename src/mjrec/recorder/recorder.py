@@ -15,15 +15,12 @@ from typing import Any, Final
 from ..errors import DirectoryNotWritable, Error, FileNotWritten
 from ..formats.bundle import FINISHED
 from ..formats.journal import JournalEntry
-from ..formats.manifest import GYM_VERSION
 from ..formats.monitor_directory import (
     episode_of,
-    stats_prefix,
     video_prefix,
 )
 from ..formats.spans import recordings_in_flight
 from ..formats.video_metadata import note_failure, reason_of
-from ..provenance import versions
 from ..results.manifest_writing import write_manifest_and_stats
 from .clips import Clips
 from .ending_reasons import CLOSE, RESET, ending
@@ -31,13 +28,12 @@ from .fast_path import FastPath
 from .finishers import Finisher, LaterFinisher
 from .kept_videos import KeptVideos
 from .monitored_run import MonitoredRun
-from .opening import open_directory
 from .options import DEFERRED, LIVE, OFF, RecorderOptions, type_of_mode
 from .recorded_environment import RecordedEnvironment, check_frames
 from .recording import EpisodeRecording
 from .selection import EpisodeChoice, Standing
 from .states import DeferredVideo
-from .stats_recorder import StatsRecorder, reward_to_float
+from .stats_recorder import reward_to_float
 from .tracking import FinishedEpisode
 from .video_recorder import VideoRecorder
 
@@ -87,8 +83,6 @@ class Recorder:
         self._choice = EpisodeChoice(options, draws=mode != OFF)
         if mode == LIVE and (self._choice.has_videos or options.has_clips):
             check_frames(env)
-        self._env = env
-        self._options = options
         self._pid = os.getpid()
         self._is_forked = False
         _recorders.add(self)
@@ -98,50 +92,23 @@ class Recorder:
         self.closed = False
         self.fast: FastPath | None = None
         self.evaluation_facts: Callable[[], Mapping[str, Any] | None] = lambda: None
-
         selection = self._choice.selection
-        self._place = open_directory(
+        self.run = MonitoredRun(
             directory,
-            force=options.force,
-            resume=options.resume,
-            uid=options.uid,
-            env_info={"gym_version": GYM_VERSION, "env_id": env.env_id},
-            facts={
-                "schedule": self._choice.schedule_name,
-                "keep": None if selection is None else {"rule": selection.name},
-                "versions": dict(versions()),
-                "views": [*env.further_views],
-                "environment": env.environment,
-                "options": {**options.recorded(), **env.view},
-            },
-            statements=options.statements,
+            env=env,
+            options=options,
+            finisher=finisher,
+            schedule=self._choice.schedule_name,
+            rule=None if selection is None else selection.name,
         )
-        self.directory, infix = self._place.path, self._place.infix
-        self.infix = str(infix)
-        self.episode_id = self._place.first_episode_id
+        self.directory, self.infix = self.run.directory, str(self.run.infix)
+        self.episode_id = self.run.first_episode_id
+        self.stats_recorder = self.run.stats
         self._states = [
             each for each in (env.states, env.clip_states) if each is not None
         ]
         for states in self._states:
             states.open(self.directory)
-        self.stats_recorder = StatsRecorder(
-            str(self.directory),
-            stats_prefix(infix),
-            env_id=env.env_id,
-            allow_early_reset=options.allow_early_reset,
-        )
-        self.stats_recorder.type = type_of_mode(options.mode)
-        self.stats_recorder.clock = options.clock
-        self.run = MonitoredRun(
-            self._place,
-            env=env,
-            options=options,
-            stats=self.stats_recorder,
-            finisher=LaterFinisher() if finisher is None else finisher(self.directory),
-            selection=(
-                {} if selection is None else {"rule": selection.name, "decided": False}
-            ),
-        )
         self._kept = None if selection is None else KeptVideos(selection)
         self._clips = Clips(self.run) if options.has_clips else None
         draws_later = mode == DEFERRED and self._clips is None
@@ -195,8 +162,8 @@ class Recorder:
 
     def resetting(self) -> AbstractContextManager[None]:
         """Return a context manager in which to reset the environment."""
-        states = self._env.states
-        if states is None or self._env.rendering.mode == LIVE:
+        states = self.run.env.states
+        if states is None or self.run.env.rendering.mode == LIVE:
             return contextlib.nullcontext()
         return states.resetting()
 
@@ -216,7 +183,7 @@ class Recorder:
         self._reset_time = now
         self._random_state = None
         if self._choice.may_keep_trajectory(self.stats_recorder.type):
-            self._random_state = self._env.random_state()
+            self._random_state = self.run.env.random_state()
 
     def reset(
         self, *, seed: Any = None, options: Any = None, observation: Any = None
@@ -264,7 +231,7 @@ class Recorder:
                 recording.live.give_up(str(error))
         if self._clips is None:
             self.fast = recording.fast_path()
-        if self._options.write_upon_reset:
+        if self.run.options.write_upon_reset:
             with self.run.tolerating("statistics", FileNotWritten, of_episode=False):
                 self._write_results()
 
@@ -673,7 +640,6 @@ class Recorder:
             if each is not None:
                 each.leave()
         self.run.leave()
-        self._place.lock.release()
 
     def _say_what_is_left(self, pending: int) -> None:
         """Log the command that renders or finishes the rest."""
@@ -711,12 +677,12 @@ class Recorder:
         number = episode_of(name)
         if number is None or not name.endswith(FINISHED):
             return name
-        return f"{video_prefix(self._place.infix, number)}.mp4"
+        return f"{video_prefix(self.run.infix, number)}.mp4"
 
     def _write_results(self) -> int:
         listing = write_manifest_and_stats(
             self.directory,
-            self._place.infix,
+            self.run.infix,
             run=self.run.events,
             stats=self.stats_recorder.stats(),
             is_own=True,
