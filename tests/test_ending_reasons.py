@@ -206,7 +206,7 @@ def test_a_signal_whose_exception_is_lost_comes_again(tmp_path):
 
 @pytest.mark.usefixtures("default_signals")
 @pytest.mark.parametrize(
-    "moment", ["states.StateRecorder.end", "recorder.Recorder._finished_episode"]
+    "moment", ["states.StateRecorder.end", "recorder.Recorder._end_episode"]
 )
 def test_the_end_of_an_episode_that_is_interrupted(moment, tmp_path, monkeypatch):
     """Ctrl-C while that is written down: recovery makes it, and the next, complete."""
@@ -217,7 +217,7 @@ def test_the_end_of_an_episode_that_is_interrupted(moment, tmp_path, monkeypatch
     with monkeypatch.context() as patch:
         patch.setattr(
             f"mjrec.recorder.{moment}",
-            lambda *_: signal.raise_signal(signal.SIGINT),
+            lambda *_, **__: signal.raise_signal(signal.SIGINT),
         )
         with pytest.raises(KeyboardInterrupt):
             steps(monitor, 1)

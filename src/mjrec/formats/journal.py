@@ -136,7 +136,7 @@ class JournalWriter:
         self._run = run
         self._descriptor: int | None = None
         self._unwritten = b""
-        self._is_empty = self._closed = False
+        self._is_empty = self._is_whole = self._closed = False
 
     def append(self, entry: JournalEntry) -> None:
         """Record a completed episode.
@@ -204,11 +204,14 @@ class JournalWriter:
         if self._descriptor is None:
             self._descriptor = open_for_appending(self.path)
             self._is_empty = not os.fstat(self._descriptor).st_size
+            self._is_whole = False
         if self._run is not None and self._is_empty:
             lines = f"{dumps({'run': self._run})}\n".encode() + lines
         try:
-            append_whole(self._descriptor, lines, torn=b"\n")
-            self._is_empty = False
+            # Only an earlier writer, or a failure, can have left half a line.
+            is_whole, self._is_whole = self._is_whole, False
+            append_whole(self._descriptor, lines, torn=b"" if is_whole else b"\n")
+            self._is_empty, self._is_whole = False, True
         except FileNotFoundError:
             # The next event creates a new file.
             os.close(self._descriptor)

@@ -3,13 +3,12 @@
 
 from __future__ import annotations
 
-import contextlib
 import functools
 import logging
 import os
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import Any, ClassVar, Literal, NoReturn, Self, SupportsIndex
+from typing import Any, ClassVar, Literal, NoReturn, Self, SupportsIndex, TypeVar
 
 from ..environments.scenes import Scenes
 from ..errors import NotPicklable, PicturesDiffer, RenderError
@@ -34,6 +33,8 @@ from ..simulation.find_simulation import simulation_time
 from .progress import render_progress
 
 logger = logging.getLogger(__name__)
+
+T = TypeVar("T")
 
 NO_SIMULATION = "it has no accessible MuJoCo model and data"
 
@@ -222,12 +223,11 @@ class EnvironmentMonitor(MonitorBase):
         """
         self._recorder.forget_frames()
 
-    @contextlib.contextmanager
-    def _resetting(self) -> Iterator[None]:
-        """Wrap the environment's reset, and note an exception in it."""
+    def _reset_by(self, reset: Callable[[], T]) -> T:
+        """Call the function that resets the environment, and note its exception."""
         try:
             with self._recorder.resetting():
-                yield
+                return reset()
         except BaseException as error:
             self._recorder.note_error(error)
             raise

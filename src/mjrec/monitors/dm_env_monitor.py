@@ -89,8 +89,7 @@ class DmEnvMonitor(EnvironmentMonitor, dm_env.Environment):  # type: ignore[misc
         if self._recorder.closed:
             return self._env.reset()
         self._recorder.before_reset()
-        with self._resetting():
-            timestep = self._env.reset()
+        timestep = self._reset_by(self._env.reset)
         self._begin(seed=self.seed, observation=timestep.observation)
         return timestep
 

@@ -96,8 +96,7 @@ class GymnasiumMonitor(EnvironmentMonitor, gymnasium.Wrapper[Any, Any, Any, Any]
         if self._recorder.closed:
             return self.env.reset(seed=seed, options=options)
         self._recorder.before_reset()
-        with self._resetting():
-            result = self.env.reset(seed=seed, options=options)
+        result = self._reset_by(lambda: self.env.reset(seed=seed, options=options))
         self._begin(seed=seed, options=options, observation=result[0])
         return result
 
@@ -113,8 +112,7 @@ class GymnasiumMonitor(EnvironmentMonitor, gymnasium.Wrapper[Any, Any, Any, Any]
             if recorder.closed:
                 return self.env.step(action)
             if self._before_step(action):
-                with self._resetting():
-                    result = self.env.step(action)
+                result = self._reset_by(lambda: self.env.step(action))
                 self._begin(observation=result[0])
                 return result
         try:

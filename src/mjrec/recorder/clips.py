@@ -64,12 +64,9 @@ class Clips:
 
     def before_step(self) -> None:
         """Begin a clip if `step_trigger` chooses this step."""
-        taken = self._run.stats.total_steps
         if self._clip is None and self._trigger is not None:
-            is_chosen: Any = False
-            with self._run.tolerating("video", Exception):
-                is_chosen = self._trigger(taken)
-            if is_chosen:
+            taken = self._run.stats.total_steps
+            if self._run.ask("video", self._trigger, taken):
                 self._start(taken)
 
     def step(
@@ -216,7 +213,7 @@ class _Clip:
                 if self._parts > 1 or self._part.is_there:
                     run.note("clip", {**said, "clip": self._name(0)})
                     run.trackers.expect(self._video)
-                    self._part.submit(run.directory / self._name(0))
+                    run.submit(run.directory / self._name(0))
 
     def _begin_part(self, start: EpisodeStart) -> None:
         """Begin a new part."""

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from ..errors import FileNotWritten
 from ..formats.row_log import TAIL_HEAD, RowLog
 from ..formats.span_writer import SpanWriter
-from ..formats.trajectory import FRAME, STEP, TERMINATED, TRUNCATED
+from ..formats.trajectory import FRAME, HEAD_WORDS, STEP, TERMINATED, TRUNCATED
 from ..simulation.raw_memory import WORDS
 from .stats_recorder import StatsRecorder
 
@@ -78,7 +78,7 @@ def gathering(
     *,
     set_action: Callable[[Any], bool],
     is_current: Callable[[], bool],
-    is_on_pace: Callable[[], bool],
+    is_on_pace: Callable[[float], bool],
     stride: int,
 ) -> FastPath:
     """Return a fast path that records each step with one copy of memory.
@@ -91,8 +91,8 @@ def gathering(
             False if the type or shape of the action differs from before.
         is_current: function that returns, after a step, whether only the state has
             changed.
-        is_on_pace: function that returns, after the first step, whether the step took
-            the expected simulated time.
+        is_on_pace: function that returns, given the time after the first step, whether
+            the step took the expected simulated time.
         stride: number of steps per frame. The last step gets a frame in any case.
     """
     log, bodies = span.log.rows, span.log.bodies
@@ -113,17 +113,17 @@ def gathering(
             if type(reward) is not int or abs(reward) > _LARGEST:
                 return False
             reward = float(reward)
-        number = span.steps + 1
-        if number == 1 and not is_on_pace():
-            return False
-        slot = row % capacity
+        number, slot = span.steps + 1, row % capacity
         take(words, None, bodies[slot], "clip")
+        head = first + slot * width
+        # A row's content begins with the state, which begins with the time.
+        if number == 1 and not is_on_pace(floats[head + HEAD_WORDS]):
+            return False
         is_last = terminated or truncated
         is_frame = is_last or number % stride == 0
         flags = both if is_frame else STEP
         if is_last:
             flags |= TERMINATED * terminated | TRUNCATED * truncated
-        head = first + slot * width
         whole[head], whole[head + 1], whole[head + 3] = row, number, flags
         floats[head + 2] = reward
         total = _sum(reward, stats.rewards)  # type: ignore[arg-type]

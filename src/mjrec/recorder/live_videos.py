@@ -26,9 +26,6 @@ class LiveVideos:
         tolerates: function that returns whether to continue after an error.
         retry_at_close: function that takes a function to call when the run closes. It
             is used to write metadata for which the disk had no room.
-        on_frame_error: function that is called with an error if taking a step's frame
-            raises an error that is not tolerated. The error may come from the
-            environment itself.
 
     Attributes:
         recorders: the video recorders.
@@ -40,12 +37,10 @@ class LiveVideos:
         *,
         tolerates: Callable[[Exception], bool],
         retry_at_close: Callable[[Callable[[], None]], object],
-        on_frame_error: Callable[[Exception], object] = lambda _: None,
     ) -> None:
         self.recorders = recorders
         self._tolerates = tolerates
         self._retry_at_close = retry_at_close
-        self._on_frame_error = on_frame_error
 
     @property
     def path(self) -> Path:
@@ -69,13 +64,9 @@ class LiveVideos:
                 if recorder.functional:
                     recorder.metadata["final_frame"] = "missing"
             return
-        try:
-            self._each(VideoRecorder.capture_frame)
-            if last:
-                self.take_last()
-        except Exception as error:
-            self._on_frame_error(error)
-            raise
+        self._each(VideoRecorder.capture_frame)
+        if last:
+            self.take_last()
 
     def take_last(self) -> None:
         """Take the last step's frames if `max_fps` left them out."""
@@ -183,7 +174,6 @@ def live_videos(
     path: Path,
     *,
     second_name: Mapping[str, str],
-    on_frame_error: Callable[[Exception], object] = lambda _: None,
 ) -> LiveVideos:
     """Create the live videos of the running episode, one for each camera.
 
@@ -191,7 +181,6 @@ def live_videos(
         run: the monitored run.
         path: the path of the first camera's video, without the extension.
         second_name: the video's second name; see `MonitoredRun.second_name`.
-        on_frame_error: see `LiveVideos`.
     """
     options, env = run.options, run.env
     sources = {"": env.frames, **env.further_frames}
@@ -226,5 +215,4 @@ def live_videos(
         recorders,
         tolerates=functools.partial(run.tolerates, "video"),
         retry_at_close=run.retry_at_close,
-        on_frame_error=on_frame_error,
     )

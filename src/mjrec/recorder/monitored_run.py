@@ -7,8 +7,8 @@ import contextlib
 import functools
 import itertools
 import logging
+import os
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -16,52 +16,30 @@ from ..annotation import Caption
 from ..atomic_files import file_sha256
 from ..errors import FileNotWritten
 from ..formats.journal import JournalEntry, JournalWriter
-from ..formats.monitor_directory import journal_name
+from ..formats.manifest import GYM_VERSION
+from ..formats.monitor_directory import journal_name, stats_prefix
 from ..formats.span_writer import SpanLogs
 from ..formats.video_metadata import recording_facts
 from ..machine import machine_fingerprint
 from ..provenance import look_around, versions
 from ..results.run import Run
 from . import tracking
-from .finishers import Finisher
-from .opening import OpenDirectory
-from .options import LIVE, WARN, RecorderOptions
+from .finishers import Finisher, LaterFinisher
+from .opening import open_directory
+from .options import LIVE, WARN, RecorderOptions, type_of_mode
 from .recorded_environment import RecordedEnvironment, check_refusal
 from .stats_recorder import StatsRecorder
-from .step_arrays import RowLayout
+from .step_arrays import StepArray
 from .tracking import Trackers
 from .video_recorder import VideoRecorder
 
 if TYPE_CHECKING:
     from ..simulation.capture import EpisodeStart
+    from .recording import EpisodeRecording
 
 logger = logging.getLogger(__name__)
 
 What = Literal["video", "trajectory", "statistics", "journal", "model", "tracker"]
-
-
-@dataclass(frozen=True, kw_only=True)
-class BegunEpisode:
-    """The facts that are known when an episode begins.
-
-    Attributes:
-        episode_id: the episode's number.
-        type: `"t"` for training, `"e"` for evaluation.
-        start_time: time just before the reset, in seconds since the Unix epoch.
-        seed: the seed given to `reset`.
-        options: the options given to `reset`.
-        random_state: state of the environment's random generator before the reset, as
-            JSON values; None if unknown or not needed.
-        reset_clock: simulated time of the reset, if frames show the time.
-    """
-
-    episode_id: int
-    type: str
-    start_time: float
-    seed: Any
-    options: Any
-    random_state: Any = None
-    reset_clock: float | None = None
 
 
 class MonitoredRun:
@@ -72,29 +50,36 @@ class MonitoredRun:
     manifest, and the simulation continues.
 
     Args:
-        place: the open directory.
+        directory: the monitor directory, in which the run claims an infix.
         env: the recorded environment.
         options: the user's options.
-        stats: the recorder that counts steps and rewards.
-        finisher: the finisher that processes ended recordings.
-        selection: facts for videos that are chosen after their episodes have ended;
-            empty if videos are chosen before.
+        finisher: creates the finisher that processes ended recordings; None if nothing
+            will be rendered now.
+        schedule: the name of the schedule.
+        rule: the rule that chooses videos after their episodes have ended; None if
+            videos are chosen before.
+
+    Raises:
+        See `open_directory`.
 
     Attributes:
         env: the recorded environment.
         options: the user's options.
         stats: the recorder that counts steps and rewards.
         finisher: the finisher that processes ended recordings.
-        selection: facts for videos that are chosen after their episodes have ended.
-        directory: the monitor directory.
+        selection: facts for videos that are chosen after their episodes have ended;
+            empty if videos are chosen before.
+        directory: the monitor directory, absolute.
         infix: the middle part of the monitor's file names.
+        first_episode_id: the number of the first episode.
         clock: function that returns the time in seconds since the Unix epoch.
         events: the journal's content so far, including events that could not be written
             because the disk was full.
         trackers: the trackers, which are notified of episodes and finished videos.
         logs: logs for the rows of episodes.
         clip_logs: logs for the rows of clips.
-        layouts: for each of the two kinds of logs, the layout of the last recording.
+        actions: for each of the two kinds of logs, the buffer for actions that the last
+            recording used.
         paces: for each of the two kinds of logs, the rate, timestep and stride of the
             last recording.
         no_video: a disabled recorder for episodes without a video.
@@ -102,18 +87,43 @@ class MonitoredRun:
 
     def __init__(
         self,
-        place: OpenDirectory,
+        directory: str | os.PathLike[str],
         *,
         env: RecordedEnvironment,
         options: RecorderOptions,
-        stats: StatsRecorder,
-        finisher: Finisher,
-        selection: Mapping[str, Any],
+        finisher: Callable[[Path], Finisher] | None,
+        schedule: str,
+        rule: str | None,
     ) -> None:
-        self.directory, self.infix = place.path, place.infix
-        self.env, self.options, self.stats = env, options, stats
-        self.clock = options.clock
-        self.finisher, self.selection = finisher, selection
+        self.env, self.options, self.clock = env, options, options.clock
+        place = open_directory(
+            directory,
+            force=options.force,
+            resume=options.resume,
+            uid=options.uid,
+            env_info={"gym_version": GYM_VERSION, "env_id": env.env_id},
+            facts={
+                "schedule": schedule,
+                "keep": None if rule is None else {"rule": rule},
+                "versions": dict(versions()),
+                "views": [*env.further_views],
+                "environment": env.environment,
+                "options": {**options.recorded(), **env.view},
+            },
+            statements=options.statements,
+        )
+        self.directory, self.infix, self._lock = place.path, place.infix, place.lock
+        self.first_episode_id = place.first_episode_id
+        self.stats = StatsRecorder(
+            self.directory,
+            stats_prefix(self.infix),
+            env_id=env.env_id,
+            allow_early_reset=options.allow_early_reset,
+        )
+        self.stats.type = type_of_mode(options.mode)
+        self.stats.clock = self.clock
+        self.finisher = LaterFinisher() if finisher is None else finisher(place.path)
+        self.selection = {} if rule is None else {"rule": rule, "decided": False}
         self.events = Run(place.run)
         path = self.directory / journal_name(self.infix)
         self._journal = JournalWriter(path, run=place.run)
@@ -153,12 +163,12 @@ class MonitoredRun:
             )
             for _ in range(2)
         )
-        self.layouts: dict[SpanLogs, RowLayout] = {}
+        self.actions: dict[SpanLogs, StepArray | None] = {}
         self.paces: dict[SpanLogs, Mapping[str, Any]] = {}
         # Functions to call when the run closes, because the disk was full.
         self._late: list[Callable[[], None]] = []
         self.no_video = VideoRecorder(env.frames, enabled=False)
-        self._episode: BegunEpisode | None = None
+        self._episode: EpisodeRecording | None = None
         # The reasons for drawing videos live that have been logged so far.
         self._said: set[str] = set()
 
@@ -171,10 +181,8 @@ class MonitoredRun:
             FileNotWritten: the disk is full.
         """
         self.events.add(entry)
-        self._lines += 1
-        self._write(lambda: self._journal.append(entry))
+        self._write(self._journal.append, entry)
         self.note_provenance()
-        self._note_stated_faults()
 
     def note(self, kind: str, facts: Any) -> None:
         """Write an event to the journal.
@@ -187,9 +195,7 @@ class MonitoredRun:
             FileNotWritten: the disk is full.
         """
         self.events.note(kind, facts)
-        self._lines += 1
-        self._write(lambda: self._journal.note(kind, facts))
-        self._note_stated_faults()
+        self._write(self._journal.note, kind, facts)
 
     def note_provenance(self, *, wait: bool = False) -> None:
         """Write the run's provenance to the journal if it is known by now.
@@ -219,6 +225,24 @@ class MonitoredRun:
             of = "" if episode_id is None else f" of episode {episode_id}"
             logger.warning("Not completely recorded: %s%s. %s", what, of, error)
         return is_warned
+
+    def ask(self, what: What, choose: Callable[..., Any], *about: Any) -> bool:
+        """Return the choice of a user's function, which may raise anything.
+
+        Args:
+            what: the part of the recording that is lost if the function raises.
+            choose: the function.
+            *about: the function's arguments.
+
+        Returns:
+            The choice; False if the function raised and `on_error` tolerates that.
+        """
+        try:
+            return bool(choose(*about))
+        except Exception as error:
+            if not self.tolerates(what, error):
+                raise
+            return False
 
     @contextlib.contextmanager
     def tolerating(
@@ -268,10 +292,11 @@ class MonitoredRun:
             self._late += late
 
     def leave(self) -> None:
-        """Release the journal and the logs as they are. Idempotent."""
+        """Release the journal, the logs and the lock as they are. Idempotent."""
         for logs in (self.logs, self.clip_logs):
             logs.release()
         self._journal.close()
+        self._lock.release()
 
     def _found(self, *, wait: bool) -> Mapping[str, Any] | None:
         if (stated := self._statements) is not None:
@@ -287,22 +312,24 @@ class MonitoredRun:
                 self.note("fault", facts)
                 return
 
-    def _write(self, write: Callable[[], None]) -> None:
+    def _write(self, write: Callable[..., None], *line: Any) -> None:
+        self._lines += 1
         try:
-            write()
+            write(*line)
         except FileNotWritten as error:
             if not self.tolerates("journal", error):
                 raise
+        self._note_stated_faults()
 
     # --- facts -----------------------------------------------------------------------
 
     @property
-    def episode(self) -> BegunEpisode:
+    def episode(self) -> EpisodeRecording:
         """The running episode."""
         assert self._episode is not None, "there was no reset"
         return self._episode
 
-    def begin(self, episode: BegunEpisode) -> None:
+    def begin(self, episode: EpisodeRecording) -> None:
         """Begin an episode. From now on, faults are attributed to it."""
         self._episode = episode
         self.events.begin(episode.episode_id, chosen=False)

@@ -15,30 +15,25 @@ from typing import Any, Final
 from ..errors import DirectoryNotWritable, Error, FileNotWritten
 from ..formats.bundle import FINISHED
 from ..formats.journal import JournalEntry
-from ..formats.manifest import GYM_VERSION
 from ..formats.monitor_directory import (
     episode_of,
-    stats_prefix,
     video_prefix,
 )
 from ..formats.spans import recordings_in_flight
 from ..formats.video_metadata import note_failure, reason_of
-from ..provenance import versions
 from ..results.manifest_writing import write_manifest_and_stats
 from .clips import Clips
 from .ending_reasons import CLOSE, RESET, ending
-from .episode_choice import EpisodeChoice
 from .fast_path import FastPath
 from .finishers import Finisher, LaterFinisher
 from .kept_videos import KeptVideos
-from .monitored_run import BegunEpisode, MonitoredRun
-from .opening import open_directory
-from .options import DEFERRED, LIVE, RecorderOptions, type_of_mode
+from .monitored_run import MonitoredRun
+from .options import DEFERRED, LIVE, OFF, RecorderOptions, type_of_mode
 from .recorded_environment import RecordedEnvironment, check_frames
 from .recording import EpisodeRecording
-from .selection import Standing
+from .selection import EpisodeChoice, Standing
 from .states import DeferredVideo
-from .stats_recorder import StatsRecorder, reward_to_float
+from .stats_recorder import reward_to_float
 from .tracking import FinishedEpisode
 from .video_recorder import VideoRecorder
 
@@ -84,12 +79,10 @@ class Recorder:
         options: RecorderOptions,
         finisher: Callable[[Path], Finisher] | None = None,
     ) -> None:
-        self._choice = EpisodeChoice(options, mode=env.rendering.mode)
-        draws = self._choice.has_videos or options.has_clips
-        if env.rendering.mode == LIVE and draws:
+        mode = env.rendering.mode
+        self._choice = EpisodeChoice(options, draws=mode != OFF)
+        if mode == LIVE and (self._choice.has_videos or options.has_clips):
             check_frames(env)
-        self._env = env
-        self._options = options
         self._pid = os.getpid()
         self._is_forked = False
         _recorders.add(self)
@@ -99,54 +92,26 @@ class Recorder:
         self.closed = False
         self.fast: FastPath | None = None
         self.evaluation_facts: Callable[[], Mapping[str, Any] | None] = lambda: None
-
         selection = self._choice.selection
-        keep = None if selection is None else selection.facts()
-        self._place = open_directory(
+        self.run = MonitoredRun(
             directory,
-            force=options.force,
-            resume=options.resume,
-            uid=options.uid,
-            env_info={"gym_version": GYM_VERSION, "env_id": env.env_id},
-            facts={
-                "schedule": self._choice.schedule_name,
-                "keep": keep,
-                "versions": dict(versions()),
-                "views": [*env.further_views],
-                "environment": env.environment,
-                "options": {**options.recorded(), **env.view},
-            },
-            statements=options.statements,
+            env=env,
+            options=options,
+            finisher=finisher,
+            schedule=self._choice.schedule_name,
+            rule=None if selection is None else selection.name,
         )
-        self.directory, infix = self._place.path, self._place.infix
-        self.infix = str(infix)
-        self.episode_id = self._place.first_episode_id
+        self.directory, self.infix = self.run.directory, str(self.run.infix)
+        self.episode_id = self.run.first_episode_id
+        self.stats_recorder = self.run.stats
         self._states = [
             each for each in (env.states, env.clip_states) if each is not None
         ]
         for states in self._states:
             states.open(self.directory)
-        self.stats_recorder = StatsRecorder(
-            str(self.directory),
-            stats_prefix(infix),
-            env_id=env.env_id,
-            allow_early_reset=options.allow_early_reset,
-        )
-        self.stats_recorder.type = type_of_mode(options.mode)
-        self.stats_recorder.clock = options.clock
-        self.run = MonitoredRun(
-            self._place,
-            env=env,
-            options=options,
-            stats=self.stats_recorder,
-            finisher=LaterFinisher() if finisher is None else finisher(self.directory),
-            selection=(
-                {} if selection is None else {"rule": selection.name, "decided": False}
-            ),
-        )
         self._kept = None if selection is None else KeptVideos(selection)
         self._clips = Clips(self.run) if options.has_clips else None
-        draws_later = env.rendering.mode == DEFERRED and self._clips is None
+        draws_later = mode == DEFERRED and self._clips is None
         if draws_later and self._choice.will_choose(self.episode_id):
             self.run.finisher.expect()
 
@@ -197,8 +162,8 @@ class Recorder:
 
     def resetting(self) -> AbstractContextManager[None]:
         """Return a context manager in which to reset the environment."""
-        states = self._env.states
-        if states is None or self._env.rendering.mode == LIVE:
+        states = self.run.env.states
+        if states is None or self.run.env.rendering.mode == LIVE:
             return contextlib.nullcontext()
         return states.resetting()
 
@@ -218,7 +183,7 @@ class Recorder:
         self._reset_time = now
         self._random_state = None
         if self._choice.may_keep_trajectory(self.stats_recorder.type):
-            self._random_state = self._env.random_state()
+            self._random_state = self.run.env.random_state()
 
     def reset(
         self, *, seed: Any = None, options: Any = None, observation: Any = None
@@ -245,21 +210,17 @@ class Recorder:
             self._cut_episode(RESET)
         self._ending = None
         self.stats_recorder.after_reset()
-        self.run.begin(
-            BegunEpisode(
-                episode_id=self.episode_id,
-                type=self.stats_recorder.episode_type,
-                start_time=self._reset_time,
-                seed=seed,
-                options=options,
-                random_state=self._random_state,
-                reset_clock=self._env.clock() if self._options.annotate else None,
-            )
-        )
-        self.episode_id += 1
         # The previous episode's recording is over, even if the schedule raises.
-        recording = EpisodeRecording(self.run, on_frame_error=self.note_error)
-        self._recording = recording
+        recording = self._recording = EpisodeRecording(
+            self.run,
+            episode_id=self.episode_id,
+            start_time=self._reset_time,
+            seed=seed,
+            options=options,
+            random_state=self._random_state,
+        )
+        self.run.begin(recording)
+        self.episode_id += 1
         try:
             self._begin_episode(recording, observation)
         except Exception as error:
@@ -270,7 +231,7 @@ class Recorder:
                 recording.live.give_up(str(error))
         if self._clips is None:
             self.fast = recording.fast_path()
-        if self._options.write_upon_reset:
+        if self.run.options.write_upon_reset:
             with self.run.tolerating("statistics", FileNotWritten, of_episode=False):
                 self._write_results()
 
@@ -335,8 +296,8 @@ class Recorder:
                 success; None if it does not report that.
         """
         reward = reward_to_float(reward)
+        done = bool(terminated or truncated)
         flags = {"terminated": bool(terminated), "truncated": bool(truncated)}
-        done = any(flags.values())
         fast, self.fast = self.fast if done else None, None
         self._ending = None
         recording, clips = self._recording, self._clips
@@ -367,16 +328,15 @@ class Recorder:
         else:
             self.stats_recorder.count(reward, done)
         if not done:
-            self._take_frames(failures, clips, reward, flags, frame)
+            self._take_frames(failures, reward, flags, frame)
             if clips is None and recording is not None:
                 self.fast = recording.fast_path()
         else:
-            episode = self._finished_episode(flags, success)
             self._end_episode(
                 {"complete": True, **flags},
-                episode,
                 failures,
-                take=lambda: self._take_frames(failures, clips, reward, flags, frame),
+                success=success,
+                take=lambda: self._take_frames(failures, reward, flags, frame),
             )
         failures.raise_first()
 
@@ -445,26 +405,21 @@ class Recorder:
         return stats.done is False and stats.steps == 0 and self._ending is None
 
     def _begin_episode(self, recording: EpisodeRecording, observation: Any) -> None:
-        episode = self.run.episode
-        wanted = keeps = False
-        # If a user's function raises, the episode is recorded without what it decides.
-        with self.run.tolerating("video", Exception):
-            wanted = self._choice.decide(episode.episode_id)
+        choice, number = self._choice, recording.episode_id
+        wanted = recording.is_chosen = self.run.ask("video", choice.decide, number)
         if self._clips is not None:
             self._clips.reset(is_chosen=wanted)
-        chosen = wanted and self._kept is None
-        self.run.events.begin(episode.episode_id, chosen=chosen)
+        self.run.events.begin(number, chosen=wanted and self._kept is None)
         # With clips the episode has no video of its own.
         wanted = wanted and self._clips is None
-        with self.run.tolerating("trajectory", Exception):
-            keeps = self._choice.keeps_trajectory(
-                episode.episode_id, episode_type=episode.type, has_video=wanted
-            )
+        keeps = self.run.ask(
+            "trajectory", choice.keeps_trajectory, number, recording.type, wanted
+        )
         recording.begin(
             observation,
             wants_video=wanted,
             keeps=keeps,
-            stays=self._choice.keeps_without_video(episode.type),
+            stays=choice.keeps_without_video(recording.type),
         )
 
     def _take_last_frame(self) -> None:
@@ -477,19 +432,23 @@ class Recorder:
     def _take_frames(
         self,
         failures: _Failures,
-        clips: Clips | None,
         reward: float,
-        flags: dict[str, bool],
+        flags: Mapping[str, bool],
         frame: bool,
     ) -> None:
         """Take a step's live frames, and the clip's frame."""
         live = None if self._recording is None else self._recording.live
         if live is not None:
             with failures:
-                live.take(last=any(flags.values()), is_there=frame)
-        if clips is not None:
+                try:
+                    live.take(last=any(flags.values()), is_there=frame)
+                except Exception as error:
+                    # It may come from the environment itself.
+                    self.note_error(error)
+                    raise
+        if self._clips is not None:
             with failures:
-                clips.step(reward, **flags, has_frame=frame)
+                self._clips.step(reward, **flags, has_frame=frame)
 
     def _cut_episode(self, reason: str) -> None:
         """End the running episode, if any, as incomplete.
@@ -508,7 +467,7 @@ class Recorder:
             return
         failures = _Failures()
         facts = {"complete": False, **(self._ending or {"reason": reason})}
-        self._end_episode(facts, None, failures)
+        self._end_episode(facts, failures)
         failures.raise_first()
 
     def _leave_recording(self, recording: EpisodeRecording) -> None:
@@ -521,45 +480,55 @@ class Recorder:
     def _end_episode(
         self,
         facts: Mapping[str, Any],
-        episode: FinishedEpisode | None,
         failures: _Failures,
+        *,
+        success: bool | None = None,
         take: Callable[[], None] = lambda: None,
     ) -> None:
-        """End an episode's recording, and submit, hold or drop it.
+        """End the running episode's recording, and submit, hold or drop it.
 
         Args:
             facts: the facts about the episode's end.
-            episode: the episode; None if it is not complete.
             failures: collects the errors raised here.
+            success: whether the environment reports a success; None if unknown.
             take: takes the episode's last frames.
         """
-        recording, kept = self._recording, self._kept
-        if recording is None:
-            return
-        # Only once, even if this is interrupted: recovery completes the rest.
-        recording.is_over = True
-        if not self._choice.has_chosen(recording.episode_id):
-            # A schedule's decision is final.
-            kept = None
+        recording, is_complete = self.run.episode, facts["complete"]
+        # A schedule's decision is final.
+        kept = self._kept if recording.is_chosen else None
+        known = self._results(facts, success) if is_complete else None
+        episode = None
+        if known is not None and (kept is not None or self.run.trackers):
+            total = self.stats_recorder.total_steps
+            episode = FinishedEpisode(**known, total_steps=total)
         standing = Standing.CHOSEN
         if kept is not None:
             standing = kept.judge(recording.episode_id, episode)
+        is_dropped = standing is Standing.DROPPED
+        is_chosen = recording.is_chosen and standing is Standing.CHOSEN
+        # Only once, even if this is interrupted: recovery completes the rest.
+        recording.is_over = True
         try:
             # After a kill, an episode without its model would be useless.
             for states in self._states:
                 states.settle()
             # Before any drawing, so that a failing video cannot lose the episode.
             with failures:
-                self._journal_end(recording, facts, episode, standing)
+                self._journal_end(
+                    {"episode_id": recording.episode_id, "reason": facts.get("reason")},
+                    known,
+                    chosen=is_chosen,
+                    recording=None if is_dropped else recording.mode,
+                )
             take()
-            if standing is Standing.DROPPED and not recording.stays:
+            if is_dropped and not recording.stays:
                 with failures:
                     recording.discard()
             else:
-                if kept is not None and standing is Standing.CHOSEN and recording.live:
+                if kept is not None and is_chosen and recording.live:
                     recording.live.say(selection=kept.chosen_facts())
                 with failures:
-                    recording.end(facts, end_time=self._end_time(facts, episode))
+                    recording.end(facts, end_time=self._end_time(facts))
                 with failures:
                     if kept is None:
                         recording.hand_on()
@@ -572,54 +541,41 @@ class Recorder:
             self._leave_recording(recording)
             raise
         if episode is not None:
-            has_video = recording.video.enabled and standing is not Standing.DROPPED
+            has_video = recording.video.enabled and not is_dropped
             self.run.trackers.episode(episode, has_video=has_video)
 
-    def _end_time(
-        self, facts: Mapping[str, Any], episode: FinishedEpisode | None
-    ) -> float:
-        if episode is not None:
-            return episode.end_time
-        return self._reset_time if facts.get("reason") == RESET else self.run.clock()
+    def _end_time(self, facts: Mapping[str, Any]) -> float:
+        if facts["complete"]:
+            return self.stats_recorder.timestamps[-1]
+        return self._reset_time if facts["reason"] == RESET else self.run.clock()
 
-    def _finished_episode(
-        self, flags: dict[str, bool], success: bool | None
-    ) -> FinishedEpisode:
-        stats, episode = self.stats_recorder, self.run.episode
-        return FinishedEpisode(
-            episode_id=episode.episode_id,
-            length=stats.episode_lengths[-1],
-            reward=stats.episode_rewards[-1],
-            type=stats.episode_types[-1],
-            success=success,
-            seed=episode.seed,
-            options=episode.options,
-            start_time=episode.start_time,
-            end_time=stats.timestamps[-1],
-            total_steps=stats.total_steps,
-            **flags,
-        )
+    def _results(
+        self, flags: Mapping[str, Any], success: bool | None
+    ) -> dict[str, Any]:
+        """Return the facts about a complete episode that are known at its end."""
+        stats, recording = self.stats_recorder, self.run.episode
+        return {
+            "episode_id": recording.episode_id,
+            "length": stats.episode_lengths[-1],
+            "reward": stats.episode_rewards[-1],
+            "type": recording.type,
+            "start_time": recording.start_time,
+            "end_time": stats.timestamps[-1],
+            "seed": recording.seed,
+            "options": recording.options,
+            "terminated": flags["terminated"],
+            "truncated": flags["truncated"],
+            "success": success,
+        }
 
     def _journal_end(
-        self,
-        recording: EpisodeRecording,
-        facts: Mapping[str, Any],
-        episode: FinishedEpisode | None,
-        standing: Standing,
+        self, cut: Mapping[str, Any], known: Mapping[str, Any] | None, **choice: Any
     ) -> None:
-        is_chosen = (
-            self._choice.has_chosen(recording.episode_id)
-            and standing is Standing.CHOSEN
-        )
-        is_out = standing is Standing.DROPPED
-        choice = {"chosen": is_chosen, "recording": None if is_out else recording.mode}
-        if episode is None:
-            number = {"episode_id": recording.episode_id}
-            self.run.note("cut", {**number, "reason": facts.get("reason"), **choice})
+        if known is None:
+            self.run.note("cut", {**cut, **choice})
         else:
-            known = {**vars(episode), **choice, "evaluation": self.evaluation_facts()}
-            del known["total_steps"]
-            self.run.add(JournalEntry(**known))
+            evaluation = self.evaluation_facts()
+            self.run.add(JournalEntry(**known, **choice, evaluation=evaluation))
 
     def _end_recordings(self) -> None:
         """End all running recordings, even if some of them fail. Idempotent."""
@@ -684,7 +640,6 @@ class Recorder:
             if each is not None:
                 each.leave()
         self.run.leave()
-        self._place.lock.release()
 
     def _say_what_is_left(self, pending: int) -> None:
         """Log the command that renders or finishes the rest."""
@@ -722,12 +677,12 @@ class Recorder:
         number = episode_of(name)
         if number is None or not name.endswith(FINISHED):
             return name
-        return f"{video_prefix(self._place.infix, number)}.mp4"
+        return f"{video_prefix(self.run.infix, number)}.mp4"
 
     def _write_results(self) -> int:
         listing = write_manifest_and_stats(
             self.directory,
-            self._place.infix,
+            self.run.infix,
             run=self.run.events,
             stats=self.stats_recorder.stats(),
             is_own=True,

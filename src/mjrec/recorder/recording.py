@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -26,11 +26,17 @@ class EpisodeRecording:
 
     Args:
         run: the monitored run.
-        on_frame_error: function that is called with an error if drawing a step's frame
-            live raises it. The error may come from the environment itself.
+        episode_id: the episode's number.
+        start_time: time just before the reset, in seconds since the Unix epoch.
+        seed: the seed given to `reset`.
+        options: the options given to `reset`.
+        random_state: state of the environment's random generator before the reset, as
+            JSON values; None if unknown or not needed.
 
     Attributes:
-        episode_id: the episode's number.
+        type: `"t"` for training, `"e"` for evaluation.
+        reset_clock: simulated time of the reset, if frames show the time.
+        is_chosen: whether the schedule chose the episode.
         video: the live or deferred video recorder. It is disabled if the episode gets
             no video.
         states: the recorder of the states; None if states are not recorded.
@@ -43,15 +49,23 @@ class EpisodeRecording:
         self,
         run: MonitoredRun,
         *,
-        on_frame_error: Callable[[Exception], object],
+        episode_id: int,
+        start_time: float,
+        seed: Any,
+        options: Any,
+        random_state: Any,
     ) -> None:
-        self.episode_id = run.episode.episode_id
+        self.episode_id, self.start_time = episode_id, start_time
+        self.seed, self.options = seed, options
+        self.type = run.stats.episode_type
+        self.reset_clock = run.env.clock() if run.options.annotate else None
         self.video: VideoRecorder | DeferredVideo = run.no_video
         self.states: StateRecorder | None = None
         self.live: LiveVideos | None = None
-        self.stays = self.is_over = False
+        self.is_chosen = self.stays = self.is_over = False
         self._run = run
-        self._on_frame_error = on_frame_error
+        self._random_state = random_state
+        self._name = trajectory_prefix(run.infix, episode_id)
         # The facts about the video for the log; None if the episode gets no video.
         self._pending_video: Mapping[str, Any] | None = None
 
@@ -74,12 +88,12 @@ class EpisodeRecording:
             stays: whether the trajectory is kept even if the video is dropped.
         """
         run, capture = self._run, self._run.env.states
+        if keeps or wants_video:
+            self._path = run.logs.path_of(self._name)
         deferred = wants_video and run.env.rendering.mode == DEFERRED
         if deferred:
             # The finisher starts while the model is inspected.
-            run.finisher.expect(
-                run.logs.path_of(trajectory_prefix(run.infix, self.episode_id))
-            )
+            run.finisher.expect(self._path)
         start = None
         if capture is not None and (keeps or deferred):
             start = capture.begin_episode()
@@ -98,12 +112,7 @@ class EpisodeRecording:
             assert self.states is not None
             self.video = DeferredVideo(run.directory, name, self.states)
         elif wants_video:
-            live = live_videos(
-                run,
-                run.directory / name,
-                second_name=second_name,
-                on_frame_error=self._on_frame_error,
-            )
+            live = live_videos(run, run.directory / name, second_name=second_name)
             self.video = live.recorders[0]
             if self.video.enabled:
                 self.live = live
@@ -160,8 +169,7 @@ class EpisodeRecording:
     def hand_on(self) -> None:
         """Submit the recording to the finisher, and announce videos to the trackers."""
         self.expect()
-        if self.states is not None:
-            self.states.submit()
+        self._submit()
 
     def expect(self) -> None:
         """Arrange for trackers to be notified of the videos once they exist."""
@@ -204,10 +212,15 @@ class EpisodeRecording:
             return
         if self.stays:
             self.states.amend({"candidate": False, "video": None})
-            self.states.submit()
+            self._submit()
             self._run.note("dropped", self.episode_id)
         else:
             self.states.drop()
+
+    def _submit(self) -> None:
+        # Without a span the disk was too full for a single row: no video will come.
+        if self.states is not None and self.states.is_there:
+            self._run.submit(self._path)
 
     def _new_states(
         self, start: EpisodeStart | None, observation: Any, name: str, *, is_kept: bool
@@ -215,7 +228,7 @@ class EpisodeRecording:
         run = self._run
         facts = {
             **run.recording_facts(start),
-            "random_state": run.episode.random_state,
+            "random_state": self._random_state,
             "kept": is_kept,
             "video": self._pending_video,
         }
@@ -227,7 +240,7 @@ class EpisodeRecording:
             facts["candidate"] = is_candidate
         return StateRecorder(
             run,
-            trajectory_prefix(run.infix, self.episode_id),
+            self._name,
             logs=run.logs,
             what="trajectory",
             facts=facts,

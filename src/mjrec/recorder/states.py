@@ -18,10 +18,9 @@ from ..errors import FileNotWritten, PicturesDiffer
 from ..formats.span_writer import SpanLogs, SpanWriter
 from ..formats.trajectory import ModelChange, row_dtype
 from ..rates import rate_from_timestep, stride_for
-from ..simulation.raw_memory import words_of
 from .fast_path import FastPath, gathering
 from .monitored_run import MonitoredRun, What
-from .step_arrays import RowLayout, StepArray, action_array, step_array
+from .step_arrays import StepArray, action_array, step_array
 
 if TYPE_CHECKING:
     from ..simulation.capture import Capture, EpisodeStart
@@ -85,45 +84,39 @@ class StateRecorder:
         self._max_fps = max_fps
         self._has_actions = has_actions
         self._is_alone = is_alone
-        self._state = None if start is None else start.state
-        self._snapshot = None if start is None else start.snapshot
-        self._takes_frames = self._snapshot is not None
-        self._layout: RowLayout | None = None
+        self._takes_frames = start is not None and start.snapshot is not None
         self._span: SpanWriter | None = None
         self._fast: FastPath | None = None
         self._irregular: set[str] = set()
         # Pairs of a step and the dtype of the actions from that step on.
         self._action_dtypes: list[list[Any]] = []
+        # The parts of the reset's row.
+        self._first: dict[str, Any] = {"action": 0}
+        self._first_change: Mapping[str, NDArray[Any]] | None = None
         self._observation = None if observation is None else step_array(observation)
-        self._first_observation = None
         if self._observation is not None:
             self._observation.set(observation)
-            self._first_observation = self._observation.values.copy()
-        self._first_state = np.empty(_words(self._state))
-        self._first_snapshot = np.empty(_words(self._snapshot), np.uint64)
-        self._first_change: Mapping[str, NDArray[Any]] | None = None
-        self._first_time = run.env.clock()
-        if capture is None:
-            self._first_state.fill(np.nan)
+            self._first["observation"] = self._observation.values.copy()
+        if capture is None or start is None:
+            self._first_time = run.env.clock()
         else:
-            capture.capture_state(self._first_state)
-            if self._takes_frames:
-                self._first_change = capture.capture_snapshot(self._first_snapshot)
+            state = self._first["state"] = np.empty(start.state.itemsize // 8)
+            capture.capture_state(state)
+            # A state begins with the time.
+            self._first_time = float(state[0])
+            if start.snapshot is not None:
+                snapshot = np.empty(start.snapshot.itemsize // 8, np.uint64)
+                self._first_change = capture.capture_snapshot(snapshot)
+                self._first["snapshot"] = snapshot
         self._pace = run.paces.get(logs)
         self._action: StepArray | None = None
-        last = run.layouts.get(logs)
-        if has_actions and last is not None:
-            self._use_action(last.action)
+        if has_actions:
+            self._use_action(run.actions.get(logs))
         if self._pace is not None and (not has_actions or self._action is not None):
             # Most likely nothing has changed since the last recording. If the row
             # cannot be written, the first step reports it.
             with contextlib.suppress(FileNotWritten):
                 self._begin(self._pace)
-
-    @property
-    def path(self) -> Path:
-        """The resulting file."""
-        return self._logs.path_of(self._name)
 
     @property
     def is_there(self) -> bool:
@@ -275,16 +268,6 @@ class StateRecorder:
             if not self._run.tolerates(self._what, error):
                 raise
 
-    def submit(self, recording: Path | None = None) -> None:
-        """Submit the ended recording to the finisher.
-
-        Args:
-            recording: the clip that this is the last part of, if any.
-        """
-        # Without a span the disk was too full for a single row: no video will come.
-        if self._span is not None or recording is not None:
-            self._run.submit(recording or self.path)
-
     def drop(self) -> None:
         """Discard its rows, even after the recording has ended.
 
@@ -321,16 +304,18 @@ class StateRecorder:
         self.note(broken_reason=reason)
 
     def _new_fast_path(self, span: SpanWriter) -> FastPath | None:
-        layout, start, action = self._layout, self._start, self._action
-        if layout is None or layout.words is None or start is None or action is None:
+        start, action = self._start, self._action
+        if start is None or start.words is None or action is None:
+            return None
+        if action.words is None:
             return None
         return gathering(
             self._run.stats,
             span,
-            layout.words,
+            np.concatenate([start.words, action.words]),
             set_action=action.set,
             is_current=start.is_current,
-            is_on_pace=lambda: self._measured_pace() == self._pace,
+            is_on_pace=lambda now: self._measured_pace(now) == self._pace,
             stride=self._stride,
         )
 
@@ -338,7 +323,7 @@ class StateRecorder:
         """Return the span for the next row, begun or corrected at the first step."""
         if self._span is not None and self.steps:
             return self._span
-        pace = self._measured_pace()
+        pace = self._measured_pace(self._run.env.clock())
         if self._span is None:
             self._begin(pace)
         elif pace != self._pace:
@@ -354,64 +339,35 @@ class StateRecorder:
 
     def _begin(self, pace: Mapping[str, Any]) -> None:
         """Begin the span and write the reset's row."""
+        action, start = self._action, self._start
         self._run.paces[self._logs] = self._pace = pace
-        layout = self._layout = self._new_layout()
+        self._run.actions[self._logs] = action
         facts = {**self._facts, **self._parts(), **pace}
-        action = self._action
         if action is not None and action.given is not None:
             self._action_dtypes = [[0, _dtype_name(action.given)]]
             facts["action_dtypes"] = self._action_dtypes
-        span = self._logs.begin(self._name, facts, layout.dtype, alone=self._is_alone)
+        dtype = _row_dtype(
+            state=None if start is None else start.state,
+            snapshot=None if start is None else start.snapshot,
+            action=None if action is None else action.kind,
+            observation=None if self._observation is None else self._observation.kind,
+        )
+        span = self._logs.begin(self._name, facts, dtype, alone=self._is_alone)
         try:
-            own = None if self._start is None else self._start.model_fields
+            own = None if start is None else start.model_fields
             for fields in (own, self._first_change):
                 if fields:
                     span.log.add_change(ModelChange(step=0, fields=fields))
-            columns, slot = span.log.columns, span.make_room()
-            first: dict[str, Any] = {
-                "state": self._first_state,
-                "snapshot": self._first_snapshot,
-                "action": 0,
-                "observation": self._first_observation,
-            }
-            for part, column in columns.items():
-                if part in first:
-                    column[slot] = first[part]
+            slot = span.make_room()
+            for part, column in span.log.columns.items():
+                if part in self._first:
+                    column[slot] = self._first[part]
             span.commit(0, is_frame=self._takes_frames)
             self._span = span
         except BaseException:
             # A video without its first frame would show nothing.
             span.drop()
             raise
-
-    def _new_layout(self) -> RowLayout:
-        """Return the row layout, reusing the last recording's if it still fits."""
-        start, action = self._start, self._action
-        kinds = (
-            self._state,
-            self._snapshot,
-            action,
-            None if self._observation is None else self._observation.kind,
-            None if start is None else start.words,
-        )
-        last = self._run.layouts.get(self._logs)
-        if last is not None and all(map(_is_same, last, kinds)):
-            return last
-        state, snapshot, _, observation, start_words = kinds
-        words = None
-        # With any other size the last word would include the memory after the action.
-        if start_words is not None and action is not None and action.size % 8 == 0:
-            words = np.concatenate([start_words, words_of([action.values])])
-        dtype = row_dtype(
-            state=state,
-            snapshot=snapshot,
-            action=None if action is None else action.kind,
-            observation=observation,
-        )
-        if last is not None and last.dtype == dtype:
-            dtype = last.dtype
-        layout = self._run.layouts[self._logs] = RowLayout(*kinds, dtype, words)
-        return layout
 
     def _write_state(self, span: SpanWriter, slot: int, *, has_frame: bool) -> None:
         if "state" not in span.log.columns:
@@ -479,14 +435,18 @@ class StateRecorder:
             logger.warning(
                 "%s: from step %d on, the %s have a different type or shape and are "
                 "recorded as zeros.",
-                self.path.name,
+                self._logs.path_of(self._name).name,
                 self.steps,
                 what,
             )
 
-    def _measured_pace(self) -> Mapping[str, Any]:
-        """Return the rate, the first step's measured time, and the frame stride."""
-        began, now = self._first_time, self._run.env.clock()
+    def _measured_pace(self, now: float | None) -> Mapping[str, Any]:
+        """Return the rate, the first step's measured time, and the frame stride.
+
+        Args:
+            now: the simulated time after the first step.
+        """
+        began = self._first_time
         if began is None or now is None or now <= began:
             return _pace(self._run.env.declared(), None, self._max_fps)
         return _measured(now - began, self._max_fps)
@@ -502,10 +462,8 @@ def _pace(
     }
 
 
-def _is_same(one: object, other: object) -> bool:
-    # Comparing two dtypes field by field is slow, and they are nearly always identical.
-    return one is other or (isinstance(one, np.dtype) and one == other)
-
+# Cached because comparing dtypes is slow unless they are the same object.
+_row_dtype = functools.lru_cache(maxsize=16)(row_dtype)
 
 # Cached because NumPy builds the name on each access.
 _dtype_name = functools.lru_cache(maxsize=16)(lambda dtype: str(dtype.name))
@@ -516,10 +474,6 @@ _dtype_name = functools.lru_cache(maxsize=16)(lambda dtype: str(dtype.name))
 def _measured(seconds: float, max_fps: float | Fraction | None) -> Mapping[str, Any]:
     rate = rate_from_timestep(seconds)
     return _pace(rate, 1 / rate, max_fps)
-
-
-def _words(kind: np.dtype[Any] | None) -> int:
-    return 0 if kind is None else kind.itemsize // 8
 
 
 class DeferredVideo:

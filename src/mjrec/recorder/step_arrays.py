@@ -1,13 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Buffers for actions and observations, and the layout of rows."""
+"""Buffers for actions and observations."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from ..simulation.raw_memory import words_of
 
 _ARRAY = np.ndarray
 
@@ -22,6 +24,8 @@ class StepArray:
     Attributes:
         kind: dtype and shape of the array, as a subarray dtype.
         values: the array that was set last. It always uses the same memory.
+        words: where this memory is (see `raw_memory.WORDS`); None if the array does not
+            fill whole words.
         parts: names and shapes of the arrays in a dictionary, which are stored one
             after another; None for a plain array.
         given: the original dtype of the array that was set last; None before the first
@@ -38,6 +42,8 @@ class StepArray:
         self.kind = np.dtype((dtype, shape))
         self.parts = parts
         self.values: NDArray[Any] = np.zeros(shape, dtype)
+        is_whole = self.values.nbytes % 8 == 0
+        self.words = words_of([self.values]) if is_whole else None
         self._shape = self.values.shape
         # Remembered because the next array usually has the same dtype.
         self.given: np.dtype[Any] | None = None
@@ -47,11 +53,6 @@ class StepArray:
         self._kinds = "fiub" if dtype.kind == "f" else "iub"
         if dtype.kind == "u":
             self._kinds = "u"
-
-    @property
-    def size(self) -> int:
-        """Size of the array in bytes."""
-        return self.values.nbytes
 
     def set(self, value: Any) -> bool:
         """Copy a value into the buffer, and return whether it fits.
@@ -136,27 +137,3 @@ def _of_mapping(example: Mapping[str, Any]) -> StepArray | None:
     shapes = {name: array.shape for name, array in arrays.items()}
     size = sum(array.size for array in arrays.values())
     return StepArray(np.dtype("<f8"), (size,), shapes)
-
-
-class RowLayout(NamedTuple):
-    """The layout of rows, which the next recording usually shares.
-
-    Attributes:
-        state: dtype of the simulation state.
-        snapshot: dtype of the snapshot.
-        action: buffer for actions.
-        observation: dtype and shape of an observation.
-        start_words: memory locations of the state and the snapshot, if both can be
-            gathered.
-        dtype: dtype of a row.
-        words: memory locations of a row's content after its head, if the content can be
-            gathered.
-    """
-
-    state: np.dtype[Any] | None
-    snapshot: np.dtype[Any] | None
-    action: StepArray | None
-    observation: np.dtype[Any] | None
-    start_words: NDArray[np.intp] | None
-    dtype: np.dtype[Any]
-    words: NDArray[np.intp] | None
