@@ -169,8 +169,7 @@ class WorkerPool:
 
         Args:
             trajectory: the trajectory's file.
-            indices: the numbers of the frames, from 0, in any order; repetitions are
-                allowed.
+            indices: the numbers of the frames, from 0, in ascending order.
             view: the camera, size and quality; None means as recorded.
             cameras: cameras that replace that of the view; None among them is as
                 recorded. Each frame is then a grid of their frames.
