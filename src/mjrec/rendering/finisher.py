@@ -51,6 +51,7 @@ class Finisher:
             jobs.
 
     Attributes:
+        pool: the worker pool.
         progress: the progress so far.
         on_progress: as given; may be replaced.
     """
@@ -60,7 +61,7 @@ class Finisher:
     ) -> None:
         self.progress = Progress(frames=0)
         self.on_progress = on_progress
-        self._pool = pool
+        self.pool = pool
         # The plan is None if planning failed. The reason is reported by `do_next`.
         self._waiting: dict[str, tuple[VideoJob, Plan | None]] = {}
         self._gl_failure: GLError | None = None
@@ -70,7 +71,7 @@ class Finisher:
 
     def close(self) -> None:
         """End the workers. Idempotent."""
-        self._pool.close()
+        self.pool.close()
 
     def add(self, job: VideoJob) -> bool:
         """Add a job, and return whether there is anything to do."""
@@ -106,18 +107,7 @@ class Finisher:
         """Start the workers ahead of the first video. Idempotent."""
         # Errors are reported when the video is drawn.
         with contextlib.suppress(Error):
-            self._pool.start()
-
-    def prepare(self, recording: Path) -> None:
-        """Make the workers load a recording's model ahead of time.
-
-        The recording may still be running.
-        """
-        self._pool.prepare(recording)
-
-    def rest(self) -> None:
-        """Release the CPUs for other processes while there is nothing to do."""
-        self._pool.rest()
+            self.pool.start()
 
     def _count(self, **more: int) -> None:
         now = {name: getattr(self.progress, name) + more[name] for name in more}
@@ -178,7 +168,7 @@ class Finisher:
             return render_video(
                 plan.parts,
                 job.variant,
-                workers=self._pool,
+                workers=self.pool,
                 out=job.video,
                 strict=job.strict,
                 on_frame=lambda: self._count(frames_done=1),
