@@ -44,9 +44,9 @@ from ..formats.monitor_directory import (
     where_recordings_are,
 )
 from ..formats.regular_files import regular_path
+from ..rendering.leftovers import has_leftovers
 from ..rendering.recorded_facts import open_for_rendering
 from ..rendering.recordings import look_at, recordings
-from ..rendering.recovery import has_leftovers
 from ..results import iter_episodes
 from ..results.monitor_files import monitors_of
 from .layout import PACKED_EPISODES

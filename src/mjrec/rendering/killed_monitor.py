@@ -55,9 +55,9 @@ from ..results.manifest_writing import manifest_lock, write_manifest_and_stats
 from ..results.monitor_files import MonitorFiles, files_of
 from .jobs import key_of
 from .killed_videos import finish_text, finish_video
+from .leftovers import Kind, RecoveredFile, lacks_results, leftovers, logs_left
 from .recorded_facts import open_for_rendering, video_path
 from .recordings import claim, parts_of
-from .recovery import Kind, RecoveredFile, lacks_results, leftovers, logs_left
 
 logger = logging.getLogger(__name__)
 
