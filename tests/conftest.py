@@ -20,7 +20,7 @@ from processes import children, kill_children
 from trajectories_by_hand import Painter
 
 from mjrec.formats.ffmpeg import ffmpeg_executable
-from mjrec.rendering import engine_jobs, finisher
+from mjrec.rendering import finish
 
 _HAS_DM_CONTROL = importlib.util.find_spec("dm_control") is not None
 
@@ -192,8 +192,7 @@ def stuck_encoder(tmp_path_factory, monkeypatch):
 def painter(monkeypatch):
     """Draw without processes and without OpenGL; the encoder is the real one."""
     painter = Painter()
-    for module in (finisher, engine_jobs):
-        monkeypatch.setattr(module, "WorkerPool", lambda count, **rest: painter)
+    monkeypatch.setattr(finish, "WorkerPool", lambda count, **rest: painter)
     return painter
 
 

@@ -82,7 +82,7 @@ def change(model, number):
     return []
 
 
-def record(directory, *, camera="rider", fresh=False, facts=None):
+def record(directory, *, camera="rider", fresh=False, count=FRAMES, facts=None):
     """Record a ride as a log, with the frames that a viewer had shown."""
     model, data = start()
     option = mujoco.MjvOption()
@@ -125,7 +125,7 @@ def record(directory, *, camera="rider", fresh=False, facts=None):
         max_geom=1000,
         fresh=fresh,
     ) as renderer:
-        for number in range(FRAMES):
+        for number in range(count):
             names = change(model, number)
             move(model, data, number)
             # Frames are of every second step.

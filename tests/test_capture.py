@@ -12,8 +12,7 @@ from mjrec.errors import PicturesDiffer
 from mjrec.simulation.capture import Capture
 from mjrec.simulation.fields import apply_fields
 from mjrec.simulation.model_store import load_model
-from mjrec.simulation.self_check import differences
-from mjrec.simulation.snapshot import restore_snapshot
+from mjrec.simulation.snapshot import differences, restore_snapshot
 from mjrec.simulation.view import SceneView, view_from_facts
 
 BALL = """

@@ -58,10 +58,10 @@ sys.addaudithook(count)
 FINISH = f"""
 from pathlib import Path
 from trajectories_by_hand import Painter
-import mjrec.rendering.finisher
+import mjrec.rendering.finish
 from mjrec.rendering.finish import finish
 
-mjrec.rendering.finisher.WorkerPool = lambda count, **rest: Painter()
+mjrec.rendering.finish.WorkerPool = lambda count, **rest: Painter()
 {COUNT}
 for result in finish(Path(directory), workers=1):
     assert not result.failures, result

@@ -22,7 +22,7 @@ import mjrec
 from mjrec import UnreadableFile, UntrustedModel, load_trajectory
 from mjrec.commands import main
 from mjrec.formats.spans import recordings_in_flight
-from mjrec.rendering.engine_jobs import VideoWorker
+from mjrec.rendering.finish import VideoWorker
 from mjrec.simulation import model_trust
 from mjrec.simulation.model_store import load_model
 from mjrec.simulation.model_trust import (

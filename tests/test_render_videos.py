@@ -32,7 +32,7 @@ from mjrec import (
     render_videos,
 )
 from mjrec.formats.dataclass_json import from_json, to_json
-from mjrec.rendering.engine_jobs import VideoWorker
+from mjrec.rendering.finish import VideoWorker
 from mjrec.rendering.jobs import Progress, RecordingKey, RenderedVideos, VideoJob
 from mjrec.rendering.recordings import claim
 from mjrec.rendering.render_videos import name_of_variant

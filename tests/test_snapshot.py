@@ -11,8 +11,14 @@ import pytest
 from mjrec.errors import InvalidArgument
 from mjrec.formats.trajectory import packed
 from mjrec.simulation.captured_arrays import needs_constraints, snapshot_dtype
-from mjrec.simulation.self_check import differences, scene_difference, updated_scene
-from mjrec.simulation.snapshot import SnapshotSource, check_layout, restore_snapshot
+from mjrec.simulation.snapshot import (
+    SnapshotSource,
+    check_layout,
+    differences,
+    restore_snapshot,
+    scene_difference,
+    updated_scene,
+)
 from mjrec.simulation.states import read_state
 from mjrec.simulation.view import SceneView
 

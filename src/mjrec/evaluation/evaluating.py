@@ -41,7 +41,7 @@ from ..formats.monitor_directory import (
 from ..gl.choice import choose
 from ..provenance import versions
 from ..recorder.keep_rules import keep_rule
-from ..rendering.engine_jobs import environ_for_drawing
+from ..rendering.finish import environ_for_drawing
 from ..results import clear_monitor_files
 from .episode_results import EpisodeResult
 from .evaluation import (

@@ -22,9 +22,7 @@ from ..formats.monitor_directory import Infix
 from ..messages import unpacked
 from ..recorder.keep_rules import keep_rule
 from ..rendering.chosen_videos import write_choice
-from ..rendering.engine_jobs import do_on_engine
-from ..rendering.finish import bring_up_to_date
-from ..rendering.finisher import do_jobs
+from ..rendering.finish import bring_up_to_date, do_jobs
 from ..rendering.jobs import Progress, RecordingKey, VideoJob
 from ..simulation.model_trust import note_models
 from .chunk_results import ChunkResults, read_chunk
@@ -325,11 +323,9 @@ def draw_videos(
             )
         )
 
-    if engine is None:
-        done = do_jobs(jobs, directory, workers=workers, on_progress=show)
-    else:
-        done = do_on_engine(engine, jobs, on_progress=show)
-    for result in done:
+    for result in do_jobs(
+        jobs, directory, workers=workers, engine=engine, on_progress=show
+    ):
         elsewhere = dict.fromkeys(result.elsewhere, "Another process is drawing it.")
         for name, text in {**result.failures, **result.blank, **elsewhere}.items():
             why[result.directory / name] = text

@@ -214,7 +214,8 @@ class Background:
             return
         try:
             if self._child is None:
-                self._child = Child(_MODULE, *self._arguments, environ=_environ())
+                environ = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}
+                self._child = Child(_MODULE, *self._arguments, environ=environ)
         except OSError as error:
             self._replace(f"it could not be started: {error}")
             return
@@ -378,7 +379,7 @@ class _Work:
                 if not finisher:
                     # Before the parent is notified, because it may then end the
                     # process.
-                    finisher.rest()
+                    finisher.pool.rest()
                 self._parent.send(progress=vars(finisher.progress))
                 failures = {**result.failures, **result.blank}
                 self._parent.send(done=job.recording, failures=failures)
@@ -395,7 +396,8 @@ class _Work:
         if "expected" in message:
             self._finisher.start_workers()
             if (name := message["expected"]) is not None:
-                self._finisher.prepare(self._directory / name)
+                # It may still be running.
+                self._finisher.pool.prepare(self._directory / name)
         elif "recording" in message:
             name = message["recording"]
             job = VideoJob(
@@ -413,15 +415,6 @@ class _Work:
             # The parent reads only while it waits, and a pipe's buffer is small.
             if self._is_waited_for:
                 self._parent.send(progress=vars(progress))
-
-
-def _environ() -> dict[str, str]:
-    """Return the environment variables of the process."""
-    environ = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}
-    # Limit even a single worker to one CPU: the threads of Mesa's rasteriser would slow
-    # down the simulation.
-    environ.setdefault("LP_NUM_THREADS", "0")
-    return environ
 
 
 if __name__ == "__main__":

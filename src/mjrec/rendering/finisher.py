@@ -9,58 +9,23 @@ from __future__ import annotations
 
 import contextlib
 import logging
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-from ..errors import (
-    Error,
-    GLError,
-    InvalidArgument,
-)
+from ..errors import Error, GLError, InvalidArgument
 from ..formats import video_metadata
 from ..formats.spans import remove_if_done
 from ..formats.trajectory_file import finish_trajectory
 from .jobs import Progress, RenderedVideos, VideoJob, key_of
 from .pool import WorkerPool
 from .recorded_facts import further_video_paths, video_facts
-from .recordings import (
-    Plan,
-    claim,
-    look_at,
-    read_recording,
-    remove_unfinished,
-)
+from .recordings import Plan, claim, look_at, read_recording, remove_unfinished
 from .render_video import render_video
 
 logger = logging.getLogger(__name__)
 
 _OnProgress = Callable[[Progress], object]
-
-
-def do_jobs(
-    jobs: Iterable[VideoJob],
-    directory: Path,
-    *,
-    workers: int | None,
-    on_progress: _OnProgress = lambda _: None,
-) -> Iterator[RenderedVideos]:
-    """Do jobs with this process's own workers, and yield the result of each.
-
-    Args:
-        jobs: the jobs to do.
-        directory: the directory whose CPU locks are used if `workers` is None.
-        workers: number of processes that draw. None means one for each free CPU.
-        on_progress: called after every frame, and when a job has ended.
-    """
-    pool = WorkerPool(workers, directory=directory)
-    with contextlib.closing(Finisher(pool, on_progress=on_progress)) as finisher:
-        for job in jobs:
-            finisher.add(job)
-        while finisher:
-            _, result = finisher.do_next()
-            if not result.is_empty:
-                yield result
 
 
 def note_failure(directory: Path, name: str, reason: str) -> None:
@@ -82,9 +47,11 @@ class Finisher:
 
     Args:
         pool: the worker pool; `close` closes it.
-        on_progress: see `do_jobs`. It may add jobs.
+        on_progress: called after every frame, and when a job has ended. It may add
+            jobs.
 
     Attributes:
+        pool: the worker pool.
         progress: the progress so far.
         on_progress: as given; may be replaced.
     """
@@ -94,7 +61,7 @@ class Finisher:
     ) -> None:
         self.progress = Progress(frames=0)
         self.on_progress = on_progress
-        self._pool = pool
+        self.pool = pool
         # The plan is None if planning failed. The reason is reported by `do_next`.
         self._waiting: dict[str, tuple[VideoJob, Plan | None]] = {}
         self._gl_failure: GLError | None = None
@@ -104,7 +71,7 @@ class Finisher:
 
     def close(self) -> None:
         """End the workers. Idempotent."""
-        self._pool.close()
+        self.pool.close()
 
     def add(self, job: VideoJob) -> bool:
         """Add a job, and return whether there is anything to do."""
@@ -140,18 +107,7 @@ class Finisher:
         """Start the workers ahead of the first video. Idempotent."""
         # Errors are reported when the video is drawn.
         with contextlib.suppress(Error):
-            self._pool.start()
-
-    def prepare(self, recording: Path) -> None:
-        """Make the workers load a recording's model ahead of time.
-
-        The recording may still be running.
-        """
-        self._pool.prepare(recording)
-
-    def rest(self) -> None:
-        """Release the CPUs for other processes while there is nothing to do."""
-        self._pool.rest()
+            self.pool.start()
 
     def _count(self, **more: int) -> None:
         now = {name: getattr(self.progress, name) + more[name] for name in more}
@@ -159,10 +115,8 @@ class Finisher:
         self.on_progress(self.progress)
 
     def _do(self, job: VideoJob) -> RenderedVideos:
-        if job.video is None:
-            nothing, name = RenderedVideos(directory=job.directory), job.key.shown_name
-        else:
-            nothing, name = RenderedVideos(directory=job.video.parent), job.video.name
+        nothing = RenderedVideos(directory=job.video_directory)
+        name = job.shown_name
         try:
             if job.variant is not None:
                 plan = _plan(job)
@@ -214,7 +168,7 @@ class Finisher:
             return render_video(
                 plan.parts,
                 job.variant,
-                workers=self._pool,
+                workers=self.pool,
                 out=job.video,
                 strict=job.strict,
                 on_frame=lambda: self._count(frames_done=1),

@@ -139,6 +139,16 @@ class VideoJob:
         return str(self.video or self.directory / self.recording)
 
     @property
+    def shown_name(self) -> str:
+        """The name to show for it before it is known which videos it writes."""
+        return self.key.shown_name if self.video is None else self.video.name
+
+    @property
+    def video_directory(self) -> Path:
+        """The directory of the videos that it writes."""
+        return self.directory if self.video is None else self.video.parent
+
+    @property
     def key(self) -> RecordingKey:
         """The key of the recording that it finishes."""
         key = key_of(self.recording)

@@ -55,7 +55,7 @@ from ..results.manifest_writing import manifest_lock, write_manifest_and_stats
 from ..results.monitor_files import MonitorFiles, files_of
 from .jobs import key_of
 from .killed_videos import finish_text, finish_video
-from .leftovers import Kind, lacks_results, leftovers, logs_left
+from .leftovers import Kind, RecoveredFile, lacks_results, leftovers, logs_left
 from .recorded_facts import open_for_rendering, video_path
 from .recordings import claim, parts_of
 
@@ -69,16 +69,16 @@ class Report:
     """A report of finished files and failures.
 
     Attributes:
-        files: pairs of a file name and what was done.
-        failures: pairs of a file name and the reason.
+        files: files that were finished.
+        failures: files that could not be finished.
     """
 
-    files: list[tuple[str, str]] = field(default_factory=list)
-    failures: list[tuple[str, str]] = field(default_factory=list)
+    files: list[RecoveredFile] = field(default_factory=list)
+    failures: list[RecoveredFile] = field(default_factory=list)
 
     def note(self, name: str, what: str) -> None:
         """Note what was done about a file."""
-        self.files.append((name, what))
+        self.files.append(RecoveredFile(name, what))
 
     @contextlib.contextmanager
     def attempt(self, name: str) -> Iterator[None]:
@@ -86,10 +86,11 @@ class Report:
         try:
             yield
         except (Error, OSError) as error:
-            self.failures.append((name, str(error)))
+            self.failures.append(RecoveredFile(name, str(error)))
         except Exception as error:
             logger.exception("%s could not be recovered.", name)
-            self.failures.append((name, f"{type(error).__name__}: {error}"))
+            why = f"{type(error).__name__}: {error}"
+            self.failures.append(RecoveredFile(name, why))
 
     def remove(self, stale: Path) -> None:
         """Remove an unfinished file, or a lock file that no process holds."""
@@ -116,7 +117,9 @@ def finish_killed_monitor(
     path = directory / lock_name(infix)
     with report.attempt(path.name):
         was_killed = path.exists()
-        monitor = _KilledMonitor(directory, infix, report, bundles=bundles)
+        monitor = _KilledMonitor(
+            directory=directory, infix=infix, report=report, bundles=bundles
+        )
         # Before the lock is taken, because a lock file is the sign of a killed monitor.
         is_behind = lacks_results(files_of(directory, infix))
         lock = try_lock(path)
@@ -136,16 +139,14 @@ def finish_killed_monitor(
             write_manifest_and_stats(directory, infix)
 
 
+@dataclass(kw_only=True)
 class _KilledMonitor:
-    """A monitor that is not open."""
+    """A monitor that is not open; see `finish_killed_monitor`."""
 
-    def __init__(
-        self, directory: Path, infix: Infix, report: Report, *, bundles: bool
-    ) -> None:
-        self._directory = directory
-        self._infix = infix
-        self._report = report
-        self._bundles = bundles
+    directory: Path
+    infix: Infix
+    report: Report
+    bundles: bool
 
     def _left(self, kind: Kind) -> list[Path]:
         """Return the leftover files of one kind, as of now."""
@@ -157,7 +158,7 @@ class _KilledMonitor:
         Args:
             is_behind: whether statistics and manifest may be outdated.
         """
-        report = self._report
+        report = self.report
         for log in logs_left(self._files()):
             with report.attempt(log.name):
                 self._finish_log(log)
@@ -186,11 +187,11 @@ class _KilledMonitor:
             self._write_results()
 
     def _files(self) -> MonitorFiles:
-        return files_of(self._directory, self._infix)
+        return files_of(self.directory, self.infix)
 
     def _note_all(self, done: Iterable[tuple[str, str]]) -> None:
         for name, what in done:
-            self._report.note(name, what)
+            self.report.note(name, what)
 
     def _finish_log(self, log: Path) -> None:
         """Turn the episodes of a log into trajectories; remove the log if it is idle.
@@ -200,19 +201,19 @@ class _KilledMonitor:
         """
         in_flight = [each for each in recordings_in(log) if each.is_in_flight]
         episodes = [each for each in in_flight if each.path.suffix == FINISHED]
-        if self._bundles:
+        if self.bundles:
             self._bundle(each.path for each in episodes)
         else:
             for recording in episodes:
                 path = recording.path
-                with self._report.attempt(path.name), self._claimed(path) as is_ours:
+                with self.report.attempt(path.name), self._claimed(path) as is_ours:
                     if is_ours and recording.is_in_flight:
                         finish_trajectory(path)
-                        self._report.note(path.name, _how_long(path))
+                        self.report.note(path.name, _how_long(path))
         is_idle = not any(each.is_in_flight for each in recordings_in(log))
         if is_idle and any(map(Path.exists, files_beside(log))):
             remove_log(log)
-            self._report.note(log.name, "nothing in flight, removed")
+            self.report.note(log.name, "nothing in flight, removed")
 
     def _bundle(self, paths: Iterable[Path]) -> None:
         """Put episodes into the monitor's bundle."""
@@ -221,10 +222,10 @@ class _KilledMonitor:
             ours = [path for path in ours if not is_finished(path)]
             failures = bundle_trajectories(ours)
             for path in ours:
-                with self._report.attempt(path.name):
+                with self.report.attempt(path.name):
                     if path in failures:
                         raise failures[path]
-                    self._report.note(path.name, _how_long(path))
+                    self.report.note(path.name, _how_long(path))
 
     @contextlib.contextmanager
     def _claimed(self, path: Path) -> Iterator[bool]:
@@ -233,7 +234,7 @@ class _KilledMonitor:
         if key is None:
             yield True
             return
-        lock = claim(self._directory, key)
+        lock = claim(self.directory, key)
         with contextlib.nullcontext() if lock is None else lock:
             yield lock is not None
 
@@ -265,7 +266,7 @@ class _KilledMonitor:
         with contextlib.suppress(UnreadableFile):
             if number is None:
                 return {}
-            path = find_trajectory(self._directory, self._infix, number)
+            path = find_trajectory(self.directory, self.infix, number)
             if path is not None:
                 return _facts_of(path)
         return {}
@@ -305,12 +306,12 @@ class _KilledMonitor:
         Some may repeat lines of the journal. Unreadable clips are left out; rendering
         the directory reports them.
         """
-        in_flight = recordings_in_flight(self._directory, self._infix)
+        in_flight = recordings_in_flight(self.directory, self.infix)
         for key in {key_of(each.name) for each in in_flight}:
             if key is None or not key.is_clip:
                 continue
             with contextlib.suppress(UnreadableFile, IndexError):
-                parts = parts_of(self._directory, key)
+                parts = parts_of(self.directory, key)
                 facts, last = _facts_of(parts[0]), _facts_of(parts[-1])
                 yield (
                     "clip",
@@ -331,9 +332,9 @@ class _KilledMonitor:
     def _complete_journal(self, now: MonitorFiles) -> None:
         """Add the lines that the monitor did not live to write."""
         lines = [*self._missing_episodes(now), *self._missing_clips(now)]
-        path = self._directory / journal_name(self._infix)
+        path = self.directory / journal_name(self.infix)
         writer = JournalWriter(path, run=self._run_facts(now))
-        with contextlib.closing(writer), manifest_lock(self._directory, self._infix):
+        with contextlib.closing(writer), manifest_lock(self.directory, self.infix):
             for kind, facts in (*lines, ("recovered", {})):
                 if kind == "episode":
                     writer.append(entry_of(facts))
@@ -341,12 +342,12 @@ class _KilledMonitor:
                     writer.note(kind, facts)
         added = sum(kind == "episode" for kind, _ in lines)
         if added:
-            self._report.note(path.name, f"{counted(added, 'episode')} added")
+            self.report.note(path.name, f"{counted(added, 'episode')} added")
 
     def _run_facts(self, now: MonitorFiles) -> Mapping[str, Any]:
         """Return the first line for a journal that is lost or was never written."""
         with contextlib.suppress(OSError, ValueError):
-            if run := locked_run(self._directory / lock_name(self._infix)):
+            if run := locked_run(self.directory / lock_name(self.infix)):
                 return run
         results = MonitorResults(now)
         details = results.details
@@ -358,16 +359,16 @@ class _KilledMonitor:
         }
 
     def _write_results(self) -> None:
-        written = write_manifest_and_stats(self._directory, self._infix, is_own=True)
+        written = write_manifest_and_stats(self.directory, self.infix, is_own=True)
         assert written is not None
-        manifest, note = written.manifest, self._report.note
+        manifest, note = written.manifest, self.report.note
         if written.stats is not None and written.is_new_stats:
             note(manifest.stats, counted(len(written.stats.timestamps), "episode"))
         if written.is_new_manifest:
             pending = len(written.pending)
             rest = f", {pending} pending: mjrec render" if pending else ""
             what = f"{counted(len(manifest.videos), 'video')}{rest}"
-            note(manifest_name(self._infix), what)
+            note(manifest_name(self.infix), what)
 
 
 def _how_long(path: Path) -> str:

@@ -8,6 +8,7 @@ simulation's process.
 from __future__ import annotations
 
 import re
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
@@ -33,6 +34,22 @@ _SHARED_LOCK = re.compile(r"\.openaigym\.(recover|render\.\d+)\.lock")
 # "stale" an unfinished file that no process will finish, or a dead process's lock.
 # Leftovers are finished in this order, after the logs.
 Kind = Literal["video", "text", "stale"]
+
+
+@dataclass(frozen=True)
+class RecoveredFile:
+    """A file, and its state after a recovery.
+
+    Attributes:
+        name: the file's final base name.
+        what: a description of what was done, or why it failed.
+    """
+
+    name: str
+    what: str
+
+    def __str__(self) -> str:
+        return f"{self.name}: {self.what}"
 
 
 def logs_left(files: MonitorFiles) -> list[Path]:

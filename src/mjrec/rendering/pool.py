@@ -107,7 +107,8 @@ class WorkerPool:
     ) -> None:
         self._fixed = check_workers(workers)
         count = self._fixed or usable_cpus()
-        self._environ = _environment(os.environ, alone=count == 1)
+        # A pool that forks draws beside a simulation, which needs the other CPUs.
+        self._environ = _environment(os.environ, alone=count == 1 and not forks)
         # The user's backend, or one that is known to work, needs no test.
         self._is_chosen = "MUJOCO_GL" in self._environ
         if trust_models:
@@ -169,8 +170,7 @@ class WorkerPool:
 
         Args:
             trajectory: the trajectory's file.
-            indices: the numbers of the frames, from 0, in any order; repetitions are
-                allowed.
+            indices: the numbers of the frames, from 0, in ascending order.
             view: the camera, size and quality; None means as recorded.
             cameras: cameras that replace that of the view; None among them is as
                 recorded. Each frame is then a grid of their frames.
@@ -493,7 +493,7 @@ def _environment(environ: Mapping[str, str], *, alone: bool) -> dict[str, str]:
 
     Args:
         environ: this process's environment variables.
-        alone: whether there is only one worker.
+        alone: whether a single worker may use all CPUs.
     """
     backend = None if rendering_is_off(environ) else backend_in_environment(environ)
     changed = environment_for(backend, environ) if backend else dict(environ)

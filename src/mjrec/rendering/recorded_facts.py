@@ -55,9 +55,6 @@ logger = logging.getLogger(__name__)
 
 _BLOCK_BYTES = 1 << 20
 
-# For an episode that ended before its second step; any rate would do.
-_RATE_OF_ONE_FRAME = Fraction(30)
-
 # A rate that the user requested is stored as given, such as 29.97, or as the exact
 # fraction of a float. `Fraction` accepts more, but 1e20000000 would keep it busy.
 _ASKED_RATE = re.compile(r"\d{1,40}(\.\d{1,40}|/0*[1-9]\d{0,39})?", re.ASCII)
@@ -214,13 +211,6 @@ def recorded_rate(facts: Mapping[str, Any]) -> Fraction | None:
     if facts.get("rate") is None:
         return None
     return Fraction(facts["rate"]) / int(facts.get("stride", 1))
-
-
-def usual_fps(facts: Mapping[str, Any], chosen: ChosenFrames) -> Fraction:
-    """Return the frame rate at which the video plays at its recorded speed."""
-    asked = video_facts(facts).get("fps")
-    rate = recorded_rate(facts) if asked is None else Fraction(asked)
-    return (_RATE_OF_ONE_FRAME if rate is None else rate) / chosen.every
 
 
 def captions(reader: TrajectoryReader, indices: Sequence[int]) -> Iterator[Caption]:

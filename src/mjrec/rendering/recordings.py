@@ -9,7 +9,7 @@ its video is finished.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
@@ -41,6 +41,9 @@ from .recorded_facts import (
     video_facts,
     video_path,
 )
+
+# For an episode that ended before its second step; any rate would do.
+_RATE_OF_ONE_FRAME = Fraction(30)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -111,6 +114,15 @@ class Recorded:
             max_fps = max_fps or video_facts(self.facts[0]).get("max_fps")
         max_fps = Fraction(max_fps) if isinstance(max_fps, str) else max_fps
         return chosen_frames(sum(self.frame_counts), self.timing, max_fps)
+
+    def usual_fps(self, chosen: ChosenFrames) -> Fraction:
+        """Return the frame rate of a video that plays at its recorded speed."""
+        asked = video_facts(self.facts[0]).get("fps")
+        if asked is None:
+            rate = recorded_rate(self.timing) or _RATE_OF_ONE_FRAME
+            return rate / chosen.every
+        # A clip records all frames, so `max_fps` does not affect the requested rate.
+        return Fraction(asked) / (1 if self.is_clip else chosen.every)
 
 
 def read_recording(parts: Sequence[Path]) -> Recorded:
@@ -218,19 +230,15 @@ def look_at(directory: Path, key: RecordingKey) -> Plan | None:
     if not (videos or is_log):
         return None
     frames = len(recorded.chosen().indices) if videos else 0
+    in_log = map(find_recording, parts if is_log else ())
     return Plan(
         parts=tuple(parts),
         videos=tuple(videos),
         frame_count=frames * len(videos),
-        logs=_logs_of(parts) if is_log else frozenset(),
+        logs=frozenset(each.log for each in in_log if each is not None),
         is_kept=not key.is_clip and facts.get("kept", True),
         model_file=model_file(directory, last) if videos else None,
     )
-
-
-def _logs_of(parts: Iterable[Path]) -> frozenset[Path]:
-    found = map(find_recording, parts)
-    return frozenset(each.log for each in found if each is not None)
 
 
 def claim(directory: Path, key: RecordingKey) -> Lock | None:

@@ -15,28 +15,17 @@ from ..formats.locks import is_locked, wait_for_lock
 from ..formats.monitor_directory import Infix
 from ..formats.second_names import give_all_second_names
 from ..results.monitor_files import monitors_of
-from .leftovers import has_leftovers, is_at_work, stale_shared_files
+from .leftovers import (
+    RecoveredFile,
+    has_leftovers,
+    is_at_work,
+    stale_shared_files,
+)
 
 # Only one process at a time recovers a directory.
 _LOCK = ".openaigym.recover.lock"
 _SECONDS = 5.0
 _MOMENT = 0.05
-
-
-@dataclass(frozen=True)
-class RecoveredFile:
-    """A file, and its state after a recovery.
-
-    Attributes:
-        name: the file's final base name.
-        what: a description of what was done, or why it failed.
-    """
-
-    name: str
-    what: str
-
-    def __str__(self) -> str:
-        return f"{self.name}: {self.what}"
 
 
 @dataclass(frozen=True)
@@ -138,11 +127,7 @@ def recover(
         for stale in stale_shared_files(path):
             report.remove(stale)
         give_all_second_names(path)
-    files, failures = (
-        tuple(RecoveredFile(name, what) for name, what in each)
-        for each in (report.files, report.failures)
-    )
-    return Recovery(path, files, failures, open_monitors)
+    return Recovery(path, (*report.files,), (*report.failures,), open_monitors)
 
 
 def _dead_and_open(directory: Path) -> tuple[list[Infix], tuple[str, ...]]:

@@ -36,11 +36,9 @@ from ..rates import to_rate
 from .jobs import RenderedVideos
 from .pool import WorkerPool
 from .recorded_facts import (
-    ChosenFrames,
     captions,
     further_video_paths,
     open_for_rendering,
-    usual_fps,
     video_facts,
     video_path,
     warn_of_other_frames,
@@ -119,7 +117,8 @@ def render_video(
         annotate = bool(video_facts(facts).get("annotate", False))
     if annotate:
         check_annotation()
-    rate = _fps(recorded, chosen) if variant.fps is None else to_rate(variant.fps)
+    rate = variant.fps
+    rate = recorded.usual_fps(chosen) if rate is None else to_rate(rate)
     stride = facts.get("stride", 1) * chosen.every
     timestep = recorded.timing.get("timestep")
     description = {
@@ -215,14 +214,6 @@ def _drawn(
                 yield from zip(frames, captions(reader, indices), strict=True)
         else:
             yield from zip(frames, itertools.repeat(None))
-
-
-def _fps(recorded: Recorded, chosen: ChosenFrames) -> Fraction:
-    asked = video_facts(recorded.facts[0]).get("fps")
-    if recorded.is_clip and asked is not None:
-        # A clip records all frames, so `max_fps` does not affect the requested rate.
-        return Fraction(asked)
-    return usual_fps(recorded.timing, chosen)
 
 
 def _metadata(recorded: Recorded) -> dict[str, Any]:

@@ -26,9 +26,7 @@ from ..formats.monitor_directory import (
 from ..formats.spans import is_recorded
 from ..machine import check_workers, usable_cpus
 from ..simulation.model_trust import trusting_models
-from .engine_jobs import do_on_engine
-from .finish import finish
-from .finisher import do_jobs
+from .finish import do_jobs, finish
 from .jobs import Progress, RecordingKey, RenderedVideos, VideoJob, key_of
 from .recordings import parts_of, recordings
 from .views import Variant, View
@@ -180,11 +178,13 @@ def iter_rendered_videos(
         )
     else:
         jobs = _variant_jobs(target, keys, variant, out, strict=strict)
-        if given is None:
-            workers = workers or usable_cpus()
-            results = do_jobs(jobs, directory, workers=workers, on_progress=on_progress)
-        else:
-            results = do_on_engine(given, jobs, on_progress=on_progress)
+        results = do_jobs(
+            jobs,
+            directory,
+            workers=workers or usable_cpus(),
+            engine=given,
+            on_progress=on_progress,
+        )
     return _trusting(results) if trust_models else results
 
 

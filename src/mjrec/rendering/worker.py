@@ -45,7 +45,7 @@ _SECONDS_BETWEEN_LOOKS = 0.02
 
 
 class Drawing:
-    """The frames of a scene, numbered from 0.
+    """The frames of a scene, numbered from 0, which are drawn in ascending order.
 
     A frame does not depend on which others were drawn before: the cameras are moved to
     where they would be if all earlier frames had been drawn.
@@ -62,7 +62,7 @@ class Drawing:
         self._scene = scene
         self._cameras = cameras
         # The number of the frame that the renderers' cameras are at.
-        self._last: int | None = None
+        self._last = -1
         self._canvas_is_old = False
         # Whether a frame can depend on the one before.
         self._looks_back = not scene.is_constant or any(
@@ -94,9 +94,8 @@ class Drawing:
                 f"Frame {index} does not exist: there are {self._scene.count} frames, "
                 "numbered from 0."
             )
-        last, self._last = self._last, None
-        if self._looks_back and (last is None or index != last + 1):
-            self._prepare(index, last)
+        if self._looks_back:
+            self._look_up_to(index)
         self._bring_to(index)
         if self._canvas_is_old:
             self._cameras[0].model_changed()
@@ -109,14 +108,11 @@ class Drawing:
         """Close the files of the scene. Idempotent."""
         self._scene.close()
 
-    def _prepare(self, index: int, last: int | None) -> None:
+    def _look_up_to(self, index: int) -> None:
         """Move the cameras to where they are just before a frame."""
-        start = max(0, index - 1)
-        if any(camera.is_following for camera in self._cameras):
-            start = 0 if last is None or last >= index else last + 1
-        if start == 0:
-            for camera in self._cameras:
-                camera.begin()
+        start = self._last + 1
+        if not any(camera.is_following for camera in self._cameras):
+            start = max(start, index - 1)
         for earlier in range(start, index):
             self._bring_to(earlier)
             for camera in self._cameras:

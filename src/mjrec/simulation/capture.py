@@ -22,8 +22,7 @@ from .fields import VIEW_PREFIXES, is_settable
 from .looks import Looks
 from .model_sources import AuthoredModel
 from .model_store import ModelStore
-from .self_check import scene_difference
-from .snapshot import SnapshotSource
+from .snapshot import SnapshotSource, scene_difference
 from .states import STATE_SPEC, state_dtype, state_words
 from .view import SceneView
 

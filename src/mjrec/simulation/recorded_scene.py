@@ -3,8 +3,6 @@
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -13,9 +11,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import FileNotWritten, InvalidArgument, UnreadableFile
-from ..formats.trajectory import ModelChange, TrajectoryReader
+from ..formats.trajectory import TrajectoryReader
 from .cameras import check_camera, raw_model
-from .fields import apply_fields, read_fields
+from .fields import apply_fields
 from .model_sources import with_embedded_files
 from .model_store import load_model
 from .renderer import is_kept_by_context
@@ -29,7 +27,8 @@ _MODEL, _STATES = "model.mjb", "states.npy"
 class RecordedScene:
     """A model and its data, as they were at a frame of a trajectory.
 
-    Only arrays that the visualizer reads are restored, so use the data only to draw.
+    Frames are restored in ascending order. Only arrays that the visualizer reads are
+    restored, so use the data only to draw.
 
     Args:
         reader: the trajectory's reader, which must stay open as long as this object is
@@ -70,8 +69,8 @@ class RecordedScene:
             check_layout(self.model, self.data, self._rows.dtype)
         except InvalidArgument as error:
             raise UnreadableFile(reader.path, error) from error
-        self._restart()
-        self._originals: dict[str, NDArray[Any]] = {}
+        self._changes = reader.iter_model_changes()
+        self._next = next(self._changes, None)
         self._block = range(0)
 
     def bring_to(self, index: int) -> bool:
@@ -95,28 +94,15 @@ class RecordedScene:
         """Close the trajectory. Idempotent."""
         self._reader.close()
 
-    def _restart(self) -> None:
-        self._changes: Iterator[ModelChange] = self._reader.iter_model_changes()
-        self._next = next(self._changes, None)
-        self._step = -1
-
     def _change_model(self, step: int) -> dict[str, NDArray[Any]]:
         """Restore the model as it was after `step`, and return the changed fields."""
         fields: dict[str, NDArray[Any]] = {}
-        if step < self._step:
-            fields.update(self._originals)
-            self._restart()
-        self._step = step
         # Merged one by one, because all changes together may not fit into memory.
         while self._next is not None and self._next.step <= step:
             fields.update(self._next.fields)
             self._next = next(self._changes, None)
-        view = {"camera": self.view.camera, "option": self.view.option}
-        for name in fields.keys() - self._originals.keys():
-            # `apply_fields` reports names that do not exist.
-            with contextlib.suppress(AttributeError):
-                self._originals |= read_fields(self.model, [name], **view)
-        apply_fields(self.model, fields, **view)
+        view = self.view
+        apply_fields(self.model, fields, camera=view.camera, option=view.option)
         return fields
 
     def _row(self, index: int) -> Any:

@@ -223,8 +223,8 @@ class SceneRenderer:
 
     MuJoCo's visualizer remembers the previous frame: an infinite plane is drawn around
     the cameras' positions in that frame, and a camera that tracks a body moves part of
-    the way toward the body in each frame. `begin` and `look` bring the renderer to any
-    frame as if all previous frames had been drawn.
+    the way toward the body in each frame. `look` brings the renderer to a later frame
+    as if all previous frames had been drawn.
 
     ::
 
@@ -286,9 +286,8 @@ class SceneRenderer:
         self._camera = placed if isinstance(camera, Mapping) else camera
         self._scene_option = scene_option or mujoco.MjvOption()
         self._fresh = fresh
-        self._begins_at = np.asarray(begins_at)
-        self._begins_looking_at = placed.lookat.copy()
         self._scene = mujoco.MjvScene(model, maxgeom=max_geom)
+        self._put_cameras(np.asarray(begins_at))
         self._owns_canvas = canvas is None
         self._canvas = canvas or Canvas()
         self._canvas.prepare(model, height=height, width=width, quality=quality)
@@ -304,14 +303,6 @@ class SceneRenderer:
         return self.is_following or (
             not self._fresh and has_infinite_plane(self._model)
         )
-
-    def begin(self) -> None:
-        """Put the cameras back to where they are before the first frame."""
-        self._put_cameras(self._begins_at)
-        if self.is_following:
-            resolve_camera(self._model, self._camera).lookat[:] = (
-                self._begins_looking_at
-            )
 
     def look(self, data: mujoco.MjData) -> None:
         """Update the scene's cameras as drawing a frame of `data` would."""
