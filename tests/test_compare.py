@@ -37,7 +37,7 @@ from mjrec.evidence.findings import (
     Verification,
 )
 from mjrec.evidence.notes import REWARDS_FILE, Notes
-from mjrec.formats.dataclass_json import from_json, to_json
+from mjrec.formats.json_fields import from_json, to_json
 
 Edit = Callable[[Path], object]
 

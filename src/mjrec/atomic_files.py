@@ -28,6 +28,22 @@ def temporary_path(path: Path) -> Path:
 
 
 @contextlib.contextmanager
+def writing(path: Path, **advice: str) -> Iterator[None]:
+    """Turn any other `OSError` in the block into `FileNotWritten`.
+
+    Args:
+        path: the file that the block writes.
+        **advice: `then`, if `FileNotWritten` should give other advice.
+    """
+    try:
+        yield
+    except FileNotWritten:
+        raise
+    except OSError as error:
+        raise FileNotWritten(path, error.strerror or error, **advice) from error
+
+
+@contextlib.contextmanager
 def replacing(path: Path) -> Iterator[Path]:
     """Yield a temporary path; rename it to `path` at the end of the block.
 
@@ -48,11 +64,8 @@ def write_text(path: Path, text: str) -> None:
     Raises:
         FileNotWritten: the disk is full, or the directory is missing or read-only.
     """
-    try:
-        with replacing(path) as temporary:
-            temporary.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise FileNotWritten(path, error.strerror) from error
+    with writing(path), replacing(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
 
 
 def make_directory(directory: Path) -> None:

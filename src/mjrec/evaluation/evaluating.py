@@ -29,7 +29,7 @@ from ..errors import (
     PolicyError,
 )
 from ..formats.bundle import FINISHED, finished_trajectories
-from ..formats.dataclass_json import to_json
+from ..formats.json_fields import to_json
 from ..formats.locks import try_lock
 from ..formats.monitor_directory import (
     Infix,

@@ -26,17 +26,18 @@ from functools import partial
 from pathlib import Path
 from typing import Any, TextIO
 
-from ..atomic_files import replacing, write_text
-from ..errors import FileNotWritten, UnreadableFile
-from ..formats.dataclass_json import from_json, to_json
+from ..atomic_files import replacing, write_text, writing
+from ..errors import UnreadableFile
 from ..formats.json_fields import (
     field,
+    from_json,
     integer,
     list_of,
     mapping,
     optional,
     read_object,
     text,
+    to_json,
     unreadable,
 )
 from ..formats.monitor_directory import Infix, video_prefix
@@ -294,14 +295,12 @@ def read_summaries(directory: Path) -> Evaluation:
 
 
 def _write(path: Path, write: Callable[[TextIO], None]) -> None:
-    try:
-        with (
-            replacing(path) as temporary,
-            temporary.open("w", encoding="utf-8", newline="") as file,
-        ):
-            write(file)
-    except OSError as error:
-        raise FileNotWritten(path, error.strerror) from error
+    with (
+        writing(path),
+        replacing(path) as temporary,
+        temporary.open("w", encoding="utf-8", newline="") as file,
+    ):
+        write(file)
 
 
 def _why_missing(directory: Path) -> str:

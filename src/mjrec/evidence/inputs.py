@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from .. import json_text
 from ..environments.scenes import shown_wrappers
-from ..formats.dataclass_json import from_json, to_json
+from ..formats.json_fields import from_json, to_json
 from ..formats.monitor_directory import Infix
 
 INPUTS_FILE: Final = "inputs.json"

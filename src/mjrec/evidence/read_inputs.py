@@ -16,9 +16,8 @@ from numpy.typing import NDArray
 
 from .. import json_text
 from ..errors import Error, UnreadableFile
-from ..formats.dataclass_json import from_json
 from ..formats.journal import JournalEntry, JournalReader
-from ..formats.json_fields import base_name, read_object, unreadable
+from ..formats.json_fields import base_name, from_json, read_object, unreadable
 from ..formats.manifest import read_manifest
 from ..formats.monitor_directory import FILE_PREFIX, Infix, episode_of
 from ..formats.regular_files import open_regular

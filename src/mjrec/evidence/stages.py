@@ -24,7 +24,7 @@ from typing import Any, Final
 from numpy.typing import NDArray
 
 from ..errors import Error, FileNotWritten, UnreadableArchive
-from ..formats.dataclass_json import to_json
+from ..formats.json_fields import to_json
 from ..sandbox import enter
 from .findings import Level
 from .inputs import ARRAYS_FILE, Inputs

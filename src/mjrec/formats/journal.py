@@ -34,11 +34,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
-from ..errors import ClosedError, FileNotWritten
+from ..atomic_files import writing
+from ..errors import ClosedError
 from ..json_text import dumps
 from .appending import append_whole, open_for_appending
-from .dataclass_json import from_json
-from .json_fields import integer, json_object, unreadable
+from .json_fields import from_json, integer, json_object, unreadable
 from .regular_files import open_regular
 
 logger = logging.getLogger(__name__)
@@ -194,10 +194,8 @@ class JournalWriter:
         lines = self._unwritten + line
         if later:
             self._unwritten = lines
-        try:
+        with writing(self.path):
             self._write(lines)
-        except OSError as error:
-            raise FileNotWritten(self.path, error.strerror or error) from error
         self._unwritten = b""
 
     def _write(self, lines: bytes) -> None:

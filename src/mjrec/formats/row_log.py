@@ -19,13 +19,12 @@ import mmap
 import os
 import struct
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import FileNotWritten
+from ..atomic_files import writing
 from .regular_files import open_regular
 
 TAIL_BYTES = 256 << 10
@@ -70,7 +69,7 @@ class RowLog:
         self.capacity = max(_LEAST_ROWS, tail_bytes // self.row_size)
         self.count = self._written = 0
         length = TAIL_HEAD + self.capacity * self.row_size
-        with self._naming_errors():
+        with writing(path):
             self._log = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666)
             try:
                 self._is_mapped = _may_be_mapped(self._log)
@@ -146,7 +145,7 @@ class RowLog:
         Raises:
             FileNotWritten: the disk is full; the rows stay in memory.
         """
-        with self._naming_errors():
+        with writing(self.path):
             while self._written < self.count:
                 first = self._written % self.capacity
                 stop = min(self.capacity, first + self.count - self._written)
@@ -172,13 +171,6 @@ class RowLog:
             raise
         finally:
             os.close(tail)
-
-    @contextlib.contextmanager
-    def _naming_errors(self) -> Iterator[None]:
-        try:
-            yield
-        except OSError as error:
-            raise FileNotWritten(self.path, error.strerror or error) from error
 
 
 def tail_path(log: Path) -> Path:

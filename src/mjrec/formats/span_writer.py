@@ -20,6 +20,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ..atomic_files import writing
 from ..errors import DirectoryNotWritable, FileNotWritten
 from .bundle import FINISHED
 from .journal import JournalWriter
@@ -236,14 +237,12 @@ class OpenLog:
         """
         record = pack_change(self.rows.count, change)
         path = self.path.with_suffix(LOOKS)
-        try:
+        with writing(path):
             if self._looks is None:
                 self._looks = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666)
             if os.pwrite(self._looks, record, self.look_size) != len(record):
                 os.ftruncate(self._looks, self.look_size)
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        except OSError as error:
-            raise FileNotWritten(path, error.strerror or error) from error
         self.look_size += len(record)
 
     def close(self) -> None:

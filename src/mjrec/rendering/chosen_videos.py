@@ -20,7 +20,6 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from ..errors import FileNotWritten
 from ..formats.bundle import FINISHED, is_finished
 from ..formats.frame_hashes import frame_hash_path
 from ..formats.journal import JournalWriter
@@ -149,7 +148,4 @@ def _note(folder: Path, infix: Infix, events: Iterable[tuple[str, Any]]) -> None
         contextlib.closing(JournalWriter(path)) as writer,
     ):
         for kind, facts in events:
-            try:
-                writer.note(kind, facts)
-            except OSError as error:
-                raise FileNotWritten(path, error.strerror or error) from error
+            writer.note(kind, facts)

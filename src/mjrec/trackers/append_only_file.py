@@ -7,8 +7,8 @@ import os
 from collections.abc import Iterable
 from pathlib import Path
 
-from ..atomic_files import make_directory
-from ..errors import DirectoryNotWritable, FileNotWritten
+from ..atomic_files import make_directory, writing
+from ..errors import DirectoryNotWritable
 from ..formats.appending import append_whole, open_for_appending
 
 
@@ -49,10 +49,8 @@ class AppendOnlyFile:
         Raises:
             FileNotWritten: the disk has no room for the piece. The file is unchanged.
         """
-        try:
+        with writing(self.path):
             append_whole(self._file.fileno(), piece)
-        except OSError as error:
-            raise FileNotWritten(self.path, error.strerror) from error
 
     def close(self) -> None:
         """Close the file."""
