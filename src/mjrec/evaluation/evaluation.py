@@ -40,7 +40,7 @@ from ..formats.json_fields import (
     to_json,
     unreadable,
 )
-from ..formats.monitor_directory import Infix, video_prefix
+from ..formats.monitor_directory import video_prefix
 from ..formats.notebook import shown
 from ..formats.spans import find_trajectory
 from ..json_text import dumps
@@ -162,11 +162,11 @@ class Evaluation:
 
         Return None if both files are missing.
         """
-        infix = Infix.parse(result.monitor or "")
+        infix = result.monitor
         if infix is None or result.episode_id is None:
             return None
         folders = {of: folder for folder, of in self.by_task[result.task].places}
-        folder = self.directory / folders[str(infix)]
+        folder = self.directory / folders[infix]
         video = folder / f"{video_prefix(infix, result.episode_id)}.mp4"
         for each in (video, video.with_suffix(".json")):
             if each.exists():

@@ -41,7 +41,7 @@ from xml.etree import ElementTree
 from ..atomic_files import replacing, writing
 from ..errors import InvalidArgument, UnreadableFile
 from ..formats.json_fields import unreadable
-from ..formats.monitor_directory import FILE_PREFIX, Infix, infix_of, is_second_name
+from ..formats.monitor_directory import FILE_PREFIX, infix_of, is_second_name
 from ..formats.trajectory_file import amend_trajectories
 from ..json_text import dumps, loads
 from .identity import Identity
@@ -257,15 +257,15 @@ def _renamed_infixes(matcher: IdentityMatcher, names: list[str]) -> Mapping[str,
     taken = {infix for infix in old if matcher.replaced_in_name(infix) == infix}
     new: dict[str, str] = {}
     for infix in old:
-        parsed = Infix.parse(infix)
-        if infix in taken or parsed is None:
+        if infix in taken:
             continue
-        uid, number = matcher.replaced_in_name(parsed.uid), 1
-        candidate = Infix(parsed.monitor_id, uid)
-        while str(candidate) in taken:
+        monitor_id, _, uid = infix.partition(".")
+        uid, number = matcher.replaced_in_name(uid), 1
+        candidate = f"{monitor_id}.{uid}"
+        while candidate in taken:
             number += 1
-            candidate = Infix(parsed.monitor_id, f"{uid}-{number}")
-        new[infix] = str(candidate)
+            candidate = f"{monitor_id}.{uid}-{number}"
+        new[infix] = candidate
         taken.add(new[infix])
     return new
 

@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 
 from .. import json_text
 from ..errors import Error, UnreadableFile
-from ..formats.journal import JournalEntry, JournalReader
+from ..formats.journal import JournalEntry, read_journal
 from ..formats.json_fields import base_name, from_json, read_object, unreadable
 from ..formats.manifest import read_manifest
-from ..formats.monitor_directory import FILE_PREFIX, Infix, episode_of
+from ..formats.monitor_directory import FILE_PREFIX, episode_of
 from ..formats.regular_files import open_regular
 from ..formats.trajectory import TrajectoryReader
 from ..formats.trajectory_hdf5 import open_hdf5
@@ -123,8 +123,6 @@ def packing_options(said: Mapping[str, Any]) -> PackingOptions:
 
 
 def _recording(files: MonitorFiles, arrays: dict[str, NDArray[Any]]) -> RecordingInputs:
-    if Infix.parse(files.infix) is None:
-        raise ValueError(f"{files.infix!r} is not a valid infix of a monitor's files")
     journal = _Journal(files.journal)
     run = journal.run
     env_info, keep = run.get("env_info"), run.get("keep")
@@ -186,7 +184,7 @@ class _Journal:
         self.was_killed = False
         if path is None:
             return
-        for entry in JournalReader(path, on_event=self._note):
+        for entry in read_journal(path, on_event=self._note):
             self._lines += 1
             self.entries[entry.episode_id] = entry
             if len(self.entries) > _MOST_EPISODES:

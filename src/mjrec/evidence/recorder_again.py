@@ -77,7 +77,7 @@ def monitor_again(
             tiled=given.get("tiled", False),
             trackers=_trackers(recording),
             statements=Statements(
-                infix=recording.own_infix,
+                infix=recording.infix,
                 first_episode_id=recording.first_episode_id,
                 provenance=recording.provenance,
                 provenance_after=recording.provenance_after,

@@ -24,7 +24,7 @@ from ..atomic_files import writing
 from ..errors import DirectoryNotWritable, FileNotWritten
 from .bundle import FINISHED
 from .journal import JournalWriter
-from .monitor_directory import Infix, log_name
+from .monitor_directory import log_name
 from .row_log import TAIL_BYTES, RowLog
 from .spans import LOOKS, Recording, remove_log
 from .trajectory import (
@@ -64,7 +64,7 @@ class SpanLogs:
     def __init__(
         self,
         directory: Path,
-        infix: Infix,
+        infix: str,
         *,
         journal: JournalWriter,
         numbers: Iterator[int],

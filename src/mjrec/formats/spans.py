@@ -43,7 +43,6 @@ from .json_fields import base_name, integer, json_object, mapping, unreadable
 from .locks import is_locked
 from .monitor_directory import (
     ClipPart,
-    Infix,
     episode_of,
     infix_of,
     journal_name,
@@ -281,7 +280,7 @@ def infix_of_recording(name: str) -> str | None:
     return None if episode_of(path) is None else infix_of(path)
 
 
-def log_paths(directory: Path, infix: Infix | str | None = None) -> Iterator[Path]:
+def log_paths(directory: Path, infix: str | None = None) -> Iterator[Path]:
     """Yield the paths of all logs in a directory, or of one monitor's logs.
 
     A log is included if any of its files exists.
@@ -291,7 +290,7 @@ def log_paths(directory: Path, infix: Infix | str | None = None) -> Iterator[Pat
         for name in names_in(directory)
         if (number := log_number(name)) is not None
         and (own := infix_of(name)) is not None
-        and (infix is None or own == str(infix))
+        and (infix is None or own == infix)
     }
     yield from sorted(logs)
 
@@ -329,14 +328,9 @@ def find_recording(path: Path) -> Recording | None:
     return recording
 
 
-def find_trajectory(
-    directory: Path, infix: Infix | str, episode_id: int
-) -> Path | None:
+def find_trajectory(directory: Path, infix: str, episode_id: int) -> Path | None:
     """Return the path of an episode's own file, or None if it was not recorded."""
-    known = infix if isinstance(infix, Infix) else Infix.parse(infix)
-    if known is None:
-        return None
-    path = directory / f"{trajectory_prefix(known, episode_id)}{FINISHED}"
+    path = directory / f"{trajectory_prefix(infix, episode_id)}{FINISHED}"
     return path if is_recorded(path) else None
 
 
@@ -360,9 +354,7 @@ def is_in_flight(path: Path) -> bool:
     return find_recording(path) is not None
 
 
-def recordings_in_flight(
-    directory: Path, infix: Infix | str | None = None
-) -> list[Recording]:
+def recordings_in_flight(directory: Path, infix: str | None = None) -> list[Recording]:
     """Return the recordings of all monitors, or of one, that exist only in logs.
 
     Unreadable logs are skipped; `recordings_in` reports the reason.
@@ -411,7 +403,7 @@ def remove_log(log: Path) -> None:
 
 
 def _is_open(log: Path) -> bool:
-    infix = Infix.parse(infix_of(log.name) or "")
+    infix = infix_of(log.name)
     try:
         return infix is not None and is_locked(log.parent / lock_name(infix))
     except OSError:

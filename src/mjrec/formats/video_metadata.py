@@ -220,10 +220,9 @@ def metadata_of(video: Path) -> Mapping[str, Any]:
 
 
 def _read_or_nothing(path: Path) -> Mapping[str, Any]:
-    try:
+    with contextlib.suppress(OSError, ValueError):
         return read_object(path)
-    except (OSError, ValueError):
-        return {}
+    return {}
 
 
 def _is_further(name: str, video: Path) -> bool:
@@ -259,10 +258,7 @@ def forget_failure(video: Path) -> None:
 
 def reason_of(video: Path) -> str | None:
     """Return the reason why a video could not be rendered, or None if unknown."""
-    try:
-        reason = read_object(failure_path(video)).get("reason")
-    except (OSError, ValueError):
-        return None
+    reason = _read_or_nothing(failure_path(video)).get("reason")
     return reason if isinstance(reason, str) else None
 
 

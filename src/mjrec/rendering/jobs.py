@@ -16,7 +16,6 @@ from typing import Self
 
 from ..formats.monitor_directory import (
     ClipPart,
-    Infix,
     VideoName,
     clip_lock_name,
     clip_part_name,
@@ -59,7 +58,7 @@ class RecordingKey:
         is_clip: whether it is a clip.
     """
 
-    infix: Infix
+    infix: str
     number: int
     is_clip: bool = False
 
@@ -98,7 +97,7 @@ def key_of(name: str) -> RecordingKey | None:
     """
     if (part := ClipPart.parse(name)) is not None:
         return RecordingKey(part.infix, part.first_step, is_clip=True)
-    infix, number = Infix.parse(infix_of(name) or ""), episode_of(name)
+    infix, number = infix_of(name), episode_of(name)
     if infix is None or number is None:
         return None
     video = VideoName.parse(name)

@@ -35,7 +35,6 @@ from ..formats.json_fields import (
 )
 from ..formats.monitor_directory import (
     ClipPart,
-    Infix,
     clip_video_prefix,
     episode_of,
     further_parts,
@@ -104,7 +103,7 @@ def video_path(recording: Path, facts: Mapping[str, Any]) -> Path:
     """
     name = str(video_facts(facts).get("name"))
     clip = ClipPart.parse(recording.name)
-    infix = clip.infix if clip else Infix.parse(infix_of(recording.name) or "")
+    infix = infix_of(recording.name)
     # Only the name of a clip's video says in which episode it began.
     episode = episode_of(name if clip else recording.name)
     own: set[str] = set()

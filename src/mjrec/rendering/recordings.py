@@ -24,6 +24,7 @@ from ..formats.frame_hashes import frame_hash_path
 from ..formats.locks import Lock, is_locked, try_lock
 from ..formats.monitor_directory import (
     ClipPart,
+    infix_order,
     lock_name,
     unfinished_files,
 )
@@ -163,10 +164,7 @@ def recordings(directory: Path) -> list[RecordingKey]:
     keys = {key_of(path.name) for path in (*finished, *in_flight)} - {None}
     return sorted(
         (key for key in keys if key is not None),
-        key=lambda key: (
-            *(key.is_clip, key.infix.monitor_id, key.infix.uid),
-            key.number,
-        ),
+        key=lambda key: (key.is_clip, infix_order(key.infix), key.number),
     )
 
 
