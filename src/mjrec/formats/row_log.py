@@ -84,11 +84,6 @@ class RowLog:
         rows = np.frombuffer(self.memory, np.uint64, offset=TAIL_HEAD)
         self.slots: NDArray[np.uint64] = rows.reshape(self.capacity, row_words)
 
-    @property
-    def size(self) -> int:
-        """The size of all rows so far, in bytes."""
-        return self.count * self.row_size
-
     def make_room(self) -> None:
         """Write the rows that are not in the log yet, so that the next slot is free.
 
@@ -111,11 +106,6 @@ class RowLog:
     def is_open(self) -> bool:
         """Whether rows can be added."""
         return self._log >= 0
-
-    @property
-    def is_there(self) -> bool:
-        """Whether the log is open and its file was not removed."""
-        return self.is_open and os.fstat(self._log).st_nlink > 0
 
     def close(self) -> None:
         """Write the last rows and remove the tail. Idempotent.
