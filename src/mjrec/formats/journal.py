@@ -33,10 +33,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
-from ..atomic_files import writing
+from ..atomic_files import append_whole, open_for_appending, writing
 from ..errors import ClosedError
 from ..json_text import dumps
-from .appending import append_whole, open_for_appending
 from .json_fields import from_json, integer, json_object, unreadable
 from .regular_files import open_regular
 
@@ -96,8 +95,8 @@ class JournalEntry:
         evaluation: `seed`, `episode` and `warnings`, for an episode of an evaluation.
     """
 
-    episode_id: Annotated[int, _count]
-    length: Annotated[int, _count]
+    episode_id: Annotated[int, count]
+    length: Annotated[int, count]
     reward: float
     type: str
     start_time: float
@@ -333,9 +332,10 @@ def missing_line(
     return "cut", {**choice, "reason": facts.get("reason", KILLED)}
 
 
-def _count(value: Any) -> int:
-    count = integer(value)
-    if not 0 <= count < MOST_EPISODES:
+def count(value: Any) -> int:
+    """Return a value from a journal as a number of episodes, steps or rows."""
+    number = integer(value)
+    if not 0 <= number < MOST_EPISODES:
         # Do not show its digits: there may be thousands.
         raise ValueError("it is negative or too large for a count")
-    return count
+    return number

@@ -137,10 +137,11 @@ _LONGEST_PART = 80
 _DIGEST = 8
 
 # The file names of Gymnasium's RecordVideo, for any portable `name_prefix`.
-_SECOND_NAME = re.compile(
-    r"(?!openaigym)[A-Za-z0-9_][A-Za-z0-9_.-]{0,99}-(episode|step)-[0-9]{1,18}\.mp4",
-    re.ASCII,
+_SECOND_STEM = (
+    r"(?!openaigym)[A-Za-z0-9_][A-Za-z0-9_.-]{0,99}-(episode|step)-[0-9]{1,18}"
 )
+_SECOND_NAME = re.compile(rf"{_SECOND_STEM}\.mp4", re.ASCII)
+_OF_SECOND_NAME = re.compile(rf"{_SECOND_STEM}(\.[^.]*)?\.(mp4|meta\.json)", re.ASCII)
 
 
 @dataclass(frozen=True)
@@ -351,15 +352,17 @@ def infix_of(name: str) -> str | None:
 
 def episode_of(name: str) -> int | None:
     """Return the episode number in a file's name, or None if it has none."""
-    match = _match(name)
-    number = None if match is None else match.groupdict().get("episode")
-    return None if number is None else int(number)
+    return _number(name, "episode")
 
 
 def log_number(name: str) -> int | None:
     """Return the number of the row log that a file belongs to, or None."""
+    return _number(name, "log")
+
+
+def _number(name: str, part: str) -> int | None:
     match = _match(name)
-    number = None if match is None else match.groupdict().get("log")
+    number = None if match is None else match.groupdict().get(part)
     return None if number is None else int(number)
 
 
@@ -539,16 +542,6 @@ def with_part(video: str, part: str) -> str:
     return f"{stem}.{part}{dot}{ending}"
 
 
-def without_part(video: str) -> str:
-    """Return the name of a video without the part before its ending.
-
-    >>> without_part("rl-video-episode-27.side.mp4")
-    'rl-video-episode-27.mp4'
-    """
-    stem, dot, ending = video.rpartition(".")
-    return f"{stem.rpartition('.')[0]}{dot}{ending}"
-
-
 def tiled_name(video: str) -> str:
     """Return the name of the video that shows all sub-environments at once.
 
@@ -572,6 +565,11 @@ def view_of(video: str) -> str:
 def is_second_name(name: str) -> bool:
     """Return whether `name` could be the second name of one of our videos."""
     return _SECOND_NAME.fullmatch(name) is not None
+
+
+def is_called_like_second(name: str) -> bool:
+    """Return whether `name` could be a second name of any file of our videos."""
+    return _OF_SECOND_NAME.fullmatch(name) is not None
 
 
 def second_name_of(name: str, second: str, *, first: str) -> str | None:

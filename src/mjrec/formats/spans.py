@@ -38,7 +38,7 @@ import numpy as np
 
 from ..errors import DirectoryNotWritable, UnreadableFile
 from .bundle import FINISHED, is_finished
-from .journal import is_of_spans
+from .journal import count, is_of_spans
 from .json_fields import base_name, integer, json_object, mapping, unreadable
 from .locks import is_locked
 from .monitor_directory import (
@@ -204,7 +204,7 @@ class _Spans:
             self.recordings[said["name"]].facts.update(mapping(said["facts"]))
         elif kind == "end":
             recording = self.recordings[said["name"]]
-            recording.stop = _count(said["row"])
+            recording.stop = count(said["row"])
             recording.facts.update(mapping(said["facts"]))
 
     def _begin(self, said: Mapping[str, Any]) -> None:
@@ -215,7 +215,7 @@ class _Spans:
         common = mapping(rows.get("facts", {})).items()
         facts = {k: v for k, v in common if k not in without}
         facts.update(mapping(said["facts"]))
-        first, look = _count(said["row"]), _count(said["look"])
+        first, look = count(said["row"]), count(said["look"])
         recording = Recording(name, log, rows, facts, row=first, look=look)
         others = self.logs.setdefault(log, [])
         if others:
@@ -228,18 +228,12 @@ class _Spans:
 
     def _log(self, number: Any) -> Path:
         infix = infix_of(self.journal.name)
-        return self.journal.with_name(log_name(infix or "", _count(number)))
+        return self.journal.with_name(log_name(infix or "", count(number)))
 
 
-class _Known(threading.local):
-    """This thread's cache. A shared cache would need a lock, which is bad with fork."""
-
-    def __init__(self) -> None:
-        self.spans: dict[Path, _Spans] = {}
-
-
-# Cached because a journal only grows, and recordings are looked up one at a time.
-_known = _Known()
+# Cached because a journal only grows, and recordings are looked up one at a time. Each
+# thread has its own: a shared cache would need a lock, which is bad with fork.
+_known = threading.local()
 _MOST_KNOWN = 64
 
 
@@ -249,7 +243,7 @@ def _read(journal: Path) -> _Spans:
     Raises:
         UnreadableFile: the journal cannot be read.
     """
-    known = _known.spans
+    known: dict[Path, _Spans] = vars(_known).setdefault("spans", {})
     # Removed from the cache first, so that an interrupted reading starts over.
     spans = known.pop(journal, None) or _Spans(journal)
     with unreadable(journal):
@@ -409,10 +403,3 @@ def _is_open(log: Path) -> bool:
     except OSError:
         # This is unknown, so leave the log's files alone.
         return True
-
-
-def _count(value: Any) -> int:
-    number = integer(value)
-    if number < 0:
-        raise ValueError(f"{number} is not a valid count")
-    return number

@@ -96,7 +96,9 @@ def timing_facts(
         stride: the usual number of steps from one frame to the next.
         frames_per_step: number of frames per step; must be 1 unless the stride is 1.
     """
-    speed = playback_speed(fps, timestep, Fraction(stride, frames_per_step))
+    speed = None
+    if fps is not None and timestep is not None:
+        speed = float(fps * timestep * Fraction(stride, frames_per_step))
     return {
         "fps": str(fps),
         "timestep": None if timestep is None else str(timestep),
@@ -105,15 +107,6 @@ def timing_facts(
         "frame_count": steps.total,
         "frame_steps": steps.ranges,
     }
-
-
-def playback_speed(
-    fps: Fraction | None, timestep: Fraction | None, steps_per_frame: Fraction
-) -> float | None:
-    """Return the simulated seconds per second of video, or None if unknown."""
-    if fps is None or timestep is None:
-        return None
-    return float(fps * timestep * steps_per_frame)
 
 
 def file_facts(file: VideoFile) -> dict[str, Any]:

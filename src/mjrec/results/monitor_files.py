@@ -18,12 +18,12 @@ from ..formats.monitor_directory import (
     infix_of,
     infix_order,
     is_bundle,
+    is_called_like_second,
     is_manifest,
     iter_monitor_files,
     log_number,
     names_in,
 )
-from ..formats.second_names import is_called_like_second
 from ..formats.spans import LOG, recordings_in_flight
 
 logger = logging.getLogger(__name__)

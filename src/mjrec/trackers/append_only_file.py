@@ -7,9 +7,13 @@ import os
 from collections.abc import Iterable
 from pathlib import Path
 
-from ..atomic_files import make_directory, writing
+from ..atomic_files import (
+    append_whole,
+    make_directory,
+    open_for_appending,
+    writing,
+)
 from ..errors import DirectoryNotWritable
-from ..formats.appending import append_whole, open_for_appending
 
 
 class AppendOnlyFile:
