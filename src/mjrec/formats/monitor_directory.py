@@ -114,7 +114,7 @@ _VISIBLE = {
 _HIDDEN = (
     re.compile(rf"\.{_VIDEO}\.lock"),
     re.compile(rf"\.{_CLIP}\.lock"),
-    re.compile(r"\.openaigym\.render\.[0-9]+\.lock"),
+    re.compile(r"\.openaigym\.(recover|render\.[0-9]+)\.lock"),
     re.compile(rf"\.openaigym\.manifest\.{_INFIX_PART}\.lock"),
     re.compile(rf"\.openaigym\.{_INFIX_PART}\.lock"),
     re.compile(r"\.openaigym\.[^/\n\0]+\.part"),
@@ -142,29 +142,6 @@ _SECOND_STEM = (
 )
 _SECOND_NAME = re.compile(rf"{_SECOND_STEM}\.mp4", re.ASCII)
 _OF_SECOND_NAME = re.compile(rf"{_SECOND_STEM}(\.[^.]*)?\.(mp4|meta\.json)", re.ASCII)
-
-
-@dataclass(frozen=True)
-class ClipPart:
-    """The parsed name of a part of a clip.
-
-    Attributes:
-        infix: the monitor's infix.
-        first_step: number of steps that the monitor had recorded when the clip began.
-        number: the part's number, from 0.
-    """
-
-    infix: str
-    first_step: int
-    number: int
-
-    @classmethod
-    def parse(cls, name: str) -> ClipPart | None:
-        """Parse the name of a clip's part, or return None for any other name."""
-        match = _CLIP_PART.fullmatch(name)
-        if match is None:
-            return None
-        return cls(match["infix"], int(match["step"]), int(match["part"]))
 
 
 @dataclass(frozen=True)
@@ -214,6 +191,16 @@ class VideoName:
         episode.
         """
         return not self.view and self.first_step is None
+
+
+def clip_step(name: str) -> int | None:
+    """Return the step at which a clip began, from the name of one of its parts.
+
+    This is the number of steps that the monitor had recorded by then. For any other
+    name, it is None.
+    """
+    match = _CLIP_PART.fullmatch(name)
+    return None if match is None else int(match["step"])
 
 
 def is_infix(text: str) -> bool:

@@ -42,7 +42,7 @@ from .journal import count, is_of_spans
 from .json_fields import base_name, integer, json_object, mapping, unreadable
 from .locks import is_locked
 from .monitor_directory import (
-    ClipPart,
+    clip_step,
     episode_of,
     infix_of,
     journal_name,
@@ -268,7 +268,7 @@ def _journal_of(path: Path) -> Path:
 
 def infix_of_recording(name: str) -> str | None:
     """Return the infix in a recording's name, or None for any other name."""
-    if ClipPart.parse(name) is not None:
+    if clip_step(name) is not None:
         return infix_of(name)
     path = f"{name}{FINISHED}"
     return None if episode_of(path) is None else infix_of(path)

@@ -31,7 +31,7 @@ from ..formats.manifest import (
     write_stats_file,
 )
 from ..formats.monitor_directory import (
-    ClipPart,
+    clip_step,
     episode_of,
     infix_of,
     is_manifest,
@@ -258,7 +258,9 @@ def _pending(directory: Path, infix: str, run: Run) -> list[Mapping[str, Any]]:
         for number in sorted(run.promised)
     ]
     clips = [
-        clip for clip in run.clips.values() if ClipPart.parse(str(clip.get("clip")))
+        clip
+        for clip in run.clips.values()
+        if clip_step(str(clip.get("clip"))) is not None
     ]
     entries += [
         {key: clip[key] for key in ("episode_id", "clip", "video")}
