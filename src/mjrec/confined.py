@@ -80,7 +80,8 @@ def confine(
     ruleset = _libc.syscall(_CREATE, packed, ctypes.c_size_t(len(packed)), 0)
     if ruleset < 0:
         return {"files": False, "network": without_network}
-    for path in {*_SYSTEM, *_python(), *readable} - {*hidden}:
+    python = {sys.prefix, sys.base_prefix, *filter(None, sys.path)}
+    for path in {*_SYSTEM, *python, *readable} - {*hidden}:
         _allow(ruleset, path, _READ)
     for path in {"/dev", *writable}:
         _allow(ruleset, path, files)
@@ -88,10 +89,6 @@ def confine(
     is_confined = _libc.syscall(_RESTRICT, ruleset, 0) == 0
     os.close(ruleset)
     return {"files": is_confined, "network": without_network}
-
-
-def _python() -> set[str]:
-    return {sys.prefix, sys.base_prefix, *filter(None, sys.path)}
 
 
 def _leave_network() -> bool:

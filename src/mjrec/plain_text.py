@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Text for people: counts with units, and escaped text from untrusted sources."""
+"""Text for people: counts, short lists, and escaped text from untrusted sources."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Final
 
 # Newlines and the spaces between digits are harmless, although they are not printable.
@@ -26,6 +27,13 @@ def spelled_out(text: str, longest: int = 1000) -> str:
     return "".join(
         c if c.isprintable() or c in _SEEN else f"\\u{ord(c):04x}" for c in text
     )
+
+
+def first_of(items: Sequence[object], most: int, *, between: str = ", ") -> str:
+    """Return the first few items, and the number of the others."""
+    more = len(items) - most
+    shown = between.join(map(str, items[:most]))
+    return f"{shown} and {more} more" if more > 0 else shown
 
 
 def counted(count: int, unit: str) -> str:

@@ -13,7 +13,7 @@ from typing import Any, Final
 
 from .. import json_text
 from ..formats.monitor_directory import FILE_PREFIX
-from ..plain_text import counted
+from ..plain_text import counted, first_of
 from .findings import (
     Excuse,
     ExcuseKind,
@@ -192,7 +192,7 @@ def _excuse(excuse: Excuse, verification: Verification) -> str:
     ]
     # If recordings are named, their files need not be.
     items = tuple(i for i in excuse.items if not i.startswith(FILE_PREFIX))
-    of = f" of {_some(items or excuse.items)}" if excuse.items else ""
+    of = f" of {first_of(items or excuse.items, _MOST_ITEMS)}" if excuse.items else ""
     allowed = ", allowed" if excuse.allowed else ""
     told = f"; {', '.join(costs)}" if costs else ""
     return f"{_claim(excuse)}{of}{allowed}: {excuse.costs}{told}"
@@ -211,12 +211,6 @@ def _worst(finding: Finding) -> str:
     if "psnr" in figures:
         return f", the worst {figures['psnr']:.1f} dB"
     return f", at most {figures['maximum']:.1g} apart" if "maximum" in figures else ""
-
-
-def _some(items: tuple[str, ...]) -> str:
-    more = len(items) - _MOST_ITEMS
-    shown = ", ".join(items[:_MOST_ITEMS])
-    return f"{shown} and {more} more" if more > 0 else shown
 
 
 def _short(value: Any) -> str:

@@ -63,6 +63,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import InvalidArgument
+from ..plain_text import first_of
 
 FILE_PREFIX = "openaigym"
 MANIFEST_PREFIX = f"{FILE_PREFIX}.manifest"
@@ -424,9 +425,7 @@ def where_recordings_are(directory: Path) -> str:
     folders = [str(path.relative_to(directory)) for path in below]
     if not folders:
         return f"To record, run `mjrec record ENV --out {shlex.quote(str(directory))}`."
-    rest = len(folders) - _SHOWN
-    more = f" and {rest} more" if rest > 0 else ""
-    return f"Its folders do ({', '.join(folders[:_SHOWN])}{more}): name one of them."
+    return f"Its folders do ({first_of(folders, _SHOWN)}): name one of them."
 
 
 def names_in(directory: Path) -> Iterator[str]:

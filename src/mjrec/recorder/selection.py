@@ -14,9 +14,12 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 from ..errors import InvalidArgument
+from ..plain_text import first_of
 from ..schedules import check_takes_one, schedule_name
 from .keep_rules import RULES, has_failed, keep_rule
 from .tracking import FinishedEpisode
+
+_SHOWN = 10
 
 
 class Standing(enum.Enum):
@@ -193,9 +196,10 @@ def _ask(
     known = [each.episode_id for each in episodes]
     unknown = sorted(numbers.difference(known))
     if unknown:
+        returned, listed = first_of(unknown, _SHOWN), first_of(known, _SHOWN) or "none"
         raise InvalidArgument(
-            f"keep={name} returned {_listed(unknown)}, but no finished episode has "
-            f"that number. The finished episodes are {_listed(known)}."
+            f"keep={name} returned {returned}, but no finished episode has that number. "
+            f"The finished episodes are {listed}."
         )
     return numbers
 
@@ -205,9 +209,3 @@ def _number(value: Any) -> int:
         # Most likely the function returned flags, which would mean episodes 0 and 1.
         raise TypeError(f"{value} is not an episode number")
     return operator.index(value)
-
-
-def _listed(numbers: Sequence[int], most: int = 10) -> str:
-    shown = ", ".join(map(str, numbers[:most])) or "none"
-    more = len(numbers) - most
-    return f"{shown} and {more} more" if more > 0 else shown
