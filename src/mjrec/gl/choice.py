@@ -10,12 +10,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 from ..errors import GLError
-from .backends import (
-    BACKENDS,
-    backend_in_environment,
-    backend_name,
-    environment_for,
-)
+from .backends import BACKENDS, backend_in_environment, backend_name, environment_for
 from .diagnosis import Diagnosis
 from .probing import Probe, probe
 

@@ -35,10 +35,7 @@ class Diagnosis:
 
 
 def diagnose(
-    text: str,
-    *,
-    backend: str | None = None,
-    environ: Mapping[str, str] | None = None,
+    text: str, *, backend: str | None = None, environ: Mapping[str, str] | None = None
 ) -> Diagnosis | None:
     """Return the cause and fix of an OpenGL failure, or None if it is unknown.
 

@@ -24,11 +24,7 @@ from typing import Any, Self
 import numpy as np
 
 from ..child_python import Child, wait_for_news
-from ..errors import (
-    ClosedError,
-    Error,
-    GLError,
-)
+from ..errors import ClosedError, Error, GLError
 from ..formats.dataclass_json import to_json
 from ..formats.locks import Lock, try_lock
 from ..formats.monitor_directory import render_lock_name

@@ -22,11 +22,7 @@ from ..errors import UnreadableFile
 from ..formats.bundle import FINISHED, finished_trajectories, is_finished
 from ..formats.frame_hashes import frame_hash_path
 from ..formats.locks import Lock, is_locked, try_lock
-from ..formats.monitor_directory import (
-    ClipPart,
-    lock_name,
-    unfinished_files,
-)
+from ..formats.monitor_directory import ClipPart, lock_name, unfinished_files
 from ..formats.spans import find_recording, find_trajectory, recordings_in_flight
 from ..formats.trajectory import added_up
 from ..formats.video_metadata import is_done, metadata_path

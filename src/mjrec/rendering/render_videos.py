@@ -100,12 +100,7 @@ def render_videos(
         Error: the engine cannot work.
     """
     variant = Variant(
-        view=View(
-            camera=camera,
-            height=height,
-            width=width,
-            quality=quality,
-        ),
+        view=View(camera=camera, height=height, width=width, quality=quality),
         max_fps=max_fps,
         fps=fps,
         annotate=annotate,

@@ -44,13 +44,7 @@ _MOST_FIGURES: Final = 120
 _MOST_PROBLEMS: Final = 200
 
 # By the number in `outcome`: none, TERMINATED, TRUNCATED, both, FAILED.
-_OUTCOMES: Final = (
-    "",
-    "terminated",
-    "truncated",
-    "terminated and truncated",
-    "failed",
-)
+_OUTCOMES: Final = ("", "terminated", "truncated", "terminated and truncated", "failed")
 _SUCCESS: Final = {1: ", success", 0: ", no success", -1: ""}
 
 _Pairs = Sequence[tuple[str, str]]
@@ -129,9 +123,7 @@ def _environment() -> Any:
         import jinja2
     except ImportError as error:
         raise MissingDependency(
-            "Jinja2",
-            purpose="Writing a report",
-            install="pip install 'mjrec[report]'",
+            "Jinja2", purpose="Writing a report", install="pip install 'mjrec[report]'"
         ) from error
     from markupsafe import Markup, escape
 

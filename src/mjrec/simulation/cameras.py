@@ -24,10 +24,7 @@ FREE_CAMERA = -1
 _TRACK = int(mujoco.mjtCamLight.mjCAMLIGHT_TRACK)
 _PLANE = int(mujoco.mjtGeom.mjGEOM_PLANE)
 _TRACKCOM = int(mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM)
-_TRAVELLING_JOINTS = (
-    int(mujoco.mjtJoint.mjJNT_FREE),
-    int(mujoco.mjtJoint.mjJNT_SLIDE),
-)
+_TRAVELLING_JOINTS = (int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_SLIDE))
 
 
 def raw_model(model: Any) -> mujoco.MjModel:
