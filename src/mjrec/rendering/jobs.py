@@ -126,13 +126,6 @@ class VideoJob:
     variant: Variant | None = None
     video: Path | None = None
 
-    @classmethod
-    def finishing(
-        cls, directory: Path, key: RecordingKey, *, strict: bool = False
-    ) -> Self:
-        """Return the job that finishes the pending parts of a recording."""
-        return cls(directory=directory, recording=key.shown_name, strict=strict)
-
     @property
     def name(self) -> str:
         """A unique name: the path of the video to write, or of the recording."""

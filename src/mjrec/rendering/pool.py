@@ -10,6 +10,7 @@ two workers are busy, not sixteen.
 from __future__ import annotations
 
 import collections
+import contextlib
 import itertools
 import logging
 import os
@@ -124,13 +125,12 @@ class WorkerPool:
     def start(self) -> None:
         """Start the workers now, so that the first frame comes sooner. Idempotent.
 
-        Raises:
-            DirectoryNotWritable: a lock cannot be created in the directory.
-            Error: a worker cannot be started.
+        Errors are reported when there is something to draw.
         """
-        self._check_usable()
-        for worker in self._workers[: self._free()]:
-            self._start(worker)
+        with contextlib.suppress(Error):
+            self._check_usable()
+            for worker in self._workers[: self._free()]:
+                self._start(worker)
         self.rest()
 
     def prepare(self, trajectory: Path) -> None:
