@@ -62,7 +62,8 @@ class ReportVideo:
         index: the index of that episode in `ReportTask.episodes`; None if unknown.
         file: the address of the copy relative to the page, or a `data:` URL; empty if
             the video is not part of the report.
-        poster: the address of a still image, in the same form; empty if there is none.
+        image: a still image, as a JPEG; None if there is none.
+        poster: the address of that image, in the same form as `file`.
         roles: which of `"best"`, `"median"`, `"worst"` its episode is.
         height: height of the frames in pixels; None if unknown.
         width: width of the frames in pixels; None if unknown.
@@ -82,6 +83,7 @@ class ReportVideo:
     episode_id: int | None = None
     index: int | None = None
     file: str = ""
+    image: bytes | None = None
     poster: str = ""
     roles: Sequence[str] = ()
     height: int | None = None

@@ -80,26 +80,17 @@ def page_of(contents: ReportContents) -> str:
         script=script,
         style_hash=_hash(style),
         script_hash=_hash(script),
-        subtitle=_subtitle(contents),
         most_problems=_MOST_PROBLEMS,
         bars=[_bar(task.summary) for task in contents.tasks],
         intervals=intervals,
         notes=_notes(contents.tasks, methods, intervals),
         percent=f"{how.confidence * 100:.4g}\N{NO-BREAK SPACE}%",
-        across=[
-            {
-                "name": name,
-                "series": index % SERIES,
-                "scores": each,
-                "method": _in_words(each.interval_method, how),
-            }
-            for index, (name, each) in enumerate(contents.across.items())
-        ],
+        num_series=SERIES,
+        method_of=lambda scores: _in_words(scores.interval_method, how),
         profile=_profile(contents),
         figures=list(_figures(contents.tasks)),
-        figures_left_out=len(contents.tasks[_MOST_FIGURES:]),
+        most_figures=_MOST_FIGURES,
         cards=cards,
-        players_left_out=len(contents.videos) - len(cards),
         roles=[role for role in ROLES if any(role in c["video"].roles for c in cards)],
         selection=_selection(contents.tasks),
         episodes=page_json(_episodes(contents, shown)),
@@ -156,21 +147,12 @@ def _environment() -> Any:
         ),
         sorted_by=lambda v: "" if v is None or math.isnan(v) else repr(float(v)),
     )
-    environment.globals["decimals_of"] = _decimals_of
+    environment.globals.update(decimals_of=_decimals_of, counted=counted)
     return environment
 
 
 def _decimals_of(task: ReportTask) -> int:
     return decimals_for((task.summary.minimum, task.summary.maximum))
-
-
-def _subtitle(contents: ReportContents) -> str:
-    tasks = contents.tasks
-    episodes = sum(len(task.episodes) for task in tasks)
-    parts = [counted(len(tasks), "task"), counted(episodes, "episode")]
-    if failed := sum(task.summary.failed for task in tasks):
-        parts.append(f"{failed} of them failed")
-    return ", ".join([*parts, counted(len(contents.videos), "video")])
 
 
 # --- The summary ------------------------------------------------------------------
