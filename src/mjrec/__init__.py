@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from .formats.archive import write_archive as write_archive
     from .formats.video_writer import VideoWriter as VideoWriter
     from .formats.video_writer import save_video as save_video
-    from .gl import use_gl as use_gl
+    from .gl.choice import use_gl as use_gl
     from .monitors import Monitor as Monitor
     from .monitors.dm_env_monitor import DmEnvMonitor as DmEnvMonitor
     from .monitors.gymnasium_monitor import GymnasiumMonitor as GymnasiumMonitor
@@ -78,7 +78,7 @@ _NAMES = {
     "evidence.verify": "verify",
     "formats.archive": "write_archive",
     "formats.video_writer": "VideoWriter save_video",
-    "gl": "use_gl",
+    "gl.choice": "use_gl",
     "monitors": "Monitor",
     "monitors.dm_env_monitor": "DmEnvMonitor",
     "monitors.gymnasium_monitor": "GymnasiumMonitor",

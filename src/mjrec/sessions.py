@@ -23,7 +23,7 @@ from .environments.policies import load_policy, policy_file
 from .errors import GLError, InvalidArgument
 from .formats.manifest import read_manifest
 from .formats.monitor_directory import Infix, infix_of, manifest_name
-from .gl import use_gl
+from .gl.choice import use_gl
 from .monitors.monitor import monitored
 from .recorder.options import DEFERRED, LIVE, OFF, RecorderOptions
 from .rendering.views import PlainCamera

@@ -30,13 +30,13 @@ from ..formats.dataclass_json import to_json
 from ..formats.locks import Lock, try_lock
 from ..formats.monitor_directory import render_lock_name
 from ..frames import Frame
-from ..gl import backend_for_children
 from ..gl.backends import (
     BACKENDS,
     backend_in_environment,
     environment_for,
     rendering_is_off,
 )
+from ..gl.choice import backend_for_children
 from ..machine import check_workers, usable_cpus
 from ..messages import log_message, unpacked
 from ..simulation.model_trust import ALL_MODELS, TRUST_VARIABLE
