@@ -26,7 +26,7 @@ import mjrec
 from mjrec.child_python import Child
 from mjrec.formats.trajectory_file import open_trajectory
 from mjrec.formats.video_file import content_facts
-from mjrec.rendering.views import View
+from mjrec.rendering.jobs import View
 from mjrec.rendering.worker import trajectory_drawing
 from mjrec.simulation.renderer import Canvas
 

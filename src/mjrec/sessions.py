@@ -26,7 +26,7 @@ from .formats.monitor_directory import Infix, infix_of, manifest_name
 from .gl.choice import use_gl
 from .monitors.monitor import monitored
 from .recorder.options import DEFERRED, LIVE, OFF, RecorderOptions
-from .rendering.views import PlainCamera
+from .rendering.jobs import PlainCamera
 from .schedules import disable_videos, schedule_from_text
 from .simulation.find_simulation import simulation_in
 

@@ -41,7 +41,7 @@ from ..machine import check_workers, usable_cpus
 from ..messages import log_message, unpacked
 from ..simulation.model_trust import ALL_MODELS, TRUST_VARIABLE
 from ..timeouts import Timeout
-from .views import PlainCamera, View, plain_camera
+from .jobs import PlainCamera, View, plain_camera
 
 logger = logging.getLogger(__name__)
 

@@ -27,9 +27,16 @@ from ..formats.spans import is_recorded
 from ..machine import check_workers, usable_cpus
 from ..simulation.model_trust import trusting_models
 from .finish import do_jobs, finish
-from .jobs import Progress, RecordingKey, RenderedVideos, VideoJob, key_of
+from .jobs import (
+    Progress,
+    RecordingKey,
+    RenderedVideos,
+    Variant,
+    VideoJob,
+    View,
+    key_of,
+)
 from .recordings import parts_of, recordings
-from .views import Variant, View
 
 _SHOWN = 20
 

@@ -46,14 +46,14 @@ from .contents import (
     rows_of_results,
     summary_of_rows,
 )
-from .provenance import (
+from .monitor_facts import (
     joined,
     machine_of,
     pairs_of_monitor,
     pairs_of_results,
+    recorded_videos,
     recorded_when,
 )
-from .recorded_videos import recorded_videos
 
 _package_logger = logging.getLogger(__package__.partition(".")[0])
 

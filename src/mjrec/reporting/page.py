@@ -29,8 +29,8 @@ from ..evaluation.summaries import TaskSummary
 from ..plain_text import counted, spelled_out
 from .contents import FAILED, ROLES, ReportContents, ReportTask, ReportVideo
 from .curves import SERIES, evaluation_curve, learning_curve, profile_curve
+from .monitor_facts import SELECTION
 from .page_text import NOTHING, address, decimals_for, interval_text, number, page_json
-from .provenance import SELECTION
 
 _LONGEST_NAME: Final = 120
 _LONGEST_REASON: Final = 300
