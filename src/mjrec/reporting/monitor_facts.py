@@ -26,7 +26,7 @@ from ..formats.monitor_directory import episode_of, view_of
 from ..formats.regular_files import regular_path
 from ..formats.video_metadata import finished_videos, is_broken, metadata_path
 from ..results.journal_or_stats import MonitorResults
-from .contents import ReportVideo
+from .contents import ReportVideo, end_times
 
 T = TypeVar("T")
 Pairs = Iterable[tuple[str, str]]
@@ -133,7 +133,8 @@ def spaced(rule: str) -> str:
 
 def recorded_when(rows: NDArray[np.void]) -> str:
     """Return the time range in which episodes ended; empty if unknown."""
-    known = rows["end_time"][~np.isnan(rows["end_time"])]
+    known = end_times(rows)
+    known = known[~np.isnan(known)]
     if not len(known):
         return ""
     try:

@@ -27,7 +27,7 @@ from ..errors import MissingDependency
 from ..evaluation.statistics import PERCENTILE_BOOTSTRAP, Bootstrap, Interval
 from ..evaluation.summaries import TaskSummary
 from ..plain_text import counted, spelled_out
-from .contents import FAILED, ROLES, ReportContents, ReportTask, ReportVideo
+from .contents import ROLES, ReportContents, ReportTask, ReportVideo, outcomes
 from .curves import SERIES, evaluation_curve, learning_curve, profile_curve
 from .monitor_facts import SELECTION
 from .page_text import NOTHING, address, decimals_for, interval_text, number, page_json
@@ -43,7 +43,7 @@ _MOST_PLAYERS: Final = 300
 _MOST_FIGURES: Final = 120
 _MOST_PROBLEMS: Final = 200
 
-# By the number in `outcome`: none, TERMINATED, TRUNCATED, both, FAILED.
+# See `contents.outcomes`.
 _OUTCOMES: Final = ("", "terminated", "truncated", "terminated and truncated", "failed")
 _SUCCESS: Final = {1: ", success", 0: ", no success", -1: ""}
 
@@ -263,10 +263,10 @@ def _card(
     if video.index is not None:
         episode = task.episodes[video.index]
         reward = float(episode["total_reward"])
-        run = int(episode["run"])
+        run = int(episode["seed"])
         where = f"run {task.runs[run]}" if task.runs else f"seed {run}"
         which = f"{where}, episode {episode['episode']}"
-        outcome = _OUTCOMES[int(episode["outcome"])]
+        outcome = _OUTCOMES[outcomes(task)[video.index]]
         success = _SUCCESS[int(episode["success"])]
         facts += [
             ("Episode", which),
@@ -344,7 +344,7 @@ def _most_telling(
     returns = task.episodes["total_reward"]
     order = np.argsort(returns, kind="stable")[: np.isfinite(returns).sum()]
     with_videos = np.array(sorted(videos)[:most], np.intp)
-    failed = np.flatnonzero(task.episodes["outcome"] == FAILED)[:most]
+    failed = np.array(sorted(task.failures)[:most], np.intp)
     return np.unique(np.concatenate((order[:most], order[-most:], with_videos, failed)))
 
 
@@ -354,12 +354,15 @@ def _columns(
     decimals = _decimals_of(task)
     at = {int(row): i for i, row in enumerate(rows)}
     chosen = task.episodes[rows]
-    names = ("run", "episode", "length", "outcome", "success")
     return {
         "name": spelled_out(task.name, _LONGEST_NAME),
         "decimals": decimals,
         "runs": [spelled_out(run, _LONGEST_NAME) for run in task.runs] or None,
-        **{name: chosen[name].tolist() for name in names},
+        "run": chosen["seed"].tolist(),
+        "episode": chosen["episode"].tolist(),
+        "length": chosen["length"].tolist(),
+        "outcome": outcomes(task)[rows].tolist(),
+        "success": chosen["success"].tolist(),
         "total_reward": _json_numbers(chosen["total_reward"], decimals),
         "failures": {
             at[i]: spelled_out(reason, _LONGEST_REASON)
