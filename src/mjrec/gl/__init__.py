@@ -7,4 +7,8 @@ processes.
 
 from __future__ import annotations
 
+from .backends import Diagnosis as Diagnosis
+from .backends import diagnose as diagnose
+from .choice import Probe as Probe
 from .devices import render_on_given_gpu as render_on_given_gpu
+from .egl import EglDevice as EglDevice

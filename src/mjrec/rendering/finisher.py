@@ -89,7 +89,8 @@ class Finisher:
     def is_ready(self) -> bool:
         """Return whether the model of the next job exists."""
         _, plan = next(iter(self._waiting.values()))
-        return plan.has_model
+        # A running simulation may still write it.
+        return plan.model_file is None or plan.model_file.exists()
 
     def do_next(self) -> tuple[VideoJob, RenderedVideos]:
         """Do the next job, and return it with its result."""
