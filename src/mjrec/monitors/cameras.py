@@ -11,7 +11,7 @@ from ..formats.monitor_directory import further_parts
 from ..frames import Frame, check_frame, grid_frame, grid_shape
 from ..recorder.recorded_environment import EpisodeFrames
 from ..recorder.video_recorder import can_give_frames
-from ..rendering.views import plain_camera
+from ..rendering.jobs import plain_camera
 
 _RGB_ARRAY = "rgb_array"
 

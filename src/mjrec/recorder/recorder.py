@@ -15,10 +15,7 @@ from typing import Any, Final
 from ..errors import DirectoryNotWritable, Error, FileNotWritten
 from ..formats.bundle import FINISHED
 from ..formats.journal import JournalEntry
-from ..formats.monitor_directory import (
-    episode_of,
-    video_prefix,
-)
+from ..formats.monitor_directory import episode_of, infix_of, video_prefix
 from ..formats.spans import recordings_in_flight
 from ..formats.video_metadata import note_failure, reason_of
 from ..results.manifest_writing import write_manifest_and_stats
@@ -389,7 +386,9 @@ class Recorder:
 
     def failures(self) -> Mapping[str, str]:
         """Return the reasons why videos could not be rendered, keyed by their names."""
-        return self.run.finisher.failures
+        # Several monitors may use the same finisher.
+        failures = self.run.finisher.failures.items()
+        return {name: why for name, why in failures if infix_of(name) == self.infix}
 
     def check_process(self) -> None:
         """Raise `Error` in a process forked from the one that created the recorder."""
