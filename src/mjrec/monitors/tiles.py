@@ -8,7 +8,7 @@ import logging
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from ..environments.gymnasium_frames import gymnasium_frames
+from ..environments.gymnasium_scenes import gymnasium_scenes
 from ..errors import InvalidArgument, NoPictures
 from ..formats.monitor_directory import video_prefix
 from ..recorder.ending_reasons import CLOSE, RESET, ending
@@ -56,7 +56,7 @@ def vector_tiles(
     camera = view["camera"]
     if isinstance(camera, list | tuple) and camera:
         view = {**view, "camera": camera[0]}
-    tiles = Tiles([gymnasium_frames(each, **view) for each in envs])
+    tiles = Tiles([gymnasium_scenes(each, **view).frames for each in envs])
     if tiles.render_mode is None:
         raise NoPictures(
             "tiled=True was requested, and a tiled video needs the frames of all "
