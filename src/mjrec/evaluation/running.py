@@ -31,9 +31,8 @@ from ..environments.episode_seeds import (
     episode_seeds,
     seed_global_generators,
 )
-from ..environments.from_name import environment_from_name
 from ..environments.named_environment import EnvironmentOptions, NamedEnvironment
-from ..environments.names import working_directory_importable
+from ..environments.names import environment_from_name, working_directory_importable
 from ..environments.policies import Policy, load_policy, policy_file, policy_from
 from ..environments.scenes import new_warnings, simulation_below
 from ..errors import Error, InvalidArgument, PolicyError
