@@ -11,11 +11,11 @@ from gymnasium.envs.mujoco.half_cheetah_v5 import HalfCheetahEnv
 import mjrec
 from conftest import Corridor
 from mjrec.environments.episode_seeds import EpisodeSeeds, episode_seeds
+from mjrec.environments.from_name import environment_from_name
 from mjrec.environments.gymnasium_environments import make_gymnasium
 from mjrec.environments.named_environment import EnvironmentOptions
 from mjrec.environments.names import (
     EnvironmentName,
-    environment_from_name,
     parse_environment_name,
 )
 from mjrec.environments.policies import load_policy

@@ -7,8 +7,8 @@ from engine_runs import run_python
 
 import mjrec
 from mjrec.environments.episode_seeds import episode_seeds
+from mjrec.environments.from_name import environment_from_name
 from mjrec.environments.named_environment import EnvironmentOptions
-from mjrec.environments.names import environment_from_name
 
 pytest.importorskip("dm_control")
 
@@ -147,7 +147,7 @@ def test_without_a_dm_control_that_works_the_line_to_run_is_named(
     (tmp_path / "dm_control" / "suite.py").write_text(suite)
     said = run_python(
         "-c",
-        "import mjrec.environments.names as f\n"
+        "import mjrec.environments.from_name as f\n"
         "try: f.environment_from_name('dm_control/cheetah-run')\n"
         "except Exception as error: print(type(error).__name__, error)\n",
         PYTHONPATH=str(tmp_path),

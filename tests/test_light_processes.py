@@ -7,7 +7,7 @@ from engine_runs import run_python
 SIMULATORS = {"mujoco", "dm_control", "OpenGL"}
 CASES = [
     (
-        "import mjrec.environments.names, mjrec.environments.policies",
+        "import mjrec.environments.from_name, mjrec.environments.policies",
         {*SIMULATORS, "gymnasium", "dm_env"},
     ),
     (

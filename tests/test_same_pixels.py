@@ -15,8 +15,8 @@ from recordings import frames_in, in_flight, metadata_of
 from robots import robotics_ids, robots_that_reset
 
 import mjrec
+from mjrec.environments.from_name import environment_from_name
 from mjrec.environments.named_environment import EnvironmentOptions
-from mjrec.environments.names import environment_from_name
 from mjrec.formats.trajectory_file import open_trajectory
 from mjrec.rendering.pool import WorkerPool
 from mjrec.simulation.cameras import raw_data, raw_model

@@ -16,12 +16,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 from .environments.episode_seeds import episode_seeds, seed_global_generators
+from .environments.from_name import environment_from_name
 from .environments.named_environment import EnvironmentOptions, NamedEnvironment
-from .environments.names import (
-    environment_from_name,
-    parse_environment_name,
-    working_directory_importable,
-)
+from .environments.names import parse_environment_name, working_directory_importable
 from .environments.policies import load_policy, policy_file
 from .errors import GLError, InvalidArgument
 from .formats.manifest import read_manifest

@@ -1,21 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Environments of any framework by their names, and imports of users' modules.
-
-A framework is loaded only when one of its environments is created. So choose the GL
-backend first.
-"""
+"""The names of environments, and imports of modules that users name."""
 
 from __future__ import annotations
 
 import contextlib
 import sys
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
-from ..errors import InvalidArgument, MissingDependency, NoPictures, UnknownName
-from .known_names import dm_control_failure
-from .named_environment import EnvironmentOptions, NamedEnvironment
+from ..errors import InvalidArgument, UnknownName
 
 _DM_CONTROL = "dm_control/"
 _MJCF_SUFFIXES = (".xml", ".mjcf")
@@ -89,46 +83,6 @@ def task_of_suite(name: str) -> tuple[str, str]:
             f"example dm_control/cheetah-run, not {name!r}."
         )
     return domain, task
-
-
-def environment_from_name(
-    text: str, options: EnvironmentOptions | None = None
-) -> NamedEnvironment:
-    """Create the environment with the given name.
-
-    If it cannot be drawn, it is created without frames, and `not_drawn` says why.
-
-    Args:
-        text: see `parse_environment_name`.
-        options: the options; None for the defaults.
-
-    Raises:
-        UnknownName, InvalidArgument: the name or an option is invalid.
-        MissingDependency: the framework or another dependency is not installed.
-        EnvironmentNotMade, UnreadableFile: creating the environment failed; the cause
-            is chained.
-    """
-    name = parse_environment_name(text)
-    options = options or EnvironmentOptions()
-    if name.framework == "dm_control":
-        try:
-            from .dm_control_environments import DmControlEnvironment
-        except Exception as error:
-            raise dm_control_failure(text, error) from error
-        return DmControlEnvironment(text, options)
-    from .gymnasium_environments import GymnasiumEnvironment, make_gymnasium
-
-    if name.framework == "mjcf":
-        from .mjcf_environments import make_mjcf
-
-        return GymnasiumEnvironment(make_mjcf(Path(name.text), options))
-    try:
-        return GymnasiumEnvironment(make_gymnasium(text, options))
-    except (NoPictures, MissingDependency) as error:
-        if not options.frames or "render_mode" in options.kwargs:
-            raise
-        without = replace(options, frames=False)
-        return GymnasiumEnvironment(make_gymnasium(text, without), not_drawn=error)
 
 
 @contextlib.contextmanager

@@ -31,8 +31,9 @@ from ..environments.episode_seeds import (
     episode_seeds,
     seed_global_generators,
 )
+from ..environments.from_name import environment_from_name
 from ..environments.named_environment import EnvironmentOptions, NamedEnvironment
-from ..environments.names import environment_from_name, working_directory_importable
+from ..environments.names import working_directory_importable
 from ..environments.policies import Policy, load_policy, policy_file, policy_from
 from ..environments.scenes import new_warnings, simulation_below
 from ..errors import Error, InvalidArgument, PolicyError
@@ -234,7 +235,7 @@ class _ChunkRun:
             for unit in missing:
                 if deaths[unit] >= TRIES:
                     why = f"{TRIES} processes died in it"
-                    self._monitored(unit).recorder.note_event(
+                    self._monitored(unit).recorder.run.note(
                         "failed", _failed(unit, why)
                     )
             missing = [unit for unit in missing if deaths[unit] < TRIES]
@@ -279,7 +280,7 @@ class _ChunkRun:
         monitor.forget_frames()
         episode_id, start = monitor.episode_id, time.time()
         seed, number = unit
-        monitor.recorder.note_event("begun", {"seed": seed, "episode": number})
+        monitor.recorder.run.note("begun", {"seed": seed, "episode": number})
         journal = self._evaluator.journal
         assert journal is not None
 
@@ -305,7 +306,7 @@ class _ChunkRun:
                 raise
             logger.warning("An episode failed with this error:", exc_info=True)
             monitor.recorder.note_error(error)
-            monitor.recorder.note_event("failed", failed(_in_one_line(error)))
+            monitor.recorder.run.note("failed", failed(_in_one_line(error)))
             self._renew()
             return False
         return True

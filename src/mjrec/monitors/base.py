@@ -22,6 +22,7 @@ from ..recorder.options import (
     WARN,
     RecorderOptions,
     RenderingChoice,
+    type_of_mode,
 )
 from ..recorder.recorded_environment import RecordedEnvironment
 from ..recorder.recorder import Recorder
@@ -73,7 +74,7 @@ class MonitorBase:
             InvalidArgument: `mode` is anything else.
         """
         for recorder in self._recorders:
-            recorder.set_mode(mode)
+            recorder.stats_recorder.type = type_of_mode(mode)
 
     def get_total_steps(self) -> int:
         """Return the total number of steps, including those of unfinished episodes."""
@@ -106,7 +107,7 @@ class MonitorBase:
             self._guard.close()
         failures: dict[str, str] = {}
         for recorder in self._recorders:
-            failures.update(recorder.failures())
+            failures.update(recorder.run.finisher.failures)
         if not wait or not failures or self._reported_failures:
             return
         self._reported_failures = True
