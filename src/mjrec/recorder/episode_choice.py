@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The choice, made when an episode begins, of a video and a trajectory for it."""
+"""The choice of episodes that get a video or keep their trajectory, as they begin."""
 
 from __future__ import annotations
 

@@ -471,7 +471,8 @@ class Recorder:
             success: whether the environment reports a success; None if unknown.
             take: takes the episode's last frames.
         """
-        recording, is_complete = self.run.episode, facts["complete"]
+        recording, is_complete = self._recording, facts["complete"]
+        assert recording is not None, "there was no reset"
         # A schedule's decision is final.
         kept = self._kept if recording.is_chosen else None
         known = self._results(facts, success) if is_complete else None
