@@ -142,7 +142,7 @@ class VectorMonitor(MonitorBase, gymnasium.vector.VectorWrapper):
         options_of_close = self._closing
         closings: list[Callable[[], object]] = []
         if tiles is not None:
-            self._tiled = TiledVideo(self.monitors[0], tiles, options, envs[0])
+            self._tiled = TiledVideo(self.monitors[0], tiles)
             # Closed first, because the first monitor's manifest lists its videos.
             closings.append(self._tiled.close)
         if shared is not None:
