@@ -88,7 +88,7 @@ def test_actions_are_played_in_the_dtype_that_was_given(data: Path) -> None:
 def test_dictionaries_are_played_as_dictionaries() -> None:
     """They are recorded as one vector."""
     episode = EpisodeInputs(
-        episode_id=0, steps=1, actions="a", parts=[("x", [2]), ("y", [])]
+        episode_id=0, steps=1, actions="a", action_parts=[("x", [2]), ("y", [])]
     )
     [action] = given_actions(episode, {"a": np.array([[1.0, 2.0, 3.0]])})
     assert action["x"].tolist() == [1.0, 2.0]

@@ -9,10 +9,8 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import functools
-import glob
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Final
 
@@ -22,6 +20,7 @@ from ..formats.monitor_directory import infix_of
 from ..formats.regular_files import open_regular
 from ..formats.trajectory_file import open_trajectory
 from ..provenance import PACKAGES
+from .compare_models import models_of
 from .descriptions import packed_with
 from .excuses import excuse_of
 from .findings import Excuse
@@ -39,52 +38,42 @@ _GL: Final = ("gl_vendor", "gl_renderer", "gl_version")
 
 def claimed_excuses(given: Path, made: Path) -> list[Excuse]:
     """Return the excuses that follow from two runs' folders (their `data/`)."""
-    found: list[Excuse] = []
-    recordings = given / RECORDINGS
-    # All trajectories of a recording come from one machine.
+    found = list(_all_claims(given, made))
+    if not any(excuse.name in _COMPILING for excuse in found):
+        return found
+    models = models_of(given / RECORDINGS)
+    return [
+        _with_models(each, models) if each.name in _COMPILING else each
+        for each in found
+    ]
+
+
+def _with_models(excuse: Excuse, models: Mapping[str, Iterable[str]]) -> Excuse:
+    """Return an excuse extended to the compiled models of its recordings."""
+    infixes = (i.removeprefix(_RECORDING) for i in excuse.items if _RECORDING in i)
+    names = {name for infix in infixes for name in models.get(infix, ())}
+    compiled = sorted(name for name in names if name.endswith(".mjb.gz"))
+    return dataclasses.replace(excuse, items=(*excuse.items, *compiled))
+
+
+def _all_claims(given: Path, made: Path) -> Iterator[Excuse]:
     looked_at = set()
-    for path in sorted(recordings.glob("openaigym.*")):
+    for path in sorted((given / RECORDINGS).glob("openaigym.*")):
         other = made / RECORDINGS / path.name
         infix = infix_of(path.name)
         if infix is None or not other.is_file():
             continue
         if path.suffix == ".h5":
+            # All trajectories of a recording come from one machine.
             if infix in looked_at:
                 continue
             looked_at.add(infix)
-        try:
-            found += _claims(path, other, f"{_RECORDING}{infix}")
-        except (Error, OSError, ValueError):
-            # The comparison reports unreadable files.
-            continue
-    with contextlib.suppress(OSError, ValueError):
-        found += _versions(
-            read_object(given / ENVIRONMENT)["packed_with"], packed_with()
-        )
-    # Several excuses share a recording, which may have thousands of trajectories.
-    models_of = functools.cache(functools.partial(_models, recordings))
-    return [_with_models(excuse, models_of) for excuse in found]
-
-
-def _with_models(excuse: Excuse, models_of: Callable[[str], Iterable[str]]) -> Excuse:
-    """Return an excuse extended to the compiled models of its recordings."""
-    if excuse.name not in _COMPILING:
-        return excuse
-    models: dict[str, None] = {}
-    for item in excuse.items:
-        if item.startswith(_RECORDING):
-            infix = item.removeprefix(_RECORDING)
-            models.update(dict.fromkeys(models_of(infix)))
-    return dataclasses.replace(excuse, items=(*excuse.items, *models))
-
-
-def _models(recordings: Path, infix: str) -> tuple[str, ...]:
-    """Return the names of the compiled models of a recording."""
-    names: dict[str, None] = {}
-    for path in recordings.glob(f"openaigym.trajectory.{glob.escape(infix)}.*.h5"):
-        with contextlib.suppress(Error), open_trajectory(path) as reader:
-            names[str(facts_in(reader.facts.get("model")).get("mjb"))] = None
-    return tuple(names)
+        # The comparison reports unreadable files.
+        with contextlib.suppress(Error, OSError, ValueError):
+            yield from list(_claims(path, other, f"{_RECORDING}{infix}"))
+    with contextlib.suppress(OSError, ValueError, KeyError):
+        said = read_object(given / ENVIRONMENT)["packed_with"]
+        yield from list(_versions(said, packed_with()))
 
 
 def _claims(given: Path, made: Path, recording: str) -> Iterator[Excuse]:
