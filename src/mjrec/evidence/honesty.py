@@ -219,12 +219,12 @@ def _repeated(inputs: Inputs, arrays: Mapping[str, NDArray[Any]]) -> Iterator[Fi
     found: dict[str, list[str]] = {}
     for recording in inputs.recordings:
         for each in recording.episodes:
-            if each.actions is None or not each.steps:
+            if not each.has_actions or not each.steps:
                 continue
             what = [recording.env_id, each.seed, each.irregular]
             if each.seed is None:
-                what += [each.random_state, _digest(arrays.get(each.first_state or ""))]
-            what.append(_digest(arrays.get(each.actions)))
+                what += [each.random_state, _digest(arrays.get(f"{each.arrays}.state"))]
+            what.append(_digest(arrays.get(each.arrays or "")))
             found.setdefault(json_text.dumps(what), []).append(recording.item(each))
     for items in found.values():
         if len(items) > 1:

@@ -79,16 +79,15 @@ class EpisodeInputs:
         options: the options given to the reset.
         random_state: the archive's state of the environment's random generators just
             before the reset. It is used only if no seed leads to it.
-        first_state: the name of the array with the state after the reset. It is used
-            only if neither a seed nor a random state leads there.
-        states: the name of the array of all states if the archive claims a different
-            MuJoCo or machine, otherwise None. Each step then starts from the recorded
-            state before it, so that differences in the last bits do not grow.
         steps: number of steps taken.
-        actions: the name of the array of actions, even if some are irregular; None if
-            the actions were not kept.
-        steps_taken: the name of the arrays `<name>.<part>` of `RecordedSteps` if
-            the environment has wrappers; otherwise None.
+        arrays: the name of its arrays; None if it has no trajectory. The array with
+            this name has the actions that are regular. `<name>.state` is the state
+            after the reset; it is used only if neither a seed nor a random state leads
+            there. `<name>.states` are all states if the archive claims a different
+            MuJoCo or machine: each step then starts from the recorded state before it,
+            so that differences in the last bits do not grow. `<name>.<part>` are the
+            parts of `RecordedSteps` if the environment has wrappers.
+        has_actions: whether the actions were kept, in the array or as irregular ones.
         action_dtypes: pairs of a step and the dtype of the actions from that step on.
         action_parts: names and shapes of a dictionary's arrays; None for plain arrays.
         irregular: `step`, `value` and, for an array, `dtype` of each action that does
@@ -113,11 +112,9 @@ class EpisodeInputs:
     seed: Any = None
     options: Any = None
     random_state: Any = None
-    first_state: str | None = None
-    states: str | None = None
     steps: int = 0
-    actions: str | None = None
-    steps_taken: str | None = None
+    arrays: str | None = None
+    has_actions: bool = False
     action_dtypes: Sequence[tuple[Count, Dtype]] = ()
     action_parts: Sequence[tuple[str, Sequence[Count]]] | None = None
     irregular: Sequence[Mapping[str, Any]] = ()
@@ -267,7 +264,7 @@ def given_actions(
         arrays: recorded actions by the names in the inputs.
     """
     irregular = {int(each["step"]): each for each in episode.irregular}
-    recorded = arrays.get(episode.actions or "")
+    recorded = arrays.get(episode.arrays or "")
     for step, action in enumerate(_regular(episode, recorded)):
         yield _whole(irregular[step]) if step in irregular else action
 

@@ -58,7 +58,7 @@ class Making:
 
     Attributes:
         directory: the monitor directory.
-        arrays: actions and first states by the names in the inputs.
+        arrays: the arrays of episodes by the names in the inputs.
         trust: ids of environments that may be created in addition to those in the
             registries.
         sources: the folder with the sources of the author's models.
@@ -165,7 +165,7 @@ class _Playing:
                 )
             self._begin(episode)
             self._warned = self._recreated.warnings()
-            if episode.actions is not None:
+            if episode.has_actions:
                 self._play(episode)
             elif episode.cut is None or episode.steps:
                 self._believe(episode)
@@ -261,7 +261,7 @@ class _Playing:
         This happens only if nothing leads there: no seed was recorded and the
         environment has no random generator.
         """
-        known = self._making.arrays.get(episode.first_state or "")
+        known = self._making.arrays.get(f"{episode.arrays}.state")
         base = getattr(self._recreated.environment, "unwrapped", None)
         if known is None or base is None or self._recreated.random_state() is not None:
             yield
@@ -288,7 +288,7 @@ class _Playing:
         step, is_dm_env = self._monitor.step, self._recreated.is_dm_env
         self._begin_stand_in(episode)
         counted = 0
-        states = self._making.arrays.get(episode.states or "")
+        states = self._making.arrays.get(f"{episode.arrays}.states")
         self._break_videos(episode)
         for action in given_actions(episode, self._making.arrays):
             if states is not None:
@@ -318,16 +318,16 @@ class _Playing:
             )
 
     def _begin_stand_in(self, episode: EpisodeInputs) -> None:
-        stand_in, name = self._recreated.stand_in, episode.steps_taken
+        stand_in, arrays = self._recreated.stand_in, self._making.arrays
         if stand_in is None:
             return
-        if name is None:
+        if f"{episode.arrays}.controls" not in arrays:
             raise NotRecreated(
                 "wrappers are missing, and the controls they produced are not recorded",
                 excuse="wrappers",
             )
-        fields = (each.name for each in dataclasses.fields(RecordedSteps))
-        parts = {part: self._making.arrays[f"{name}.{part}"] for part in fields}
+        names = [each.name for each in dataclasses.fields(RecordedSteps)]
+        parts = {part: arrays[f"{episode.arrays}.{part}"] for part in names}
         stand_in.begin(RecordedSteps(**parts))
 
     def _note_stand_in(self, episode: EpisodeInputs) -> None:

@@ -309,28 +309,23 @@ def _of_trajectory(
     is_wrapped: bool,
     arrays: dict[str, NDArray[Any]],
 ) -> dict[str, Any]:
-    found: dict[str, NDArray[Any] | None] = {}
     with open_hdf5(path) as reader:
         facts, steps = reader.facts, reader.step_count
-        found[name] = reader.actions(0, steps)
+        if (actions := reader.actions(0, steps)) is not None:
+            arrays[name] = actions
         if reader.kind("state") is not None:
             if facts.get("seed") is None and facts.get("random_state") is None:
-                found[f"{name}.state"] = reader.read("state", 0, 1)
+                arrays[f"{name}.state"] = reader.read("state", 0, 1)
             if _is_elsewhere(facts):
-                found[f"{name}.states"] = reader.read("state", 0, reader.row_count)
-        taken = _steps_taken(reader) if is_wrapped else {}
-        found |= {f"{name}.{part}": values for part, values in taken.items()}
-    known = {key: values for key, values in found.items() if values is not None}
-    arrays |= known
-    # If no action fits into an array, all of them are in the journal.
-    is_whole = name in known or len(irregular) == steps
+                arrays[f"{name}.states"] = reader.read("state", 0, reader.row_count)
+        for part, values in _steps_taken(reader) if is_wrapped else ():
+            arrays[f"{name}.{part}"] = values
     return {
         **_known(facts, _FACTS),
-        "first_state": f"{name}.state" if f"{name}.state" in known else None,
-        "states": f"{name}.states" if f"{name}.states" in known else None,
         "steps": steps,
-        "steps_taken": name if taken else None,
-        "actions": name if is_whole else None,
+        "arrays": name,
+        # If no action fits into an array, all of them are in the journal.
+        "has_actions": name in arrays or len(irregular) == steps,
         "irregular": irregular,
         "selection": _selection(facts.get("video")),
         "has_trajectory": facts.get("kept") is not False,
@@ -345,17 +340,13 @@ def _is_elsewhere(facts: Mapping[str, Any]) -> bool:
     )
 
 
-def _steps_taken(reader: TrajectoryReader) -> dict[str, NDArray[Any]]:
-    """Return the parts of `RecordedSteps`; empty if controls are not recorded."""
+def _steps_taken(reader: TrajectoryReader) -> Iterator[tuple[str, NDArray[Any]]]:
+    """Yield the parts of `RecordedSteps`; none if controls are not recorded."""
     kind = reader.kind("state")
-    if kind is None or "ctrl" not in (kind.names or ()):
-        return {}
-    return {
-        "controls": reader.read("state", 1, reader.row_count)["ctrl"],
-        "rewards": reader.rewards,
-        "terminated": reader.terminated,
-        "truncated": reader.truncated,
-    }
+    if kind is not None and "ctrl" in (kind.names or ()):
+        yield "controls", reader.read("state", 1, reader.row_count)["ctrl"]
+        for part in ("rewards", "terminated", "truncated"):
+            yield part, getattr(reader, part)
 
 
 def _of_evaluation(kind: str, facts: Mapping[str, Any]) -> Mapping[str, Any]:
