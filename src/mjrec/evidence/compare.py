@@ -80,13 +80,19 @@ class _Kind(NamedTuple):
     proved: tuple[tuple[Topic, str], ...] = ()
 
 
-# Kinds of files, by the ends of their names.
+# Kinds of files, by the ends of their names, in the order of the comparison. Metadata
+# comes after videos, because it has the hash of the decoded frames.
 _KINDS: Final[Mapping[str, _Kind]] = {
+    ".zip": _Kind(Topic.IDENTITY, compare_sources),
     ".mjb.gz": _Kind(
         Topic.IDENTITY, compare_models, ((Topic.IDENTITY, "compiled model"),)
     ),
-    ".zip": _Kind(Topic.IDENTITY, compare_sources),
     ".jsonl": _Kind(Topic.REWARDS, compare_journals),
+    ".mp4": _Kind(
+        Topic.VIDEOS,
+        compare_videos,
+        ((Topic.VIDEOS, "video"), (Topic.FILES, "encoding")),
+    ),
     ".stats.json": _Kind(Topic.REWARDS, compare_objects),
     ".manifest.json": _Kind(
         Topic.SELECTION,
@@ -96,22 +102,15 @@ _KINDS: Final[Mapping[str, _Kind]] = {
     ".h5": _Kind(Topic.PHYSICS, compare_trajectories),
     ".framehash": _Kind(Topic.PICTURES, compare_frame_hashes),
     ".meta.json": _Kind(Topic.VIDEOS, compare_objects),
-    ".mp4": _Kind(
-        Topic.VIDEOS,
-        compare_videos,
-        ((Topic.VIDEOS, "video"), (Topic.FILES, "encoding")),
-    ),
     ".monitor.csv": _Kind(Topic.FILES, _other_bytes),
     ".json": _Kind(Topic.PICTURES, compare_objects),
+    "": _Kind(Topic.FILES, _other_bytes),
 }
-_UNKNOWN: Final = _Kind(Topic.FILES, _other_bytes)
 # Kinds of files in a run that was recreated without rendering.
 _UNDRAWN: Final = (".jsonl", ".stats.json", ".manifest.json", ".h5")
 _MODELS: Final = (".mjb.gz", ".zip")
 # Kinds whose equal items are counted by their comparators.
 _COUNTED: Final = (".jsonl", ".framehash")
-# Compared first. Metadata comes after videos: it has the hash of the decoded frames.
-_ORDER: Final = (".zip", ".mjb.gz", ".jsonl", ".mp4")
 
 
 class Comparison:
@@ -195,7 +194,7 @@ class Comparison:
         }
         kinds: tuple[str, ...] = _UNDRAWN
         if self._level is Level.PIXELS:
-            kinds = (*_KINDS, *([""] if self._rules.is_packed else []))
+            kinds = tuple(end for end in _KINDS if end or self._rules.is_packed)
         return {f: size for f, size in found.items() if _ending(f) in kinds}
 
     def _only_in_one(
@@ -296,19 +295,18 @@ class Comparison:
 
 
 def _order(file: str) -> tuple[int, str]:
-    ending = _ending(file)
-    return (_ORDER.index(ending) if ending in _ORDER else len(_ORDER)), file
+    return [*_KINDS].index(_ending(file)), file
 
 
 def _ending(file: str) -> str:
     """Return the end of a file's name that states its kind; "" if it is unknown."""
     if not file.startswith(f"{RECORDINGS}/openaigym."):
         return ""
-    return next((end for end in _KINDS if file.endswith(end)), "")
+    return next(end for end in _KINDS if file.endswith(end))
 
 
 def _kind(file: str) -> _Kind:
-    return _KINDS.get(_ending(file), _UNKNOWN)
+    return _KINDS[_ending(file)]
 
 
 def _damaged(file: str, error: Error) -> Difference:

@@ -38,7 +38,6 @@ from .recorder_again import monitor_again
 
 # A limit, because steps without recorded actions are counted one by one.
 _MOST_BELIEVED_STEPS = 100_000_000
-_STEPS_BETWEEN_COUNTS = 1000
 # Events that cut an episode off from outside, and their excuses. Closing a run in the
 # middle of its last episode is normal, so it needs no excuse.
 _EVENTS = {
@@ -63,7 +62,7 @@ class Making:
             registries.
         sources: the folder with the sources of the author's models.
         notes: receives the facts that could not be recreated, with their excuses.
-        on_steps: called with the number of steps taken since the last call.
+        on_step: called after each step.
     """
 
     directory: Path
@@ -71,7 +70,7 @@ class Making:
     trust: frozenset[str]
     sources: Path
     notes: list[Finding]
-    on_steps: Callable[[int], object]
+    on_step: Callable[[], object]
 
 
 def play_recording(recording: RecordingInputs, making: Making) -> None:
@@ -239,20 +238,18 @@ class _Playing:
         stated = episode.random_state
         if stated is None or stated == self._recreated.random_state():
             return
-        if seed is not None and not self._recreated.is_dm_env:
-            # No belief is needed, because the reset reseeds the generator.
-            self._recreated.set_random_state(stated)
-            return
         if seed is None and (fresh := self._recreated.seed_behind(stated)) is not None:
             self._recreated.seed(fresh)
             return
         self._recreated.set_random_state(stated)
-        self._note(
-            episode,
-            "unseeded beginning",
-            "no seed leads to its beginning; the state of the random generator before "
-            "its reset is believed",
-        )
+        # No belief is needed if the reset reseeds the generator.
+        if seed is None or self._recreated.is_dm_env:
+            self._note(
+                episode,
+                "unseeded beginning",
+                "no seed leads to its beginning; the state of the random generator "
+                "before its reset is believed",
+            )
 
     @contextlib.contextmanager
     def _set_into_first_state(self, episode: EpisodeInputs) -> Iterator[None]:
@@ -285,22 +282,18 @@ class _Playing:
 
     def _play(self, episode: EpisodeInputs) -> None:
         """Take the recorded actions of an episode until the environment ends it."""
-        step, is_dm_env = self._monitor.step, self._recreated.is_dm_env
+        take, is_dm_env = self._monitor.step, self._recreated.is_dm_env
         self._begin_stand_in(episode)
-        counted = 0
         states = self._making.arrays.get(f"{episode.arrays}.states")
         self._break_videos(episode)
-        for action in given_actions(episode, self._making.arrays):
+        for step, action in enumerate(given_actions(episode, self._making.arrays)):
             if states is not None:
-                self._recreated.put_into(states[counted : counted + 1])
-            result = step(action)
-            counted += 1
-            if counted % _STEPS_BETWEEN_COUNTS == 0:
-                self._making.on_steps(_STEPS_BETWEEN_COUNTS)
+                self._recreated.put_into(states[step : step + 1])
+            result = take(action)
+            self._making.on_step()
             if result.last() if is_dm_env else result[2] or result[3]:
                 break
         self._note_stand_in(episode)
-        self._making.on_steps(counted % _STEPS_BETWEEN_COUNTS)
 
     def _break_videos(self, episode: EpisodeInputs) -> None:
         """Make the live videos that broke off do so again."""

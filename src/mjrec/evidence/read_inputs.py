@@ -161,7 +161,8 @@ def _monitor_csv_start(files: MonitorFiles) -> float | None:
         return None
     with open_regular(path) as file:
         header = file.readline(_LONGEST_HEADER).decode()
-    return _time(json_text.loads(header.removeprefix("#")).get("t_start"))
+    start = json_text.loads(header.removeprefix("#")).get("t_start")
+    return start if isinstance(start, int | float) else None
 
 
 class _Journal:
@@ -391,7 +392,3 @@ def _options(said: Any) -> dict[str, Any]:
         if name not in OPTIONS or type(value) not in OPTIONS[name]:
             raise ValueError(f"the option {name!r:.80} must not be {value!r:.80}")
     return dict(said)
-
-
-def _time(value: Any) -> float | None:
-    return float(value) if isinstance(value, int | float) else None

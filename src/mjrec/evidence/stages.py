@@ -138,9 +138,9 @@ def _make(request: Mapping[str, Any], say: _Say) -> None:
     steps = sum(e.steps for each in inputs.recordings for e in each.episodes)
     taken = 0
 
-    def count_steps(more: int) -> None:
+    def count_step() -> None:
         nonlocal taken
-        taken += more
+        taken += 1
         counter(min(taken, steps - 1), steps)
 
     with np.load(folder / ARRAYS_FILE, allow_pickle=False) as arrays:
@@ -150,7 +150,7 @@ def _make(request: Mapping[str, Any], say: _Say) -> None:
             trust=frozenset(request["trust"]),
             sources=folder,
             notes=notes,
-            on_steps=count_steps,
+            on_step=count_step,
         )
         for recording in inputs.recordings:
             try:

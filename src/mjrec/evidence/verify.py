@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import contextlib
-import importlib
 import importlib.metadata
 import operator
 import os
@@ -32,6 +31,7 @@ from ..sandbox import Sandbox
 from .excuses import with_allowed
 from .findings import Excuse, Finding, Level, Outcome, Topic, Verification
 from .stages import GIVEN, INPUTS, MADE, MODULE
+from .verification_report import write_verification_report
 
 _PACKAGES = ("mjrec", "mujoco", "numpy", "gymnasium", "dm-control", "imageio-ffmpeg")
 # Compiling a model may take 300 s.
@@ -116,7 +116,8 @@ def verify(
     }
     with_allowed((), allow)
     page = None if report is None else Path(report).absolute()
-    write_report = None if page is None else _report_writer(page)
+    if page is not None and not page.parent.is_dir():
+        raise DirectoryNotWritable(page.parent, "no such directory")
     given = Path(path)
     if not given.exists():
         raise UnreadableArchive(given, "no such file or directory")
@@ -135,8 +136,8 @@ def verify(
                 "machine": dict(machine_fingerprint()),
             },
         )
-        if write_report is not None:
-            write_report(verification, page)
+        if page is not None:
+            write_verification_report(verification, page)
     return verification
 
 
@@ -242,15 +243,6 @@ def _sample(sample: int | None) -> int | None:
             f"got {sample!r}. Leave it out to check all of them."
         )
     return operator.index(sample)
-
-
-def _report_writer(page: Path) -> Callable[..., object]:
-    if not page.parent.is_dir():
-        raise DirectoryNotWritable(page.parent, "no such directory")
-    # Imported here, because reports need an extra.
-    module = importlib.import_module(".verification_report", __package__)
-    writer: Callable[..., object] = module.write_verification_report
-    return writer
 
 
 def _versions() -> Iterator[tuple[str, str]]:
