@@ -58,8 +58,6 @@ class Statements:
         clock: function that returns the time in seconds since the Unix epoch.
         faults: the facts of each fault, paired with the number of journal lines before
             it.
-        only_counted: whether episodes without a video keep no trajectory. This is the
-            case if only their rewards and ends are compared.
     """
 
     infix: str
@@ -68,7 +66,6 @@ class Statements:
     provenance_after: int
     clock: Callable[[], float]
     faults: Sequence[tuple[int, Mapping[str, Any]]] = ()
-    only_counted: bool = False
 
 
 def open_directory(
