@@ -47,7 +47,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from .plain_text import first_of
+from .plain_text import listed
 
 
 class Error(Exception):
@@ -117,7 +117,7 @@ class ExistingRecordings(Error):
         self.directory = directory
         self.names = list(names)
         super().__init__(
-            f"{directory} already contains recordings: {first_of(names, 5)}. Use a "
+            f"{directory} already contains recordings: {listed(names, 5)}. Use a "
             "separate directory for each run, resume=True (--resume) to add to these "
             "recordings, or force=True (--force) to delete them."
         )
@@ -326,9 +326,9 @@ class UnfinishedRecordings(PackError):
     def __init__(self, directory: Path, names: Sequence[str], *, advice: str) -> None:
         self.directory = directory
         self.names = list(names)
-        listed = first_of(names, 5)
+        shown = listed(names, 5)
         super().__init__(
-            f"The recordings in {directory} are not finished: {listed}. {advice}"
+            f"The recordings in {directory} are not finished: {shown}. {advice}"
         )
 
 
@@ -365,9 +365,9 @@ class IdentityLeft(PackError):
 
     def __init__(self, found: Sequence[tuple[str, str]]) -> None:
         self.found = list(found)
-        listed = first_of([f"{name}: {what}" for name, what in found], 10, between="; ")
+        shown = listed([f"{name}: {what}" for name, what in found], 10, between="; ")
         super().__init__(
-            f"The packed run would not be anonymous, so it was not written: {listed}. "
+            f"The packed run would not be anonymous, so it was not written: {shown}. "
             "Change the title, record again without these names (uid, camera, body), "
             "or leave out the episodes that contain them."
         )

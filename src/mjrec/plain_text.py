@@ -29,13 +29,6 @@ def spelled_out(text: str, longest: int = 1000) -> str:
     )
 
 
-def first_of(items: Sequence[object], most: int, *, between: str = ", ") -> str:
-    """Return the first few items, and the number of the others."""
-    more = len(items) - most
-    shown = between.join(map(str, items[:most]))
-    return f"{shown} and {more} more" if more > 0 else shown
-
-
 def counted(count: int, unit: str) -> str:
     """Return a count with its unit: "1 step", "12 steps", "2 frame hashes"."""
     if count == 1:
@@ -43,3 +36,23 @@ def counted(count: int, unit: str) -> str:
     if unit.endswith("y"):
         return f"{count:,} {unit[:-1]}ies"
     return f"{count:,} {unit}{'es' if unit.endswith('sh') else 's'}"
+
+
+def listed(
+    items: Sequence[object],
+    most: int,
+    *,
+    count: int | None = None,
+    between: str = ", ",
+) -> str:
+    """Return the first few items: "a, b and 2 more".
+
+    Args:
+        items: the items, or only the first of them.
+        most: maximum number of items to list.
+        count: the number of items, if not all are given.
+        between: the text between two items.
+    """
+    shown = between.join(map(str, items[:most]))
+    more = (len(items) if count is None else count) - most
+    return f"{shown} and {more} more" if more > 0 else shown

@@ -132,28 +132,17 @@ def check_bag(bag: Path, on_progress: _OnProgress) -> Iterator[Finding]:
     """
     objections = list(_objections(bag, on_progress))
     for name, reason in objections[:_MOST_FAILURES]:
-        yield Finding(
-            topic=Topic.FILES, item=name, outcome=Outcome.DIFFERENT, reason=reason
-        )
-    if len(objections) > _MOST_FAILURES:
-        yield Finding(
-            topic=Topic.FILES,
-            item="",
-            outcome=Outcome.DIFFERENT,
-            reason="more files that are missing, changed or not listed",
-            count=len(objections) - _MOST_FAILURES,
-        )
+        yield Finding(Topic.FILES, name, Outcome.DIFFERENT, reason)
+    if (more := len(objections) - _MOST_FAILURES) > 0:
+        reason = "more files that are missing, changed or not listed"
+        yield Finding(Topic.FILES, "", Outcome.DIFFERENT, reason, count=more)
 
 
 def unchanged(bag: Path) -> Finding:
     """Return the finding for a bag without objections."""
-    return Finding(
-        topic=Topic.FILES,
-        item="",
-        outcome=Outcome.NOTED,
-        reason="the files and their SHA-512 are those that the bag lists",
-        count=sum(path.is_file() for path in bag.rglob("*")),
-    )
+    reason = "the files and their SHA-512 are those that the bag lists"
+    count = len(_files(bag))
+    return Finding(Topic.FILES, "", Outcome.NOTED, reason, count=count)
 
 
 def _files(folder: Path) -> list[Path]:

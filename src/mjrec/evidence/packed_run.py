@@ -14,7 +14,7 @@ from ..environments.scenes import shown_arguments, shown_wrappers
 from ..formats import json_fields
 from ..formats.json_fields import facts_in, read_object, unreadable
 from ..formats.trajectory_hdf5 import open_hdf5
-from ..plain_text import counted, first_of
+from ..plain_text import counted, listed
 from ..results import Episode, iter_episodes
 from ..results.journal_or_stats import MonitorResults
 from ..results.monitor_files import MonitorFiles, monitors_of
@@ -164,8 +164,8 @@ class PackedRun:
     @property
     def title(self) -> str:
         """The stated title, or one made of the recorded environments' ids."""
-        listed = first_of(self.env_ids, _SHOWN)
-        return self.statements.title or f"Recordings of {listed}"
+        made = f"Recordings of {listed(self.env_ids, _SHOWN)}"
+        return self.statements.title or made
 
     @property
     def episodes(self) -> int:

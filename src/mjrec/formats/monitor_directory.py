@@ -63,7 +63,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import InvalidArgument
-from ..plain_text import first_of
+from ..plain_text import listed
 
 FILE_PREFIX = "openaigym"
 MANIFEST_PREFIX = f"{FILE_PREFIX}.manifest"
@@ -425,7 +425,7 @@ def where_recordings_are(directory: Path) -> str:
     folders = [str(path.relative_to(directory)) for path in below]
     if not folders:
         return f"To record, run `mjrec record ENV --out {shlex.quote(str(directory))}`."
-    return f"Its folders do ({first_of(folders, _SHOWN)}): name one of them."
+    return f"Its folders do ({listed(folders, _SHOWN)}): name one of them."
 
 
 def names_in(directory: Path) -> Iterator[str]:

@@ -21,7 +21,7 @@ from ..formats.monitor_directory import infix_of, is_bundle
 from ..formats.notebook import shown
 from ..formats.spans import recordings_in_flight
 from ..formats.trajectory import TrajectoryReader
-from ..plain_text import first_of
+from ..plain_text import listed
 from .foreign_files import open_vetted_trajectory
 
 if TYPE_CHECKING:
@@ -288,5 +288,5 @@ def _what_is_in(path: Path) -> str:
         names = sorted({*finished, *in_flight})
     if not names:
         return f"{path} is a {kind} without trajectories."
-    listed = first_of(names, _SHOWN)
-    return f"{path} is a {kind}. Name one of the trajectories in it: {listed}."
+    shown = listed(names, _SHOWN)
+    return f"{path} is a {kind}. Name one of the trajectories in it: {shown}."
