@@ -514,7 +514,11 @@ def further_parts(cameras: Sequence[Any]) -> list[str]:
     for place, camera in enumerate(cameras[1:], 2):
         has_name = isinstance(camera, str | int)
         part = camera_part(camera) if has_name else f"camera{place}"
-        parts.append(_unlike(part, parts))
+        unlike, number = part, 1
+        while unlike in parts:
+            number += 1
+            unlike = f"{part}-{number}"
+        parts.append(unlike)
     return parts
 
 
@@ -576,11 +580,3 @@ def second_name_of(name: str, second: str, *, first: str) -> str | None:
     if not name.startswith(f"{stem}."):
         return None
     return second.removesuffix(_MP4) + name.removeprefix(stem)
-
-
-def _unlike(part: str, others: Sequence[str]) -> str:
-    unlike, number = part, 1
-    while unlike in others:
-        number += 1
-        unlike = f"{part}-{number}"
-    return unlike
