@@ -15,11 +15,7 @@ from ..annotation import check_annotation
 from ..errors import InvalidArgument
 from ..evaluation.chunk_results import recorded_results
 from ..evaluation.evaluation import is_evaluation
-from ..formats.monitor_directory import (
-    Infix,
-    recording_directories,
-    trajectory_prefix,
-)
+from ..formats.monitor_directory import recording_directories
 from ..monitors.progress import render_progress
 from ..plain_text import counted
 from ..rendering.jobs import RenderedVideos
@@ -173,9 +169,8 @@ def _places(target: Path, episode: int | None) -> tuple[list[Path], int | None]:
 
 def _trajectories(directory: Path, episode: int) -> Iterator[Path]:
     for folder, result in recorded_results(directory):
-        infix = Infix.parse(result.monitor or "")
-        if result.episode == episode and infix and result.episode_id is not None:
-            yield folder / f"{trajectory_prefix(infix, result.episode_id)}.h5"
+        if result.episode == episode and (key := result.key):
+            yield folder / f"{key.name}.h5"
 
 
 def _collect(

@@ -6,6 +6,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+from ..formats.monitor_directory import Infix
+from ..rendering.jobs import RecordingKey
+
 
 @dataclass(frozen=True, kw_only=True)
 class EpisodeResult:
@@ -62,3 +65,11 @@ class EpisodeResult:
     def unit(self) -> tuple[int, int]:
         """The seed and episode number, which identify the episode within its task."""
         return self.seed, self.episode
+
+    @property
+    def key(self) -> RecordingKey | None:
+        """The key of the episode's recording; None if it was not recorded."""
+        infix = Infix.parse(self.monitor or "")
+        if infix is None or self.episode_id is None:
+            return None
+        return RecordingKey(infix, self.episode_id)

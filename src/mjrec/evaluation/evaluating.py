@@ -22,41 +22,23 @@ from ..atomic_files import make_directory
 from ..engines.choice import given_engine
 from ..engines.jobs import WORK_FOLDER, Run, Work
 from ..engines.local import LocalEngine
-from ..errors import (
-    DirectoryInUse,
-    GLError,
-    InvalidArgument,
-    PolicyError,
-)
-from ..formats.bundle import FINISHED, finished_trajectories
+from ..errors import DirectoryInUse, GLError, InvalidArgument, PolicyError
 from ..formats.dataclass_json import to_json
 from ..formats.locks import try_lock
-from ..formats.monitor_directory import (
-    Infix,
-    iter_monitor_files,
-    names_in,
-    trajectory_prefix,
-    video_prefix,
-)
+from ..formats.monitor_directory import names_in
 from ..gl.choice import choose
 from ..provenance import versions
 from ..recorder.keep_rules import keep_rule
 from ..rendering.finish import environ_for_drawing
 from ..results import clear_monitor_files
-from .episode_results import EpisodeResult
-from .evaluation import (
-    RESULT_NAMES,
-    Evaluation,
-    read_results,
-    write_results,
-)
+from .evaluation import RESULT_NAMES, Evaluation, read_results, write_results
 from .following import (
-    Choice,
     EvaluationProgress,
     check_tasks,
     choose_videos,
     chunks_in,
     draw_videos,
+    files_of,
     results_of,
     run_chunks,
 )
@@ -71,7 +53,6 @@ from .plan import (
 )
 from .planning import check_score_ranges, plan_from
 from .policy_objects import SentPolicy, sent_policy
-from .result_tables import EpisodeFiles
 from .statistics import Bootstrap, load_scipy
 from .summaries import default_score_range, summarize_across, summarize_results
 
@@ -266,7 +247,30 @@ def evaluate(
         results = results_of(plan, chunks)
         choice = choose_videos(plan, chunks, results)
         # Written before the videos are drawn, because drawing takes a long time.
-        _write(place, plan, results, choice, ranges, how)
+        scales = {
+            task.name: ranges.get(task.name)
+            or default_score_range(task.name, task.step_limit)
+            for task in plan.tasks
+        }
+        returns = {
+            name: [each.total_reward for each in own if each.total_reward is not None]
+            for name, own in results.items()
+        }
+        evaluation = Evaluation(
+            directory=place,
+            plan=plan,
+            summaries=[
+                summarize_results(name, own, score_range=scales[name], bootstrap=how)
+                for name, own in results.items()
+            ],
+            across=summarize_across(returns, scales, bootstrap=how),
+            bootstrap=how,
+            selection=choice.selection,
+            # SciPy is included because it computes the statistics.
+            versions=versions("scipy"),
+        )
+        episodes_of = [result for own in results.values() for result in own]
+        write_results(evaluation, episodes_of, files_of(evaluation, chunks))
         videos, pending = draw_videos(
             choice,
             place,
@@ -401,78 +405,3 @@ def _held(directory: Path) -> Iterator[None]:
         )
     with lock:
         yield
-
-
-def _write(
-    directory: Path,
-    plan: EvaluationPlan,
-    results: Sequence[EpisodeResult],
-    choice: Choice,
-    ranges: Mapping[str, tuple[float, float]],
-    bootstrap: Bootstrap,
-) -> None:
-    scales = {
-        task.name: ranges.get(task.name)
-        or default_score_range(task.name, task.step_limit)
-        for task in plan.tasks
-    }
-    by_task: dict[str, list[EpisodeResult]] = {name: [] for name in scales}
-    for result in results:
-        by_task[result.task].append(result)
-    returns = {
-        name: [each.total_reward for each in own if each.total_reward is not None]
-        for name, own in by_task.items()
-    }
-    write_results(
-        directory,
-        plan=plan,
-        results=results,
-        summaries=[
-            summarize_results(name, own, score_range=scales[name], bootstrap=bootstrap)
-            for name, own in by_task.items()
-        ],
-        across=summarize_across(returns, scales, bootstrap=bootstrap),
-        bootstrap=bootstrap,
-        selection=choice.selection,
-        # SciPy is included because it computes the statistics.
-        versions=versions("scipy"),
-        files=_Files(directory, plan, choice),
-    )
-
-
-class _Files:
-    """A function that looks up the files of an episode."""
-
-    def __init__(self, directory: Path, plan: EvaluationPlan, choice: Choice) -> None:
-        self._directory = directory
-        self._plan = plan
-        self._chosen = {
-            task: {(each.seed, each.episode) for each in chosen}
-            for task, chosen in choice.selection.items()
-        }
-        self._folders = {task.name: task.folder for task in plan.tasks}
-        # The file names in the previous episode's folder are cached.
-        self._folder = ""
-        self._names: set[str] = set()
-
-    def __call__(self, result: EpisodeResult) -> EpisodeFiles:
-        infix = Infix.parse(result.monitor or "")
-        chunk = self._plan.chunk_of(result.unit)
-        if infix is None or chunk is None or result.episode_id is None:
-            return EpisodeFiles()
-        folder = f"{self._folders[result.task]}/{chunk.folder}"
-        if folder != self._folder:
-            place = self._directory / folder
-            files = (*iter_monitor_files(place), *finished_trajectories(place))
-            self._folder, self._names = folder, {path.name for path in files}
-        trajectory = f"{trajectory_prefix(infix, result.episode_id)}{FINISHED}"
-        prefix = video_prefix(infix, result.episode_id)
-        # Text environments have a text recording instead of a video.
-        video = f"{prefix}.json" if f"{prefix}.json" in self._names else None
-        if video is None and result.unit in self._chosen.get(result.task, ()):
-            video = f"{prefix}.mp4"
-        return EpisodeFiles(
-            folder=folder,
-            trajectory=trajectory if trajectory in self._names else None,
-            video=video,
-        )

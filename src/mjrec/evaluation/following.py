@@ -8,17 +8,18 @@ of workers.
 from __future__ import annotations
 
 import dataclasses
+import functools
 import logging
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from ..engines.jobs import Run
 from ..errors import EnvironmentNotMade, Error
-from ..formats.monitor_directory import Infix
+from ..formats.bundle import FINISHED, finished_trajectories
+from ..formats.monitor_directory import iter_monitor_files
 from ..messages import unpacked
 from ..recorder.keep_rules import keep_rule
 from ..rendering.chosen_videos import write_choice
@@ -27,8 +28,9 @@ from ..rendering.jobs import Progress, RecordingKey, VideoJob
 from ..simulation.model_trust import note_models
 from .chunk_results import ChunkResults, read_chunk
 from .episode_results import EpisodeResult
-from .evaluation import ChosenEpisode
-from .plan import Chunk, EvaluatedTask, EvaluationPlan
+from .evaluation import ChosenEpisode, Evaluation
+from .plan import Chunk, EvaluatedTask, EvaluationPlan, Unit
+from .result_tables import EpisodeFiles
 
 logger = logging.getLogger(__name__)
 
@@ -92,9 +94,27 @@ class ChunkRun:
     is_over: bool = False
 
     @property
+    def place(self) -> str:
+        """Path of the folder, relative to the evaluation's directory."""
+        return f"{self.task.folder}/{self.chunk.folder}"
+
+    @property
     def is_complete(self) -> bool:
         """Whether all episodes of the chunk have a result."""
         return all(unit in self.known.results for unit in self.chunk)
+
+    def result(self, unit: Unit) -> EpisodeResult:
+        """Return the result of an episode, which has failed if no result is known."""
+        return self.known.results.get(unit) or EpisodeResult(
+            task=self.task.name,
+            seed=unit[0],
+            episode=unit[1],
+            total_reward=None,
+            length=0,
+            terminated=None,
+            truncated=None,
+            failure=self.reason,
+        )
 
 
 @dataclass(frozen=True)
@@ -215,75 +235,102 @@ def run_chunks(run: Run, chunks: Sequence[ChunkRun], tell: _Tell) -> EvaluationP
     return progress
 
 
-def results_of(plan: EvaluationPlan, chunks: Iterable[ChunkRun]) -> list[EpisodeResult]:
-    """Return the results of all episodes, in the plan's order."""
-    by_name = {(each.task.name, each.chunk.folder): each for each in chunks}
-    results = []
+def by_episode(chunks: Iterable[ChunkRun], task: str) -> dict[Unit, ChunkRun]:
+    """Return the chunk of each episode of a task."""
+    return {
+        unit: each for each in chunks if each.task.name == task for unit in each.chunk
+    }
+
+
+def results_of(
+    plan: EvaluationPlan, chunks: Iterable[ChunkRun]
+) -> dict[str, list[EpisodeResult]]:
+    """Return the results of each task's episodes, in the plan's order."""
+    chunks, results = list(chunks), {}
     for task in plan.tasks:
-        for unit in plan:
-            chunk = plan.chunk_of(unit)
-            assert chunk is not None
-            of = by_name[task.name, chunk.folder]
-            lost = EpisodeResult(
-                task=task.name,
-                seed=unit[0],
-                episode=unit[1],
-                total_reward=None,
-                length=0,
-                terminated=None,
-                truncated=None,
-                failure=of.reason,
-            )
-            results.append(of.known.results.get(unit, lost))
+        of = by_episode(chunks, task.name)
+        results[task.name] = [of[unit].result(unit) for unit in plan]
     return results
 
 
 def choose_videos(
-    plan: EvaluationPlan, chunks: Sequence[ChunkRun], results: Iterable[EpisodeResult]
+    plan: EvaluationPlan,
+    chunks: Sequence[ChunkRun],
+    results: Mapping[str, Sequence[EpisodeResult]],
 ) -> Choice:
     """Choose the episodes that get a video, and write the choice to the folders."""
     selection: dict[str, list[ChosenEpisode]] = {}
     videos: list[tuple[Path, RecordingKey]] = []
     impossible: dict[Path, str] = {}
-    by_task: dict[str, list[EpisodeResult]] = {task.name: [] for task in plan.tasks}
-    for result in results:
-        by_task[result.task].append(result)
-    for task, own in by_task.items():
-        chosen: dict[str, dict[RecordingKey, list[ChosenEpisode]]] = {}
+    for task, of_task in results.items():
+        chunk_of = by_episode(chunks, task)
         # The order in which ties are broken must depend only on the episodes.
-        own.sort(key=lambda each: each.unit)
-        begun = [each if each.episode_id is not None else None for each in own]
-        kept = keep_rule(plan.keep).choose(begun)
+        own = sorted(of_task, key=lambda each: each.unit)
+        kept = keep_rule(plan.keep).choose([each if each.key else None for each in own])
+        roles: dict[Path, dict[RecordingKey, list[str]]] = {}
         for result, role in kept:
-            chunk = plan.chunk_of(result.unit)
-            infix = Infix.parse(result.monitor or "")
-            if chunk and infix and result.episode_id is not None:
-                key = RecordingKey(infix, result.episode_id)
-                episode = ChosenEpisode(*result.unit, role)
-                chosen.setdefault(chunk.folder, {}).setdefault(key, []).append(episode)
-        drawable: set[ChosenEpisode] = set()
+            if result.key is not None:
+                folder = chunk_of[result.unit].folder
+                of_chunk = roles.setdefault(folder, {})
+                of_chunk.setdefault(result.key, []).append(role)
+        drawable: set[RecordingKey] = set()
         for each in chunks:
-            mine = chosen.get(each.chunk.folder, {}) if each.task.name == task else {}
-            if each.task.name != task or not (mine or each.known.is_drawn_live):
+            folder, chosen = each.folder, roles.get(each.folder, {})
+            if each.task.name != task or not (chosen or each.known.is_drawn_live):
                 continue
-            roles = {key: [e.role for e in mine[key]] for key in mine}
             try:
-                keys = write_choice(
-                    each.folder, roles, rule=plan.keep, finished=len(own)
-                )
+                keys = write_choice(folder, chosen, rule=plan.keep, finished=len(own))
             except Error as error:
-                logger.warning("%s: videos could not be chosen: %s", each.folder, error)
-                keys = {*mine}
-                impossible |= {each.folder / k.video_name: str(error) for k in keys}
-            videos += [(each.folder, key) for key in mine if key in keys]
-            drawable |= {e for key in mine if key in keys for e in mine[key]}
+                logger.warning("%s: videos could not be chosen: %s", folder, error)
+                keys = {*chosen}
+                impossible |= {folder / key.video_name: str(error) for key in keys}
+            videos += [(folder, key) for key in chosen if key in keys]
+            drawable |= keys
         # The episodes keep the order in which the rule returned them.
         selection[task] = [
-            episode
+            ChosenEpisode(*result.unit, role)
             for result, role in kept
-            if (episode := ChosenEpisode(*result.unit, role)) in drawable
+            if result.key in drawable
         ]
     return Choice(selection, videos, impossible)
+
+
+def files_of(
+    evaluation: Evaluation, chunks: Iterable[ChunkRun]
+) -> Callable[[EpisodeResult], EpisodeFiles]:
+    """Return a function that looks up the files of an episode."""
+    folders = {
+        (result.task, result.monitor): each.place
+        for each in chunks
+        for result in each.known.results.values()
+    }
+    chosen = {
+        (task, each.seed, each.episode)
+        for task, of_task in evaluation.selection.items()
+        for each in of_task
+    }
+
+    @functools.lru_cache(maxsize=1)
+    def names_in(folder: str) -> set[str]:
+        place = evaluation.directory / folder
+        files = (*iter_monitor_files(place), *finished_trajectories(place))
+        return {path.name for path in files}
+
+    def files_of_episode(result: EpisodeResult) -> EpisodeFiles:
+        key = result.key
+        if key is None:
+            return EpisodeFiles()
+        folder = folders[result.task, result.monitor]
+        names, trajectory = names_in(folder), f"{key.name}{FINISHED}"
+        # Text environments have a text recording instead of a video.
+        as_text, video = f"{key.video_name.removesuffix('.mp4')}.json", None
+        if as_text in names:
+            video = as_text
+        elif (result.task, *result.unit) in chosen:
+            video = key.video_name
+        return EpisodeFiles(folder, trajectory if trajectory in names else None, video)
+
+    return files_of_episode
 
 
 def draw_videos(
@@ -351,10 +398,8 @@ def draw_videos(
 def _submit(run: Run, each: ChunkRun) -> str:
     each.rounds += 1
     each.size = each.known.size
-    folder = f"{each.task.folder}/{each.chunk.folder}"
-    key = f"{folder}/{each.rounds}"
-    chunk: dict[str, Any] = dataclasses.asdict(each.chunk)
-    run.submit(key, kind="run", task=each.task.name, folder=folder, chunk=chunk)
+    key, chunk = f"{each.place}/{each.rounds}", dataclasses.asdict(each.chunk)
+    run.submit(key, kind="run", task=each.task.name, folder=each.place, chunk=chunk)
     return key
 
 
