@@ -394,11 +394,8 @@ def _example_lines(evaluation: Evaluation) -> Iterator[str]:
     """Yield a line for the best, median and worst episode of each task."""
     not_finite = set(map(_name, evaluation.not_finite))
     for task in evaluation.plan.tasks[:_SHOWN]:
-        known = [
-            each
-            for each in sorted(evaluation.results, key=lambda each: each.unit)
-            if each.task == task.name and _name(each) not in not_finite
-        ]
+        known = sorted(evaluation.by_task[task.name], key=lambda each: each.unit)
+        known = [each for each in known if _name(each) not in not_finite]
         for each, role in keep_rule("best,median,worst").choose(known):
             value, file = _number(each.total_reward), evaluation.file_of(each)
             yield f"  {role:6}  {value:>10}  {_name(each)}  {file}"

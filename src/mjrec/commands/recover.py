@@ -9,6 +9,7 @@ from typing import Annotated
 import tyro
 
 from ..evaluation.evaluation import is_evaluation
+from ..formats.dataclass_json import to_json
 from ..formats.monitor_directory import monitor_directories_in
 from ..rendering.leftovers import RecoveredFile
 from ..rendering.recovery import Recovery
@@ -40,7 +41,7 @@ def recover(
     """
     recovery = _recover_all(directory, timeout)
     if as_json:
-        print_json(_fields(recovery))
+        print_json(to_json(recovery))
     else:
         print_lines(result_console(), [str(recovery)])
     return _FAILED if recovery.failures else 0
@@ -63,16 +64,3 @@ def _recover_all(directory: Path, timeout: float) -> Recovery:
             recovery.open_monitors + found.open_monitors,
         )
     return recovery
-
-
-def _fields(recovery: Recovery) -> dict[str, object]:
-    return {
-        "directory": str(recovery.directory),
-        "files": _listed(recovery.files),
-        "failures": _listed(recovery.failures),
-        "open_monitors": list(recovery.open_monitors),
-    }
-
-
-def _listed(files: tuple[RecoveredFile, ...]) -> list[dict[str, str]]:
-    return [{"name": file.name, "what": file.what} for file in files]

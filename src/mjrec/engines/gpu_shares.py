@@ -1,13 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The number of workers, and the GPUs that each worker gets."""
+"""What engines have in common: workers, shares of GPUs, packages, environments."""
 
 from __future__ import annotations
 
+import contextlib
+import importlib
 import math
-from collections.abc import Sequence
+import os
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
-from ..errors import InvalidArgument
+from ..errors import InvalidArgument, MissingDependency
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -97,3 +101,34 @@ def check_worker_count(count: int | None, name: str = "workers") -> int | None:
             f"{name} must be a whole number of at least 1, not {count!r}."
         )
     return count
+
+
+def engine_package(package: str, engine: str, *, install: str) -> Any:
+    """Import the package that an engine needs, which is slow and optional.
+
+    Raises:
+        MissingDependency: the package is not installed.
+    """
+    try:
+        return importlib.import_module(package)
+    except ModuleNotFoundError as error:
+        if error.name != package:
+            raise
+        raise MissingDependency(
+            package, purpose=f'engine="{engine}"', install=f'pip install "{install}"'
+        ) from error
+
+
+@contextlib.contextmanager
+def changed_environ(changes: Mapping[str, str | None]) -> Iterator[None]:
+    """Set (or, for None, remove) environment variables, and restore all afterwards."""
+    before = dict(os.environ)
+    for name in changes:
+        os.environ.pop(name, None)
+    os.environ.update({name: v for name, v in changes.items() if v is not None})
+    try:
+        yield
+    finally:
+        for name in set(os.environ) - set(before):
+            del os.environ[name]
+        os.environ.update(before)

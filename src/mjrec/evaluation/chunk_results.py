@@ -24,14 +24,16 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from ..formats.dataclass_json import from_json
 from ..formats.journal import JournalEntry, JournalReader
 from ..formats.json_fields import field as field_of
-from ..formats.json_fields import integer, mapping, number, optional, text, unreadable
+from ..formats.json_fields import integer, mapping, text, unreadable
 from ..formats.monitor_directory import infix_of, monitor_directories_in
 from .episode_results import EpisodeResult
 from .plan import Unit, read_plan
 
 _JOURNALS = "openaigym.episodes.*.jsonl"
+_UNFINISHED = dict.fromkeys(("total_reward", "terminated", "truncated"))
 
 
 @dataclass
@@ -140,22 +142,10 @@ def _completed(
 
 
 def _failed(recorded: Mapping[str, Any], task: str, monitor: str) -> EpisodeResult:
-    seed, episode = _unit(recorded)
-    episode_id = field_of(recorded, "episode_id", optional(integer))
-    return EpisodeResult(
-        task=task,
-        seed=seed,
-        episode=episode,
-        total_reward=None,
-        length=field_of(recorded, "length", integer),
-        terminated=None,
-        truncated=None,
-        failure=field_of(recorded, "failure", text),
-        monitor=None if episode_id is None else monitor,
-        episode_id=episode_id,
-        start_time=field_of(recorded, "start_time", optional(number)),
-        seconds=field_of(recorded, "seconds", optional(number)),
-    )
+    is_known = recorded.get("episode_id") is not None
+    facts = {**_UNFINISHED, **recorded, "failure": text(recorded.get("failure"))}
+    given = {"task": task, "monitor": monitor if is_known else None}
+    return from_json(EpisodeResult, {**facts, **given})
 
 
 def _unit(recorded: Mapping[str, Any]) -> Unit:

@@ -203,7 +203,12 @@ def evaluate(
         policy_kwargs=policy_kwargs or None,
     )
     if policy is None and begun is not None:
-        policy = _policy_as_begun(begun)
+        if begun.is_object:
+            raise PolicyError(
+                f"The policy of this evaluation is an object ({begun.policy}). To "
+                "continue the evaluation, pass the object again (policy=...)."
+            )
+        policy = begun.policy
     if policy is None:
         raise PolicyError(
             "An evaluation needs a policy: random, zero, module:name, or an object."
@@ -316,26 +321,13 @@ def _begun(directory: Path, *, resume: bool, force: bool) -> EvaluationPlan | No
 
 def _options(begun: EvaluationPlan | None, **given: Any) -> dict[str, Any]:
     """Replace options that are None by their earlier values or their defaults."""
-    if begun is None:
-        return {
-            name: _DEFAULTS.get(name) if value is None else value
-            for name, value in given.items()
-        }
-    if given["max_fps"] == _DEFAULT_FPS:
+    if begun is not None and given["max_fps"] == _DEFAULT_FPS:
         given["max_fps"] = None
+    earlier = _DEFAULTS if begun is None else vars(begun)
     return {
-        name: getattr(begun, name) if value is None else value
+        name: earlier.get(name) if value is None else value
         for name, value in given.items()
     }
-
-
-def _policy_as_begun(begun: EvaluationPlan) -> str:
-    if begun.is_object:
-        raise PolicyError(
-            f"The policy of this evaluation is an object ({begun.policy}). To continue "
-            "the evaluation, pass the object again (policy=...)."
-        )
-    return begun.policy
 
 
 def _work(

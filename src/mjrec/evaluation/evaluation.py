@@ -31,6 +31,7 @@ from ..formats.dataclass_json import from_json, to_json
 from ..formats.json_fields import integer, text, unreadable
 from ..formats.notebook import shown
 from ..formats.spans import find_trajectory
+from .chunk_results import recorded_results
 from .episode_results import EpisodeResult
 from .plan import PLAN_NAME, EvaluationPlan, read_versioned, write_versioned
 from .result_tables import (
@@ -247,6 +248,25 @@ def read_summaries(directory: Path) -> Evaluation:
         selection=read.selection.by_task,
         versions=read.versions,
     )
+
+
+def results_in(directory: Path) -> Iterator[tuple[EpisodeResult, Path | None]]:
+    """Yield the results of an evaluation, finished or not, and the videos' paths.
+
+    The episodes are in the plan's order. Videos are None if it is not finished.
+
+    Raises:
+        UnreadableFile: the plan or a journal cannot be read.
+    """
+    try:
+        results = read_results(directory)
+    except UnreadableFile:
+        yield from ((result, None) for _, result in recorded_results(directory))
+        return
+    for columns in results.by_task.values():
+        for index, result in enumerate(columns):
+            video = columns.video_path(index)
+            yield result, None if video is None else directory / video
 
 
 def _write(path: Path, write: Callable[[TextIO], None]) -> None:

@@ -8,6 +8,7 @@ resumed evaluation from mixing the results of different policies.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import importlib.util
 import inspect
@@ -53,13 +54,13 @@ def sent_policy(policy: Any, kwargs: Mapping[str, Any]) -> SentPolicy:
     Raises:
         PolicyError: `policy` is not a valid policy or cannot be pickled.
     """
-    arguments = {
-        f"the file of its argument {name}": digest
+    files: dict[str, str | None] = {
+        f"the file of its argument {name}": value
         for name, value in kwargs.items()
-        if isinstance(value, str) and (digest := _file_digest(Path(value)))
+        if isinstance(value, str)
     }
     if isinstance(policy, str):
-        return SentPolicy(policy, None, {**_digests_of_text(policy), **arguments})
+        return SentPolicy(policy, None, _digests({**_source_of(policy), **files}))
     if not (callable(policy) or callable(getattr(policy, "predict", None))):
         raise PolicyError(
             f"The policy {policy!r:.200} is not callable and has no predict() method. "
@@ -71,19 +72,16 @@ def sent_policy(policy: Any, kwargs: Mapping[str, Any]) -> SentPolicy:
     name = str(named.__qualname__)
     name = name if module is None else f"{module.__name__}:{name}"
     payload = _pickled(policy, name)
-    digests = {"its content": _digest_of_pickle(payload)}
-    source = getattr(module, "__file__", None)
-    if source is not None and (digest := _file_digest(Path(source))):
-        digests["its code"] = digest
-    return SentPolicy(name, payload, {**digests, **arguments})
+    content = {"its content": _digest_of_pickle(payload)}
+    files = {"its code": getattr(module, "__file__", None), **files}
+    return SentPolicy(name, payload, {**content, **_digests(files)})
 
 
-def _digests_of_text(policy: str) -> dict[str, str]:
-    """Return the digest of the policy file or of the module's source file."""
+def _source_of(policy: str) -> dict[str, str | None]:
+    """Return the policy file, or the source file of the policy's module."""
     module, colon, _ = policy.partition(":")
     if not colon:
-        digest = _file_digest(Path(policy))
-        return {} if digest is None else {"its file": digest}
+        return {"its file": policy}
     source = getattr(sys.modules.get(module), "__file__", None)
     try:
         if source is None:
@@ -93,15 +91,17 @@ def _digests_of_text(policy: str) -> dict[str, str]:
     except Exception:
         # The workers will import the module and report the error.
         return {}
-    digest = None if source is None else _file_digest(Path(source))
-    return {} if digest is None else {"its code": digest}
+    return {"its code": source}
 
 
-def _file_digest(path: Path) -> str | None:
-    try:
-        return file_sha256(path) if path.is_file() else None
-    except OSError:
-        return None
+def _digests(files: Mapping[str, str | None]) -> dict[str, str]:
+    """Return the SHA-256 of each file that exists."""
+    digests = {}
+    for what, name in files.items():
+        with contextlib.suppress(OSError):
+            if name is not None and Path(name).is_file():
+                digests[what] = file_sha256(Path(name))
+    return digests
 
 
 def _pickled(policy: Any, name: str) -> bytes:
