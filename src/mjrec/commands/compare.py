@@ -20,13 +20,7 @@ from ..evaluation.requirements import parse_requirement
 from ..evaluation.statistics import Estimate
 from ..plain_text import counted
 from .options import AsJson
-from .terminal import (
-    print_json,
-    print_lines,
-    printable,
-    result_console,
-    table,
-)
+from .terminal import print_json, print_lines, printable, result_console, table
 
 _UNMET = 1
 

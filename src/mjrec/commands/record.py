@@ -18,12 +18,7 @@ from ..formats.video_metadata import finished_videos
 from ..monitors.progress import progress_bar
 from ..plain_text import counted
 from ..recorder.options import RecorderOptions
-from ..sessions import (
-    Session,
-    SessionEpisode,
-    record_session,
-    with_chosen_videos,
-)
+from ..sessions import Session, SessionEpisode, record_session, with_chosen_videos
 from .options import AsJson, camera_of, kwargs_of, size_of
 from .terminal import print_json, print_lines
 
@@ -229,10 +224,8 @@ def _fields(
         "interrupted": interrupted,
         "episodes": [
             {
-                "episode_id": episode.episode_id,
-                "length": episode.length,
-                "reward": episode.reward,
-                "video": episode.video.name if episode.video else None,
+                **vars(episode),
+                "video": episode.video and episode.video.name,
                 "pending": bool(episode.video and not episode.video.exists()),
             }
             for episode in recorded

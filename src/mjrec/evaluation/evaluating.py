@@ -31,17 +31,8 @@ from ..provenance import versions
 from ..recorder.keep_rules import keep_rule
 from ..rendering.finish import environ_for_drawing
 from ..results import clear_monitor_files
+from . import following
 from .evaluation import RESULT_NAMES, Evaluation, read_results, write_results
-from .following import (
-    EvaluationProgress,
-    check_tasks,
-    choose_videos,
-    chunks_in,
-    draw_videos,
-    files_of,
-    results_of,
-    run_chunks,
-)
 from .plan import (
     NO_GL,
     PLAN_NAME,
@@ -52,7 +43,7 @@ from .plan import (
     write_plan,
 )
 from .planning import check_score_ranges, plan_from
-from .policy_objects import SentPolicy, sent_policy
+from .policy_objects import sent_policy
 from .statistics import Bootstrap, load_scipy
 from .summaries import default_score_range, summarize_across, summarize_results
 
@@ -76,7 +67,7 @@ _DEFAULTS: Mapping[str, Any] = {
     "quality": "full",
 }
 
-_Tell = Callable[[EvaluationProgress], object]
+_Tell = Callable[[following.EvaluationProgress], object]
 
 
 def evaluate(
@@ -213,10 +204,9 @@ def evaluate(
         raise PolicyError(
             "An evaluation needs a policy: random, zero, module:name, or an object."
         )
-    sent = sent_policy(policy, options["policy_kwargs"] or {})
-    plan = plan_from(
-        tasks, sent, seeds=seeds, num_seeds=num_seeds, begun=begun, **options
-    )
+    described, payload = sent_policy(policy, options["policy_kwargs"] or {})
+    options.update(described)
+    plan = plan_from(tasks, seeds=seeds, num_seeds=num_seeds, begun=begun, **options)
     ranges = check_score_ranges(score_ranges, [task.name for task in plan.tasks])
     if begun is not None:
         check_continues(place, begun, plan)
@@ -229,28 +219,30 @@ def evaluate(
             stack.enter_context(_held(place))
         executor = given or local
         is_here = isinstance(executor, LocalEngine)
-        work = _work(plan, sent, place, chooses_gl=given is not None)
+        work = _work(plan, payload, place, chooses_gl=given is not None)
         # Quick checks run locally, so that they do not wait in a cluster's queue.
         with Run(executor if is_here else local, work) as home:
             load_scipy()
             needed = min(local.workers, len(plan.tasks) * len(plan.chunks))
-            plan, velocities = check_tasks(home, plan, workers=needed if is_here else 1)
+            plan, velocities = following.check_tasks(
+                home, plan, workers=needed if is_here else 1
+            )
             if begun is None:
                 make_directory(place)
                 stack.enter_context(_held(place))
                 _clear(place)
             write_plan(place, plan)
-            chunks = chunks_in(place, plan)
+            chunks = following.chunks_in(place, plan)
             # The slowest tasks come first, so that all workers finish at about the same
             # time.
             chunks.sort(key=lambda each: -velocities.get(each.task.name, 0))
             if is_here:
-                progress = run_chunks(home, chunks, tell)
+                progress = following.run_chunks(home, chunks, tell)
         if not is_here:
             with Run(executor, work) as run:
-                progress = run_chunks(run, chunks, tell)
-        results = results_of(plan, chunks)
-        choice = choose_videos(plan, chunks, results)
+                progress = following.run_chunks(run, chunks, tell)
+        results = following.results_of(plan, chunks)
+        choice = following.choose_videos(plan, chunks, results)
         # Written before the videos are drawn, because drawing takes a long time.
         scales = {
             task.name: ranges.get(task.name)
@@ -275,8 +267,8 @@ def evaluate(
             versions=versions("scipy"),
         )
         episodes_of = [result for own in results.values() for result in own]
-        write_results(evaluation, episodes_of, files_of(evaluation, chunks))
-        videos, pending = draw_videos(
+        write_results(evaluation, episodes_of, following.files_of(evaluation, chunks))
+        videos, pending = following.draw_videos(
             choice,
             place,
             engine=given,
@@ -331,7 +323,7 @@ def _options(begun: EvaluationPlan | None, **given: Any) -> dict[str, Any]:
 
 
 def _work(
-    plan: EvaluationPlan, sent: SentPolicy, directory: Path, *, chooses_gl: bool
+    plan: EvaluationPlan, payload: bytes | None, directory: Path, *, chooses_gl: bool
 ) -> Work:
     return Work(
         entry=_WORKER,
@@ -345,7 +337,7 @@ def _work(
         },
         environ=_environ_of_workers(plan, is_elsewhere=chooses_gl),
         shared_directory=directory.absolute(),
-        payload=sent.payload,
+        payload=payload,
     )
 
 

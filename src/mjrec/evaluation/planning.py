@@ -22,7 +22,6 @@ from ..json_text import loads
 from ..rates import to_rate
 from ..recorder.keep_rules import keep_rule
 from .plan import SEEDED, SUITE, Chunk, EvaluatedTask, EvaluationPlan
-from .policy_objects import SentPolicy
 from .task_sets import tasks_from
 
 DEFAULT_SEEDS = 5
@@ -40,7 +39,6 @@ _MOST_EPISODES_OF_CHUNK = 25
 
 def plan_from(
     tasks: str | Sequence[str],
-    sent: SentPolicy,
     *,
     seeds: Iterable[int] | None,
     num_seeds: int | None,
@@ -53,13 +51,12 @@ def plan_from(
 
     Args:
         tasks: see `evaluate`. If empty, the tasks of `begun` are used.
-        sent: the policy.
         seeds: see `evaluate`. If `seeds` and `num_seeds` are both None, the seeds of
             `begun` are used.
         num_seeds: see `evaluate`.
         begun: the plan to continue, if any. Its folders and chunks are kept.
-        **options: all fields of the plan that do not follow from the policy, the tasks
-            and the seeds.
+        **options: all fields of the plan that do not follow from the tasks and the
+            seeds.
 
     Raises:
         UnknownName, InvalidArgument: an argument is invalid.
@@ -98,12 +95,7 @@ def plan_from(
             f"evaluation can have at most {_MOST_UNITS}."
         )
     plan = EvaluationPlan(
-        tasks=_with_folders(names, known),
-        policy=sent.name,
-        is_object=sent.is_object,
-        policy_digests=sent.digests,
-        seeds=checked_seeds,
-        **options,
+        tasks=_with_folders(names, known), seeds=checked_seeds, **options
     )
     chunks = chunks_of(plan, begun.chunks if begun else ())
     return dataclasses.replace(plan, chunks=chunks)

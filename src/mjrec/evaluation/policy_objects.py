@@ -14,7 +14,6 @@ import importlib.util
 import inspect
 import sys
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -23,33 +22,19 @@ from ..environments.names import working_directory_importable
 from ..errors import PolicyError
 
 
-@dataclass(frozen=True)
-class SentPolicy:
-    """A policy that can be sent to workers.
-
-    Attributes:
-        name: the policy as given if it is a string, otherwise its qualified name.
-        payload: the pickled object; None if the policy is a string.
-        digests: SHA-256 of each part of the policy, keyed by a description of the part.
-    """
-
-    name: str
-    payload: bytes | None = None
-    digests: Mapping[str, str] = field(default_factory=dict)
-
-    @property
-    def is_object(self) -> bool:
-        """Whether the policy is an object instead of a string."""
-        return self.payload is not None
-
-
-def sent_policy(policy: Any, kwargs: Mapping[str, Any]) -> SentPolicy:
+def sent_policy(
+    policy: Any, kwargs: Mapping[str, Any]
+) -> tuple[dict[str, Any], bytes | None]:
     """Convert a policy to a form that can be sent to workers.
 
     Args:
         policy: a string as in `mjrec record`, a function, an object with `predict`, or
             a class that is built with each environment.
         kwargs: keyword arguments for the policy.
+
+    Returns:
+        The plan's fields about the policy, and the pickled object; None if the policy
+        is a string.
 
     Raises:
         PolicyError: `policy` is not a valid policy or cannot be pickled.
@@ -60,7 +45,7 @@ def sent_policy(policy: Any, kwargs: Mapping[str, Any]) -> SentPolicy:
         if isinstance(value, str)
     }
     if isinstance(policy, str):
-        return SentPolicy(policy, None, _digests({**_source_of(policy), **files}))
+        return _fields(policy, _digests({**_source_of(policy), **files})), None
     if not (callable(policy) or callable(getattr(policy, "predict", None))):
         raise PolicyError(
             f"The policy {policy!r:.200} is not callable and has no predict() method. "
@@ -74,7 +59,14 @@ def sent_policy(policy: Any, kwargs: Mapping[str, Any]) -> SentPolicy:
     payload = _pickled(policy, name)
     content = {"its content": _digest_of_pickle(payload)}
     files = {"its code": getattr(module, "__file__", None), **files}
-    return SentPolicy(name, payload, {**content, **_digests(files)})
+    fields = _fields(name, {**content, **_digests(files)}, is_object=True)
+    return fields, payload
+
+
+def _fields(
+    name: str, digests: Mapping[str, str], *, is_object: bool = False
+) -> dict[str, Any]:
+    return {"policy": name, "policy_digests": digests, "is_object": is_object}
 
 
 def _source_of(policy: str) -> dict[str, str | None]:
