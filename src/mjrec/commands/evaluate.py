@@ -18,6 +18,7 @@ import tyro
 
 from ..errors import InvalidArgument, UnknownName
 from ..evaluation.episode_results import EpisodeResult
+from ..evaluation.evaluating import DEFAULT_FPS
 from ..evaluation.evaluating import evaluate as evaluate_policy
 from ..evaluation.evaluation import Evaluation
 from ..evaluation.following import EvaluationProgress
@@ -136,29 +137,11 @@ def evaluate(
             "other place, render the episodes afterwards: mjrec render DIR --episode N "
             f"--camera {shlex.quote(str(camera))}"
         )
-    least = _by_task("--fail-under", fail_under, float, "TASK=VALUE")
-    options: dict[str, Any] = {
-        "policy": policy,
-        "episodes": episodes,
-        "seeds": None if seeds is None else _seeds_of(seeds),
-        "num_seeds": num_seeds,
-        "keep": keep,
-        "protocol": protocol,
-        "max_steps": max_steps,
-        "episode_timeout": episode_timeout,
-        "camera": view_from,
-        "height": height,
-        "width": width,
-        "max_fps": max_fps,
-        "quality": quality,
-        "env_kwargs": None if env_kwargs is None else kwargs_of(env_kwargs),
-        "policy_kwargs": None
-        if policy_kwargs is None
-        else kwargs_of(policy_kwargs, "--policy-kwargs"),
-        "score_ranges": _by_task(
-            "--score-range", score_range, _range_of, "TASK=LOW:HIGH"
-        ),
-    }
+    least = _by_task("--fail-under", fail_under, _value_of, "TASK=VALUE")
+    ranges = _by_task("--score-range", score_range, _range_of, "TASK=LOW:HIGH")
+    listed = None if seeds is None else _seeds_of(seeds)
+    env_options = kwargs_of(env_kwargs or "{}")
+    policy_options = kwargs_of(policy_kwargs or "{}", "--policy-kwargs")
     tasks, out = _tasks_and_directory(tasks, out, resume=resume)
     names = tasks_from(tasks) if tasks else ()
     if names:
@@ -169,24 +152,34 @@ def evaluate(
         with progress_bar(console) as show:
             evaluation = evaluate_policy(
                 names,
+                policy=policy,
                 directory=out,
+                episodes=episodes,
+                seeds=listed,
+                num_seeds=num_seeds,
                 workers=workers if engine is None else None,
-                engine=engine,
+                keep=keep,
+                protocol=protocol,
                 resume=resume,
                 force=force,
+                max_steps=max_steps,
+                episode_timeout=episode_timeout,
+                camera=view_from,
+                height=height,
+                width=width,
+                max_fps=DEFAULT_FPS if max_fps is None else max_fps,
+                quality=quality,
+                env_kwargs=env_options,
+                policy_kwargs=policy_options,
+                score_ranges=ranges,
                 confidence=confidence,
                 on_progress=_shown_progress(show, console),
-                # Other options are as in the evaluation to resume, or by default.
-                **{name: value for name, value in options.items() if value is not None},
+                engine=engine,
             )
     except KeyboardInterrupt:
-        print_lines(
-            console,
-            [
-                f"Interrupted. Finished episodes are in {out}. To continue: mjrec "
-                f"evaluate --resume {out}"
-            ],
-        )
+        way_on = f"To continue: mjrec evaluate --resume {out}"
+        interrupted = f"Interrupted. Finished episodes are in {out}. {way_on}"
+        print_lines(console, [interrupted])
         return _INTERRUPTED
     least = _matching(least, [task.name for task in evaluation.plan.tasks])
     short = dict(_shortfalls(evaluation, least))
@@ -267,15 +260,16 @@ def _by_task(
         try:
             if not (task and equals):
                 raise ValueError
-            said[task] = _finite(read(value))
+            said[task] = read(value)
         except ValueError:
             raise InvalidArgument(f"{option} must be {form}, got {text!r}.") from None
     return said
 
 
-def _finite(value: T) -> T:
-    if isinstance(value, float) and not math.isfinite(value):
-        raise ValueError(value)
+def _value_of(text: str) -> float:
+    value = float(text)
+    if not math.isfinite(value):
+        raise ValueError(text)
     return value
 
 

@@ -33,6 +33,9 @@ from .episode_results import EpisodeResult
 from .plan import Unit, read_plan
 
 _JOURNALS = "openaigym.episodes.*.jsonl"
+_AS_RECORDED = (
+    *("length", "terminated", "truncated", "success", "episode_id", "start_time"),
+)
 _UNFINISHED = dict.fromkeys(("total_reward", "terminated", "truncated"))
 
 
@@ -129,15 +132,10 @@ def _completed(
         seed=seed,
         episode=episode,
         total_reward=entry.reward,
-        length=entry.length,
-        terminated=entry.terminated,
-        truncated=entry.truncated,
-        success=entry.success,
         warnings=field_of(recorded, "warnings", mapping, default={}),
         monitor=monitor,
-        episode_id=entry.episode_id,
-        start_time=entry.start_time,
         seconds=entry.end_time - entry.start_time,
+        **{name: getattr(entry, name) for name in _AS_RECORDED},
     )
 
 

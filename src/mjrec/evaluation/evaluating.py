@@ -59,7 +59,7 @@ _ONE_THREAD_EACH = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"
 
 _GL = "MUJOCO_GL"
 
-_DEFAULT_FPS = 60
+DEFAULT_FPS = 60
 _DEFAULTS: Mapping[str, Any] = {
     "episodes": 10,
     "keep": "best,median,worst",
@@ -88,7 +88,7 @@ def evaluate(
     camera: str | int | None = None,
     height: int | None = None,
     width: int | None = None,
-    max_fps: float | None = _DEFAULT_FPS,
+    max_fps: float | None = DEFAULT_FPS,
     quality: str | None = None,
     env_kwargs: Mapping[str, Any] | None = None,
     policy_kwargs: Mapping[str, Any] | None = None,
@@ -313,7 +313,7 @@ def _begun(directory: Path, *, resume: bool, force: bool) -> EvaluationPlan | No
 
 def _options(begun: EvaluationPlan | None, **given: Any) -> dict[str, Any]:
     """Replace options that are None by their earlier values or their defaults."""
-    if begun is not None and given["max_fps"] == _DEFAULT_FPS:
+    if begun is not None and given["max_fps"] == DEFAULT_FPS:
         given["max_fps"] = None
     earlier = _DEFAULTS if begun is None else vars(begun)
     return {

@@ -47,6 +47,10 @@ from .summaries import AcrossTasks, TaskSummary
 RESULTS_NAME = "results.json"
 _TABLE_NAME = "results.csv"
 _TIMING_NAME = "timing.csv"
+_UNFINISHED = (
+    "the evaluation is not finished; to continue it, run the same command with --resume"
+)
+_NO_EVALUATION = "the directory contains no evaluation"
 RESULT_NAMES = (RESULTS_NAME, _TABLE_NAME, _TIMING_NAME, PLAN_NAME)
 
 
@@ -232,7 +236,8 @@ def read_summaries(directory: Path) -> Evaluation:
     """
     path = directory / RESULTS_NAME
     if not path.exists():
-        raise UnreadableFile(path, _why_missing(directory))
+        is_begun = (directory / PLAN_NAME).exists()
+        raise UnreadableFile(path, _UNFINISHED if is_begun else _NO_EVALUATION)
     with unreadable(path):
         read = from_json(_ResultsFile, read_versioned(path))
         if [each.task for each in read.tasks] != [
@@ -278,15 +283,6 @@ def _write(path: Path, write: Callable[[TextIO], None]) -> None:
             write(file)
     except OSError as error:
         raise FileNotWritten(path, error.strerror) from error
-
-
-def _why_missing(directory: Path) -> str:
-    if (directory / PLAN_NAME).exists():
-        return (
-            "the evaluation is not finished; to continue it, run the same command with "
-            "--resume"
-        )
-    return "the directory contains no evaluation"
 
 
 def _plan(value: Any) -> EvaluationPlan:

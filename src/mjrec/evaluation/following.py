@@ -78,20 +78,16 @@ class ChunkRun:
         chunk: the chunk.
         folder: the chunk's monitor directory.
         known: the chunk's finished episodes, as last read.
-        rounds: number of times that the chunk was submitted.
         size: value of `ChunkResults.size` when the chunk was last submitted.
         reason: the reason to give for episodes that have no result.
-        is_over: whether the chunk will not produce any more results.
     """
 
     task: EvaluatedTask
     chunk: Chunk
     folder: Path
     known: ChunkResults
-    rounds: int = 0
     size: int = 0
     reason: str = "its result is missing"
-    is_over: bool = False
 
     @property
     def place(self) -> str:
@@ -198,11 +194,7 @@ def run_chunks(run: Run, chunks: Sequence[ChunkRun], tell: _Tell) -> EvaluationP
     Raises:
         Error: workers cannot be started, or a journal is damaged.
     """
-    by_key: dict[str, ChunkRun] = {}
-    for each in chunks:
-        each.is_over = each.is_complete
-        if not each.is_over:
-            by_key[_submit(run, each)] = each
+    by_key = {_submit(run, each): each for each in chunks if not each.is_complete}
     counts_from = 0.0
     progress = _progress(chunks)
     for outcome in run.results(timeout_s=_SECONDS_BETWEEN_REPORTS):
@@ -216,7 +208,6 @@ def run_chunks(run: Run, chunks: Sequence[ChunkRun], tell: _Tell) -> EvaluationP
                 # repeatedly kills its process eventually counts as failed.
                 by_key[_submit(run, each)] = each
                 continue
-            each.is_over = True
             if not each.is_complete:
                 said = outcome.failure or (
                     f"A worker finished {each.folder}, but the recordings are missing "
@@ -226,8 +217,8 @@ def run_chunks(run: Run, chunks: Sequence[ChunkRun], tell: _Tell) -> EvaluationP
                 each.reason = said.partition(" Its last output")[0]
         now = time.monotonic()
         if now >= counts_from or not by_key:
-            for each in chunks:
-                if not each.is_over and each.folder.exists():
+            for each in by_key.values():
+                if each.folder.exists():
                     each.known = read_chunk(each.folder, each.task.name)
             progress = _progress(chunks)
             counts_from = now + (time.monotonic() - now) / _MOST_OF_TIME
@@ -396,9 +387,9 @@ def draw_videos(
 
 
 def _submit(run: Run, each: ChunkRun) -> str:
-    each.rounds += 1
+    # A chunk is only submitted again when its size has grown, so the key is unique.
     each.size = each.known.size
-    key, chunk = f"{each.place}/{each.rounds}", dataclasses.asdict(each.chunk)
+    key, chunk = f"{each.place}/{each.size}", dataclasses.asdict(each.chunk)
     run.submit(key, kind="run", task=each.task.name, folder=each.place, chunk=chunk)
     return key
 

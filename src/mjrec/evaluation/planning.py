@@ -144,7 +144,17 @@ def check_score_ranges(
     for task, given in (score_ranges or {}).items():
         if task not in names:
             raise UnknownName("task with a score range in this evaluation", task, names)
-        checked[task] = _score_range(task, given)
+        try:
+            low, high = map(float, given)
+        except (TypeError, ValueError):
+            low = high = np.nan
+        if not (np.isfinite([low, high]).all() and low < high):
+            raise InvalidArgument(
+                f"The score range of {task} must be the return for a score of 0 and a "
+                "higher return for a score of 1, such as (0, 1000), but it is "
+                f"{given!r}."
+            )
+        checked[task] = low, high
     return checked
 
 
@@ -159,19 +169,6 @@ def _range(what: str, first: int, last: int) -> str:
     if first == last:
         return f"{what}-{first:03d}"
     return f"{what}s-{first:03d}-{last:03d}"
-
-
-def _score_range(task: str, given: Any) -> tuple[float, float]:
-    try:
-        low, high = map(float, given)
-    except (TypeError, ValueError):
-        low = high = np.nan
-    if not (np.isfinite([low, high]).all() and low < high):
-        raise InvalidArgument(
-            f"The score range of {task} must be the return for a score of 0 and a "
-            f"higher return for a score of 1, such as (0, 1000), but it is {given!r}."
-        )
-    return low, high
 
 
 def _seeds(seeds: Iterable[int] | None, num_seeds: int | None) -> tuple[int, ...]:
