@@ -214,7 +214,8 @@ def killed(directory: Path) -> None:
                 monitor.step(np.full(1, 0.1, np.float32))
         os.kill(os.getpid(), signal.SIGKILL)
     os.waitpid(child, 0)
-    mjrec.recover(directory)
+    # The worker of the killed process may still be drawing.
+    mjrec.recover(directory, timeout=60)
     mjrec.render_videos(directory)
 
 

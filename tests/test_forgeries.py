@@ -1100,7 +1100,7 @@ FORGERIES = (
     Forgery(
         "a claim in the README beside versions, with another MuJoCo claimed",
         CLAIMS["another MuJoCo"],
-        bag=replace_in("README.md", "- Versions: ", "- Versions: best policy, "),
+        bag=replace_in("README.md", "| versions | ", "| versions | best policy, "),
         line="README",
     ),
     Forgery(

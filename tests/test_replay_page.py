@@ -335,7 +335,8 @@ def test_tendons_and_cloth_move(pages: Any, tmp_path: Path) -> None:
     made = mjrec.write_replay(trajectory, file)
     assert made.notes == ()
     page = pages(f"{file.as_uri()}#step=8")
-    page.wait_for_timeout(1000)
+    # The page draws the cloth with vertices at zero until its motion is loaded.
+    page.wait_for_function(f"({_VERTICES})('/flex/0')?.some(Boolean)")
     data = data_at(trajectory, 8)
     shown = np.reshape(page.evaluate(_VERTICES, "/flex/0"), (-1, 3))
     assert shown == pytest.approx(data.flexvert_xpos, abs=1e-5)

@@ -284,7 +284,10 @@ def test_a_field_that_is_forgotten_is_noticed(xml, field, words):
     if field == "cam_xpos":
         shown.camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
         shown.camera.fixedcamid = 0
-    row = changed(row_of(model, data), **{field: None})
+    row = row_of(model, data)
+    if field == "tendon_rgba" and (row[field] == model.tendon_rgba).all():
+        pytest.skip("this MuJoCo does not colour tendons at their limits")
+    row = changed(row, **{field: None})
     before = model.tendon_rgba.copy(), read_state(model, data), data.geom_xpos.copy()
     found = scene_difference(model, data, row, shown)
     assert words in (found or "")

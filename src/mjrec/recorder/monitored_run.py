@@ -10,7 +10,7 @@ import logging
 import os
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, Protocol
 
 from ..annotation import Caption
 from ..atomic_files import file_sha256
@@ -35,9 +35,20 @@ from .video_recorder import VideoRecorder
 
 if TYPE_CHECKING:
     from ..simulation.capture import EpisodeStart
-    from .recording import EpisodeRecording
 
 logger = logging.getLogger(__name__)
+
+
+class RunningEpisode(Protocol):
+    """The facts that an `EpisodeRecording` has about its episode."""
+
+    episode_id: int
+    type: str
+    start_time: float
+    seed: Any
+    options: Any
+    reset_clock: float | None
+
 
 What = Literal["video", "trajectory", "statistics", "journal", "model", "tracker"]
 
@@ -168,7 +179,7 @@ class MonitoredRun:
         # Functions to call when the run closes, because the disk was full.
         self._late: list[Callable[[], None]] = []
         self.no_video = VideoRecorder(env.frames, enabled=False)
-        self._episode: EpisodeRecording | None = None
+        self._episode: RunningEpisode | None = None
         # The reasons for drawing videos live that have been logged so far.
         self._said: set[str] = set()
 
@@ -324,12 +335,12 @@ class MonitoredRun:
     # --- facts -----------------------------------------------------------------------
 
     @property
-    def episode(self) -> EpisodeRecording:
+    def episode(self) -> RunningEpisode:
         """The running episode."""
         assert self._episode is not None, "there was no reset"
         return self._episode
 
-    def begin(self, episode: EpisodeRecording) -> None:
+    def begin(self, episode: RunningEpisode) -> None:
         """Begin an episode. From now on, faults are attributed to it."""
         self._episode = episode
         self.events.begin(episode.episode_id, chosen=False)

@@ -24,6 +24,7 @@ from ..formats.video_metadata import note_failure, reason_of
 from ..results.manifest_writing import write_manifest_and_stats
 from .clips import Clips
 from .ending_reasons import CLOSE, RESET, ending
+from .episode_choice import EpisodeChoice
 from .fast_path import FastPath
 from .finishers import Finisher, LaterFinisher
 from .kept_videos import KeptVideos
@@ -31,7 +32,7 @@ from .monitored_run import MonitoredRun
 from .options import DEFERRED, LIVE, OFF, RecorderOptions, type_of_mode
 from .recorded_environment import RecordedEnvironment, check_frames
 from .recording import EpisodeRecording
-from .selection import EpisodeChoice, Standing
+from .selection import Standing
 from .states import DeferredVideo
 from .stats_recorder import reward_to_float
 from .tracking import FinishedEpisode
@@ -493,7 +494,8 @@ class Recorder:
             success: whether the environment reports a success; None if unknown.
             take: takes the episode's last frames.
         """
-        recording, is_complete = self.run.episode, facts["complete"]
+        recording, is_complete = self._recording, facts["complete"]
+        assert recording is not None, "there was no reset"
         # A schedule's decision is final.
         kept = self._kept if recording.is_chosen else None
         known = self._results(facts, success) if is_complete else None

@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The choice of episodes that get a video or keep their trajectory.
+"""The choice of episodes for `Monitor(..., keep=...)`, made as the episodes end.
 
-An `EpisodeChoice` decides when an episode begins. With `Monitor(..., keep=...)`, a
-`Selection` then receives each finished episode and decides which episodes are chosen,
-which are dropped, and which are still candidates. Neither deals with files.
+A selection receives each finished episode and decides which episodes are chosen, which
+are dropped, and which are still candidates. It does not deal with files.
 """
 
 from __future__ import annotations
@@ -12,24 +11,12 @@ import enum
 import functools
 import operator
 from collections.abc import Callable, Iterable, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from ..errors import InvalidArgument
-from ..schedules import (
-    Schedule,
-    capped_cubic_video_schedule,
-    check_takes_one,
-    disable_videos,
-    schedule_name,
-    to_schedule,
-)
+from ..schedules import check_takes_one, schedule_name
 from .keep_rules import RULES, has_failed, keep_rule
 from .tracking import FinishedEpisode
-
-if TYPE_CHECKING:
-    from .options import RecorderOptions
-
-_EVALUATION = "e"
 
 
 class Standing(enum.Enum):
@@ -224,75 +211,3 @@ def _listed(numbers: Sequence[int], most: int = 10) -> str:
     shown = ", ".join(map(str, numbers[:most])) or "none"
     more = len(numbers) - most
     return f"{shown} and {more} more" if more > 0 else shown
-
-
-class EpisodeChoice:
-    """Decides what to record of an episode when it begins, based on the options.
-
-    A user's function is called only once per episode number, even if several resets
-    have the same number.
-
-    Args:
-        options: the user's options.
-        draws: whether any videos are drawn.
-
-    Attributes:
-        selection: the object that chooses among finished episodes; None if episodes are
-            chosen when they begin.
-        schedule_name: the schedule's name in the manifest.
-        has_videos: whether any episode may get a video of its own.
-        decide: function that returns whether an episode gets a video.
-    """
-
-    def __init__(self, options: RecorderOptions, *, draws: bool) -> None:
-        self.selection: Selection | None = None
-        schedule: Schedule = to_schedule(options.video_callable)
-        if options.keep is not None:
-            schedule = self.selection = selection_from(options.keep)
-        if options.step_trigger is not None or not draws:
-            schedule = disable_videos
-        self.schedule_name = schedule_name(schedule)
-        self.has_videos = schedule is not disable_videos
-        self.decide = functools.lru_cache(maxsize=1)(schedule)
-        self._is_default = schedule is capped_cubic_video_schedule
-        kept = self._kept = options.trajectory_callable
-        if callable(kept):
-            self._kept = functools.lru_cache(maxsize=1)(kept)
-        stated = options.statements
-        self._only_counted = stated is not None and stated.only_counted
-
-    def will_choose(self, episode_id: int) -> bool:
-        """Return whether an episode is already certain to get a video.
-
-        A user's schedule is not called before the episode begins, so the result is True
-        only for the default schedule.
-        """
-        return self._is_default and capped_cubic_video_schedule(episode_id)
-
-    def may_keep_trajectory(self, episode_type: str) -> bool:
-        """Return whether an episode of this type may keep its trajectory.
-
-        This can be called before `decide`.
-        """
-        return self.has_videos or self.keeps_without_video(episode_type)
-
-    def keeps_trajectory(
-        self, episode_id: int, episode_type: str, has_video: bool
-    ) -> Any:
-        """Return whether an episode keeps its trajectory.
-
-        Args:
-            episode_id: the episode's number.
-            episode_type: "t" for training, "e" for evaluation.
-            has_video: whether the episode gets a video.
-        """
-        kept = self._kept
-        if self._only_counted:
-            return has_video
-        if kept is None:
-            return has_video or episode_type == _EVALUATION
-        return kept(episode_id) if callable(kept) else kept
-
-    def keeps_without_video(self, episode_type: str) -> bool:
-        """Return whether a trajectory is kept even if its video is dropped."""
-        return self._kept is not None or episode_type == _EVALUATION

@@ -243,7 +243,13 @@ def _asset_mesh(
 
 def _flex_mesh(model: mujoco.MjModel, flex: int) -> trimesh.Trimesh:
     """Return the triangles of a 2D flex, or of a 3D flex's shell."""
-    vertices = _part(model.flex_vert, model.flex_vertadr, model.flex_vertnum, flex)
+    # `flex_vert` is zero where each vertex has a body. A mesh with equal vertices and
+    # normals shares their memory in the page, which then loses the vertices.
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    mujoco.mj_flex(model, data)
+    places = data.flexvert_xpos
+    vertices = _part(places, model.flex_vertadr, model.flex_vertnum, flex)
     is_cloth = model.flex_dim[flex] == 2
     if is_cloth:
         lists = (model.flex_elem, model.flex_elemdataadr, 3 * model.flex_elemnum)
