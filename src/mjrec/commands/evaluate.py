@@ -32,6 +32,8 @@ from ..plain_text import counted
 from ..recorder.keep_rules import keep_rule
 from .options import NO_ENGINE, AsJson, Engine, camera_of, kwargs_of, size_of
 from .terminal import (
+    FAILED,
+    INTERRUPTED,
     and_more,
     names_by,
     print_json,
@@ -43,8 +45,6 @@ from .terminal import (
 
 T = TypeVar("T")
 
-_FAILED = 1
-_INTERRUPTED = 130
 _SHOWN = 10
 _MOST_SEEDS = 1_000_000
 _COLUMNS = ("IQM", "median", "min..max", "success", "failed")
@@ -180,7 +180,7 @@ def evaluate(
         way_on = f"To continue: mjrec evaluate --resume {out}"
         interrupted = f"Interrupted. Finished episodes are in {out}. {way_on}"
         print_lines(console, [interrupted])
-        return _INTERRUPTED
+        return INTERRUPTED
     least = _matching(least, [task.name for task in evaluation.plan.tasks])
     short = dict(_shortfalls(evaluation, least))
     if as_json:
@@ -189,7 +189,7 @@ def evaluate(
         result_console().print(_table(evaluation))
         print_lines(result_console(), _lines(evaluation, short))
     is_nan = bool(evaluation.not_finite) and not allow_nan
-    return _FAILED if evaluation.failed or short or is_nan else 0
+    return FAILED if evaluation.failed or short or is_nan else 0
 
 
 def _shown_progress(

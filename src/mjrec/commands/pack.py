@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import re
 import shlex
 import zipfile
@@ -13,6 +12,7 @@ from typing import Annotated
 import rich.console
 import tyro
 
+from ..atomic_files import file_sha256
 from ..errors import InvalidArgument
 from ..evidence.pack import pack as pack_directory
 from ..evidence.size_limit import shown_size
@@ -86,13 +86,11 @@ def _numbers(text: str) -> list[int]:
 
 def _lines(archive: Path) -> list[str]:
     size = archive.stat().st_size
-    with archive.open("rb") as file:
-        digest = hashlib.file_digest(file, "sha256").hexdigest()
     with zipfile.ZipFile(archive) as packed:
         count = len(packed.infolist())
     return [
         str(archive),
         f"  {count} files, {shown_size(size)} ({size} bytes)",
-        f"  sha256 {digest}",
+        f"  sha256 {file_sha256(archive)}",
         f"To verify it: mjrec verify {shlex.quote(str(archive))}",
     ]

@@ -15,9 +15,7 @@ from ..rendering.leftovers import RecoveredFile
 from ..rendering.recovery import Recovery
 from ..rendering.recovery import recover as recover_directory
 from .options import AsJson
-from .terminal import print_json, print_lines, result_console
-
-_FAILED = 1
+from .terminal import FAILED, print_json, print_lines, result_console
 
 
 def recover(
@@ -44,7 +42,7 @@ def recover(
         print_json(to_json(recovery))
     else:
         print_lines(result_console(), [str(recovery)])
-    return _FAILED if recovery.failures else 0
+    return FAILED if recovery.failures else 0
 
 
 def _recover_all(directory: Path, timeout: float) -> Recovery:

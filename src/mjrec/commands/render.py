@@ -22,10 +22,7 @@ from ..rendering.jobs import RenderedVideos
 from ..rendering.render_videos import iter_rendered_videos
 from ..rendering.views import Variant, View
 from .options import NO_ENGINE, AsJson, Engine, camera_of, size_of
-from .terminal import names_by, print_json, print_lines
-
-_FAILED = 1
-_INTERRUPTED = 130
+from .terminal import FAILED, INTERRUPTED, names_by, print_json, print_lines
 
 
 def render(
@@ -143,8 +140,8 @@ def render(
     else:
         print_lines(console, _summary(report, is_interrupted))
     if is_interrupted:
-        return _INTERRUPTED
-    return _FAILED if report.failures or report.blank else 0
+        return INTERRUPTED
+    return FAILED if report.failures or report.blank else 0
 
 
 def _places(target: Path, episode: int | None) -> tuple[list[Path], int | None]:

@@ -13,6 +13,9 @@ import rich.table
 
 from .. import json_text
 
+# Exit statuses. The second is what shells report for a process that Ctrl-C ended.
+FAILED, INTERRUPTED = 1, 130
+
 _LOG_WIDTH = 160
 # The number of rows from which the column widths of a long table are measured.
 _ROWS_MEASURED = 1000
