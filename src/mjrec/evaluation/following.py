@@ -226,22 +226,24 @@ def run_chunks(run: Run, chunks: Sequence[ChunkRun], tell: _Tell) -> EvaluationP
     return progress
 
 
-def by_episode(chunks: Iterable[ChunkRun], task: str) -> dict[Unit, ChunkRun]:
-    """Return the chunk of each episode of a task."""
-    return {
-        unit: each for each in chunks if each.task.name == task for unit in each.chunk
-    }
-
-
 def results_of(
     plan: EvaluationPlan, chunks: Iterable[ChunkRun]
 ) -> dict[str, list[EpisodeResult]]:
     """Return the results of each task's episodes, in the plan's order."""
-    chunks, results = list(chunks), {}
-    for task in plan.tasks:
-        of = by_episode(chunks, task.name)
-        results[task.name] = [of[unit].result(unit) for unit in plan]
-    return results
+    # The chunks of a seed are in the order of their episodes.
+    by_seed: dict[tuple[str, int], list[ChunkRun]] = {}
+    for each in chunks:
+        for seed in each.chunk.seeds:
+            by_seed.setdefault((each.task.name, seed), []).append(each)
+    return {
+        task.name: [
+            each.result((seed, number))
+            for seed in plan.seeds
+            for each in by_seed[task.name, seed]
+            for number in range(each.chunk.first, each.chunk.stop)
+        ]
+        for task in plan.tasks
+    }
 
 
 def choose_videos(
@@ -253,15 +255,15 @@ def choose_videos(
     selection: dict[str, list[ChosenEpisode]] = {}
     videos: list[tuple[Path, RecordingKey]] = []
     impossible: dict[Path, str] = {}
+    chunk_of = _by_monitor(chunks)
     for task, of_task in results.items():
-        chunk_of = by_episode(chunks, task)
         # The order in which ties are broken must depend only on the episodes.
         own = sorted(of_task, key=lambda each: each.unit)
         kept = keep_rule(plan.keep).choose([each if each.key else None for each in own])
         roles: dict[Path, dict[RecordingKey, list[str]]] = {}
         for result, role in kept:
             if result.key is not None:
-                folder = chunk_of[result.unit].folder
+                folder = chunk_of[task, result.monitor].folder
                 of_chunk = roles.setdefault(folder, {})
                 of_chunk.setdefault(result.key, []).append(role)
         drawable: set[RecordingKey] = set()
@@ -290,11 +292,7 @@ def files_of(
     evaluation: Evaluation, chunks: Iterable[ChunkRun]
 ) -> Callable[[EpisodeResult], EpisodeFiles]:
     """Return a function that looks up the files of an episode."""
-    folders = {
-        (result.task, result.monitor): each.place
-        for each in chunks
-        for result in each.known.results.values()
-    }
+    chunk_of = _by_monitor(chunks)
     chosen = {
         (task, each.seed, each.episode)
         for task, of_task in evaluation.selection.items()
@@ -311,7 +309,7 @@ def files_of(
         key = result.key
         if key is None:
             return EpisodeFiles()
-        folder = folders[result.task, result.monitor]
+        folder = chunk_of[result.task, result.monitor].place
         names, trajectory = names_in(folder), f"{key.name}{FINISHED}"
         # Text environments have a text recording instead of a video.
         as_text, video = f"{key.video_name.removesuffix('.mp4')}.json", None
@@ -384,6 +382,17 @@ def draw_videos(
         names = [str(path) for path in pending if pending[path] == reason]
         logger.warning("%s: %s", ", ".join(names), reason)
     return videos, pending
+
+
+def _by_monitor(
+    chunks: Iterable[ChunkRun],
+) -> dict[tuple[str, str | None], ChunkRun]:
+    """Return the chunks, by task and by the monitors that recorded them."""
+    return {
+        (each.task.name, result.monitor): each
+        for each in chunks
+        for result in each.known.results.values()
+    }
 
 
 def _submit(run: Run, each: ChunkRun) -> str:
