@@ -33,7 +33,6 @@ import contextlib
 import logging
 import pickle
 import re
-import sys
 import time
 import warnings
 from collections.abc import Callable, Mapping
@@ -41,6 +40,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
+from .. import provenance
 from ..atomic_files import make_directory
 from ..engines.jobs import TRIES
 from ..engines.worker import time_limit
@@ -116,7 +116,7 @@ class EvaluationWorker:
         self._directory = Path(settings["directory"])
         self.plan = from_json(EvaluationPlan, settings["plan"])
         # A reader of the recordings needs the command that started the evaluation.
-        sys.orig_argv[:] = settings.get("command", sys.orig_argv)
+        provenance.command = settings.get("command", provenance.command)
         policy = settings.get("payload")
         self._policy = None if policy is None else Path(policy).read_bytes()
         self._draws = not keep_rule(self.plan.keep).keeps_none
