@@ -143,11 +143,6 @@ class Run:
         self._done: queue.SimpleQueue[Future[Any]] = queue.SimpleQueue()
         self._told: set[tuple[str, int, str]] = set()
 
-    @property
-    def unfinished(self) -> int:
-        """Number of jobs without an outcome."""
-        return len(self._tasks) + len(self._parked)
-
     def submit(self, key: str, **arguments: Any) -> None:
         """Add a job, which is possible even while results arrive.
 
