@@ -18,7 +18,7 @@ from typing import Any
 import gymnasium
 
 import mjrec
-from mjrec.evaluation.chunk_results import read_chunk
+from mjrec.evaluation.episode_results import read_chunk
 from mjrec.evaluation.evaluation import Evaluation, write_results
 from mjrec.evaluation.plan import EvaluatedTask, EvaluationPlan
 from mjrec.evaluation.statistics import Bootstrap

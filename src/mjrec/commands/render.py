@@ -13,7 +13,7 @@ import tyro
 
 from ..annotation import check_annotation
 from ..errors import InvalidArgument
-from ..evaluation.chunk_results import recorded_results
+from ..evaluation.episode_results import recorded_results
 from ..evaluation.evaluation import is_evaluation
 from ..formats.monitor_directory import recording_directories
 from ..monitors.progress import render_progress

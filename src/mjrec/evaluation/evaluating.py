@@ -43,7 +43,6 @@ from .plan import (
     write_plan,
 )
 from .planning import check_score_ranges, plan_from
-from .policy_objects import sent_policy
 from .statistics import Bootstrap, load_scipy
 from .summaries import default_score_range, summarize_across, summarize_results
 
@@ -204,9 +203,9 @@ def evaluate(
         raise PolicyError(
             "An evaluation needs a policy: random, zero, module:name, or an object."
         )
-    described, payload = sent_policy(policy, options["policy_kwargs"] or {})
-    options.update(described)
-    plan = plan_from(tasks, seeds=seeds, num_seeds=num_seeds, begun=begun, **options)
+    plan, payload = plan_from(
+        tasks, policy, seeds=seeds, num_seeds=num_seeds, begun=begun, **options
+    )
     ranges = check_score_ranges(score_ranges, [task.name for task in plan.tasks])
     if begun is not None:
         check_continues(place, begun, plan)

@@ -31,8 +31,7 @@ from ..formats.dataclass_json import from_json, to_json
 from ..formats.json_fields import integer, text, unreadable
 from ..formats.notebook import shown
 from ..formats.spans import find_trajectory
-from .chunk_results import recorded_results
-from .episode_results import EpisodeResult
+from .episode_results import EpisodeResult, recorded_results
 from .plan import PLAN_NAME, EvaluationPlan, read_versioned, write_versioned
 from .result_tables import (
     EpisodeFiles,

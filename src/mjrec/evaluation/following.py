@@ -26,8 +26,7 @@ from ..rendering.chosen_videos import write_choice
 from ..rendering.finish import bring_up_to_date, do_jobs
 from ..rendering.jobs import Progress, RecordingKey, VideoJob
 from ..simulation.model_trust import note_models
-from .chunk_results import ChunkResults, read_chunk
-from .episode_results import EpisodeResult
+from .episode_results import ChunkResults, EpisodeResult, read_chunk
 from .evaluation import ChosenEpisode, Evaluation
 from .plan import Chunk, EvaluatedTask, EvaluationPlan, Unit
 from .result_tables import EpisodeFiles

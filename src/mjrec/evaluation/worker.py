@@ -64,7 +64,7 @@ from ..recorder.options import LIVE
 from ..rendering.recovery import recover
 from ..schedules import record_all
 from ..simulation.model_trust import noting_models
-from .chunk_results import read_chunk
+from .episode_results import read_chunk
 from .plan import NO_GL, SUITE, Chunk, EvaluationPlan, Unit
 
 if TYPE_CHECKING:
