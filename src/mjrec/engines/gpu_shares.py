@@ -1,13 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What engines have in common: workers, shares of GPUs, packages, environments."""
+"""The number of workers, the GPUs that each worker gets, and engines' packages."""
 
 from __future__ import annotations
 
-import contextlib
 import importlib
 import math
-import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -117,18 +115,3 @@ def engine_package(package: str, engine: str, *, install: str) -> Any:
         raise MissingDependency(
             package, purpose=f'engine="{engine}"', install=f'pip install "{install}"'
         ) from error
-
-
-@contextlib.contextmanager
-def changed_environ(changes: Mapping[str, str | None]) -> Iterator[None]:
-    """Set (or, for None, remove) environment variables, and restore all afterwards."""
-    before = dict(os.environ)
-    for name in changes:
-        os.environ.pop(name, None)
-    os.environ.update({name: v for name, v in changes.items() if v is not None})
-    try:
-        yield
-    finally:
-        for name in set(os.environ) - set(before):
-            del os.environ[name]
-        os.environ.update(before)

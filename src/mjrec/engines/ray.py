@@ -24,9 +24,10 @@ from typing import Any
 
 import mjrec
 
+from ..child_python import changed_environ
 from ..errors import ClosedError, Error, GLError, InvalidArgument
 from ..machine import usable_cpus
-from .gpu_shares import GpuShare, changed_environ, check_worker_count, engine_package
+from .gpu_shares import GpuShare, check_worker_count, engine_package
 
 logger = logging.getLogger(__name__)
 

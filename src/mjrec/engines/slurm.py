@@ -35,9 +35,10 @@ from pathlib import Path
 from typing import Any
 
 from ..atomic_files import write_text
+from ..child_python import changed_environ
 from ..errors import ClosedError, Error, InvalidArgument, UnknownName
 from ..machine import usable_cpus
-from .gpu_shares import GpuShare, changed_environ, check_worker_count, engine_package
+from .gpu_shares import GpuShare, check_worker_count, engine_package
 from .local import LocalEngine
 from .worker import do_job, end_idle_children
 
