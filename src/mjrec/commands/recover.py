@@ -9,7 +9,7 @@ from typing import Annotated
 import tyro
 
 from ..evaluation.evaluation import is_evaluation
-from ..formats.dataclass_json import to_json
+from ..formats.json_fields import to_json
 from ..formats.monitor_directory import monitor_directories_in
 from ..rendering.leftovers import RecoveredFile
 from ..rendering.recovery import Recovery

@@ -18,9 +18,8 @@ from ..evaluation.evaluation import is_evaluation
 from ..formats.monitor_directory import recording_directories
 from ..monitors.progress import render_progress
 from ..plain_text import counted
-from ..rendering.jobs import RenderedVideos
+from ..rendering.jobs import RenderedVideos, Variant, View
 from ..rendering.render_videos import iter_rendered_videos
-from ..rendering.views import Variant, View
 from .options import NO_ENGINE, AsJson, Engine, camera_of, size_of
 from .terminal import FAILED, INTERRUPTED, names_by, print_json, print_lines
 

@@ -24,11 +24,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from ..formats.dataclass_json import from_json
-from ..formats.journal import JournalEntry, JournalReader
+from ..formats.journal import JournalEntry, read_journal
 from ..formats.json_fields import field as field_of
-from ..formats.json_fields import integer, mapping, text, unreadable
-from ..formats.monitor_directory import Infix, infix_of, monitor_directories_in
+from ..formats.json_fields import from_json, integer, mapping, text, unreadable
+from ..formats.monitor_directory import infix_of, monitor_directories_in
 from ..rendering.jobs import RecordingKey
 from .plan import Unit, read_plan
 
@@ -98,10 +97,9 @@ class EpisodeResult:
     @property
     def key(self) -> RecordingKey | None:
         """The key of the episode's recording; None if it was not recorded."""
-        infix = Infix.parse(self.monitor or "")
-        if infix is None or self.episode_id is None:
+        if self.monitor is None or self.episode_id is None:
             return None
-        return RecordingKey(infix, self.episode_id)
+        return RecordingKey(self.monitor, self.episode_id)
 
 
 @dataclass
@@ -179,7 +177,7 @@ def _read(path: Path, task: str, found: ChunkResults) -> None:
             found.results.setdefault(failed.unit, failed)
 
     with unreadable(path):
-        for entry in JournalReader(path, on_event=note):
+        for entry in read_journal(path, on_event=note):
             if entry.evaluation is not None:
                 running.clear()
                 found.is_drawn_live |= entry.recording == "live"

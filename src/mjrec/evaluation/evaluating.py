@@ -23,7 +23,7 @@ from ..engines.choice import given_engine
 from ..engines.jobs import WORK_FOLDER, Run, Work
 from ..engines.local import LocalEngine
 from ..errors import DirectoryInUse, GLError, InvalidArgument, PolicyError
-from ..formats.dataclass_json import to_json
+from ..formats.json_fields import to_json
 from ..formats.locks import try_lock
 from ..formats.monitor_directory import names_in
 from ..gl.choice import choose

@@ -25,10 +25,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple, TextIO
 
-from ..atomic_files import replacing
-from ..errors import FileNotWritten, UnreadableFile
-from ..formats.dataclass_json import from_json, to_json
-from ..formats.json_fields import integer, text, unreadable
+from ..atomic_files import replacing, writing
+from ..errors import UnreadableFile
+from ..formats.json_fields import from_json, integer, text, to_json, unreadable
 from ..formats.notebook import shown
 from ..formats.spans import find_trajectory
 from .episode_results import EpisodeResult, recorded_results
@@ -156,7 +155,7 @@ class Evaluation:
         if key is None:
             return None
         folders = {of: folder for folder, of in self.by_task[result.task].places}
-        folder = self.directory / folders[str(key.infix)]
+        folder = self.directory / folders[key.infix]
         video = folder / key.video_name
         for each in (video, video.with_suffix(".json")):
             if each.exists():
@@ -274,14 +273,12 @@ def results_in(directory: Path) -> Iterator[tuple[EpisodeResult, Path | None]]:
 
 
 def _write(path: Path, write: Callable[[TextIO], None]) -> None:
-    try:
-        with (
-            replacing(path) as temporary,
-            temporary.open("w", encoding="utf-8", newline="") as file,
-        ):
-            write(file)
-    except OSError as error:
-        raise FileNotWritten(path, error.strerror) from error
+    with (
+        writing(path),
+        replacing(path) as temporary,
+        temporary.open("w", encoding="utf-8", newline="") as file,
+    ):
+        write(file)
 
 
 def _plan(value: Any) -> EvaluationPlan:

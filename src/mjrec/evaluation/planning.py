@@ -28,7 +28,6 @@ from ..atomic_files import file_sha256
 from ..environments.episode_seeds import episode_seeds
 from ..environments.named_environment import EnvironmentOptions
 from ..environments.names import (
-    MjcfName,
     parse_environment_name,
     working_directory_importable,
 )
@@ -255,9 +254,9 @@ def _with_folders(
 
 
 def _folder(name: str, taken: set[str]) -> str:
-    parsed = parse_environment_name(name)
+    is_file = parse_environment_name(name).framework == "mjcf"
     # The results must not reveal where a file was stored.
-    text = parsed.path.name if isinstance(parsed, MjcfName) else name
+    text = Path(name).name if is_file else name
     base = _OUTSIDE.sub(_encoded, text.replace("/", "-"))[:_LONGEST_FOLDER]
     # Avoids hidden folders and relative paths such as `..`.
     base = f"-{base}" if base.startswith(".") else base

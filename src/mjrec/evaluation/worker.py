@@ -51,10 +51,10 @@ from ..environments.names import working_directory_importable
 from ..environments.policies import Policy, load_policy, policy_file, policy_from
 from ..environments.scenes import new_warnings, simulation_below
 from ..errors import Error, GLError, InvalidArgument, PolicyError
-from ..formats.dataclass_json import from_json
+from ..formats.json_fields import from_json
 from ..formats.locks import wait_for_lock
-from ..formats.monitor_directory import Infix, journal_name
-from ..gl import use_gl
+from ..formats.monitor_directory import journal_name
+from ..gl.choice import use_gl
 from ..json_text import dumps
 from ..messages import carried
 from ..monitors import Monitor
@@ -280,7 +280,7 @@ class _ChunkRun:
             for unit in missing:
                 if deaths[unit] >= TRIES:
                     why = f"{TRIES} processes died in it"
-                    self._monitored(unit).recorder.note_event(
+                    self._monitored(unit).recorder.run.note(
                         "failed", _failed(unit, why)
                     )
             missing = [unit for unit in missing if deaths[unit] < TRIES]
@@ -328,7 +328,7 @@ class _ChunkRun:
         monitor.forget_frames()
         episode_id, start = monitor.episode_id, time.time()
         own = {"seed": unit[0], "episode": unit[1]}
-        monitor.recorder.note_event("begun", own)
+        monitor.recorder.run.note("begun", own)
         acting, journal = self._worker.acting(self._task, unit[0]), self._worker.journal
         assert journal is not None
         before: dict[str, int] = {}
@@ -361,7 +361,7 @@ class _ChunkRun:
                 # Otherwise the monitor does not know the episode.
                 length = monitor.stats_recorder.steps or 0
                 failed.update(episode_id=episode_id, length=length)
-            monitor.recorder.note_event("failed", failed)
+            monitor.recorder.run.note("failed", failed)
             self._renew()
             return False
         return True
@@ -398,9 +398,7 @@ class _ChunkRun:
             self._monitor.recorder.bundle_trajectories()
             self._monitor.leave_environment_open()
             self._open.enter_context(self._monitor)
-            infix = Infix.parse(self._monitor.infix)
-            assert infix is not None
-            self._worker.journal = self._folder / journal_name(infix)
+            self._worker.journal = self._folder / journal_name(self._monitor.infix)
         return self._monitor
 
     def _renew(self) -> None:
