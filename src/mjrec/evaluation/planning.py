@@ -27,10 +27,7 @@ import numpy as np
 from ..atomic_files import file_sha256
 from ..environments.episode_seeds import episode_seeds
 from ..environments.named_environment import EnvironmentOptions
-from ..environments.names import (
-    parse_environment_name,
-    working_directory_importable,
-)
+from ..environments.names import parse_environment_name, working_directory_importable
 from ..errors import InvalidArgument, PolicyError, UnknownName
 from ..frames import check_quality
 from ..json_text import loads
