@@ -35,7 +35,7 @@ from ..environments.from_name import environment_from_name
 from ..environments.named_environment import EnvironmentOptions, NamedEnvironment
 from ..environments.names import working_directory_importable
 from ..environments.policies import Policy, load_policy, policy_file, policy_from
-from ..environments.scenes import new_warnings, simulation_below
+from ..environments.scenes import mujoco_warnings, new_warnings
 from ..errors import Error, InvalidArgument, PolicyError
 from ..formats.monitor_directory import Infix, journal_name
 from ..json_text import dumps
@@ -321,11 +321,11 @@ class _ChunkRun:
         ) -> Any:
             first = begin(named, env, seeds)
             # Not every reset clears the warning counts.
-            before.update(_warnings(named.environment))
+            before.update(mujoco_warnings(named.environment))
             return first
 
         def facts() -> Mapping[str, Any]:
-            warnings = new_warnings(before, _warnings(acting.named.environment))
+            warnings = new_warnings(before, acting.named.environment)
             return {"seed": unit[0], "episode": unit[1], "warnings": warnings}
 
         monitor.recorder.evaluation_facts = facts
@@ -398,16 +398,6 @@ def _play(acting: Acting, env: Any, seeds: EpisodeSeeds, begin: _Begin) -> None:
         while not done:
             observation, _, *ends = named.step(env, policy(observation))
             done = any(ends)
-
-
-def _warnings(environment: Any) -> dict[str, int]:
-    simulation = simulation_below(environment)
-    if simulation is None:
-        return {}
-    # Imported here because it loads MuJoCo, which some tasks do not need.
-    from ..simulation.warnings import warning_counts
-
-    return warning_counts(simulation)
 
 
 def _uid(folder: Path) -> str:

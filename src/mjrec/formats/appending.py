@@ -10,7 +10,11 @@ from __future__ import annotations
 
 import errno
 import os
+from collections.abc import Iterable
 from pathlib import Path
+
+from ..atomic_files import make_directory
+from ..errors import DirectoryNotWritable, FileNotWritten
 
 
 def open_for_appending(path: Path, *, new: bool = False) -> int:
@@ -57,3 +61,50 @@ def append_whole(descriptor: int, piece: bytes, *, torn: bytes = b"") -> None:
         if os.fstat(descriptor).st_size == end:
             os.ftruncate(descriptor, end - written)
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+class AppendOnlyFile:
+    """A new file to which whole pieces are appended immediately.
+
+    A piece is appended completely or not at all, because half a row would be read as a
+    different row, and nothing after half a record would be read. Appended pieces
+    survive the end of this process.
+
+    Args:
+        names: candidate paths, which may come from an iterator. The first path that
+            does not exist is created, together with its directory.
+
+    Raises:
+        DirectoryNotWritable: the directory cannot be created or written to.
+
+    Attributes:
+        path: the file.
+    """
+
+    def __init__(self, names: Iterable[Path]) -> None:
+        for path in names:
+            make_directory(path.parent)
+            try:
+                self._file = os.fdopen(open_for_appending(path, new=True), "ab", 0)
+            except FileExistsError:
+                continue
+            except OSError as error:
+                raise DirectoryNotWritable(path.parent, error.strerror) from error
+            self.path = path
+            return
+        raise ValueError("names must contain a name that is not in use")
+
+    def append(self, piece: bytes) -> None:
+        """Append `piece`.
+
+        Raises:
+            FileNotWritten: the disk has no room for the piece. The file is unchanged.
+        """
+        try:
+            append_whole(self._file.fileno(), piece)
+        except OSError as error:
+            raise FileNotWritten(self.path, error.strerror) from error
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()

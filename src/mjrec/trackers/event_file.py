@@ -23,7 +23,7 @@ from tensorboard.summary.writer.record_writer import RecordWriter
 
 from ..atomic_files import make_directory
 from ..errors import DirectoryNotWritable
-from .append_only_file import AppendOnlyFile
+from ..formats.appending import AppendOnlyFile
 
 # Format and offset of the width and height in a GIF.
 _GIF_SIZE = struct.Struct("<HH")
