@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Any
 
 import mjrec
-from mjrec.formats.dataclass_json import to_json
-from mjrec.rendering.views import View
+from mjrec.formats.json_fields import to_json
+from mjrec.rendering.jobs import View
 
 from .children import call
 from .results import Reference, Result, at_least

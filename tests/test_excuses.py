@@ -9,8 +9,9 @@ import pytest
 
 from mjrec.errors import InvalidArgument
 from mjrec.evidence.differences import Aspect, Difference
-from mjrec.evidence.excuses import Trial, applicable, excuse_of, merged, with_allowed
+from mjrec.evidence.excuses import applicable, excuse_of, merged, with_allowed
 from mjrec.evidence.findings import Outcome, Topic
+from mjrec.evidence.trial import Trial
 
 RECORDING = "recording 0.u"
 EPISODE = "episode 3 of 0.u"

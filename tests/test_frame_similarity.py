@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mjrec.evidence.decoded_video import DecodedVideo
+from mjrec.evidence.decoded_video import decoded_video
 from mjrec.evidence.frame_similarity import (
     OTHER_CPU,
     OTHER_ENCODER,
@@ -37,7 +37,7 @@ def test_planes_are_those_that_the_encoder_is_given(
     path = tmp_path / "lossless.mp4"
     with VideoWriter(path, fps=10, crf=0) as video:
         video.write(frame)
-    with DecodedVideo(path) as decoded:
+    with decoded_video(path) as (_, decoded):
         [shipped] = decoded
     for ours, theirs in zip(planes_of(frame), shipped, strict=True):
         assert ours.shape == theirs.shape

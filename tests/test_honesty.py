@@ -40,15 +40,16 @@ def said(
             for number, episodes in enumerate(recordings)
         ]
     )
-    names = [e.actions for each in recordings for e in each if e.actions]
+    names = [e.arrays for each in recordings for e in each if e.arrays]
     # Of one name in the test is one content.
     arrays = {name: np.full(3, ord(name[0])) for name in names}
     return list(remarks(inputs, arrays))
 
 
 def episode(number: int, **inputs: Any) -> EpisodeInputs:
-    """Return an episode."""
-    return EpisodeInputs(episode_id=number, steps=3, **inputs)
+    """Return an episode, with actions if it has arrays."""
+    has_actions = "arrays" in inputs
+    return EpisodeInputs(episode_id=number, steps=3, has_actions=has_actions, **inputs)
 
 
 @pytest.mark.parametrize(
@@ -113,8 +114,8 @@ def test_a_missing_predecessor_is_in_the_first_line() -> None:
 
 def test_equal_episodes_count_once_and_are_named() -> None:
     """Wherever they are; other actions, or another beginning, are another episode."""
-    first = [episode(0, seed=1, actions="a"), episode(1, seed=2, actions="a2")]
-    second = [episode(0, seed=1, actions="a3"), episode(1, seed=1, actions="b")]
+    first = [episode(0, seed=1, arrays="a"), episode(1, seed=2, arrays="a2")]
+    second = [episode(0, seed=1, arrays="a3"), episode(1, seed=1, arrays="b")]
     found = [each for each in said(first, second) if each.is_headline]
     [finding] = found
     assert "episode 0 of 0.1, episode 0 of 1.1" in finding.reason

@@ -69,7 +69,7 @@ def test_inputs_are_what_was_asked_for_and_done(data: Path) -> None:
     first, second = recording.episodes
     assert (first.seed, first.options, first.cut) == (3, {"a": 1}, "exception")
     assert (second.seed, second.cut, second.is_chosen) == (None, None, True)
-    assert [a.tolist() for a in arrays[str(second.actions)]][2:] == [[1.0], [1.0]]
+    assert [a.tolist() for a in arrays[str(second.arrays)]][2:] == [[1.0], [1.0]]
 
 
 def test_actions_are_played_in_the_dtype_that_was_given(data: Path) -> None:
@@ -88,7 +88,7 @@ def test_actions_are_played_in_the_dtype_that_was_given(data: Path) -> None:
 def test_dictionaries_are_played_as_dictionaries() -> None:
     """They are recorded as one vector."""
     episode = EpisodeInputs(
-        episode_id=0, steps=1, actions="a", parts=[("x", [2]), ("y", [])]
+        episode_id=0, steps=1, arrays="a", action_parts=[("x", [2]), ("y", [])]
     )
     [action] = given_actions(episode, {"a": np.array([[1.0, 2.0, 3.0]])})
     assert action["x"].tolist() == [1.0, 2.0]

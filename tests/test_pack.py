@@ -301,6 +301,7 @@ def test_the_readme_leads_a_stranger(infix: str, recorded: Path, bag: Path) -> N
         "capped_cubic_video_schedule",
         f"openaigym.video.{infix}.video000001.mp4",
         "| OpenGL | ",
+        "a view of the recorded states, not evidence of its own",
         f"| {infix} | InvertedPendulum-v5 | 3 | {sum(returns) / 3:.6g} | ",
     ):
         assert part in text

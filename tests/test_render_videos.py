@@ -31,12 +31,18 @@ from mjrec import (
     UnknownName,
     render_videos,
 )
-from mjrec.formats.dataclass_json import from_json, to_json
+from mjrec.formats.json_fields import from_json, to_json
 from mjrec.rendering.finish import VideoWorker
-from mjrec.rendering.jobs import Progress, RecordingKey, RenderedVideos, VideoJob
+from mjrec.rendering.jobs import (
+    Progress,
+    RecordingKey,
+    RenderedVideos,
+    Variant,
+    VideoJob,
+    View,
+)
 from mjrec.rendering.recordings import claim
 from mjrec.rendering.render_videos import name_of_variant
-from mjrec.rendering.views import Variant, View
 from mjrec.simulation.model_trust import note_models
 
 VIDEO = "openaigym.video.0.7.video000000"

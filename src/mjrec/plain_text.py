@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Final
 
 # Newlines and the spaces between digits are harmless, although they are not printable.
@@ -35,3 +36,16 @@ def counted(count: int, unit: str) -> str:
     if unit.endswith("y"):
         return f"{count:,} {unit[:-1]}ies"
     return f"{count:,} {unit}{'es' if unit.endswith('sh') else 's'}"
+
+
+def listed(items: Sequence[object], most: int, *, count: int | None = None) -> str:
+    """Return the first few items: "a, b and 2 more".
+
+    Args:
+        items: the items, or only the first of them.
+        most: maximum number of items to list.
+        count: the number of items, if not all are given.
+    """
+    shown = ", ".join(map(str, items[:most]))
+    more = (len(items) if count is None else count) - most
+    return f"{shown} and {more} more" if more > 0 else shown

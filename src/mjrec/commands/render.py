@@ -16,15 +16,13 @@ from ..errors import InvalidArgument
 from ..evaluation.chunk_results import recorded_results
 from ..evaluation.evaluation import is_evaluation
 from ..formats.monitor_directory import (
-    Infix,
     recording_directories,
     trajectory_prefix,
 )
 from ..monitors.progress import render_progress
 from ..plain_text import counted
-from ..rendering.jobs import RenderedVideos
+from ..rendering.jobs import RenderedVideos, Variant, View
 from ..rendering.render_videos import iter_rendered_videos
-from ..rendering.views import Variant, View
 from .options import NO_ENGINE, AsJson, Engine, camera_of, size_of
 from .terminal import names_by, print_json, print_lines
 
@@ -173,7 +171,7 @@ def _places(target: Path, episode: int | None) -> tuple[list[Path], int | None]:
 
 def _trajectories(directory: Path, episode: int) -> Iterator[Path]:
     for folder, result in recorded_results(directory):
-        infix = Infix.parse(result.monitor or "")
+        infix = result.monitor
         if result.episode == episode and infix and result.episode_id is not None:
             yield folder / f"{trajectory_prefix(infix, result.episode_id)}.h5"
 

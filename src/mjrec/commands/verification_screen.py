@@ -12,20 +12,12 @@ import rich.markup
 import rich.table
 
 from ..evidence import summary
-from ..evidence.findings import Finding, Outcome, Verdict, Verification
+from ..evidence.findings import Finding, Verification
 from ..plain_text import counted
 from .terminal import printable
 
 _MOST_SHOWN: Final = 8
-_STYLES: Final = {
-    str(Verdict.PASS): "bold green",
-    str(Verdict.PARTLY): "bold yellow",
-    str(Verdict.FAIL): "bold red",
-    str(Outcome.RECREATED): "green",
-    str(Outcome.WITHIN_TOLERANCE): "yellow",
-    str(Outcome.BELIEVED): "yellow",
-    str(Outcome.DIFFERENT): "bold red",
-}
+_COLOURS: Final = {"pass": "green", "open": "yellow", "fail": "bold red"}
 
 
 def show_verification(
@@ -39,8 +31,8 @@ def show_verification(
         verbose: list all findings, and the software and machine it was verified with.
     """
     most = None if verbose else _MOST_SHOWN
-    verdict = str(verification.verdict)
-    console.print(f"{_styled(verdict)}  {_plain(summary.headline(verification))}")
+    verdict = f"[bold]{_styled(str(verification.verdict))}[/]"
+    console.print(f"{verdict}  {_plain(summary.headline(verification))}")
     _list(console, "", summary.remarks(verification), most)
     _list(console, "Different", summary.failures(verification), most)
     _list(console, "Excuses", summary.excuses(verification), most)
@@ -88,7 +80,8 @@ def _list(
 
 
 def _styled(word: str) -> str:
-    return f"[{_STYLES[word]}]{word}[/]" if word in _STYLES else word
+    style = summary.STYLES.get(word)
+    return word if style is None else f"[{_COLOURS[style]}]{word}[/]"
 
 
 def _plain(text: str) -> str:

@@ -23,7 +23,8 @@ import zipfile
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 
-from ..errors import FileNotWritten, PackError
+from ..atomic_files import writing
+from ..errors import PackError
 from ..formats.regular_files import read_regular
 from .archive import BAG_DECLARATION, digest_of
 from .findings import Finding, Outcome, Topic
@@ -113,16 +114,13 @@ def write_zip(folder: Path, path: Path) -> None:
     Raises:
         FileNotWritten: the disk is full.
     """
-    try:
-        with path.open("xb") as file:
-            with zipfile.ZipFile(file, "w") as archive:
-                for source in _files(folder):
-                    name = source.relative_to(folder.parent).as_posix()
-                    _add(archive, source, name)
-            file.flush()
-            os.fsync(file.fileno())
-    except OSError as error:
-        raise FileNotWritten(path, error.strerror or error, then=TRY_AGAIN) from error
+    with writing(path, then=TRY_AGAIN), path.open("xb") as file:
+        with zipfile.ZipFile(file, "w") as archive:
+            for source in _files(folder):
+                name = source.relative_to(folder.parent).as_posix()
+                _add(archive, source, name)
+        file.flush()
+        os.fsync(file.fileno())
 
 
 def check_bag(bag: Path, on_progress: _OnProgress) -> Iterator[Finding]:
@@ -134,28 +132,17 @@ def check_bag(bag: Path, on_progress: _OnProgress) -> Iterator[Finding]:
     """
     objections = list(_objections(bag, on_progress))
     for name, reason in objections[:_MOST_FAILURES]:
-        yield Finding(
-            topic=Topic.FILES, item=name, outcome=Outcome.DIFFERENT, reason=reason
-        )
-    if len(objections) > _MOST_FAILURES:
-        yield Finding(
-            topic=Topic.FILES,
-            item="",
-            outcome=Outcome.DIFFERENT,
-            reason="more files that are missing, changed or not listed",
-            count=len(objections) - _MOST_FAILURES,
-        )
+        yield Finding(Topic.FILES, name, Outcome.DIFFERENT, reason)
+    if (more := len(objections) - _MOST_FAILURES) > 0:
+        reason = "more files that are missing, changed or not listed"
+        yield Finding(Topic.FILES, "", Outcome.DIFFERENT, reason, count=more)
 
 
 def unchanged(bag: Path) -> Finding:
     """Return the finding for a bag without objections."""
-    return Finding(
-        topic=Topic.FILES,
-        item="",
-        outcome=Outcome.NOTED,
-        reason="the files and their SHA-512 are those that the bag lists",
-        count=sum(path.is_file() for path in bag.rglob("*")),
-    )
+    reason = "the files and their SHA-512 are those that the bag lists"
+    count = len(_files(bag))
+    return Finding(Topic.FILES, "", Outcome.NOTED, reason, count=count)
 
 
 def _files(folder: Path) -> list[Path]:

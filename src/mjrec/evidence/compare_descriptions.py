@@ -74,7 +74,7 @@ def _compare(name: str, path: Path, text: str) -> Same | Difference:
     with unreadable(path):
         given = read_regular(path, limit=_LONGEST_FILE)
     if given == text.encode():
-        return Same(topic=Topic.FILES, file=name)
+        return Same(Topic.FILES, file=name)
     lines = (given.decode(errors="backslashreplace").split("\n"), text.split("\n"))
     added, missing = (_first_more(*each) for each in (lines, lines[::-1]))
     match added, missing:
@@ -99,4 +99,4 @@ def _first_more(lines: list[str], others: list[str]) -> tuple[int, str] | None:
 
 
 def _difference(name: str, how: str, *, where: str = "") -> Difference:
-    return Difference(topic=Topic.FILES, file=name, where=where, how=how)
+    return Difference(Topic.FILES, file=name, where=where, how=how)

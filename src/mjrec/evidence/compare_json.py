@@ -10,20 +10,21 @@ from __future__ import annotations
 import itertools
 import math
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, BinaryIO, Final, NamedTuple, TypeAlias
+from typing import Any, BinaryIO, Final, NamedTuple
 
+from ..atomic_files import file_sha256
 from ..formats.journal import is_of_spans
 from ..formats.json_fields import json_object, read_object, unreadable
 from ..formats.regular_files import open_regular, read_regular
 from .differences import (
+    STORED_DIFFERENTLY,
     Aspect,
     Difference,
     Same,
     only_in,
-    stored_differently,
     unlike,
 )
 from .findings import Topic
@@ -43,9 +44,6 @@ class Rule(NamedTuple):
 
 
 _OF_FILES: Final = Rule(Topic.FILES)
-# Whether a value that differs from the recreated one is right for the archive's own
-# file, such as its hash. Called with the file's name and the value, or ABSENT.
-Own: TypeAlias = Callable[[str, Any], bool]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,24 +51,24 @@ class Rules:
     """How the values of a file are compared.
 
     Attributes:
-        keys: rules by key. A key's rule also applies to everything below it.
-        usual: the rule for all other keys.
-        own: checks by key, for values that follow from a file of the archive itself or
-            that cannot be recreated.
-        claims: keys whose values are versions by package name.
+        given: the archive's file.
+        usual: the topic of all keys that the table does not list.
         left_out: keys to ignore.
         renamed: names in the archive, mapped to those of the recreated files: a
             compiled model has its hash in its name.
         is_packed: whether packing removed the lines about rows from journals.
+        is_drawn: whether the recreated run was rendered.
+        decoded: the SHA-256 of all decoded frames of the archive's videos, by path.
+            The comparison of videos adds them.
     """
 
-    keys: Mapping[str, Rule] = field(default_factory=dict)
-    usual: Rule = _OF_FILES
-    own: Mapping[str, Own] = field(default_factory=dict)
-    claims: frozenset[str] = frozenset(("versions", "rendered_with"))
+    given: Path
+    usual: Topic = Topic.FILES
     left_out: frozenset[str] = frozenset()
     renamed: Mapping[str, str] = field(default_factory=dict)
     is_packed: bool = False
+    is_drawn: bool = True
+    decoded: dict[Path, str] = field(default_factory=dict)
 
     def translated(self, text: bytes) -> bytes:
         """Return bytes of the archive with the names of the recreated files."""
@@ -90,8 +88,8 @@ _GL: Final = Rule(Topic.PICTURES, Aspect.CLAIM, "gl")
 _FFMPEG: Final = Rule(Topic.VIDEOS, Aspect.CLAIM, "ffmpeg")
 _MODEL: Final = Rule(Topic.IDENTITY, Aspect.MODEL)
 
-# For all files: a key means the same everywhere.
-KEYS: Final[Mapping[str, Rule]] = {
+# For all files: a key means the same everywhere, and so does everything below it.
+_KEYS: Final[Mapping[str, Rule]] = {
     **dict.fromkeys(("reward", "episode_rewards", "reward_before"), _RETURN),
     **dict.fromkeys(("length", "episode_lengths", "terminated", "truncated"), _END),
     **dict.fromkeys(("type", "episode_types", "warnings"), _END),
@@ -111,6 +109,8 @@ KEYS: Final[Mapping[str, Rule]] = {
     "machine": Rule(Topic.PHYSICS, Aspect.CLAIM, "machine"),
     "model": _MODEL,
 }
+# The keys of versions by package name.
+_VERSIONS: Final = frozenset(("versions", "rendered_with"))
 # The program's name and version. Its other arguments are not claims.
 _ENCODER: Final = ("encoder_version.version", "encoder_version.cmdline[0]")
 # The one of several similar devices that rendered. EGL numbers them; other APIs do not.
@@ -120,7 +120,12 @@ _DEVICE: Final = {
 }
 
 
-def is_gl_device(value: Any) -> bool:
+def _is_own_sha256(rules: Rules, value: Any) -> bool:
+    path = video_of(rules.given)
+    return path.is_file() and file_sha256(path) == value
+
+
+def _is_gl_device(_: Rules, value: Any) -> bool:
     """Return whether a value is ABSENT or a valid `gl_device`, free of other text."""
     if value is ABSENT:
         return True
@@ -133,26 +138,33 @@ def is_gl_device(value: Any) -> bool:
     )
 
 
+# Whether a value that differs from the recreated one is right for the archive's own
+# file, or cannot be recreated. Called with the value, or ABSENT.
+_OWN: Final[Mapping[str, Callable[[Rules, Any], bool]]] = {
+    "file_sha256": _is_own_sha256,
+    "decoded_sha256": lambda rules, value: (
+        rules.decoded.get(video_of(rules.given)) == value
+    ),
+    "gl_device": _is_gl_device,
+}
+
+
 def compare_objects(
-    given: Path, made: Path, file: str, rules: Rules
+    given: Path, made: Path, rules: Rules
 ) -> Iterator[Same | Difference]:
     """Yield the differences between two files that each contain a JSON object.
 
     Raises:
         UnreadableFile: a file is damaged.
     """
-    one = _translated_object(given, rules)
-    yield from _or_bytes(json_differences(one, read_object(made), file, rules), file)
-
-
-def _translated_object(given: Path, rules: Rules) -> Mapping[str, Any]:
-    """Return a JSON object of the archive with the names of the recreated files."""
     with unreadable(given):
-        return json_object(rules.translated(read_regular(given, limit=_LONGEST_FILE)))
+        one = json_object(rules.translated(read_regular(given, limit=_LONGEST_FILE)))
+    found = list(json_differences(one, read_object(made), rules))
+    yield from found or [STORED_DIFFERENTLY]
 
 
 def compare_journals(
-    given: Path, made: Path, file: str, rules: Rules
+    given: Path, made: Path, rules: Rules
 ) -> Iterator[Same | Difference]:
     """Compare two journals line by line; yield differences and equal episodes.
 
@@ -160,127 +172,104 @@ def compare_journals(
         UnreadableFile: a journal is damaged.
     """
     with unreadable(given), open_regular(given) as one, open_regular(made) as other:
-        given_lines = _lines(one) if rules.is_packed else _without_rows(one)
+        given_lines = lines_of(one) if rules.is_packed else _without_rows(one)
         pairs = itertools.zip_longest(given_lines, _without_rows(other))
         for number, (a, b) in enumerate(pairs, start=1):
             if a is None or b is None:
-                yield Difference(
-                    topic=Topic.REWARDS,
-                    file=file,
-                    where=f"line {number}",
-                    how=only_in(b is None, (a or b or b"").decode(errors="replace")),
-                )
+                how = only_in(b is None, (a or b or b"").decode(errors="replace"))
+                yield Difference(Topic.REWARDS, where=f"line {number}", how=how)
                 return
-            yield from _compare_lines(number, rules.translated(a), b, file, rules)
-
-
-def same_journal(path: Path, file: str) -> Iterator[Same]:
-    """Yield the episodes of a journal whose bytes equal the other's."""
-    with unreadable(path), open_regular(path) as journal:
-        for line in _lines(journal):
-            if begin := _EPISODE.match(line):
-                number = int(begin[1])
-                yield Same(
-                    topic=Topic.REWARDS, file=file, unit="episode", episode=number
-                )
+            yield from _compare_lines(number, rules.translated(a), b, rules)
 
 
 def _compare_lines(
-    number: int, one: bytes, other: bytes, file: str, rules: Rules
+    number: int, one: bytes, other: bytes, rules: Rules
 ) -> Iterator[Same | Difference]:
-    given = json_object(one)
-    episode = given.get("episode_id")
-    episode = episode if type(episode) is int else None
-    found = []
+    begin, found = _EPISODE.match(one), []
+    episode = int(begin[1]) if begin else None
     if one != other:
+        given, made = json_object(one), json_object(other)
+        named = given.get("episode_id")
+        episode = named if type(named) is int else None
         where = f"line {number}" if episode is None else f"episode {episode}"
-        found = list(
-            json_differences(
-                given, json_object(other), file, rules, where=where, episode=episode
-            )
-        )
-        yield from _or_bytes(found, file)
+        found = list(json_differences(given, made, rules, where=where, episode=episode))
+        yield from found or [STORED_DIFFERENTLY]
     if not found and episode is not None:
-        yield Same(topic=Topic.REWARDS, file=file, unit="episode", episode=episode)
+        yield Same(Topic.REWARDS, unit="episode", episode=episode)
 
 
 def json_differences(
     given: Any,
     made: Any,
-    file: str,
     rules: Rules,
     *,
     where: str = "",
     episode: int | None = None,
-    rule: Rule | None = None,
 ) -> Iterator[Difference]:
     """Yield the differences between two JSON values.
 
     Args:
         given: the archive's value.
         made: the recreated value.
-        file: the name of the file that contains them.
         rules: the rules of the comparison.
         where: the values' path in the file.
         episode: the number of the episode that they belong to.
-        rule: the rule for everything in the values. None if no outer key has one.
     """
-    if given is made or (type(given) is type(made) and given == made):
-        return
-    if isinstance(given, dict) and isinstance(made, dict):
-        for key in dict.fromkeys((*given, *made)):
-            if key in rules.left_out:
-                continue
-            inner = f"{where}.{key}" if where else key
-            own = rules.own.get(key)
-            value, other = given.get(key, ABSENT), made.get(key, ABSENT)
-            if own is not None and own(file, value):
-                if value != other:
-                    yield _leaf(value, other, file, inner, episode, _STATEMENT)
-                continue
-            yield from json_differences(
-                value,
-                other,
-                file,
-                rules,
-                where=inner,
-                episode=episode,
-                rule=_rule(key, inner, rules, rule),
-            )
-    elif isinstance(given, list) and isinstance(made, list) and len(given) == len(made):
-        for index, pair in enumerate(zip(given, made, strict=True)):
-            inner = f"{where}[{index}]"
-            deeper = _FFMPEG if inner.endswith(_ENCODER) else rule
-            yield from json_differences(
-                *pair, file, rules, where=inner, episode=episode, rule=deeper
-            )
-    else:
-        yield _leaf(given, made, file, where, episode, rule or rules.usual)
+
+    def walk(
+        given: Any, made: Any, where: str, rule: Rule | None
+    ) -> Iterator[Difference]:
+        if given is made or (type(given) is type(made) and given == made):
+            return
+        if isinstance(given, dict) and isinstance(made, dict):
+            for key in dict.fromkeys((*given, *made)):
+                one, other = given.get(key, ABSENT), made.get(key, ABSENT)
+                inner = f"{where}.{key}" if where else key
+                own = _OWN.get(key)
+                if key in rules.left_out:
+                    continue
+                if own is None or not own(rules, one):
+                    yield from walk(one, other, inner, _rule(key, inner, rule))
+                elif one != other:
+                    yield _leaf(one, other, inner, _STATEMENT, episode)
+        elif (
+            isinstance(given, list)
+            and isinstance(made, list)
+            and len(given) == len(made)
+        ):
+            for index, pair in enumerate(zip(given, made, strict=True)):
+                inner = f"{where}[{index}]"
+                deeper = _FFMPEG if inner.endswith(_ENCODER) else rule
+                yield from walk(*pair, inner, deeper)
+        else:
+            usual = rule or Rule(rules.usual)
+            yield _leaf(given, made, where, usual, episode)
+
+    return walk(given, made, where, None)
 
 
-def _rule(key: str, where: str, rules: Rules, outer: Rule | None) -> Rule | None:
+def _rule(key: str, where: str, outer: Rule | None) -> Rule | None:
+    """Return the rule for a key below one with the rule `outer`."""
     if where.endswith(_ENCODER):
         return _FFMPEG
     if outer is not None and not outer.claim.endswith("*"):
         return outer
     if outer is not None:
         return Rule(outer.topic, Aspect.CLAIM, key)
-    if key in rules.claims:
+    if key in _VERSIONS:
         # The keys below it are the packages' names.
         return Rule(Topic.IDENTITY, Aspect.CLAIM, "*")
-    return rules.keys.get(key)
+    return _KEYS.get(key)
 
 
 def _leaf(
-    given: Any, made: Any, file: str, where: str, episode: int | None, rule: Rule
+    given: Any, made: Any, where: str, rule: Rule, episode: int | None
 ) -> Difference:
-    size = None
+    size, aspect, how = None, rule.aspect, unlike(given, made)
     if isinstance(given, int | float) and isinstance(made, int | float):
         error = abs(given - made) / (1 + abs(given))
         size = error if math.isfinite(error) else None
-    aspect = rule.aspect
     is_gone = given is ABSENT or made is ABSENT
-    how = unlike(given, made)
     if is_gone:
         how = only_in(made is ABSENT, given if made is ABSENT else made)
     may_be_gone = aspect is Aspect.STATEMENT or (
@@ -291,8 +280,7 @@ def _leaf(
         # OpenGL's names may be missing here.
         aspect = Aspect.EXACT
     return Difference(
-        topic=rule.topic,
-        file=file,
+        rule.topic,
         unit="value" if episode is None else "episode",
         episode=episode,
         aspect=aspect,
@@ -303,15 +291,8 @@ def _leaf(
     )
 
 
-def _or_bytes(found: Iterable[Difference], file: str) -> Iterator[Same | Difference]:
-    """Yield differences; if there are none, one in how the values are written."""
-    differences = list(found)
-    yield from differences
-    if not differences:
-        yield stored_differently(file)
-
-
-def _lines(file: BinaryIO) -> Iterator[bytes]:
+def lines_of(file: BinaryIO) -> Iterator[bytes]:
+    """Yield the lines of a file with a limited length."""
     while line := file.readline(_LONGEST_LINE):
         if len(line) >= _LONGEST_LINE:
             raise ValueError("a line is too long")
@@ -319,4 +300,9 @@ def _lines(file: BinaryIO) -> Iterator[bytes]:
 
 
 def _without_rows(file: BinaryIO) -> Iterator[bytes]:
-    return (line for line in _lines(file) if not is_of_spans(line))
+    return (line for line in lines_of(file) if not is_of_spans(line))
+
+
+def video_of(metadata: Path) -> Path:
+    """Return the path of the video with a metadata file."""
+    return metadata.with_name(f"{metadata.name.removesuffix('.meta.json')}.mp4")

@@ -18,9 +18,11 @@ from pathlib import Path
 from typing import Final
 
 from .. import json_text
-from ..errors import UnreadableFile
-from ..formats.json_fields import json_object
-from .differences import Aspect, Difference, Same, stored_differently
+from ..errors import Error, UnreadableFile
+from ..formats.json_fields import facts_in, json_object
+from ..formats.monitor_directory import infix_of
+from ..formats.trajectory_hdf5 import open_hdf5
+from .differences import STORED_DIFFERENTLY, Aspect, Difference, Same
 from .findings import Topic
 from .zip_contents import open_plain_zip
 
@@ -31,6 +33,14 @@ _LARGEST_MODEL: Final = 1 << 30
 _SOURCES: Final = "*.model.*.zip"
 # In the zip file of the sources.
 _CONTENTS: Final = "contents.json"
+
+
+RECOMPILED: Final = Difference(
+    Topic.IDENTITY,
+    aspect=Aspect.MODEL,
+    unit="compiled model",
+    how="it was compiled differently",
+)
 
 
 def model_name(file: str) -> str:
@@ -56,19 +66,30 @@ def renamed_models(given: Path, made: Path) -> dict[str, str]:
     }
 
 
-def compare_sources(given: Path, made: Path, file: str) -> Iterator[Same | Difference]:
+def models_of(recordings: Path) -> dict[str, set[str]]:
+    """Return the names of the model files of each recording, by its infix."""
+    found: dict[str, set[str]] = {}
+    for path in recordings.glob("openaigym.trajectory.*.h5"):
+        # The comparison reports damaged files.
+        with contextlib.suppress(Error), open_hdf5(path) as reader:
+            said = facts_in(reader.facts.get("model"))
+            names = {str(name) for key in ("mjb", "xml") if (name := said.get(key))}
+            found.setdefault(infix_of(path.name) or "", set()).update(names)
+    return found
+
+
+def compare_sources(given: Path, made: Path, _: object) -> Iterator[Same | Difference]:
     """Yield the difference between two models' sources whose bytes differ."""
     is_equal = _sources(given) == _sources(made)
     yield Difference(
-        topic=Topic.IDENTITY,
-        file=file,
+        Topic.IDENTITY,
         # Only the name of the main file differs.
         aspect=Aspect.STATEMENT if is_equal else Aspect.EXACT,
         how="its sources differ from those of the recreated model",
     )
 
 
-def compare_models(given: Path, made: Path, file: str) -> Iterator[Same | Difference]:
+def compare_models(given: Path, made: Path, _: object) -> Iterator[Same | Difference]:
     """Compare two compiled models whose bytes differ."""
     contents = []
     for path in (given, made):
@@ -79,22 +100,11 @@ def compare_models(given: Path, made: Path, file: str) -> Iterator[Same | Differ
             raise UnreadableFile(path, error) from error
     if contents[0][:_MODEL_HEAD] == contents[1][:_MODEL_HEAD]:
         # The header has the version of MuJoCo that wrote the model.
-        yield Same(topic=Topic.IDENTITY, file=file, unit="compiled model")
+        yield Same(Topic.IDENTITY, unit="compiled model")
     if contents[0] != contents[1]:
-        yield recompiled(file)
+        yield RECOMPILED
     else:
-        yield stored_differently(file)
-
-
-def recompiled(file: str) -> Difference:
-    """Return the difference for a model that was compiled differently."""
-    return Difference(
-        topic=Topic.IDENTITY,
-        file=file,
-        aspect=Aspect.MODEL,
-        unit="compiled model",
-        how="it was compiled differently",
-    )
+        yield STORED_DIFFERENTLY
 
 
 def _sources(path: Path) -> str:

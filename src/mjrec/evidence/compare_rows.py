@@ -7,10 +7,10 @@ Rows are read in blocks, so memory does not grow with an episode's length.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, TypeAlias
 
 import h5py
 import numpy as np
@@ -20,8 +20,10 @@ from ..errors import UnreadableFile
 from ..formats.json_fields import json_object
 from ..formats.trajectory_hdf5 import open_hdf5
 from .compare_json import Rules, json_differences
-from .differences import Aspect, Difference, Same, differs, stored_differently, unlike
+from .differences import STORED_DIFFERENTLY, Aspect, Difference, Same, differs, unlike
 from .findings import Topic
+
+_Key: TypeAlias = tuple[Topic, Aspect]
 
 _BLOCK_BYTES: Final = 1 << 22
 # `model_changes/<n>/<field>`.
@@ -47,14 +49,13 @@ _CHECKSUM: Final = "crc32"
 
 
 def compare_trajectories(
-    given: Path, made: Path, file: str, rules: Rules
+    given: Path, made: Path, rules: Rules
 ) -> Iterator[Same | Difference]:
     """Compare two trajectories; yield differences and equal items.
 
     Args:
         given: the archive's trajectory.
         made: the recreated trajectory.
-        file: the name of both, below `data/`.
         rules: the rules for comparing their facts.
 
     Raises:
@@ -65,65 +66,43 @@ def compare_trajectories(
         # Raises for anything that is not a trajectory.
         open_hdf5(given).close()
         with h5py.File(given, "r") as one, h5py.File(made, "r") as other:
-            for found in _compare_groups(one, other, file, rules):
+            for found in _compare_groups(one, other, rules):
                 differs |= isinstance(found, Difference)
                 yield found
     except (AttributeError, LookupError, OSError, RuntimeError, ValueError) as error:
         raise UnreadableFile(given, error) from error
     if not differs:
-        yield stored_differently(file)
+        yield STORED_DIFFERENTLY
 
 
-def same_trajectory(path: Path, file: str) -> Iterator[Same]:
+def same_trajectory(path: Path) -> Iterator[Same]:
     """Yield the equal items of a trajectory whose bytes equal the other's."""
     with h5py.File(path, "r") as trajectory:
         for name in ("rewards", "states"):
-            yield from _same(name, trajectory.get(name), file)
-
-
-def compare_rewards(
-    given: Path, made: NDArray[np.float64], file: str
-) -> Iterator[Same | Difference]:
-    """Compare the rewards of a trajectory with the recreated ones.
-
-    Raises:
-        UnreadableFile: the trajectory is damaged.
-    """
-    with open_hdf5(given) as reader:
-        rewards = reader.rewards
-    if rewards.shape != made.shape:
-        counts = [f"{len(each)} steps" for each in (rewards, made)]
-        yield differs(Topic.REWARDS, file, "rewards", *counts)
-        return
-    found = _Rows("rewards", *_DATASETS["rewards"], file)
-    if rewards.tobytes() != made.tobytes():
-        found.add(0, rewards, made)
-    yield from found.differences()
-    if not found.any:
-        yield Same(topic=Topic.REWARDS, file=file, unit="trajectory")
+            yield from _same(name, trajectory.get(name), {})
 
 
 def _compare_groups(
-    one: h5py.File, other: h5py.File, file: str, rules: Rules
+    one: h5py.File, other: h5py.File, rules: Rules
 ) -> Iterator[Same | Difference]:
     named = [_objects(each) for each in (one, other)]
     before = [f"{each.userblock_size} bytes" for each in (one, other)]
     if before[0] != before[1]:
-        yield differs(Topic.FILES, file, "the bytes before the HDF5 data", *before)
-    yield from _compare_attributes(one, other, file, rules)
+        yield differs(Topic.FILES, "the bytes before the HDF5 data", *before)
+    yield from _compare_attributes(one, other, rules)
     for name in sorted(named[0] | named[1]):
         dataset = name.partition("/")[0]
         topic, _ = _DATASETS.get(dataset, (Topic.FILES, Aspect.EXACT))
         if name not in named[0] or name not in named[1]:
             where = ["it" if name in each else "none" for each in named]
-            yield differs(topic, file, name, *where)
+            yield differs(topic, name, *where)
             continue
         a, b = one[name], other[name]
-        yield from _compare_attributes(a, b, file, rules, name)
+        yield from _compare_attributes(a, b, rules, name)
         if isinstance(a, h5py.Dataset) and isinstance(b, h5py.Dataset):
-            yield from _compare_datasets(name, a, b, file)
+            yield from _compare_datasets(name, a, b)
         elif type(a) is not type(b):
-            yield differs(topic, file, name, type(a).__name__, type(b).__name__)
+            yield differs(topic, name, type(a).__name__, type(b).__name__)
 
 
 def _objects(file: h5py.File) -> set[str]:
@@ -146,13 +125,13 @@ def _objects(file: h5py.File) -> set[str]:
 
 
 def _compare_attributes(
-    a: Any, b: Any, file: str, rules: Rules, name: str = ""
+    a: Any, b: Any, rules: Rules, name: str = ""
 ) -> Iterator[Difference]:
     where = f"{name}: attribute " if name else "attribute "
     for key in sorted({*a.attrs, *b.attrs}):
         if key not in a.attrs or key not in b.attrs:
             values = ["one" if key in each.attrs else "none" for each in (a, b)]
-            yield differs(Topic.FILES, file, f"{where}{key}", *values)
+            yield differs(Topic.FILES, f"{where}{key}", *values)
             continue
         left, right = (_raw_attribute(each, key) for each in (a, b))
         if left == right or (key == _CHECKSUM and not name):
@@ -160,9 +139,9 @@ def _compare_attributes(
         if key == _FACTS and not name:
             given = json_object(rules.translated(bytes(a.attrs[key])))
             made = json_object(bytes(b.attrs[key]))
-            yield from json_differences(given, made, file, rules)
+            yield from json_differences(given, made, rules)
         else:
-            yield differs(Topic.FILES, file, f"{where}{key}", left[-1], right[-1])
+            yield differs(Topic.FILES, f"{where}{key}", left[-1], right[-1])
 
 
 def _raw_attribute(owner: Any, key: str) -> tuple[Any, ...]:
@@ -174,134 +153,105 @@ def _raw_attribute(owner: Any, key: str) -> tuple[Any, ...]:
 
 
 def _compare_datasets(
-    name: str, a: h5py.Dataset, b: h5py.Dataset, file: str
+    name: str, a: h5py.Dataset, b: h5py.Dataset
 ) -> Iterator[Same | Difference]:
     topic, aspect = _DATASETS.get(name.partition("/")[0], (Topic.FILES, Aspect.EXACT))
     if a.is_virtual or a.external:
         raise ValueError(f"its {name} is stored in another file")
     kinds = [f"{each.dtype} of {each.shape}" for each in (a, b)]
     if kinds[0] != kinds[1]:
-        other = differs(topic, file, name, *kinds)
+        other = differs(topic, name, *kinds)
         # A wrapper may change the shape of observations.
         yield replace(other, aspect=aspect) if aspect is Aspect.OBSERVED else other
         return
-    found = _Rows(name, topic, aspect, file)
+    found = _Rows(name, topic, aspect)
     rows = a.shape[0] if a.shape else 0
     step = max(1, _BLOCK_BYTES // max(1, a.nbytes // rows)) if rows else 1
     # A single value has no rows.
     for start in range(0, max(rows, 1), step):
         key = np.s_[start : start + step] if a.shape else ()
-        left, right = np.asarray(a[key]), np.asarray(b[key])
+        left, right = (np.atleast_1d(each[key]) for each in (a, b))
         if left.tobytes() != right.tobytes():
             found.add(start, left, right)
-    yield from found.differences()
-    yield from _same(name, a, file, found)
+    for which, worst in found.worst.items():
+        yield replace(worst, count=found.counts[which])
+    yield from _same(name, a, found.worst)
 
 
-def _same(
-    name: str, item: Any, file: str, differing: _Rows | None = None
-) -> Iterator[Same]:
+def _same(name: str, item: Any, worst: Mapping[_Key, Difference]) -> Iterator[Same]:
     """Yield the items that the equal rows of a dataset prove."""
     if not isinstance(item, h5py.Dataset):
         return
-    is_equal = differing is None or not differing.any
-    if name == "rewards" and is_equal:
-        yield Same(topic=Topic.REWARDS, file=file, unit="trajectory")
+    if name == "rewards" and not worst:
+        yield Same(Topic.REWARDS, unit="trajectory")
     if name == "states" and item.shape[0] and item.dtype.names:
-        if differing is None or not differing.is_first_other:
-            yield Same(topic=Topic.BEGINNING, file=file, unit="episode")
-        if is_equal:
-            count = item.shape[0] - 1
-            yield Same(topic=Topic.PHYSICS, file=file, count=count, unit="step")
+        if not any(topic is Topic.BEGINNING for topic, _ in worst):
+            yield Same(Topic.BEGINNING, unit="episode")
+        if not worst:
+            yield Same(Topic.PHYSICS, count=item.shape[0] - 1, unit="step")
 
 
 class _Rows:
-    """The number of rows of a dataset that differ, and the largest difference.
+    """The rows of a dataset that differ.
 
-    Rows are counted by aspect. The first state is counted separately: it is the
-    episode's beginning.
+    The first state is counted separately: it is the episode's beginning.
 
     Args:
         name: the dataset's name.
         topic: the dataset's topic.
         aspect: the aspect of its numbers.
-        file: the trajectory's name, below `data/`.
+
+    Attributes:
+        counts: the number of rows that differ, by topic and aspect.
+        worst: the largest difference, by topic and aspect.
     """
 
-    def __init__(self, name: str, topic: Topic, aspect: Aspect, file: str) -> None:
-        self._name, self._topic, self._aspect, self._file = name, topic, aspect, file
-        self._counts: Counter[tuple[Topic, Aspect]] = Counter()
-        self._worst: dict[tuple[Topic, Aspect], Difference] = {}
-
-    @property
-    def any(self) -> bool:
-        """Whether any rows differ."""
-        return bool(self._worst)
-
-    @property
-    def is_first_other(self) -> bool:
-        """Whether the episode's beginning differs."""
-        return any(topic is Topic.BEGINNING for topic, _ in self._worst)
+    def __init__(self, name: str, topic: Topic, aspect: Aspect) -> None:
+        self._name, self._topic, self._aspect = name, topic, aspect
+        self.counts: Counter[_Key] = Counter()
+        self.worst: dict[_Key, Difference] = {}
 
     def add(self, start: int, a: NDArray[Any], b: NDArray[Any]) -> None:
         """Add a block of rows that differ, the first of which has the index `start`."""
-        is_beginning = start == 0 and self._name in ("states", "observations")
-        differing: dict[tuple[Topic, Aspect], NDArray[np.bool_]] = {}
+        if start == 0 and self._name in ("states", "observations"):
+            self._add(Topic.BEGINNING, 0, a[:1], b[:1])
+            start, a, b = 1, a[1:], b[1:]
+        self._add(self._topic, start, a, b)
+
+    def _add(self, topic: Topic, start: int, a: NDArray[Any], b: NDArray[Any]) -> None:
+        rows: dict[Aspect, NDArray[np.bool_]] = {}
         for member in a.dtype.names or ("",):
             left, right = (_table(each[member] if member else each) for each in (a, b))
             is_other = _bits(left) != _bits(right)
+            if not is_other.any():
+                continue
             aspect = self._aspect
             if aspect is Aspect.STATE:
                 aspect = _MEMBERS.get(member, aspect)
-            parts = [(self._topic, slice(None))]
-            if is_beginning:
-                parts = [(Topic.BEGINNING, np.s_[:1]), (self._topic, np.s_[1:])]
-            for topic, rows in parts:
-                here = is_other[rows]
-                if not here.any():
-                    continue
-                known = differing.setdefault((topic, aspect), here.any(axis=1))
-                known |= here.any(axis=1)
-                first = start + (rows.start or 0)
-                self._note(topic, aspect, member, first, left[rows], right[rows], here)
-        for key, rows_of_key in differing.items():
-            self._counts[key] += int(rows_of_key.sum())
+            rows[aspect] = rows.get(aspect, False) | is_other.any(axis=1)
+            errors = np.where(is_other, _errors(left, right), -1.0)
+            row, column = map(int, np.unravel_index(np.argmax(errors), errors.shape))
+            size, known = float(errors[row, column]), self.worst.get((topic, aspect))
+            if known is None or size > (np.inf if known.size is None else known.size):
+                is_finite = bool(np.isfinite(size))
+                may_be_any = is_finite or aspect is Aspect.OBSERVED
+                self.worst[topic, aspect] = Difference(
+                    topic,
+                    unit=self._unit(topic, aspect),
+                    aspect=aspect if may_be_any else Aspect.EXACT,
+                    where=f"{self._name}[{start + row}]" + f".{member}" * bool(member),
+                    how=unlike(left[row, column].item(), right[row, column].item()),
+                    size=size if is_finite else None,
+                )
+        for aspect, differing in rows.items():
+            self.counts[topic, aspect] += int(differing.sum())
 
-    def _note(
-        self,
-        topic: Topic,
-        aspect: Aspect,
-        member: str,
-        first: int,
-        left: NDArray[Any],
-        right: NDArray[Any],
-        is_other: NDArray[np.bool_],
-    ) -> None:
-        errors = np.where(is_other, _errors(left, right), -1.0)
-        row, column = map(int, np.unravel_index(np.argmax(errors), errors.shape))
-        size = float(errors[row, column])
-        known = self._worst.get((topic, aspect))
-        if known is not None and size <= (np.inf if known.size is None else known.size):
-            return
-        is_finite, unit = np.isfinite(size), _UNITS.get(self._name, "step")
-        if topic is Topic.BEGINNING:
-            unit = "episode"
+    def _unit(self, topic: Topic, aspect: Aspect) -> str:
         if aspect is Aspect.SOLVER:
-            unit = "warm start"
-        self._worst[topic, aspect] = Difference(
-            topic=topic,
-            file=self._file,
-            unit=unit,
-            aspect=aspect if is_finite or aspect is Aspect.OBSERVED else Aspect.EXACT,
-            where=f"{self._name}[{first + row}]" + (f".{member}" if member else ""),
-            how=unlike(left[row, column].item(), right[row, column].item()),
-            size=size if is_finite else None,
-        )
-
-    def differences(self) -> Iterator[Difference]:
-        """Yield the worst difference of each kind, with its number of rows."""
-        for key, worst in self._worst.items():
-            yield replace(worst, count=self._counts[key])
+            return "warm start"
+        if topic is Topic.BEGINNING:
+            return "episode"
+        return _UNITS.get(self._name, "step")
 
 
 def _table(values: NDArray[Any]) -> NDArray[Any]:

@@ -12,17 +12,18 @@ import functools
 import hashlib
 import itertools
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import BinaryIO, Final
+from typing import Final
 
 import imageio.v3
 import numpy as np
 
 from ..formats.json_fields import unreadable
 from ..formats.regular_files import open_regular, read_regular
-from .decoded_video import DecodedVideo, has_messages, has_usual_colours
+from .compare_json import Rules, lines_of
+from .decoded_video import decoded_video, has_messages, has_usual_colours
 from .differences import Aspect, Difference, Same, differs, short
 from .findings import Topic
 from .frame_similarity import (
@@ -43,7 +44,6 @@ _ENCODED: Final = frozenset(
 # Present only if frames are stored out of order or are not all key frames.
 _OPTIONAL: Final = frozenset(("ctts", "stss"))
 _LONGEST_HASHES: Final = 1 << 28
-_LONGEST_LINE: Final = 1 << 20
 _HASH_BEGINS: Final = re.compile(rb"0, +\d+, +\d+, +1, +\d+, ")
 _EQUAL: Final = Similarity(100.0, 1.0, 0.0)
 _differs = functools.partial(differs, Topic.VIDEOS, unit="video")
@@ -52,22 +52,20 @@ _differs = functools.partial(differs, Topic.VIDEOS, unit="video")
 def compare_videos(
     given: Path,
     made: Path,
-    file: str,
-    on_decoded: Callable[[str], object] = lambda _: None,
+    rules: Rules,
 ) -> Iterator[Same | Difference]:
     """Compare two videos whose bytes differ.
 
     Args:
         given: the archive's video.
         made: the recreated video.
-        file: the name of both, below `data/`.
-        on_decoded: called with the SHA-256 of all planes of the archive's video.
+        rules: receives the SHA-256 of all planes of the archive's video.
 
     Raises:
         UnreadableFile, EncoderError: a video is damaged.
     """
     boxes, again = read_boxes(given), read_boxes(made)
-    found = list(_compare_boxes(boxes, again, file))
+    found = list(_compare_boxes(boxes, again))
     with unreadable(given):
         times = [shown_times(each) for each in (boxes, again)]
     if times[0] != times[1]:
@@ -75,69 +73,63 @@ def compare_videos(
             each if isinstance(each, str) else f"{each[0]} frames of {each[1]} s"
             for each in times
         ]
-        found.append(_differs(file, "times", *shown))
+        found.append(_differs("times", *shown))
     yield from found
     yield Difference(
-        topic=Topic.FILES,
-        file=file,
+        Topic.FILES,
         unit="encoding",
         aspect=Aspect.ENCODED,
         how="it was encoded differently",
     )
-    frames = [
-        *_compare_frames(given, made, file, on_decoded),
-        *_compare_streams(given, file),
-    ]
+    frames = [*_compare_frames(given, made, rules), *_streams(given)]
     yield from frames
     if not found and not any(each.topic is Topic.VIDEOS for each in frames):
-        yield Same(topic=Topic.VIDEOS, file=file, unit="video")
+        yield Same(Topic.VIDEOS, unit="video")
 
 
-def _compare_boxes(
-    given: Sequence[Box], made: Sequence[Box], file: str
-) -> Iterator[Difference]:
+def _compare_boxes(given: Sequence[Box], made: Sequence[Box]) -> Iterator[Difference]:
     kept = [[b for b in boxes if b.name not in _OPTIONAL] for boxes in (given, made)]
     paths = [[box.path for box in boxes] for boxes in kept]
     if paths[0] != paths[1]:
         extra = [path for path in paths[0] if path not in paths[1]] or paths[0]
         missing = [path for path in paths[1] if path not in paths[0]] or paths[1]
-        yield _differs(file, "boxes", short(", ".join(extra)), ", ".join(missing))
+        yield _differs("boxes", short(", ".join(extra)), ", ".join(missing))
         return
     for one, other in zip(*kept, strict=True):
         if one.name not in _ENCODED and one.content != other.content:
-            yield _differs(file, one.path, one.content.hex(), other.content.hex())
+            yield _differs(one.path, one.content.hex(), other.content.hex())
 
 
 def _compare_frames(
-    given: Path, made: Path, file: str, on_decoded: Callable[[str], object]
+    given: Path, made: Path, rules: Rules
 ) -> Iterator[Same | Difference]:
-    worst, digest = Worst(file), hashlib.sha256()
-    with DecodedVideo(given) as one, DecodedVideo(made) as other:
-        if one.header != other.header:
-            yield _differs(file, "the stream", one.header, other.header)
+    worst, digest = Worst(), hashlib.sha256()
+    with decoded_video(given) as (header, one), decoded_video(made) as (again, other):
+        if header != again:
+            yield _differs("the stream", header, again)
             return
         for number, (a, b) in enumerate(itertools.zip_longest(one, other)):
             if a is None or b is None:
                 which = ["no frame" if each is None else "a frame" for each in (a, b)]
-                yield _differs(file, f"frame {number}", *which)
+                yield _differs(f"frame {number}", *which)
                 return
             for plane in a:
                 digest.update(np.ascontiguousarray(plane).data)
             worst.add(number, a, b)
-    on_decoded(digest.hexdigest())
+    rules.decoded[given] = digest.hexdigest()
     yield from worst.differences()
 
 
-def _compare_streams(given: Path, file: str) -> Iterator[Difference]:
+def _streams(given: Path) -> Iterator[Difference]:
     """Yield differences outside the frames: colour tags and captions."""
     if not has_usual_colours(given):
-        yield _differs(file, "colour tags", "other tags", "BT.709")
+        yield _differs("colour tags", "other tags", "BT.709")
     if has_messages(given):
-        yield _differs(file, "the stream", "frames and messages", "frames")
+        yield _differs("the stream", "frames and messages", "frames")
 
 
 def compare_sampled(
-    video: Path, hashes: Path, drawn: Path, file: str
+    video: Path, hashes: Path, drawn: Path
 ) -> Iterator[Same | Difference]:
     """Compare some rerendered frames with a video and the hashes of its frames.
 
@@ -145,7 +137,6 @@ def compare_sampled(
         video: the archive's video.
         hashes: its `.framehash` file.
         drawn: the folder with the rendered frames, `<number>.png`.
-        file: the video's name, below `data/`.
 
     Raises:
         UnreadableFile, EncoderError: the video or the file of hashes is damaged.
@@ -155,8 +146,8 @@ def compare_sampled(
     recorded = [line.rpartition(b", ")[2] for line in lines if line[:1].isdigit()]
     wanted = {int(path.stem): path for path in drawn.glob("*.png")}
     # The encoder is lossy. Its limits apply on any machine.
-    worst, shipped, equal = Worst(file), Worst(file), 0
-    with DecodedVideo(video) as decoded:
+    worst, shipped, equal = Worst(), Worst(), 0
+    with decoded_video(video) as (_, decoded):
         for number, planes in enumerate(decoded):
             path = wanted.pop(number, None)
             if path is None:
@@ -165,7 +156,7 @@ def compare_sampled(
             expected = planes_of(frame)
             if expected.luma.shape != planes.luma.shape:
                 sizes = [f"{p.luma.shape[::-1]} pixels" for p in (planes, expected)]
-                yield _differs(file, f"frame {number}", *sizes)
+                yield _differs(f"frame {number}", *sizes)
                 return
             is_equal = number < len(recorded) and (
                 recorded[number] == hashlib.sha256(frame.data).hexdigest().encode()
@@ -173,35 +164,34 @@ def compare_sampled(
             equal += is_equal
             (shipped if is_equal else worst).add(number, planes, expected)
     if wanted:
-        yield _differs(file, f"frame {min(wanted)}", "no such frame", "a frame")
+        yield _differs(f"frame {min(wanted)}", "no such frame", "a frame")
     if shipped.strain > 1:
         for difference in shipped.differences():
             yield replace(difference, topic=Topic.VIDEOS, aspect=Aspect.EXACT)
     yield from worst.differences()
     if equal:
-        yield Same(topic=Topic.PICTURES, file=file, count=equal, unit="frame")
+        yield Same(Topic.PICTURES, count=equal, unit="frame")
 
 
 def compare_frame_hashes(
-    given: Path, made: Path, file: str
+    given: Path, made: Path, _: object
 ) -> Iterator[Same | Difference]:
     """Compare two videos' frame hashes; yield differences and equal frames."""
     differing, equal, first = 0, 0, ""
     with unreadable(given), open_regular(given) as one, open_regular(made) as other:
-        pairs = itertools.zip_longest(_lines(one), _lines(other))
+        pairs = itertools.zip_longest(lines_of(one), lines_of(other))
         for number, (a, b) in enumerate(pairs, start=1):
             begins = [_HASH_BEGINS.match(line or b"") for line in (a, b)]
             if a == b:
                 equal += begins[0] is not None
             elif not begins[0] or not begins[1] or begins[0][0] != begins[1][0]:
-                yield _differs(file, f"line {number}", *map(_text, (a, b)))
+                yield _differs(f"line {number}", *map(_text, (a, b)))
             else:
                 differing += 1
                 first = first or _text(a).split(",")[1].strip()
     if differing:
         yield Difference(
-            topic=Topic.PICTURES,
-            file=file,
+            Topic.PICTURES,
             count=differing,
             unit="frame hash",
             aspect=Aspect.HASH,
@@ -209,14 +199,13 @@ def compare_frame_hashes(
             how="its hash differs",
         )
     if equal:
-        yield Same(topic=Topic.PICTURES, file=file, count=equal, unit="frame")
+        yield Same(Topic.PICTURES, count=equal, unit="frame")
 
 
 class Worst:
     """Compares pairs of frames and keeps the largest differences."""
 
-    def __init__(self, file: str) -> None:
-        self._file = file
+    def __init__(self) -> None:
         self._plain, self._lit, self._shadow = _EQUAL, _EQUAL, 0.0
         self._differing, self._worst = 0, 0
         self.strain = 0.0
@@ -243,8 +232,7 @@ class Worst:
             return
         plain, lit = self._plain, self._lit
         yield Difference(
-            topic=Topic.PICTURES,
-            file=self._file,
+            Topic.PICTURES,
             count=self._differing,
             unit="frame",
             aspect=Aspect.PICTURE,
@@ -270,8 +258,3 @@ def _lower(one: Similarity, other: Similarity) -> Similarity:
 
 def _text(line: bytes | None) -> str:
     return "nothing" if line is None else line.decode(errors="replace").rstrip("\n")
-
-
-def _lines(file: BinaryIO) -> Iterator[bytes]:
-    while line := file.readline(_LONGEST_LINE):
-        yield line

@@ -8,10 +8,12 @@ different size is not mistaken for one of the recorded size.
 
 from __future__ import annotations
 
+import contextlib
+import io
 import re
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Final, Self
+from typing import Any, BinaryIO, Final
 
 import numpy as np
 
@@ -22,6 +24,7 @@ from ..formats.ffmpeg import (
     every_frame_arguments,
     run_ffmpeg,
 )
+from ..formats.json_fields import unreadable
 from ..formats.regular_files import regular_path
 from .frame_similarity import Planes
 
@@ -96,103 +99,70 @@ def _stream(path: Path, filters: str, *output: str) -> bytes:
     return run_ffmpeg(arguments, what=f"The video {path.name} cannot be read.")
 
 
-class DecodedVideo:
-    """A video that is being decoded. Use it in a `with` block.
+@contextlib.contextmanager
+def decoded_video(path: Path) -> Iterator[tuple[str, Iterator[Planes]]]:
+    """Decode a video.
 
     Args:
         path: the mp4 file.
 
-    Attributes:
-        height: height of the frames in pixels.
-        width: width of the frames in pixels.
-        header: ffmpeg's header of the stream: size, rate, pixel aspect ratio, format.
+    Yields:
+        ffmpeg's header of the stream (size, rate, pixel aspect ratio, format), and the
+        planes of each frame, to the end of the file.
 
     Raises:
         UnreadableFile: the path is not a regular file, or the video has no frames or an
             odd height or width.
-        EncoderError: the video cannot be decoded.
+        EncoderError: the video cannot be decoded (to its end).
         Error: ffmpeg cannot be started.
     """
-
-    def __init__(self, path: Path) -> None:
-        try:
-            source = regular_path(path)
-        except (OSError, ValueError) as error:
-            raise UnreadableFile(path, error) from error
-        self._rest = b""
-        self._process = FfmpegProcess(
-            [
-                *_BEGINNING,
-                *_INPUT,
-                *("-c:v", "h264", "-i", as_file(source)),
-                *("-map", "0:v:0", *every_frame_arguments()),
-                *("-pix_fmt", "yuv420p", "-f", "yuv4mpegpipe", "pipe:1"),
-            ],
-            what=f"The video {path.name} cannot be decoded.",
-            writes=True,
-        )
-        try:
-            self._read_header(path)
-        except BaseException:
-            self.close()
-            raise
-
-    def __iter__(self) -> Iterator[Planes]:
-        """Yield the planes of each frame, to the end of the file.
-
-        Raises:
-            EncoderError: the video cannot be decoded to its end.
-        """
-        size = self.height * self.width
-        while self._take(len(_FRAME)) == _FRAME:
-            data = np.frombuffer(self._take(size * 3 // 2), np.uint8)
-            if data.size < size * 3 // 2:
-                break
-            half = self.height // 2, self.width // 2
-            quarter = size // 4
-            yield Planes(
-                data[:size].reshape(self.height, self.width),
-                data[size : size + quarter].reshape(half),
-                data[size + quarter :].reshape(half),
-            )
-        self._process.wait()
-
-    def close(self) -> None:
-        """Stop ffmpeg. Idempotent."""
-        self._process.kill()
-        self._process.release()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
-    def _read_header(self, path: Path) -> None:
-        while b"\n" not in self._rest and len(self._rest) < _LONGEST_HEADER:
-            block = self._process.read(_LONGEST_HEADER)
-            if not block:
-                self._process.wait()
-                raise UnreadableFile(path, "it contains no frames")
-            self._rest += block
-        line, _, self._rest = self._rest.partition(b"\n")
+    with unreadable(path):
+        source = as_file(regular_path(path))
+    arguments = [
+        *(*_BEGINNING, *_INPUT, "-c:v", "h264", "-i", source),
+        *("-map", "0:v:0", *every_frame_arguments()),
+        *("-pix_fmt", "yuv420p", "-f", "yuv4mpegpipe", "pipe:1"),
+    ]
+    what = f"The video {path.name} cannot be decoded."
+    with FfmpegProcess(arguments, what=what, writes=True) as process:
+        output = io.BufferedReader(_Output(process), _READ_SIZE)
+        line = output.readline(_LONGEST_HEADER).removesuffix(b"\n")
+        if not line:
+            process.wait()
+            raise UnreadableFile(path, "it contains no frames")
         match = _HEADER.fullmatch(line)
         if match is None:
             raise UnreadableFile(path, f"ffmpeg describes it as {line!r:.80}")
         width, height = map(int, match.groups())
         if height % 2 or width % 2:
             raise UnreadableFile(path, f"its frame size is odd: {width}x{height}")
-        self.height, self.width = height, width
-        self.header = line.decode("ascii", "backslashreplace")
+        header = line.decode("ascii", "backslashreplace")
+        yield header, _planes(output, height, width, process)
 
-    def _take(self, size: int) -> bytes:
-        """Read exactly `size` bytes; fewer at the end."""
-        parts, missing = [self._rest[:size]], size - len(self._rest[:size])
-        self._rest = self._rest[size:]
-        while missing:
-            block = self._process.read(min(_READ_SIZE, missing))
-            if not block:
-                break
-            parts.append(block)
-            missing -= len(block)
-        return b"".join(parts)
+
+class _Output(io.RawIOBase):
+    """The output of an ffmpeg process."""
+
+    def __init__(self, process: FfmpegProcess) -> None:
+        self._process = process
+
+    def readable(self) -> bool:
+        return True
+
+    def readinto(self, buffer: Any) -> int:
+        block = self._process.read(len(buffer))
+        buffer[: len(block)] = block
+        return len(block)
+
+
+def _planes(
+    output: BinaryIO, height: int, width: int, process: FfmpegProcess
+) -> Iterator[Planes]:
+    size, half = height * width, (height // 2, width // 2)
+    while output.read(len(_FRAME)) == _FRAME:
+        data = np.frombuffer(output.read(size * 3 // 2), np.uint8)
+        if data.size < size * 3 // 2:
+            break
+        luma, blue, red = np.split(data, (size, size * 5 // 4))
+        yield Planes(luma.reshape(height, width), blue.reshape(half), red.reshape(half))
+    process.wait()

@@ -26,6 +26,7 @@ from .. import json_text
 from ..errors import MissingDependency
 from ..formats.json_fields import facts_in, read_object, unreadable
 from ..formats.monitor_directory import episode_of
+from ..plain_text import listed
 from ..results import Episode, iter_episodes
 from .layout import (
     CITATION,
@@ -185,13 +186,8 @@ def _made_with_rows(sessions: Sequence[Session]) -> Iterator[tuple[str, str, str
             monitors.setdefault(what, {}).setdefault(value, []).append(session.infix)
     for what, values in monitors.items():
         for value, infixes in values.items():
-            more = len(infixes) - _MOST_MONITORS
-            shown = ", ".join(infixes[:_MOST_MONITORS])
-            if len(infixes) == len(sessions):
-                shown = "all"
-            elif more > 0:
-                shown += f" and {more} more"
-            yield what, value, shown
+            is_of_all = len(infixes) == len(sessions)
+            yield what, value, "all" if is_of_all else listed(infixes, _MOST_MONITORS)
 
 
 def _shown_facts(session: Session) -> dict[str, str]:

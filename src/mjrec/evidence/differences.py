@@ -10,7 +10,7 @@ from __future__ import annotations
 import enum
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import KW_ONLY, dataclass, field
 from types import MappingProxyType
 from typing import Any, Final
 
@@ -59,13 +59,13 @@ class Aspect(enum.Enum):
     STATEMENT = "statement"
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Place:
     """The location of an item.
 
     Attributes:
         topic: the item's topic.
-        file: the file's name below `data/`.
+        file: the file's name below `data/`. Comparators leave it out.
         count: number of units.
         unit: the unit that is counted, such as "episode", "step", "frame", "video" or
             "file".
@@ -74,6 +74,7 @@ class Place:
     """
 
     topic: Topic
+    _: KW_ONLY
     file: str = ""
     count: int = 1
     unit: str = "file"
@@ -99,7 +100,7 @@ class Place:
         return first if first.startswith("episode ") else self.file
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Same(Place):
     """Something that is equal, bit for bit."""
 
@@ -137,17 +138,15 @@ def unlike(given: Any, made: Any) -> str:
 
 
 def differs(
-    topic: Topic, file: str, where: str, given: Any, made: Any, *, unit: str = "file"
+    topic: Topic, where: str, given: Any, made: Any, *, unit: str = "file"
 ) -> Difference:
     """Return the difference between two values that must be equal."""
-    how = unlike(given, made)
-    return Difference(topic=topic, file=file, unit=unit, where=where, how=how)
+    return Difference(topic, unit=unit, where=where, how=unlike(given, made))
 
 
-def stored_differently(file: str) -> Difference:
-    """Return the difference for a file with equal contents but different bytes."""
-    how = "the same contents, stored differently"
-    return Difference(topic=Topic.FILES, file=file, aspect=Aspect.STORED, how=how)
+STORED_DIFFERENTLY: Final = Difference(
+    Topic.FILES, aspect=Aspect.STORED, how="the same contents, stored differently"
+)
 
 
 def only_in(is_given: bool, value: Any) -> str:

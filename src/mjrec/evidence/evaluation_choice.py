@@ -19,8 +19,9 @@ from ..plain_text import counted
 from ..recorder.keep_rules import keep_rule
 from ..rendering.chosen_videos import write_choice
 from ..rendering.jobs import RecordingKey
+from .excuses import note
+from .findings import Finding
 from .inputs import RecordingInputs
-from .notes import Notes
 
 
 class _Ended(NamedTuple):
@@ -37,7 +38,7 @@ _Choices = dict[int, dict[RecordingKey, list[str]]]
 
 
 def choose_for_evaluations(
-    recordings: Iterable[RecordingInputs], directory: Path, notes: Notes
+    recordings: Iterable[RecordingInputs], directory: Path, notes: list[Finding]
 ) -> None:
     """Choose the videos of evaluations, and store the choice with their recordings.
 
@@ -59,7 +60,7 @@ def choose_for_evaluations(
 
 
 def _choose(
-    group: list[RecordingInputs], rule: str, directory: Path, notes: Notes
+    group: list[RecordingInputs], rule: str, directory: Path, notes: list[Finding]
 ) -> None:
     choices = _stated(group)
     again = _made_again(group, rule, directory)
@@ -68,17 +69,15 @@ def _choose(
     else:
         among = " and later ".join(map(str, sorted(choices)))
         here = counted(sum(len(each.episodes) for each in group), "episode")
-        notes.add(
-            group[0].name,
-            "rule",
+        reason = (
             f"its videos were chosen among {among} episodes of an evaluation, but the "
-            f"archive has {here}: the choice by the rule {rule!r:.80} is believed",
-            count=sum(map(len, choices.values())),
-            unit="video",
+            f"archive has {here}: the choice by the rule {rule!r:.80} is believed"
         )
+        count = sum(map(len, choices.values()))
+        notes.append(note(group[0].name, "rule", reason, count=count, unit="video"))
     for finished, chosen in sorted(choices.items()):
         for each in group:
-            own = {k: roles for k, roles in chosen.items() if k.infix == each.own_infix}
+            own = {k: roles for k, roles in chosen.items() if k.infix == each.infix}
             write_choice(directory, own, rule=rule, finished=finished, among=each.infix)
 
 
@@ -112,7 +111,9 @@ def _made_again(
             if isinstance(number, int):
                 failed = _Ended(_key(recording, number), None, None, None)
             ended[facts["seed"], facts["episode"]] = failed
-        for entry in read_journal(directory / journal_name(recording.infix)):
+        for entry in read_journal(
+            directory / journal_name(recording.infix), warns=True
+        ):
             unit, key = entry.evaluation or {}, _key(recording, entry.episode_id)
             ended[unit.get("seed"), unit.get("episode")] = _Ended(
                 key, entry.reward, entry.terminated, entry.success
@@ -128,7 +129,7 @@ def _made_again(
 
 
 def _key(recording: RecordingInputs, number: int) -> RecordingKey:
-    return RecordingKey(recording.own_infix, number)
+    return RecordingKey(recording.infix, number)
 
 
 def _count(facts: Mapping[str, object]) -> int:

@@ -11,13 +11,15 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Final, TypeAlias
 
+from .. import json_text
 from ..errors import InvalidArgument
-from .differences import Aspect, Difference, Place, Same
+from ..formats.json_fields import from_json, to_json
+from .differences import Aspect, Difference
 from .findings import Excuse, ExcuseKind, Finding, Outcome, Topic
 from .frame_similarity import (
     OTHER_BUILD,
@@ -27,7 +29,6 @@ from .frame_similarity import (
     Limits,
     Similarity,
 )
-from .notes import Note
 
 _Allowed: TypeAlias = Mapping[Aspect, float | Limits]
 
@@ -46,7 +47,7 @@ _RECOMPILED: Final[_Allowed] = {Aspect.SOLVER: math.inf, Aspect.MODEL: math.inf}
 _ALIKE: Final[_Allowed] = {**_REDRAWN, **_RESTORED, Aspect.PICTURE: OTHER_ENCODER}
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class _Rule:
     """The effects of an excuse.
 
@@ -54,7 +55,6 @@ class _Rule:
         kind: the kind of the excuse.
         costs: what the excuse weakens, as a clause.
         allows: the largest allowed differences, by aspect.
-        excludes: topics in which every difference is believed.
         fed: topics whose values were copied from the archive into the recreated run.
             Equality proves nothing there, and a difference is not excused.
     """
@@ -62,25 +62,26 @@ class _Rule:
     kind: ExcuseKind
     costs: str
     allows: _Allowed = field(default_factory=dict)
-    excludes: Sequence[Topic] = ()
     fed: Sequence[Topic] = ()
 
 
+# Every difference of its items is believed.
+_ENVIRONMENT: Final = "environment"
 _STEPS: Final = "steps and rewards are compared within a tolerance"
 _BY_NAME: Final[Mapping[str, _Rule]] = {
     "mujoco": _Rule(
-        kind=ExcuseKind.VERSION,
-        costs=f"{_STEPS}, and compiled models are believed",
-        allows={**_ALIKE, **_RECOMPILED, **_NEAR},
+        ExcuseKind.VERSION,
+        f"{_STEPS}, and compiled models are believed",
+        {**_ALIKE, **_RECOMPILED, **_NEAR},
     ),
     # From one state to the next, MuJoCo 4.0 against 3.17, in 3,600 random steps each of
     # Gymnasium's Ant and Humanoid: Ant's quaternions differed by 5e-3 and velocities by
     # 0.53 at most, its rewards by 0.051 and returns by 1.5e-3; Humanoid's by less. Ant
     # observes contact forces from -1 to 1.
     "rk4": _Rule(
-        kind=ExcuseKind.VERSION,
-        costs="rotations of free bodies are compared within a wide tolerance",
-        allows={
+        ExcuseKind.VERSION,
+        "rotations of free bodies are compared within a wide tolerance",
+        {
             Aspect.STATE: 0.05,
             Aspect.VELOCITY: 1.0,
             Aspect.DERIVED: 0.1,
@@ -89,100 +90,79 @@ _BY_NAME: Final[Mapping[str, _Rule]] = {
         },
     ),
     "machine": _Rule(
-        kind=ExcuseKind.HARDWARE,
-        costs=_STEPS,
-        allows={**_ALIKE, **_RECOMPILED, **_NEAR, Aspect.PICTURE: OTHER_CPU},
+        ExcuseKind.HARDWARE,
+        _STEPS,
+        {**_ALIKE, **_RECOMPILED, **_NEAR, Aspect.PICTURE: OTHER_CPU},
     ),
     "gl": _Rule(
-        kind=ExcuseKind.HARDWARE,
-        costs="frames are compared within a tolerance, and their hashes are believed",
-        allows={**_ALIKE, Aspect.PICTURE: OTHER_RENDERER},
+        ExcuseKind.HARDWARE,
+        "frames are compared within a tolerance, and their hashes are believed",
+        {**_ALIKE, Aspect.PICTURE: OTHER_RENDERER},
     ),
     "ffmpeg": _Rule(
-        kind=ExcuseKind.VERSION,
-        costs="frames in the files are compared within a tolerance",
+        ExcuseKind.VERSION,
+        "frames in the files are compared within a tolerance",
         # Frames are hashed before they are encoded.
-        allows={a: limit for a, limit in _ALIKE.items() if a is not Aspect.HASH},
+        {a: limit for a, limit in _ALIKE.items() if a is not Aspect.HASH},
     ),
     **dict.fromkeys(
         ("numpy", "gymnasium", "gymnasium-robotics", "dm-control"),
         _Rule(
-            kind=ExcuseKind.VERSION,
-            costs="beginnings and rewards are compared within a tolerance",
-            allows={**_ROUNDED, **_RESTORED},
+            ExcuseKind.VERSION,
+            "beginnings and rewards are compared within a tolerance",
+            {**_ROUNDED, **_RESTORED},
         ),
     ),
-    "mjrec": _Rule(
-        kind=ExcuseKind.VERSION,
-        costs="descriptions are believed",
-        allows=_RESTORED,
-    ),
-    "environment": _Rule(
-        kind=ExcuseKind.CODE,
-        costs="its beginning, physics, rewards and videos are believed",
-        excludes=tuple(Topic),
+    "mjrec": _Rule(ExcuseKind.VERSION, "descriptions are believed", _RESTORED),
+    _ENVIRONMENT: _Rule(
+        ExcuseKind.CODE, "its beginning, physics, rewards and videos are believed"
     ),
     "wrappers": _Rule(
-        kind=ExcuseKind.CODE,
-        costs="its changes to actions, rewards and ends are believed",
-        allows={Aspect.OBSERVED: math.inf},
+        ExcuseKind.CODE,
+        "its changes to actions, rewards and ends are believed",
+        {Aspect.OBSERVED: math.inf},
         fed=(Topic.REWARDS,),
     ),
     **dict.fromkeys(
-        ("schedule", "rule", "step_trigger"),
+        ("schedule", "rule"),
         _Rule(
-            kind=ExcuseKind.CODE,
-            costs="its choice of episodes is believed",
+            ExcuseKind.CODE,
+            "its choice of episodes is believed",
             fed=(Topic.SELECTION,),
         ),
     ),
     "actions not kept": _Rule(
-        kind=ExcuseKind.EVENT,
-        costs="returns and ends are believed",
+        ExcuseKind.EVENT,
+        "returns and ends are believed",
         fed=(Topic.REWARDS, Topic.BEGINNING, Topic.PHYSICS),
     ),
     "unseeded beginning": _Rule(
-        kind=ExcuseKind.EVENT,
-        costs="its initial state is believed",
-        fed=(Topic.BEGINNING,),
+        ExcuseKind.EVENT, "its initial state is believed", fed=(Topic.BEGINNING,)
     ),
+    # An encoder's death may show only at the end: the keys' order depends on it.
     "broken video": _Rule(
-        kind=ExcuseKind.EVENT,
-        costs="where it breaks off is believed",
-        # An encoder's death may show only at the end: the keys' order depends on it.
-        allows=_RESTORED,
+        ExcuseKind.EVENT,
+        "where it breaks off is believed",
+        _RESTORED,
         fed=(Topic.VIDEOS,),
     ),
     **dict.fromkeys(
         ("kill", "early reset", "exception", "fault"),
-        _Rule(
-            kind=ExcuseKind.EVENT,
-            costs="its end is believed",
-            fed=(Topic.REWARDS,),
-        ),
+        _Rule(ExcuseKind.EVENT, "its end is believed", fed=(Topic.REWARDS,)),
     ),
 }
 # Claims that can change the numbers of a step.
 NUMERIC: Final = (
     *("mujoco", "machine", "numpy", "gymnasium", "gymnasium-robotics", "dm-control"),
-    "environment",
+    _ENVIRONMENT,
 )
 _ANY_VERSION: Final = _Rule(
-    kind=ExcuseKind.VERSION,
-    costs="only the version itself is believed",
-    allows=_RESTORED,
+    ExcuseKind.VERSION, "only the version itself is believed", _RESTORED
 )
 _DESCRIPTIONS: Final = ("README.md", "CITATION.cff", "ro-crate-metadata.json")
-_OUTCOMES: Final = {
-    Aspect.CLAIM: Outcome.NOTED,
-    Aspect.STORED: Outcome.NOTED,
-    Aspect.ENCODED: Outcome.NOTED,
-    Aspect.STATE: Outcome.WITHIN_TOLERANCE,
-    Aspect.VELOCITY: Outcome.WITHIN_TOLERANCE,
-    Aspect.DERIVED: Outcome.WITHIN_TOLERANCE,
-    Aspect.SUMMED: Outcome.WITHIN_TOLERANCE,
-    Aspect.PICTURE: Outcome.WITHIN_TOLERANCE,
-}
+_NOTED: Final = (Aspect.CLAIM, Aspect.STORED, Aspect.ENCODED)
+# How numbers differ that other code has computed.
+COMPUTED: Final = (Aspect.STATE, Aspect.VELOCITY, Aspect.DERIVED, Aspect.SUMMED)
 # The aspect whose limit applies if an excuse has none for this one.
 _WIDER: Final = {
     Aspect.VELOCITY: Aspect.STATE,
@@ -195,11 +175,9 @@ _BELIEVED: Final = {
     Aspect.MODEL: "it was compiled elsewhere",
     Aspect.HASH: "they were rendered elsewhere",
 }
-# The largest share of frames that may be bitwise equal: with another rasterizer, few;
-# with the same one on another CPU, those that rounding did not change.
-_MOST_EQUAL_FRAMES: Final = {"gl": 0.5, "machine": 0.8}
-_ELSEWHERE: Final = (ExcuseKind.VERSION, ExcuseKind.HARDWARE)
 _FAMILIES: Final = ("llvmpipe", "softpipe", "nvidia", "amd", "radeon", "intel", "apple")
+# In the folder of a recreated run.
+_NOTES: Final = "maker.json"
 
 
 def excuse_of(name: str, claimed: str, here: str = "", *items: str) -> Excuse:
@@ -211,32 +189,69 @@ def excuse_of(name: str, claimed: str, here: str = "", *items: str) -> Excuse:
         here: the reader's value.
         items: the items that it is claimed for. The whole archive if empty.
     """
-    rule = _BY_NAME.get(name, _ANY_VERSION)
+    kind, costs = _rule(name).kind, _rule(name).costs
     return Excuse(
-        kind=rule.kind,
-        name=name,
-        claimed=claimed,
-        here=here,
-        items=items,
-        costs=rule.costs,
+        kind=kind, name=name, claimed=claimed, here=here, items=items, costs=costs
     )
+
+
+def note(
+    item: str, excuse: str, reason: str, *, count: int = 1, unit: str = "episode"
+) -> Finding:
+    """Return a note on a fact that could not be recreated and had to be believed.
+
+    Args:
+        item: "episode 27 of 0.4711" or "recording 0.4711".
+        excuse: the name of the excuse that claims it.
+        reason: a clause with the reason and the fact that is believed.
+        count: number of units that the note covers.
+        unit: the unit of `count`.
+    """
+    topic = next(iter(_rule(excuse).fed), Topic.FILES)
+    return Finding(
+        topic, item, Outcome.BELIEVED, reason, excuse=excuse, count=count, unit=unit
+    )
+
+
+def write_notes(folder: Path, notes: Iterable[Finding]) -> None:
+    """Write notes next to a recreated run, for the process that compares it."""
+    (folder / _NOTES).write_text(json_text.dumps([to_json(each) for each in notes]))
+
+
+def read_notes(folder: Path) -> list[Finding]:
+    """Return the notes in a folder; empty if it has none."""
+    path = folder / _NOTES
+    said = json_text.loads(path.read_text()) if path.exists() else []
+    return [from_json(Finding, each) for each in said]
+
+
+def noted_excuse(note: Finding) -> Excuse:
+    """Return the excuse that a note claims."""
+    name = str(note.excuse)
+    # For code, the reason names it.
+    is_stated = _rule(name).kind is not ExcuseKind.EVENT
+    return excuse_of(name, note.reason if is_stated else "", "", note.item)
+
+
+def is_fed(excuse: str, topic: Topic | None = None) -> bool:
+    """Return whether values (of a topic) were copied from the archive."""
+    fed = _rule(excuse).fed
+    return bool(fed) if topic is None else topic in fed
 
 
 def merged(excuses: Iterable[Excuse]) -> tuple[Excuse, ...]:
     """Merge excuses with the same name and values into one for all their items."""
-    found: dict[tuple[str, str, str], Excuse] = {}
-    items: dict[tuple[str, str, str], dict[str, None]] = {}
-    of_all = set()
-    for excuse in excuses:
-        key = excuse.name, excuse.claimed, excuse.here
-        found.setdefault(key, excuse)
-        items.setdefault(key, {}).update(dict.fromkeys(excuse.items))
-        if not excuse.items:
-            of_all.add(key)
-    return tuple(
-        dataclasses.replace(each, items=() if key in of_all else tuple(items[key]))
-        for key, each in found.items()
-    )
+    groups: dict[tuple[str, str, str], list[Excuse]] = {}
+    for each in excuses:
+        groups.setdefault((each.name, each.claimed, each.here), []).append(each)
+    return tuple(map(_merged, groups.values()))
+
+
+def _merged(same: list[Excuse]) -> Excuse:
+    # An excuse without items applies to the whole archive.
+    is_of_all = not all(each.items for each in same)
+    items = dict.fromkeys(item for each in same for item in each.items)
+    return dataclasses.replace(same[0], items=() if is_of_all else tuple(items))
 
 
 def applicable(excuses: Iterable[Excuse]) -> tuple[Excuse, ...]:
@@ -284,184 +299,46 @@ def with_allowed(excuses: Iterable[Excuse], allow: Iterable[str]) -> tuple[Excus
     )
 
 
-class Trial:
-    """Tests excuses against all equal and all different items.
-
-    Args:
-        excuses: the claimed excuses.
-    """
-
-    def __init__(self, excuses: Sequence[Excuse]) -> None:
-        self._excuses = excuses
-        self._scopes = [frozenset(excuse.items) for excuse in excuses]
-        self._used: Counter[int] = Counter()
-        # By excuse and unit.
-        self._equal: Counter[tuple[int, str]] = Counter()
-        self._other: Counter[tuple[int, str]] = Counter()
-
-    def same(self, place: Same) -> bool:
-        """Count an equal item; return True if it was fed in and so proves nothing."""
-        is_fed = False
-        for index in self._reaching(place):
-            self._equal[index, place.unit] += place.count
-            is_fed |= place.topic in _rule(self._excuses[index]).fed
-        return is_fed
-
-    def judge(self, found: Difference) -> Finding | None:
-        """Return the finding for a difference; None if it need not be reported."""
-        if found.aspect is Aspect.STATEMENT:
-            return None
-        for index in self._reaching(found):
-            excuse = self._excuses[index]
-            outcome = _outcome(excuse, found)
-            if outcome is None:
-                continue
-            self._other[index, found.unit] += found.count
-            if outcome is not Outcome.NOTED:
-                self._used[index] += found.count
-            return _finding(found, outcome, excuse)
-        return _finding(found, Outcome.DIFFERENT, None)
-
-    def use(self, name: str) -> None:
-        """Mark the excuses with a name as used."""
-        for index, excuse in enumerate(self._excuses):
-            self._used[index] += excuse.name == name
-
-    @property
-    def excuses(self) -> tuple[Excuse, ...]:
-        """The used and refuted excuses, and all those of versions and hardware."""
-        tried = (
-            dataclasses.replace(
-                excuse,
-                is_needed=self._used[index] > 0,
-                refuted=self._refutation(index) is not None,
-            )
-            for index, excuse in enumerate(self._excuses)
-        )
-        return tuple(
-            excuse
-            for excuse in tried
-            if excuse.is_needed or excuse.refuted or excuse.kind in _ELSEWHERE
-        )
-
-    def refutations(self) -> Iterator[Finding]:
-        """Yield a finding for each refuted claim."""
-        for index, excuse in enumerate(self._excuses):
-            reason = self._refutation(index)
-            if reason is not None:
-                yield Finding(
-                    topic=Topic.IDENTITY,
-                    item=", ".join(excuse.items[:3]),
-                    outcome=Outcome.DIFFERENT,
-                    reason=f"{excuse.name} is claimed to be {excuse.claimed} and is "
-                    f"{excuse.here} here, but {reason}",
-                    unit="claim",
-                )
-
-    def _reaching(self, place: Place) -> Iterator[int]:
-        scopes = place.scopes
-        for index, items in enumerate(self._scopes):
-            if not items or not items.isdisjoint(scopes):
-                yield index
-
-    def _refutation(self, index: int) -> str | None:
-        """Return why a claimed difference is refuted; None if it is not."""
-        excuse, equal = self._excuses[index], self._equal
-        frames, videos = equal[index, "frame"], equal[index, "encoding"]
-        if excuse.name == "mujoco" and equal[index, "compiled model"]:
-            return "the compiled model was written by the same version"
-        if excuse.name == "ffmpeg" and videos and self._other[index, "encoding"]:
-            return f"{videos} videos are equal byte for byte and others are not"
-        others = self._other[index, "frame hash"]
-        if excuse.name == "gl" and _family(excuse.claimed) == _family(excuse.here):
-            return None
-        if excuse.name == "machine" and not others:
-            # It may be invisible: no step of the half cheetah depends on the CPU.
-            return None
-        most = _MOST_EQUAL_FRAMES.get(excuse.name)
-        if frames and most is not None and frames >= most * (frames + others):
-            return f"{frames} frames are equal bit for bit"
-        return None
-
-
-def believed(note: Note) -> tuple[Excuse, Finding | None]:
-    """Return a maker's note as an excuse, and a finding for what is believed.
-
-    The finding is None if the excuse matters only for differences.
-    """
-    name, item, reason = note.excuse, note.item, note.reason
-    rule = _BY_NAME.get(name)
-    # For code, the reason names it.
-    is_stated = rule is not None and rule.kind is not ExcuseKind.EVENT
-    excuse = excuse_of(name, reason if is_stated else "", "", item)
-    if rule is not None and not rule.fed:
-        return excuse, None
-    if rule is None:
-        excuse = dataclasses.replace(excuse, kind=ExcuseKind.EVENT, costs=reason)
-    finding = Finding(
-        topic=rule.fed[0] if rule else Topic.FILES,
-        item=item,
-        outcome=Outcome.BELIEVED,
-        reason=reason,
-        excuse=name,
-        count=note.count,
-        unit=note.unit,
-    )
-    return excuse, finding
-
-
-def _outcome(excuse: Excuse, found: Difference) -> Outcome | None:
+def outcome_under(excuse: Excuse, found: Difference) -> Outcome | None:
     """Return a difference's outcome under an excuse; None if it is not allowed."""
-    rule = _rule(excuse)
-    if found.topic in rule.excludes:
+    aspect = found.aspect
+    if excuse.name == _ENVIRONMENT:
         return Outcome.BELIEVED
-    if found.aspect is Aspect.CLAIM:
+    if aspect is Aspect.CLAIM:
         return Outcome.NOTED if found.claim == excuse.name else None
-    if found.aspect is Aspect.EXACT:
+    if aspect is Aspect.EXACT:
         is_described = excuse.name == "mjrec" and found.file in _DESCRIPTIONS
         return Outcome.BELIEVED if is_described else None
-    allows = _allows(excuse, rule)
-    aspect: Aspect = found.aspect
+    allows = _allows(excuse)
     if aspect not in allows:
         aspect = _WIDER.get(aspect, aspect)
     limit = allows.get(aspect)
-    if limit is None:
+    if limit is None or not _is_within(found, limit):
         return None
-    if isinstance(limit, Limits):
-        is_within = _is_alike(found.figures, limit)
-    else:
-        is_within = math.isinf(limit) or (
-            found.size is not None and found.size <= limit
-        )
-    return _OUTCOMES.get(aspect, Outcome.BELIEVED) if is_within else None
+    if aspect in _NOTED:
+        return Outcome.NOTED
+    return (
+        Outcome.WITHIN_TOLERANCE
+        if aspect in (*COMPUTED, Aspect.PICTURE)
+        else Outcome.BELIEVED
+    )
 
 
-def _allows(excuse: Excuse, rule: _Rule) -> _Allowed:
-    if excuse.name == "mujoco" and _major(excuse.claimed) != _major(excuse.here):
-        return {**rule.allows, **_OTHER_MAJOR}
-    if excuse.name == "gl" and _family(excuse.claimed) == _family(excuse.here):
-        return {**rule.allows, Aspect.PICTURE: OTHER_BUILD}
-    return rule.allows
-
-
-def _is_alike(figures: Mapping[str, float], limits: Limits) -> bool:
-    suffix = "_lit" if 0 < figures["shadow"] <= limits.shadow else ""
-    names = (f"{name}{suffix}" for name in Similarity._fields)
-    return limits.strain(Similarity(*(figures[name] for name in names))) <= 1
-
-
-def _finding(found: Difference, outcome: Outcome, excuse: Excuse | None) -> Finding:
-    figures = dict(found.figures)
-    reason, is_believed = found.reason, outcome is Outcome.BELIEVED
-    if excuse is not None and is_believed:
+def finding_under(
+    excuse: Excuse | None, found: Difference, outcome: Outcome
+) -> Finding:
+    """Return the finding for a difference with an outcome."""
+    figures, reason = dict(found.figures), found.reason
+    if outcome is not Outcome.BELIEVED:
+        if found.size is not None:
+            figures["maximum"] = found.size
+    elif excuse is not None:
         reason = _BELIEVED.get(found.aspect, excuse.costs)
-    if found.size is not None and not is_believed:
-        figures["maximum"] = found.size
     return Finding(
-        topic=found.topic,
-        item=found.item,
-        outcome=outcome,
-        reason=reason,
+        found.topic,
+        found.item,
+        outcome,
+        reason,
         excuse=excuse.name if excuse else None,
         count=found.count,
         unit=found.unit,
@@ -469,8 +346,31 @@ def _finding(found: Difference, outcome: Outcome, excuse: Excuse | None) -> Find
     )
 
 
-def _rule(excuse: Excuse) -> _Rule:
-    return _BY_NAME.get(excuse.name, _ANY_VERSION)
+def is_same_family(excuse: Excuse) -> bool:
+    """Return whether two renderers are of the same vendor."""
+    return _family(excuse.claimed) == _family(excuse.here)
+
+
+def _allows(excuse: Excuse) -> _Allowed:
+    allows = _rule(excuse.name).allows
+    if excuse.name == "mujoco" and _major(excuse.claimed) != _major(excuse.here):
+        return {**allows, **_OTHER_MAJOR}
+    if excuse.name == "gl" and is_same_family(excuse):
+        return {**allows, Aspect.PICTURE: OTHER_BUILD}
+    return allows
+
+
+def _is_within(found: Difference, limit: float | Limits) -> bool:
+    if not isinstance(limit, Limits):
+        return math.isinf(limit) or (found.size is not None and found.size <= limit)
+    figures = found.figures
+    suffix = "_lit" if 0 < figures["shadow"] <= limit.shadow else ""
+    names = (f"{name}{suffix}" for name in Similarity._fields)
+    return limit.strain(Similarity(*(figures[name] for name in names))) <= 1
+
+
+def _rule(name: str) -> _Rule:
+    return _BY_NAME.get(name, _ANY_VERSION)
 
 
 def _major(version: str) -> str:

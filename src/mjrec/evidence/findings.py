@@ -10,12 +10,12 @@ from __future__ import annotations
 
 import enum
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import KW_ONLY, dataclass, field
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Final
 
-from ..formats.dataclass_json import to_json
+from ..formats.json_fields import to_json
 
 _NOTHING: Final[Mapping[str, Any]] = MappingProxyType({})
 
@@ -75,7 +75,7 @@ class Verdict(enum.StrEnum):
         return {Verdict.PASS: 0, Verdict.FAIL: 1, Verdict.PARTLY: 3}[self]
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Finding:
     """One compared item, or several with the same result.
 
@@ -98,6 +98,7 @@ class Finding:
     item: str
     outcome: Outcome
     reason: str = ""
+    _: KW_ONLY
     excuse: str | None = None
     count: int = 1
     unit: str = "file"

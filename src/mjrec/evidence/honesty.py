@@ -7,11 +7,11 @@ video may show only part of its episode, or be faster than real time.
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import itertools
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from pathlib import Path
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -19,8 +19,7 @@ from numpy.typing import NDArray
 
 from .. import json_text
 from ..environments.episode_seeds import episode_seeds
-from ..formats.json_fields import read_object
-from ..formats.video_metadata import metadata_path
+from ..plain_text import listed
 from .findings import Finding, Outcome, Topic
 from .inputs import EpisodeInputs, Inputs, RecordingInputs
 
@@ -48,26 +47,15 @@ def remarks(inputs: Inputs, arrays: Mapping[str, NDArray[Any]]) -> Iterator[Find
     yield from _repeated(inputs, arrays)
 
 
-def read_metadata(video: Path) -> Mapping[str, Any]:
-    """Return a video's metadata; empty if the metadata file cannot be read."""
-    return _read(metadata_path(video))
-
-
-def remarks_on_video(metadata: Path, file: str) -> Iterator[Finding]:
+def remarks_on_video(metadata: Mapping[str, Any], file: str) -> Iterator[Finding]:
     """Yield the facts about a video that a reader would not expect.
 
     Args:
-        metadata: the video's metadata file.
+        metadata: the video's metadata.
         file: the metadata file's name below `data/`.
     """
-    for reason in _of_video(_read(metadata)):
-        yield Finding(
-            topic=Topic.VIDEOS,
-            item=file,
-            outcome=Outcome.NOTED,
-            reason=reason,
-            unit="video",
-        )
+    for reason in _of_video(metadata):
+        yield Finding(Topic.VIDEOS, file, Outcome.NOTED, reason, unit="video")
 
 
 def _unfinished(inputs: Inputs) -> Iterator[Finding]:
@@ -75,54 +63,42 @@ def _unfinished(inputs: Inputs) -> Iterator[Finding]:
     episodes = [each for one in inputs.recordings for each in one.episodes]
     complete, planned = sum(e.cut is None for e in episodes), inputs.planned or 0
     if complete < planned:
-        yield _headline(
-            Topic.SELECTION,
-            "",
+        reason = (
             f"{complete} of {planned} episodes: the evaluation is not finished, or "
-            "some of its episodes failed",
-            outcome=Outcome.BELIEVED,
-            count=planned - complete,
+            "some of its episodes failed"
         )
+        yield _headline("", reason, Outcome.BELIEVED, planned - complete)
 
 
 def _name(recording: RecordingInputs) -> Iterator[Finding]:
     """Yield a remark if an environment goes by a name that is not its own."""
     environment = recording.environment or {}
     env_id, name = environment.get("id"), recording.env_id
+    is_registered = _REGISTERED.fullmatch(name) is not None
     if env_id is not None and name != env_id:
-        is_anothers = _REGISTERED.fullmatch(name) is not None
-        yield _headline(
-            Topic.IDENTITY,
-            recording.name,
-            f"its name is {name!r:.80}, but its environment is {env_id!r:.80}",
-            outcome=Outcome.DIFFERENT if is_anothers else Outcome.BELIEVED,
-            unit="recording",
-        )
-    elif environment.get("framework") == "mjcf" and _REGISTERED.fullmatch(name):
-        yield _headline(
-            Topic.IDENTITY,
-            recording.name,
+        reason = f"its name is {name!r:.80}, but its environment is {env_id!r:.80}"
+        outcome = Outcome.DIFFERENT if is_registered else Outcome.BELIEVED
+    elif environment.get("framework") == "mjcf" and is_registered:
+        reason = (
             f"{name!r:.80} is the author's own model (MJCF), not the environment of "
-            "that name",
-            outcome=Outcome.NOTED,
-            unit="recording",
+            "that name"
         )
+        outcome = Outcome.NOTED
+    else:
+        return
+    remark = _headline(recording.name, reason, outcome, unit="recording")
+    yield dataclasses.replace(remark, topic=Topic.IDENTITY)
 
 
 def _gaps(
     recording: RecordingInputs, all_of_them: Sequence[RecordingInputs]
 ) -> Iterator[Finding]:
-    first = recording.first_episode_id
+    first, name = recording.first_episode_id, recording.name
     numbers = {each.episode_id for each in recording.episodes}
     count, missing = _missing(numbers, first, max(numbers, default=first - 1) + 1)
     if count:
-        yield _headline(
-            Topic.SELECTION,
-            recording.name,
-            f"episodes are missing: {missing}",
-            outcome=Outcome.DIFFERENT,
-            count=count,
-        )
+        reason = f"episodes are missing: {missing}"
+        yield _headline(name, reason, Outcome.DIFFERENT, count)
     before = {
         each.episode_id
         for other in all_of_them
@@ -131,14 +107,11 @@ def _gaps(
     }
     count, missing = _missing(before, 0, first)
     if count:
-        yield _headline(
-            Topic.SELECTION,
-            recording.name,
+        reason = (
             f"it begins with episode {first}, and the earlier recordings of its "
-            f"environment are not included: {missing} are missing",
-            outcome=Outcome.BELIEVED,
-            count=count,
+            f"environment are not included: {missing} are missing"
         )
+        yield _headline(name, reason, Outcome.BELIEVED, count)
 
 
 def _cuts(
@@ -155,14 +128,12 @@ def _cuts(
         for other in all_of_them
     )
     then = ", and another recording continues after them" if goes_on else ""
-    yield _headline(
-        Topic.SELECTION,
-        recording.name,
+    reason = (
         f"episodes not in the statistics because they were cut off: "
-        f"{_listed(cut)}{then}",
-        outcome=Outcome.BELIEVED if goes_on else Outcome.NOTED,
-        count=len(cut),
+        f"{listed(sorted(cut), _MOST_SHOWN)}{then}"
     )
+    outcome = Outcome.BELIEVED if goes_on else Outcome.NOTED
+    yield _headline(recording.name, reason, outcome, len(cut))
 
 
 def _types(recording: RecordingInputs) -> Iterator[Finding]:
@@ -170,34 +141,24 @@ def _types(recording: RecordingInputs) -> Iterator[Finding]:
     complete = [each for each in recording.episodes if each.cut is None]
     training = [each.episode_id for each in complete if each.type != "e"]
     if training and len(training) < len(complete):
-        yield _headline(
-            Topic.SELECTION,
-            recording.name,
+        reason = (
             f"{len(training)} of {len(complete)} episodes are labelled training, the "
-            f"others evaluation: {_listed(training)}",
-            outcome=Outcome.NOTED,
-            count=len(training),
+            f"others evaluation: {listed(sorted(training), _MOST_SHOWN)}"
         )
+        yield _headline(recording.name, reason, Outcome.NOTED, len(training))
 
 
 def _faults(recording: RecordingInputs) -> Iterator[Finding]:
     """Yield the faults of the recorder. All of their effects are compared."""
-    said = [
-        f"{fault['what']}: {fault['reason']:.200}"
-        if fault["episode_id"] is None
-        else f"{fault['what']} of episode {fault['episode_id']}: {fault['reason']:.200}"
-        for _, fault in recording.faults
-    ]
+    said = []
+    for _, fault in recording.faults:
+        number = fault["episode_id"]
+        of = "" if number is None else f" of episode {number}"
+        said.append(f"{fault['what']}{of}: {fault['reason']:.200}")
     if said:
-        yield _headline(
-            Topic.SELECTION,
-            recording.name,
-            "faults while recording, according to its author: "
-            f"{_shown(said[:_MOST_SHOWN], len(said))}",
-            outcome=Outcome.NOTED,
-            count=len(said),
-            unit="fault",
-        )
+        shown = listed(said, _MOST_SHOWN)
+        reason = f"faults while recording, according to its author: {shown}"
+        yield _headline(recording.name, reason, Outcome.NOTED, len(said), unit="fault")
 
 
 def _gaps_of_evaluations(recordings: Sequence[RecordingInputs]) -> Iterator[Finding]:
@@ -215,13 +176,9 @@ def _gaps_of_evaluations(recordings: Sequence[RecordingInputs]) -> Iterator[Find
     for (env_id, seed), known in numbers.items():
         count, missing = _missing(known, 0, max(known) + 1)
         if count:
-            yield _headline(
-                Topic.SELECTION,
-                f"{env_id:.80}, seed {seed}",
-                f"episodes of the evaluation that are missing or failed: {missing}",
-                outcome=Outcome.BELIEVED,
-                count=count,
-            )
+            reason = f"episodes of the evaluation that are missing or failed: {missing}"
+            item = f"{env_id:.80}, seed {seed}"
+            yield _headline(item, reason, Outcome.BELIEVED, count)
 
 
 def _seeds(recording: RecordingInputs) -> Iterator[Finding]:
@@ -230,14 +187,9 @@ def _seeds(recording: RecordingInputs) -> Iterator[Finding]:
     if not given:
         return
     rule = _rule_of(recording.episodes, given, recording.options.get("seed"))
-    yield Finding(
-        topic=Topic.BEGINNING,
-        item=recording.name,
-        outcome=Outcome.NOTED,
-        reason=rule or "seeds chosen by the author: they do not follow a stated rule",
-        count=len(given),
-        unit="seed",
-    )
+    reason = rule or "seeds chosen by the author: they do not follow a stated rule"
+    item, outcome, count = recording.name, Outcome.NOTED, len(given)
+    yield Finding(Topic.BEGINNING, item, outcome, reason, count=count, unit="seed")
 
 
 def _rule_of(
@@ -257,7 +209,7 @@ def _rule_of(
         if each.seed != episode_seeds(*numbers).environment:
             return None
     if is_evaluation:
-        seeds = _listed({seed for seed, _ in pairs})
+        seeds = listed(sorted({seed for seed, _ in pairs}), _MOST_SHOWN)
         return f"SeedSequence([S, i]) for episode i, S in {seeds}"
     return f"SeedSequence([{seed}, i]) for episode i"
 
@@ -267,23 +219,20 @@ def _repeated(inputs: Inputs, arrays: Mapping[str, NDArray[Any]]) -> Iterator[Fi
     found: dict[str, list[str]] = {}
     for recording in inputs.recordings:
         for each in recording.episodes:
-            if each.actions is None or not each.steps:
+            if not each.has_actions or not each.steps:
                 continue
             what = [recording.env_id, each.seed, each.irregular]
             if each.seed is None:
-                what += [each.random_state, _digest(arrays.get(each.first_state or ""))]
-            what.append(_digest(arrays.get(each.actions)))
+                what += [each.random_state, _digest(arrays.get(f"{each.arrays}.state"))]
+            what.append(_digest(arrays.get(each.arrays or "")))
             found.setdefault(json_text.dumps(what), []).append(recording.item(each))
     for items in found.values():
         if len(items) > 1:
-            yield _headline(
-                Topic.SELECTION,
-                items[0],
+            reason = (
                 "the same episode, with the same beginning and actions: "
-                f"{_listed(items)}; it counts once",
-                outcome=Outcome.BELIEVED,
-                count=len(items) - 1,
+                f"{listed(sorted(items), _MOST_SHOWN)}; it counts once"
             )
+            yield _headline(items[0], reason, Outcome.BELIEVED, len(items) - 1)
 
 
 def _digest(array: NDArray[Any] | None) -> str:
@@ -292,22 +241,11 @@ def _digest(array: NDArray[Any] | None) -> str:
 
 
 def _headline(
-    topic: Topic,
-    item: str,
-    reason: str,
-    *,
-    outcome: Outcome,
-    count: int = 1,
-    unit: str = "episode",
+    item: str, reason: str, outcome: Outcome, count: int = 1, *, unit: str = "episode"
 ) -> Finding:
+    topic = Topic.SELECTION
     return Finding(
-        topic=topic,
-        item=item,
-        outcome=outcome,
-        reason=reason,
-        count=count,
-        unit=unit,
-        is_headline=True,
+        topic, item, outcome, reason, count=count, unit=unit, is_headline=True
     )
 
 
@@ -315,17 +253,8 @@ def _missing(known: set[int], start: int, stop: int) -> tuple[int, str]:
     """Return the number of unknown numbers in a range, and the first few as a list."""
     count = max(0, stop - start) - sum(start <= number < stop for number in known)
     missing = (number for number in range(start, stop) if number not in known)
-    return count, _shown(itertools.islice(missing, min(count, _MOST_SHOWN)), count)
-
-
-def _listed(items: Iterable[Any]) -> str:
-    ordered = sorted(items)
-    return _shown(ordered[:_MOST_SHOWN], len(ordered))
-
-
-def _shown(first: Iterable[Any], count: int) -> str:
-    text, more = ", ".join(map(str, first)), count - _MOST_SHOWN
-    return f"{text} and {more} more" if more > 0 else text
+    first = [*itertools.islice(missing, min(count, _MOST_SHOWN))]
+    return count, listed(first, _MOST_SHOWN, count=count)
 
 
 def _of_video(said: Mapping[str, Any]) -> Iterator[str]:
@@ -364,10 +293,3 @@ def _is_whole(runs: Any, length: Any) -> bool:
         return bool(runs[0][0] == 0 and runs[-1][1] == length)
     except (TypeError, LookupError):
         return False
-
-
-def _read(path: Path) -> Mapping[str, Any]:
-    try:
-        return read_object(path)
-    except (OSError, ValueError):
-        return {}

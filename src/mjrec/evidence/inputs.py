@@ -12,15 +12,14 @@ import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final
+from typing import Annotated, Any, Final, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .. import json_text
 from ..environments.scenes import shown_wrappers
-from ..formats.dataclass_json import from_json, to_json
-from ..formats.monitor_directory import Infix
+from ..formats.json_fields import from_json, to_json
 
 INPUTS_FILE: Final = "inputs.json"
 ARRAYS_FILE: Final = "arrays.npz"
@@ -46,6 +45,28 @@ OPTIONS: Final[Mapping[str, tuple[type, ...]]] = {
 }
 
 
+_DTYPES: Final = frozenset(
+    f"{kind}{bits}" for kind in ("float", "int", "uint") for bits in (8, 16, 32, 64)
+) | {"bool"}
+
+
+def count(value: Any) -> int:
+    """Return a value unchanged if it is a valid count."""
+    if type(value) is not int or value < 0:
+        raise ValueError(f"{value!r:.80} is not a valid count")
+    return value
+
+
+def _dtype(name: Any) -> str:
+    if name not in _DTYPES:
+        raise ValueError(f"actions cannot have the dtype {name!r:.80}")
+    return str(name)
+
+
+Count: TypeAlias = Annotated[int, count]
+Dtype: TypeAlias = Annotated[str, _dtype]
+
+
 @dataclass(frozen=True, kw_only=True)
 class EpisodeInputs:
     """The inputs of one episode: its reset, its actions, and what cut it off.
@@ -57,18 +78,17 @@ class EpisodeInputs:
         options: the options given to the reset.
         random_state: the archive's state of the environment's random generators just
             before the reset. It is used only if no seed leads to it.
-        first_state: the name of the array with the state after the reset. It is used
-            only if neither a seed nor a random state leads there.
-        states: the name of the array of all states if the archive claims a different
-            MuJoCo or machine, otherwise None. Each step then starts from the recorded
-            state before it, so that differences in the last bits do not grow.
         steps: number of steps taken.
-        actions: the name of the array of actions, even if some are irregular; None if
-            the actions were not kept.
-        steps_taken: the name of the arrays `<name>.<part>` of `RecordedSteps` if
-            the environment has wrappers; otherwise None.
-        dtypes: pairs of a step and the dtype of the actions from that step on.
-        parts: names and shapes of a dictionary's arrays; None for plain arrays.
+        arrays: the name of its arrays; None if it has no trajectory. The array with
+            this name has the actions that are regular. `<name>.state` is the state
+            after the reset; it is used only if neither a seed nor a random state leads
+            there. `<name>.states` are all states if the archive claims a different
+            MuJoCo or machine: each step then starts from the recorded state before it,
+            so that differences in the last bits do not grow. `<name>.<part>` are the
+            parts of `RecordedSteps` if the environment has wrappers.
+        has_actions: whether the actions were kept, in the array or as irregular ones.
+        action_dtypes: pairs of a step and the dtype of the actions from that step on.
+        action_parts: names and shapes of a dictionary's arrays; None for plain arrays.
         irregular: `step`, `value` and, for an array, `dtype` of each action that does
             not fit into the array.
         cut: the reason why the episode is not in the statistics (`reset`, `close`,
@@ -91,13 +111,11 @@ class EpisodeInputs:
     seed: Any = None
     options: Any = None
     random_state: Any = None
-    first_state: str | None = None
-    states: str | None = None
     steps: int = 0
-    actions: str | None = None
-    steps_taken: str | None = None
-    dtypes: Sequence[tuple[int, str]] = ()
-    parts: Sequence[tuple[str, Sequence[int]]] | None = None
+    arrays: str | None = None
+    has_actions: bool = False
+    action_dtypes: Sequence[tuple[Count, Dtype]] = ()
+    action_parts: Sequence[tuple[str, Sequence[Count]]] | None = None
     irregular: Sequence[Mapping[str, Any]] = ()
     cut: str | None = None
     exception: Mapping[str, Any] | None = None
@@ -151,7 +169,7 @@ class RecordingInputs:
     options: Mapping[str, Any] = field(default_factory=dict)
     schedule: str | None = None
     rule: str | None = None
-    first_episode_id: int = 0
+    first_episode_id: Count = 0
     kept: Sequence[int] = ()
     clip_starts: Sequence[int] = ()
     episodes: Sequence[EpisodeInputs] = ()
@@ -179,13 +197,6 @@ class RecordingInputs:
     def name(self) -> str:
         """The recording's name in findings."""
         return f"recording {self.infix}"
-
-    @property
-    def own_infix(self) -> Infix:
-        """The infix, parsed."""
-        infix = Infix.parse(self.infix)
-        assert infix is not None, "reading the inputs has checked it"
-        return infix
 
     def item(self, episode: EpisodeInputs) -> str:
         """Return the name of one of its episodes in findings."""
@@ -245,7 +256,7 @@ def given_actions(
         arrays: recorded actions by the names in the inputs.
     """
     irregular = {int(each["step"]): each for each in episode.irregular}
-    recorded = arrays.get(episode.actions or "")
+    recorded = arrays.get(episode.arrays or "")
     for step, action in enumerate(_regular(episode, recorded)):
         yield _whole(irregular[step]) if step in irregular else action
 
@@ -279,11 +290,11 @@ def _unusual(recording: RecordingInputs) -> Iterator[tuple[str, Any]]:
 def _regular(episode: EpisodeInputs, recorded: NDArray[Any] | None) -> Iterator[Any]:
     if recorded is None:
         yield from itertools.repeat(None, episode.steps)
-    elif episode.parts is not None:
-        yield from (_split(action, episode.parts) for action in recorded)
+    elif episode.action_parts is not None:
+        yield from (_split(action, episode.action_parts) for action in recorded)
     else:
-        bounds = [*(step for step, _ in episode.dtypes), len(recorded)]
-        names = [name for _, name in episode.dtypes]
+        bounds = [*(step for step, _ in episode.action_dtypes), len(recorded)]
+        names = [name for _, name in episode.action_dtypes]
         yield from recorded[: bounds[0]]
         for name, (start, stop) in zip(names, itertools.pairwise(bounds), strict=True):
             yield from recorded[start:stop].astype(name)

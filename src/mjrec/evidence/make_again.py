@@ -21,7 +21,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from numpy.typing import NDArray
 
 from ..environments.recreate import NotRecreated, Recreated, checked_options, recreate
@@ -32,13 +31,13 @@ from ..formats.journal import KILLED
 from ..plain_text import counted
 from ..recorder.endings import EXCEPTION, INTERRUPT, RESET
 from ..simulation.model_sources import read_authored
+from .excuses import note, read_notes, write_notes
+from .findings import Finding
 from .inputs import EpisodeInputs, RecordingInputs, given_actions
-from .notes import Notes, read_notes
 from .recorder_again import monitor_again
 
 # A limit, because steps without recorded actions are counted one by one.
 _MOST_BELIEVED_STEPS = 100_000_000
-_STEPS_BETWEEN_COUNTS = 1000
 # Events that cut an episode off from outside, and their excuses. Closing a run in the
 # middle of its last episode is normal, so it needs no excuse.
 _EVENTS = {
@@ -47,6 +46,7 @@ _EVENTS = {
     INTERRUPT: "fault",
     KILLED: "kill",
 }
+_ENDS = ("terminated", "truncated")
 _SOURCE = "source/"
 _MODES = {"e": "evaluation"}
 
@@ -57,33 +57,24 @@ class Making:
 
     Attributes:
         directory: the monitor directory.
-        arrays: actions and first states by the names in the inputs.
+        arrays: the arrays of episodes by the names in the inputs.
         trust: ids of environments that may be created in addition to those in the
             registries.
         sources: the folder with the sources of the author's models.
-        only_counted: record only rewards and ends, and keep states only of episodes
-            with a video.
         notes: receives the facts that could not be recreated, with their excuses.
-        on_steps: called with the number of steps taken since the last call.
+        on_step: called after each step.
     """
 
     directory: Path
     arrays: Mapping[str, NDArray[Any]]
     trust: frozenset[str]
     sources: Path
-    only_counted: bool
-    notes: Notes
-    on_steps: Callable[[int], object]
+    notes: list[Finding]
+    on_step: Callable[[], object]
 
 
-def play_recording(
-    recording: RecordingInputs, making: Making
-) -> Mapping[str, NDArray[np.float64]]:
+def play_recording(recording: RecordingInputs, making: Making) -> None:
     """Replay a recording into a monitor directory, with pending videos.
-
-    Returns:
-        If `only_counted`, the rewards of each replayed episode by the name of its
-        actions; otherwise, or if the recording was killed, an empty mapping.
 
     Raises:
         NotRecreated: the environment cannot be created here, or the recording cannot
@@ -92,7 +83,7 @@ def play_recording(
     """
     if recording.environment is None:
         raise NotRecreated("the journal does not name its environment")
-    directory, notes = making.directory, making.notes
+    directory = making.directory
     mjcf = None
     if recording.sources is not None:
         mjcf = _unpack_sources(making.sources / recording.sources, directory.parent)
@@ -103,14 +94,12 @@ def play_recording(
         mjcf=mjcf,
     )
     if recreated.turns_by_rk4():
-        notes.add(
-            recording.name,
-            "rk4",
-            "MuJoCo 4.0 rotates free bodies differently with the integrator RK4",
-            count=len(recording.episodes),
-        )
+        reason = "MuJoCo 4.0 rotates free bodies differently with the integrator RK4"
+        count = len(recording.episodes)
+        making.notes.append(note(recording.name, "rk4", reason, count=count))
     if not recording.was_killed:
-        return _Playing(recording, recreated, making).run()
+        _Playing(recording, recreated, making).run()
+        return
     # A child process is killed in the same place, so that it leaves the same files.
     child = os.fork()
     if child == 0:
@@ -121,12 +110,11 @@ def play_recording(
     _, status = os.waitpid(child, 0)
     if os.waitstatus_to_exitcode(status) != -signal.SIGKILL:
         raise NotRecreated("the killed recording could not be replayed")
-    notes.all = list(read_notes(directory.parent))
+    making.notes[:] = read_notes(directory.parent)
     if not recording.has_sources:
         # A thread may have stored the sources just before the kill.
         for path in directory.glob("openaigym.model.*.zip"):
             path.unlink()
-    return {}
 
 
 class _Playing:
@@ -146,26 +134,17 @@ class _Playing:
         self._now = 0.0
         self._warned: Mapping[str, int] = {}
         self._events = [*recording.evaluation_events]
-        self._rewards: dict[str, NDArray[np.float64]] = {}
         # A monitor for Gymnasium or dm_env.
         self._monitor: Any = monitor_again(
             recording,
             recreated,
             making.directory,
-            clock=self._clock,
-            only_counted=making.only_counted,
+            clock=lambda: self._now,
             notes=making.notes,
         )
 
-    def _clock(self) -> float:
-        return self._now
-
-    def run(self) -> Mapping[str, NDArray[np.float64]]:
-        """Replay all episodes; if the recording was killed, kill this process too.
-
-        Returns:
-            See `play_recording`.
-        """
+    def run(self) -> None:
+        """Replay all episodes; if the recording was killed, kill this process too."""
         try:
             self._play_all()
         except NotRecreated:
@@ -173,7 +152,6 @@ class _Playing:
             with contextlib.suppress(Error):
                 self._monitor.close()
             raise
-        return self._rewards
 
     def _play_all(self) -> None:
         recorder = self._monitor.recorder
@@ -186,7 +164,7 @@ class _Playing:
                 )
             self._begin(episode)
             self._warned = mujoco_warnings(self._recreated.environment)
-            if episode.actions is not None:
+            if episode.has_actions:
                 self._play(episode)
             elif episode.cut is None or episode.steps:
                 self._believe(episode)
@@ -197,15 +175,15 @@ class _Playing:
         for event in self._events:
             self._say(*event)
         if self._recording.was_killed and not self._recording.episodes:
-            self._making.notes.add(
-                self._recording.name,
+            self._note(
+                None,
                 "kill",
                 "it was killed before the first step of an episode, which is believed",
             )
         if self._recording.has_sources:
             recorder.finish_models()
         if self._recording.was_killed:
-            self._making.notes.write(self._making.directory.parent)
+            write_notes(self._making.directory.parent, self._making.notes)
             os.kill(os.getpid(), signal.SIGKILL)
         self._monitor.close()
 
@@ -225,8 +203,8 @@ class _Playing:
     def _say(self, kind: str, facts: Mapping[str, Any] | None) -> None:
         self._monitor.recorder.run.note(kind, None if facts is None else dict(facts))
         if kind == "failed" and facts is not None:
-            self._making.notes.add(
-                self._recording.name,
+            self._note(
+                None,
                 "exception",
                 f"seed {facts['seed']}, episode {facts['episode']} failed, according "
                 f"to its author: {facts.get('failure')!s:.200}",
@@ -260,20 +238,18 @@ class _Playing:
         stated = episode.random_state
         if stated is None or stated == self._recreated.random_state():
             return
-        if seed is not None and not self._recreated.is_dm_env:
-            # No belief is needed, because the reset reseeds the generator.
-            self._recreated.set_random_state(stated)
-            return
         if seed is None and (fresh := self._recreated.seed_behind(stated)) is not None:
             self._recreated.seed(fresh)
             return
         self._recreated.set_random_state(stated)
-        self._note(
-            episode,
-            "unseeded beginning",
-            "no seed leads to its beginning; the state of the random generator before "
-            "its reset is believed",
-        )
+        # No belief is needed if the reset reseeds the generator.
+        if seed is None or self._recreated.is_dm_env:
+            self._note(
+                episode,
+                "unseeded beginning",
+                "no seed leads to its beginning; the state of the random generator "
+                "before its reset is believed",
+            )
 
     @contextlib.contextmanager
     def _set_into_first_state(self, episode: EpisodeInputs) -> Iterator[None]:
@@ -282,7 +258,7 @@ class _Playing:
         This happens only if nothing leads there: no seed was recorded and the
         environment has no random generator.
         """
-        known = self._making.arrays.get(episode.first_state or "")
+        known = self._making.arrays.get(f"{episode.arrays}.state")
         base = getattr(self._recreated.environment, "unwrapped", None)
         if known is None or base is None or self._recreated.random_state() is not None:
             yield
@@ -306,26 +282,18 @@ class _Playing:
 
     def _play(self, episode: EpisodeInputs) -> None:
         """Take the recorded actions of an episode until the environment ends it."""
-        step, is_dm_env = self._monitor.step, self._recreated.is_dm_env
+        take, is_dm_env = self._monitor.step, self._recreated.is_dm_env
         self._begin_stand_in(episode)
-        counted, rewards = 0, []
-        states = self._making.arrays.get(episode.states or "")
+        states = self._making.arrays.get(f"{episode.arrays}.states")
         self._break_videos(episode)
-        for action in given_actions(episode, self._making.arrays):
+        for step, action in enumerate(given_actions(episode, self._making.arrays)):
             if states is not None:
-                self._recreated.put_into(states[counted : counted + 1])
-            result = step(action)
-            counted += 1
-            if self._making.only_counted:
-                rewards.append(result.reward if is_dm_env else result[1])
-            if counted % _STEPS_BETWEEN_COUNTS == 0:
-                self._making.on_steps(_STEPS_BETWEEN_COUNTS)
+                self._recreated.put_into(states[step : step + 1])
+            result = take(action)
+            self._making.on_step()
             if result.last() if is_dm_env else result[2] or result[3]:
                 break
         self._note_stand_in(episode)
-        if self._making.only_counted and episode.actions is not None:
-            self._rewards[episode.actions] = np.array(rewards, np.float64)
-        self._making.on_steps(counted % _STEPS_BETWEEN_COUNTS)
 
     def _break_videos(self, episode: EpisodeInputs) -> None:
         """Make the live videos that broke off do so again."""
@@ -343,16 +311,16 @@ class _Playing:
             )
 
     def _begin_stand_in(self, episode: EpisodeInputs) -> None:
-        stand_in, name = self._recreated.stand_in, episode.steps_taken
+        stand_in, arrays = self._recreated.stand_in, self._making.arrays
         if stand_in is None:
             return
-        if name is None:
+        if f"{episode.arrays}.controls" not in arrays:
             raise NotRecreated(
                 "wrappers are missing, and the controls they produced are not recorded",
                 excuse="wrappers",
             )
-        fields = (each.name for each in dataclasses.fields(RecordedSteps))
-        parts = {part: self._making.arrays[f"{name}.{part}"] for part in fields}
+        names = [each.name for each in dataclasses.fields(RecordedSteps)]
+        parts = {part: arrays[f"{episode.arrays}.{part}"] for part in names}
         stand_in.begin(RecordedSteps(**parts))
 
     def _note_stand_in(self, episode: EpisodeInputs) -> None:
@@ -361,20 +329,19 @@ class _Playing:
             return
         names = (self._recording.environment or {}).get("wrappers") or ()
         without = f"without {', '.join(map(str, names)):.300}"
-        if stand_in.differing:
-            self._note(
-                episode,
-                "wrappers",
-                f"{without} the rewards or the end of {stand_in.differing} of its "
-                "steps differ; they are believed",
-            )
-        if stand_in.translated:
-            self._note(
-                episode,
-                "wrappers",
-                f"{without} the actions of {stand_in.translated} of its steps are not "
-                "its controls; that they led to these is believed",
-            )
+        for steps, claim in (
+            (
+                stand_in.differing,
+                "the rewards or the end of {} of its steps differ; they are believed",
+            ),
+            (
+                stand_in.translated,
+                "the actions of {} of its steps are not its controls; that they led to "
+                "these is believed",
+            ),
+        ):
+            if steps:
+                self._note(episode, "wrappers", f"{without} {claim.format(steps)}")
 
     def _believe(self, episode: EpisodeInputs) -> None:
         """Record an episode without actions from its length, return and end."""
@@ -386,15 +353,11 @@ class _Playing:
         if episode.steps > _MOST_BELIEVED_STEPS:
             raise NotRecreated(f"an episode cannot have {episode.steps} steps")
         recorder, said = self._monitor.recorder, episode.believed
-        ends = {name: said.get(name) is True for name in ("terminated", "truncated")}
         for left in range(max(1, episode.steps) - 1, -1, -1):
             recorder.before_step()
             reward = 0.0 if left or said.get("reward") is None else said["reward"]
-            last = (
-                ends
-                if left == 0 and episode.cut is None
-                else dict.fromkeys(ends, False)
-            )
+            is_end = left == 0 and episode.cut is None
+            last = {name: is_end and said.get(name) is True for name in _ENDS}
             recorder.step(reward, **last, success=None if left else said.get("success"))
 
     def _cut_off(self, episode: EpisodeInputs) -> None:
@@ -411,8 +374,11 @@ class _Playing:
             kind = _exception_kind(str(said.get("type", "Exception")))
         self._monitor.recorder.note_error(kind(said.get("message", "")))
 
-    def _note(self, episode: EpisodeInputs, excuse: str, reason: str) -> None:
-        self._making.notes.add(self._recording.item(episode), excuse, reason)
+    def _note(self, episode: EpisodeInputs | None, excuse: str, reason: str) -> None:
+        """Note what is believed about an episode, or about the whole recording."""
+        recording = self._recording
+        item = recording.name if episode is None else recording.item(episode)
+        self._making.notes.append(note(item, excuse, reason))
 
 
 def _exception_kind(name: str) -> type[BaseException]:

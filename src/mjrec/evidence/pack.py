@@ -34,7 +34,7 @@ from .identity import Identity, identity_of_user
 from .identity_matching import remaining_identity
 from .layout import MOST_ENTRIES, PAYLOAD, RECORDINGS
 from .packed_run import PackedRun, PackingOptions, planned_episodes, read_run
-from .size_limit import archive_within, byte_count
+from .size_limit import byte_count, shrinking
 from .statements import state
 
 logger = logging.getLogger(__name__)
@@ -178,17 +178,12 @@ def _bag(
     _stage(contents, staged)
     if options.max_size is None:
         return bag, _make_bag(staged, bag, options, identity)
-    runs = []
-
-    def make() -> Path:
-        archive = folder / _ARCHIVE
+    archive = folder / _ARCHIVE
+    for _ in shrinking(options.max_size, staged, archive, on_progress=on_progress):
         archive.unlink(missing_ok=True)
-        runs.append(_make_bag(staged, bag, options, identity))
+        run = _make_bag(staged, bag, options, identity)
         write_zip(bag, archive)
-        return archive
-
-    archive_within(options.max_size, staged, make=make, on_progress=on_progress)
-    return bag, runs[-1]
+    return bag, run
 
 
 def _make_bag(

@@ -14,7 +14,7 @@ from ..environments.scenes import shown_arguments, shown_wrappers
 from ..formats import json_fields
 from ..formats.json_fields import facts_in, read_object, unreadable
 from ..formats.trajectory_hdf5 import open_hdf5
-from ..plain_text import counted
+from ..plain_text import counted, listed
 from ..results import Episode, iter_episodes
 from ..results.journal_or_stats import MonitorResults
 from ..results.monitor_files import MonitorFiles, monitors_of
@@ -164,9 +164,8 @@ class PackedRun:
     @property
     def title(self) -> str:
         """The stated title, or one made of the recorded environments' ids."""
-        ids = self.env_ids
-        more = f" and {len(ids) - _SHOWN} more" if len(ids) > _SHOWN else ""
-        return self.statements.title or f"Recordings of {', '.join(ids[:_SHOWN])}{more}"
+        made = f"Recordings of {listed(self.env_ids, _SHOWN)}"
+        return self.statements.title or made
 
     @property
     def episodes(self) -> int:

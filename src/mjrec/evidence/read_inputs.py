@@ -6,9 +6,8 @@ It is done in a sandbox, because journals and HDF5 files are parsed.
 
 from __future__ import annotations
 
-import dataclasses
 import re
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -16,11 +15,16 @@ from numpy.typing import NDArray
 
 from .. import json_text
 from ..errors import Error, UnreadableFile
-from ..formats.dataclass_json import from_json
-from ..formats.journal import JournalEntry, JournalReader
-from ..formats.json_fields import base_name, read_object, unreadable
+from ..formats.journal import JournalEntry, read_journal
+from ..formats.json_fields import (
+    base_name,
+    facts_in,
+    from_json,
+    read_object,
+    unreadable,
+)
 from ..formats.manifest import read_manifest
-from ..formats.monitor_directory import FILE_PREFIX, Infix, episode_of
+from ..formats.monitor_directory import FILE_PREFIX, episode_of
 from ..formats.regular_files import open_regular
 from ..formats.trajectory import TrajectoryReader
 from ..formats.trajectory_hdf5 import open_hdf5
@@ -29,7 +33,7 @@ from ..provenance import versions
 from ..recorder.options import LIVE
 from ..results.monitor_files import MonitorFiles, monitors_of
 from ..results.run import EVALUATION
-from .inputs import OPTIONS, EpisodeInputs, Inputs, RecordingInputs
+from .inputs import OPTIONS, Inputs, RecordingInputs, count
 from .layout import ENVIRONMENT, RECORDINGS
 from .packed_run import PackingOptions
 from .portable_names import portable_parts
@@ -55,9 +59,15 @@ _PROVENANCE: Mapping[str, tuple[str, ...]] = {
 _SELECTION = ("rule", "decided", "scope", "finished", "roles")
 _EVALUATION_KEEP = (*_SELECTION[:-1], "chosen", "recorded", "recording")
 _FAULT = ("episode_id", "what", "reason")
-_DTYPES = frozenset(
-    f"{kind}{bits}" for kind in ("float", "int", "uint") for bits in (8, 16, 32, 64)
-) | {"bool"}
+# The facts of a trajectory that are inputs of its episode.
+_FACTS = (
+    *("type", "seed", "options", "random_state", "exception"),
+    *("action_dtypes", "action_parts", "start_time", "end_time"),
+)
+# The facts of a completed episode that are inputs, whether it has a trajectory or not.
+_OF_ENTRY = ("type", "seed", "options", "start_time", "end_time")
+# Those that are believed if its actions were not kept.
+_ENDS = ("reward", "terminated", "truncated", "success")
 
 
 def read_inputs(data: Path) -> tuple[Inputs, dict[str, NDArray[Any]]]:
@@ -100,8 +110,7 @@ def _packing(path: Path) -> Mapping[str, Any]:
     if not path.exists():
         return {}
     with unreadable(path):
-        packed_with = read_object(path).get("packed_with")
-        said = packed_with.get("options") if isinstance(packed_with, Mapping) else None
+        said = facts_in(read_object(path).get("packed_with")).get("options")
         if not isinstance(said, Mapping):
             return {}
         packing_options(said)
@@ -124,35 +133,28 @@ def packing_options(said: Mapping[str, Any]) -> PackingOptions:
 
 
 def _recording(files: MonitorFiles, arrays: dict[str, NDArray[Any]]) -> RecordingInputs:
-    if Infix.parse(files.infix) is None:
-        raise ValueError(f"{files.infix!r} is not a valid infix of a monitor's files")
     journal = _Journal(files.journal)
-    run = journal.run
-    env_info, keep = run.get("env_info"), run.get("keep")
-    environment = run.get("environment")
-    return RecordingInputs(
-        infix=files.infix,
-        env_id=str(env_info.get("env_id")) if isinstance(env_info, Mapping) else "",
-        environment=environment if isinstance(environment, Mapping) else None,
-        sources=_sources(files, environment),
-        options=_options(run.get("options")),
-        schedule=_text(run.get("schedule")),
-        rule=_text(keep.get("rule")) if isinstance(keep, Mapping) else None,
-        first_episode_id=_count(run.get("first_episode_id", 0)),
-        kept=journal.kept,
-        clip_starts=tuple(sorted(journal.clip_starts())),
-        episodes=tuple(_episodes(files, journal, arrays)),
-        evaluation_events=tuple(journal.evaluation_events),
-        evaluation_keeps=tuple(journal.evaluation_keeps),
-        faults=tuple(journal.faults),
-        monitor_csv_start=_monitor_csv_start(files),
-        provenance=journal.provenance,
-        provenance_after=journal.provenance_after,
-        was_killed=journal.was_killed,
-        has_sources=any(
-            path.suffix == ".zip"
-            for path in (files.journal or Path()).parent.glob("openaigym.model.*")
-        ),
+    run: dict[str, Any] = next(reversed(journal.facts_of("run")), {})
+    known = {key: run[key] for key in ("schedule", "first_episode_id") if key in run}
+    environment = facts_in(run.get("environment")) or None
+    return from_json(
+        RecordingInputs,
+        {
+            **known,
+            **_events(journal),
+            "infix": files.infix,
+            "env_id": str(facts_in(run.get("env_info")).get("env_id", "")),
+            "environment": environment,
+            "sources": _sources(files, environment),
+            "options": _options(run.get("options")),
+            "rule": facts_in(run.get("keep")).get("rule"),
+            "monitor_csv_start": _monitor_csv_start(files),
+            "episodes": list(_episodes(files, journal, environment, arrays)),
+            "has_sources": any(
+                path.suffix == ".zip"
+                for path in (files.journal or Path()).parent.glob("openaigym.model.*")
+            ),
+        },
     )
 
 
@@ -162,7 +164,8 @@ def _monitor_csv_start(files: MonitorFiles) -> float | None:
         return None
     with open_regular(path) as file:
         header = file.readline(_LONGEST_HEADER).decode()
-    return _time(json_text.loads(header.removeprefix("#")).get("t_start"))
+    start = json_text.loads(header.removeprefix("#")).get("t_start")
+    return start if isinstance(start, int | float) else None
 
 
 class _Journal:
@@ -170,109 +173,113 @@ class _Journal:
 
     Args:
         path: the journal, or None if it is missing.
+
+    Attributes:
+        entries: its completed episodes by their numbers.
+        events: its other lines: the number of lines before each, not counting the
+            first, and its kind and facts.
     """
 
     def __init__(self, path: Path | None) -> None:
-        self.run: Mapping[str, Any] = {}
-        self.provenance: Mapping[str, Any] | None = None
-        self.provenance_after = self._lines = 0
         self.entries: dict[int, JournalEntry] = {}
-        self.cuts: dict[int, Mapping[str, Any]] = {}
-        self.irregular: dict[int, list[Mapping[str, Any]]] = {}
-        self.clips: list[Mapping[str, Any]] = []
-        self.evaluation_events: list[tuple[str, Mapping[str, Any] | None]] = []
-        self.evaluation_keeps: list[Mapping[str, Any]] = []
-        self.faults: list[tuple[int, Mapping[str, Any]]] = []
-        self.kept: tuple[int, ...] = ()
-        self.was_killed = False
-        if path is None:
-            return
-        for entry in JournalReader(path, on_event=self._note):
-            self._lines += 1
+        self.events: list[tuple[int, str, Any]] = []
+        lines = 0
+
+        def note(kind: str, facts: Any) -> None:
+            nonlocal lines
+            self.events.append((lines, kind, facts))
+            lines += kind != "run"
+
+        for entry in read_journal(path, on_event=note) if path else ():
+            lines += 1
             self.entries[entry.episode_id] = entry
             if len(self.entries) > _MOST_EPISODES:
                 raise ValueError(f"more than {_MOST_EPISODES} episodes")
 
-    def clip_starts(self) -> Iterator[int]:
-        """Yield the numbers of the steps at which a trigger started clips."""
-        for clip in self.clips:
-            _, marker, number = str(clip.get("video")).rpartition(".step")
-            digits = number.removesuffix(".mp4")
-            if marker and digits.isdecimal():
-                yield int(digits)
+    def facts_of(self, kind: str) -> list[dict[str, Any]]:
+        """Return the facts of all events of a kind."""
+        return [f for _, k, f in self.events if k == kind and isinstance(f, dict)]
 
-    def failed_unit(self, number: int) -> Mapping[str, Any] | None:
-        """Return the seed and episode of an evaluation's failed episode, or None."""
-        for kind, facts in self.evaluation_events:
-            if kind == "failed" and facts and facts.get("episode_id") == number:
-                return {name: facts[name] for name in _UNIT}
-        return None
+    def of_episodes(self, kind: str) -> dict[int, list[dict[str, Any]]]:
+        """Return the facts of all events of a kind by the number of their episode."""
+        found: dict[int, list[dict[str, Any]]] = {}
+        for facts in self.facts_of(kind):
+            if type(number := facts.get("episode_id")) is int:
+                found.setdefault(number, []).append(facts)
+        return found
 
-    def _note(self, kind: str, facts: Any) -> None:
-        self._note_facts(kind, facts)
-        self._lines += kind != "run"
 
-    def _note_facts(self, kind: str, facts: Any) -> None:
+def _events(journal: _Journal) -> dict[str, Any]:
+    """Return the inputs that are events in a journal."""
+    found: dict[str, Any] = {"faults": [], "evaluation_keeps": []}
+    events = found["evaluation_events"] = []
+    for before, kind, facts in journal.events:
         match kind, facts:
-            case "run", dict():
-                self.run = facts
             case "provenance", dict():
-                self.provenance = _provenance(facts)
-                self.provenance_after = self._lines
-            case "cut", {"episode_id": int(number)}:
-                self.cuts[number] = facts
-            case "action", {"episode_id": int(number), "step": int()}:
-                self.irregular.setdefault(number, []).append(facts)
-            case "clip", dict():
-                self.clips.append(facts)
+                found["provenance"] = _provenance(facts)
+                found["provenance_after"] = before
             case "begun", None:
-                self.evaluation_events.append((kind, None))
+                events.append([kind, None])
             case "begun" | "failed", dict():
-                self.evaluation_events.append((kind, _of_evaluation(kind, facts)))
+                events.append([kind, _of_evaluation(kind, facts)])
             case "keep", {"scope": "evaluation", "chosen": list(numbers)}:
-                known = {**facts, "chosen": [*map(_count, numbers)]}
-                self.evaluation_keeps.append(_known(known, _EVALUATION_KEEP))
+                known = {**facts, "chosen": [*map(count, numbers)]}
+                found["evaluation_keeps"].append(_known(known, _EVALUATION_KEEP))
             case "keep", {"recorded": list(numbers)}:
-                self.kept = tuple(map(_count, numbers))
+                found["kept"] = [*map(count, numbers)]
             case "fault", {"episode_id": int() | None, "what": str(), "reason": str()}:
-                self.faults.append((self._lines, _known(facts, _FAULT)))
+                found["faults"].append([before, _known(facts, _FAULT)])
             case "recovered", _:
-                self.was_killed = True
-            case _:
-                pass
+                found["was_killed"] = True
+    return {**found, "clip_starts": sorted(_clip_starts(journal.facts_of("clip")))}
+
+
+def _clip_starts(clips: Iterable[Mapping[str, Any]]) -> Iterator[int]:
+    """Yield the numbers of the steps at which a trigger started clips."""
+    for clip in clips:
+        _, marker, number = str(clip.get("video")).rpartition(".step")
+        digits = number.removesuffix(".mp4")
+        if marker and digits.isdecimal():
+            yield int(digits)
 
 
 def _episodes(
-    files: MonitorFiles, journal: _Journal, arrays: dict[str, NDArray[Any]]
-) -> Iterator[EpisodeInputs]:
-    broken = _broken(files)
-    for number in sorted({*journal.entries, *journal.cuts}):
-        entry, cut = journal.entries.get(number), journal.cuts.get(number)
-        episode = EpisodeInputs(episode_id=number)
+    files: MonitorFiles,
+    journal: _Journal,
+    environment: Mapping[str, Any] | None,
+    arrays: dict[str, NDArray[Any]],
+) -> Iterator[dict[str, Any]]:
+    """Yield the values of each episode's `EpisodeInputs`."""
+    broken, cuts = _broken(files), journal.of_episodes("cut")
+    irregular = journal.of_episodes("action")
+    failed = {facts.get("episode_id"): facts for facts in journal.facts_of("failed")}
+    is_wrapped = bool(facts_in(environment).get("wrappers"))
+    for number in sorted({*journal.entries, *cuts}):
+        known: dict[str, Any] = {}
         if number in files.trajectories:
-            episode = _with_trajectory(
-                episode,
+            known = _of_trajectory(
                 files.trajectories[number],
                 name=f"{files.infix}.{number}",
-                irregular=journal.irregular.get(number, []),
-                is_wrapped=bool((journal.run.get("environment") or {}).get("wrappers")),
+                irregular=[e for e in irregular.get(number, []) if "step" in e],
+                is_wrapped=is_wrapped,
                 arrays=arrays,
             )
-        if entry is not None:
-            episode = _with_entry(episode, entry)
-        elif cut is not None:
-            episode = dataclasses.replace(
-                episode,
-                cut=str(cut.get("reason")),
-                is_chosen=cut.get("chosen") is True,
-                evaluation=journal.failed_unit(number),
-            )
-        yield dataclasses.replace(episode, broken=broken.get(number, {}))
+        if (entry := journal.entries.get(number)) is not None:
+            known = {"steps": entry.length, **known, **_of_entry(entry)}
+        elif number in cuts:
+            cut = cuts[number][-1]
+            known |= {
+                "cut": str(cut.get("reason")),
+                "is_chosen": cut.get("chosen") is True,
+            }
+            if number in failed:
+                known["evaluation"] = _known(failed[number], _UNIT)
+        yield {**known, "episode_id": number, "broken": broken.get(number, {})}
 
 
-def _broken(files: MonitorFiles) -> dict[int, dict[str, tuple[str, int]]]:
+def _broken(files: MonitorFiles) -> dict[int, dict[str, list[Any]]]:
     """Return the inputs `broken` of the episodes that have them, by number."""
-    found: dict[int, dict[str, tuple[str, int]]] = {}
+    found: dict[int, dict[str, list[Any]]] = {}
     details = read_manifest(files.manifest).mjrec if files.manifest else None
     for name in map(base_name, (details or {}).get("broken") or ()):
         path, number = files.paths[0].with_name(name), episode_of(name)
@@ -283,102 +290,67 @@ def _broken(files: MonitorFiles) -> dict[int, dict[str, tuple[str, int]]]:
         # A deferred video cannot break off: its states are kept to render it again.
         if said.get("recording") == LIVE and said.get("broken") is True:
             video = name.removesuffix(".meta.json")
-            broken = str(said.get("broken_reason")), _count(said.get("frame_count", 0))
-            found.setdefault(number, {})[video] = broken
+            reason, frames = str(said.get("broken_reason")), said.get("frame_count", 0)
+            found.setdefault(number, {})[video] = [reason, count(frames)]
     return found
 
 
-def _with_entry(episode: EpisodeInputs, entry: JournalEntry) -> EpisodeInputs:
-    evaluation = entry.evaluation or {}
-    return dataclasses.replace(
-        episode,
-        type=entry.type,
-        seed=entry.seed,
-        options=entry.options,
-        steps=episode.steps if episode.has_trajectory else entry.length,
-        is_chosen=entry.chosen,
-        start_time=entry.start_time,
-        end_time=entry.end_time,
-        believed={
-            "reward": entry.reward,
-            "terminated": entry.terminated,
-            "truncated": entry.truncated,
-            "success": entry.success,
-        },
-        evaluation={k: evaluation.get(k) for k in ("seed", "episode")}
-        if evaluation
-        else None,
-    )
+def _of_entry(entry: JournalEntry) -> dict[str, Any]:
+    evaluation, facts = entry.evaluation or {}, vars(entry)
+    return {
+        **_known(facts, _OF_ENTRY),
+        "is_chosen": entry.chosen,
+        "believed": _known(facts, _ENDS),
+        "evaluation": {k: evaluation.get(k) for k in _UNIT} if evaluation else None,
+    }
 
 
-def _with_trajectory(
-    episode: EpisodeInputs,
+def _of_trajectory(
     path: Path,
     *,
     name: str,
-    irregular: list[Mapping[str, Any]],
+    irregular: list[dict[str, Any]],
     is_wrapped: bool,
     arrays: dict[str, NDArray[Any]],
-) -> EpisodeInputs:
-    found: dict[str, NDArray[Any] | None] = {}
+) -> dict[str, Any]:
     with open_hdf5(path) as reader:
         facts, steps = reader.facts, reader.step_count
-        found[name] = reader.actions(0, steps)
+        if (actions := reader.actions(0, steps)) is not None:
+            arrays[name] = actions
         if reader.kind("state") is not None:
             if facts.get("seed") is None and facts.get("random_state") is None:
-                found[f"{name}.state"] = reader.read("state", 0, 1)
+                arrays[f"{name}.state"] = reader.read("state", 0, 1)
             if _is_elsewhere(facts):
-                found[f"{name}.states"] = reader.read("state", 0, reader.row_count)
-        taken = _steps_taken(reader) if is_wrapped else {}
-        found |= {f"{name}.{part}": values for part, values in taken.items()}
-    known = {key: values for key, values in found.items() if values is not None}
-    arrays |= known
-    parts = facts.get("action_parts")
-    exception = facts.get("exception")
-    # If no action fits into an array, all of them are in the journal.
-    is_whole = name in known or len(irregular) == steps
-    return dataclasses.replace(
-        episode,
-        type=str(facts.get("type")),
-        seed=facts.get("seed"),
-        options=facts.get("options"),
-        random_state=facts.get("random_state"),
-        first_state=f"{name}.state" if f"{name}.state" in known else None,
-        states=f"{name}.states" if f"{name}.states" in known else None,
-        steps=steps,
-        steps_taken=name if taken else None,
-        actions=name if is_whole else None,
-        dtypes=tuple(_dtypes(facts.get("action_dtypes"))),
-        parts=None if parts is None else tuple(_parts(parts)),
-        irregular=tuple(irregular),
-        exception=exception if isinstance(exception, Mapping) else None,
-        selection=_selection(facts.get("video")),
-        has_trajectory=facts.get("kept") is not False,
-        start_time=_time(facts.get("start_time")),
-        end_time=_time(facts.get("end_time")),
-    )
+                arrays[f"{name}.states"] = reader.read("state", 0, reader.row_count)
+        for part, values in _steps_taken(reader) if is_wrapped else ():
+            arrays[f"{name}.{part}"] = values
+    return {
+        **_known(facts, _FACTS),
+        "steps": steps,
+        "arrays": name,
+        # If no action fits into an array, all of them are in the journal.
+        "has_actions": name in arrays or len(irregular) == steps,
+        "irregular": irregular,
+        "selection": _selection(facts.get("video")),
+        "has_trajectory": facts.get("kept") is not False,
+    }
 
 
 def _is_elsewhere(facts: Mapping[str, Any]) -> bool:
     """Return whether the facts claim a different MuJoCo version or machine."""
-    said = facts.get("versions")
-    version = said.get("mujoco") if isinstance(said, Mapping) else None
+    version = facts_in(facts.get("versions")).get("mujoco")
     return version != versions().get("mujoco") or (
         facts.get("machine") != machine_fingerprint()
     )
 
 
-def _steps_taken(reader: TrajectoryReader) -> dict[str, NDArray[Any]]:
-    """Return the parts of `RecordedSteps`; empty if controls are not recorded."""
+def _steps_taken(reader: TrajectoryReader) -> Iterator[tuple[str, NDArray[Any]]]:
+    """Yield the parts of `RecordedSteps`; none if controls are not recorded."""
     kind = reader.kind("state")
-    if kind is None or "ctrl" not in (kind.names or ()):
-        return {}
-    return {
-        "controls": reader.read("state", 1, reader.row_count)["ctrl"],
-        "rewards": reader.rewards,
-        "terminated": reader.terminated,
-        "truncated": reader.truncated,
-    }
+    if kind is not None and "ctrl" in (kind.names or ()):
+        yield "controls", reader.read("state", 1, reader.row_count)["ctrl"]
+        for part in ("rewards", "terminated", "truncated"):
+            yield part, getattr(reader, part)
 
 
 def _of_evaluation(kind: str, facts: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -389,10 +361,8 @@ def _of_evaluation(kind: str, facts: Mapping[str, Any]) -> Mapping[str, Any]:
 
 
 def _selection(video: Any) -> Mapping[str, Any] | None:
-    said = video.get("selection") if isinstance(video, Mapping) else None
-    if not isinstance(said, Mapping) or said.get("scope") != EVALUATION:
-        return None
-    return _known(said, _SELECTION)
+    said = facts_in(facts_in(video).get("selection"))
+    return _known(said, _SELECTION) if said.get("scope") == EVALUATION else None
 
 
 def _provenance(said: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -410,13 +380,11 @@ def _known(said: Mapping[str, Any], keys: Collection[str]) -> dict[str, Any]:
     return {key: value for key, value in said.items() if key in keys}
 
 
-def _sources(files: MonitorFiles, environment: Any) -> str | None:
-    is_mjcf = isinstance(environment, Mapping) and environment["framework"] == "mjcf"
-    if not is_mjcf or not files.trajectories:
+def _sources(files: MonitorFiles, environment: Mapping[str, Any] | None) -> str | None:
+    if not environment or environment["framework"] != "mjcf" or not files.trajectories:
         return None
     with open_hdf5(files.trajectories[min(files.trajectories)]) as reader:
-        model = reader.facts.get("model")
-    name = model.get("xml") if isinstance(model, Mapping) else None
+        name = facts_in(reader.facts.get("model")).get("xml")
     return name if isinstance(name, str) and _SOURCES.fullmatch(name) else None
 
 
@@ -427,29 +395,3 @@ def _options(said: Any) -> dict[str, Any]:
         if name not in OPTIONS or type(value) not in OPTIONS[name]:
             raise ValueError(f"the option {name!r:.80} must not be {value!r:.80}")
     return dict(said)
-
-
-def _dtypes(said: Any) -> Iterator[tuple[int, str]]:
-    for step, name in said or ():
-        if name not in _DTYPES:
-            raise ValueError(f"actions cannot have the dtype {name!r:.80}")
-        yield _count(step), name
-
-
-def _parts(said: Any) -> Iterator[tuple[str, tuple[int, ...]]]:
-    for name, shape in said:
-        yield str(name), tuple(map(_count, shape))
-
-
-def _text(value: Any) -> str | None:
-    return value if isinstance(value, str) else None
-
-
-def _count(value: Any) -> int:
-    if type(value) is not int or value < 0:
-        raise ValueError(f"{value!r:.80} is not a valid count")
-    return value
-
-
-def _time(value: Any) -> float | None:
-    return float(value) if isinstance(value, int | float) else None

@@ -4,8 +4,9 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import re
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable
 from fractions import Fraction
 from pathlib import Path
 from typing import Any, cast
@@ -17,11 +18,11 @@ from ..monitors.monitor import monitored
 from ..recorder.keep_rules import RULES, keep_rule
 from ..recorder.opening import JOIN, Statements
 from ..recorder.options import RecorderOptions
-from ..recorder.tracking import FinishedEpisode, Tracker
 from ..schedules import Schedule, schedule_from_text
 from ..trackers.monitor_csv import MonitorCsvTracker
+from .excuses import note
+from .findings import Finding
 from .inputs import RecordingInputs
-from .notes import Notes
 
 # mjrec's own schedules by their names in a journal. They choose episodes again.
 _SCHEDULES = {
@@ -29,6 +30,11 @@ _SCHEDULES = {
     "record_all": "all",
     "disable_videos": "none",
 }
+# Options whose values in a journal are those given to the recorder.
+_UNCHANGED = (
+    *("quality", "render", "observations", "video_length", "name_prefix", "seed"),
+    *("annotate", "tiled"),
+)
 _SCHEDULE = re.compile(r"(every|at):[\d,]+", re.ASCII)
 
 
@@ -38,8 +44,7 @@ def monitor_again(
     directory: Path,
     *,
     clock: Callable[[], float],
-    only_counted: bool,
-    notes: Notes,
+    notes: list[Finding],
 ) -> EnvironmentMonitor:
     """Return a monitor with the options of the recording's monitor.
 
@@ -49,13 +54,12 @@ def monitor_again(
         directory: the monitor directory, which may already contain other recordings of
             the same run.
         clock: returns the time, in seconds since the epoch.
-        only_counted: record only rewards and ends.
         notes: receives the author's choices, which are believed.
 
     Raises:
         NotRecreated: an option is invalid, or the monitor cannot be created.
     """
-    given = recording.options
+    given, start = recording.options, recording.monitor_csv_start
     try:
         options = RecorderOptions(
             video_callable=_schedule(recording, notes),
@@ -63,28 +67,20 @@ def monitor_again(
             resume=JOIN,
             fps=_rate(given.get("fps")),
             max_fps=_rate(given.get("max_fps")),
-            quality=given.get("quality", "full"),
-            render=given.get("render"),
             # Videos are rendered after all recordings have been replayed.
             workers=0,
             trajectory_callable=_trajectories(recording),
-            observations=given.get("observations", False),
             allow_early_reset=True,
             step_trigger=_step_trigger(recording, notes),
-            video_length=given.get("video_length"),
-            name_prefix=given.get("name_prefix"),
-            seed=given.get("seed"),
-            annotate=given.get("annotate", False),
-            tiled=given.get("tiled", False),
-            trackers=_trackers(recording),
+            **{name: value for name, value in given.items() if name in _UNCHANGED},
+            trackers=() if start is None else MonitorCsvTracker(clock=lambda: start),
             statements=Statements(
-                infix=recording.own_infix,
+                infix=recording.infix,
                 first_episode_id=recording.first_episode_id,
                 provenance=recording.provenance,
                 provenance_after=recording.provenance_after,
                 clock=clock,
                 faults=recording.faults,
-                only_counted=only_counted,
             ),
         )
         view = {name: given.get(name) for name in ("camera", "height", "width")}
@@ -98,26 +94,24 @@ def monitor_again(
         ) from error
 
 
-def _schedule(recording: RecordingInputs, notes: Notes) -> Schedule | None:
+def _schedule(recording: RecordingInputs, notes: list[Finding]) -> Schedule | None:
     name = recording.schedule or ""
     if recording.rule is not None or "step_trigger" in recording.options:
         return None
     if name in _SCHEDULES or _SCHEDULE.fullmatch(name):
         return schedule_from_text(_SCHEDULES.get(name, name))
     chosen = {each.episode_id for each in recording.episodes if each.is_chosen}
-    _believe_choice(recording, notes, "schedule", f"the schedule {name!r:.80}")
+    notes.append(_choice(recording, "schedule", f"the schedule {name!r:.80}"))
     return _named(name, chosen.__contains__)
 
 
-def _rule(
-    recording: RecordingInputs, notes: Notes
-) -> str | Callable[[Sequence[FinishedEpisode]], Iterable[int]] | None:
+def _rule(recording: RecordingInputs, notes: list[Finding]) -> Any:
     name = recording.rule
     if name is None:
         return None
     with contextlib.suppress(InvalidArgument):
         return keep_rule(name, RULES).name
-    _believe_choice(recording, notes, "rule", f"the rule {name!r:.80}")
+    notes.append(_choice(recording, "rule", f"the rule {name!r:.80}"))
     return _named(name, lambda _: recording.kept)
 
 
@@ -130,42 +124,27 @@ def _trajectories(recording: RecordingInputs) -> Callable[[int], bool] | bool | 
 
 
 def _step_trigger(
-    recording: RecordingInputs, notes: Notes
+    recording: RecordingInputs, notes: list[Finding]
 ) -> Callable[[int], bool] | None:
     name = recording.options.get("step_trigger")
     if name is None:
         return None
-    starts = set(recording.clip_starts)
-    _believe_choice(
-        recording,
-        notes,
-        "schedule",
-        f"{name!r:.80}, which started clips,",
-        what="steps",
-        count=len(recording.clip_starts),
-        unit="clip",
+    starts = recording.clip_starts
+    chooser = f"{name!r:.80}, which started clips,"
+    choice = _choice(recording, "schedule", chooser, what="steps")
+    notes.append(dataclasses.replace(choice, count=len(starts), unit="clip"))
+    return _named(name, set(starts).__contains__)
+
+
+def _choice(
+    recording: RecordingInputs, excuse: str, chooser: str, *, what: str = "episodes"
+) -> Finding:
+    """Return the note that a choice by a function of the author is believed."""
+    reason = (
+        f"{chooser} is the author's own function; that it chose these {what} is "
+        "believed"
     )
-    return _named(name, starts.__contains__)
-
-
-def _believe_choice(
-    recording: RecordingInputs,
-    notes: Notes,
-    excuse: str,
-    chooser: str,
-    *,
-    what: str = "episodes",
-    **counted: Any,
-) -> None:
-    """Note that a choice by a function of the author is believed."""
-    counted = counted or {"count": len(recording.episodes)}
-    reason = f"{chooser} is the author's own function; that it chose these {what} is "
-    notes.add(recording.name, excuse, f"{reason}believed", **counted)
-
-
-def _trackers(recording: RecordingInputs) -> Sequence[Tracker]:
-    start = recording.monitor_csv_start
-    return () if start is None else [MonitorCsvTracker(clock=lambda: start)]
+    return note(recording.name, excuse, reason, count=len(recording.episodes))
 
 
 def _named(name: str, function: Callable[[Any], Any]) -> Callable[[Any], Any]:

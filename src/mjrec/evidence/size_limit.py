@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import operator
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Generator, Iterator
 from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
@@ -21,14 +21,13 @@ from ..atomic_files import write_text
 from ..errors import ArchiveTooLarge, InvalidArgument, PackError
 from ..formats.json_fields import read_object, unreadable
 from ..formats.manifest import read_manifest
-from ..formats.monitor_directory import Infix, episode_of, infix_of, is_manifest
+from ..formats.monitor_directory import episode_of, infix_of, is_manifest
 from ..formats.spans import find_trajectory
 from ..formats.video_metadata import metadata_path
 from ..machine import usable_cpus
-from ..rendering.jobs import Progress
+from ..rendering.jobs import Progress, Variant, View
 from ..rendering.pool import WorkerPool
 from ..rendering.render_video import render_video
-from ..rendering.views import Variant, View
 from .bag import STORED
 
 # Scales of width and height, tried in order until the archive is small enough.
@@ -85,38 +84,28 @@ def shown_size(size: int) -> str:
     return f"{size} bytes"
 
 
-def archive_within(
+def shrinking(
     limit: int,
     staged: Path,
+    archive: Path,
     *,
-    make: Callable[[], Path],
     on_progress: Callable[[Progress], object],
-) -> Path:
-    """Return an archive of at most `limit` bytes, with smaller videos if necessary.
+) -> Iterator[None]:
+    """Yield each time an archive must be made, with smaller videos until it fits.
 
     Args:
         limit: maximum size of the archive in bytes.
         staged: the folder with the recordings to pack.
-        make: packs the recordings in their current state and returns the archive.
+        archive: the archive to make of them.
         on_progress: called with the progress of re-rendering.
 
     Raises:
         ArchiveTooLarge: even the smallest archive is too large.
         PackError: a re-rendered video has different frames from the recorded one.
     """
-
-    def attempt() -> tuple[Path | None, int]:
-        # Files that the archive stores uncompressed.
-        least = sum(s for name, s in _sizes(staged) if name.endswith(STORED))
-        if least > limit:
-            return None, least
-        archive = make()
-        size = archive.stat().st_size
-        return (archive if size <= limit else None), size
-
-    archive, size = attempt()
-    if archive is not None:
-        return archive
+    size = yield from _attempt(limit, staged, archive)
+    if size <= limit:
+        return
     videos = _redrawable(staged)
     drawn = sum(video.stat().st_size for video, _, _ in videos)
     rest = size - drawn
@@ -126,9 +115,9 @@ def archive_within(
             if rest + drawn * scale**2 > limit and scale is not _SCALES[-1]:
                 continue
             _draw_all(videos, scale, workers=workers, on_progress=on_progress)
-            archive, size = attempt()
-            if archive is not None:
-                return archive
+            size = yield from _attempt(limit, staged, archive)
+            if size <= limit:
+                return
     largest = sorted(_sizes(staged), key=lambda item: (-item[1], item[0]))[:_LARGEST]
     reason = "This is with videos at a quarter of their width and height."
     if not videos:
@@ -139,6 +128,16 @@ def archive_within(
     elif rest >= limit:
         reason = f"The files that cannot be made smaller already have {rest} bytes."
     raise ArchiveTooLarge(size, limit, largest, reason=reason)
+
+
+def _attempt(limit: int, staged: Path, archive: Path) -> Generator[None, None, int]:
+    """Yield to make an archive unless it is certainly too large; return its size."""
+    # Files that the archive stores uncompressed.
+    least = sum(size for name, size in _sizes(staged) if name.endswith(STORED))
+    if least > limit:
+        return least
+    yield
+    return archive.stat().st_size
 
 
 def _sizes(staged: Path) -> list[tuple[str, int]]:
@@ -153,7 +152,7 @@ def _redrawable(staged: Path) -> list[_Redrawable]:
     for video, metadata in videos:
         with unreadable(staged / metadata):
             said = dict(read_object(staged / metadata))
-        infix, number = Infix.parse(infix_of(video) or ""), episode_of(video)
+        infix, number = infix_of(video), episode_of(video)
         # The states of a clip are deleted once its video exists.
         if said.get("recording") == "deferred" and "first_step" not in said:
             assert infix is not None

@@ -21,34 +21,36 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Final
 
-from numpy.typing import NDArray
-
 from ..errors import Error, FileNotWritten, UnreadableArchive
-from ..formats.dataclass_json import to_json
+from ..formats.json_fields import to_json
 from ..sandbox import enter
-from .findings import Level
+from .findings import Finding, Level
 from .inputs import ARRAYS_FILE, Inputs
 from .layout import PAYLOAD, RECORDINGS, SAMPLED
-from .notes import REWARDS_FILE, Notes
 
 MODULE: Final = "mjrec.evidence.stages"
+# Below the folder of a verification. Each is in the folder of the stage that creates
+# it, which may write only there.
+GIVEN: Final = "open/given"
+INPUTS: Final = "open/inputs"
+MADE: Final = "make/made"
 
 _SECONDS_BETWEEN_COUNTS = 0.2
 _Say = Callable[..., None]
 
 
-class _Counter:
-    """Reports progress at a limited rate."""
+def _counter(say: _Say) -> Callable[[int, int], None]:
+    """Return a function that reports progress at a limited rate."""
+    said_at = 0.0
 
-    def __init__(self, say: _Say) -> None:
-        self._say = say
-        self._said_at = 0.0
-
-    def __call__(self, done: int, total: int) -> None:
+    def count(done: int, total: int) -> None:
+        nonlocal said_at
         now = time.monotonic()
-        if done >= total or now - self._said_at > _SECONDS_BETWEEN_COUNTS:
-            self._said_at = now
-            self._say(count=[int(done), int(total)])
+        if done >= total or now - said_at > _SECONDS_BETWEEN_COUNTS:
+            said_at = now
+            say(count=[int(done), int(total)])
+
+    return count
 
 
 def main() -> int:
@@ -84,7 +86,7 @@ def _open(request: Mapping[str, Any], say: _Say) -> None:
     from .packed_run import planned_episodes
     from .read_inputs import read_inputs
 
-    given, counter = Path(request["given"]), _Counter(say)
+    given, counter = Path(request["folder"], GIVEN), _counter(say)
     say(facts=dict(bring_in(Path(request["path"]), given)))
     is_bag = (given / BAG_DECLARATION).exists()
     objections = list(check_bag(given, counter)) if is_bag else []
@@ -98,7 +100,7 @@ def _open(request: Mapping[str, Any], say: _Say) -> None:
     if not inputs.packing:
         planned = planned_episodes(Path(request["path"]))
         inputs = dataclasses.replace(inputs, planned=planned)
-    folder = Path(request["inputs"])
+    folder = Path(request["folder"], INPUTS)
     folder.mkdir()
     inputs.write(folder, arrays)
     for recording in inputs.recordings:
@@ -119,24 +121,26 @@ def _make(request: Mapping[str, Any], say: _Say) -> None:
     from ..rendering.recovery import recover
     from .draw_again import draw_all, draw_sample
     from .evaluation_choice import choose_for_evaluations
+    from .excuses import note, write_notes
     from .make_again import Making, play_recording
     from .pack import pack_folder
     from .read_inputs import packing_options
 
-    level, folder = Level(request["level"]), Path(request["inputs"])
-    made, place = Path(request["made"]), Path(request["place"])
-    inputs, counter, notes = Inputs.read(folder), _Counter(say), Notes()
+    level, folder = Level(request["level"]), Path(request["folder"], INPUTS)
+    made = Path(request["folder"], MADE)
+    inputs, counter = Inputs.read(folder), _counter(say)
+    notes: list[Finding] = []
     draws_all = level is Level.PIXELS and request["sample"] is None
     is_packed = bool(inputs.packing) and draws_all
-    played = (place / "played" if is_packed else made / PAYLOAD) / RECORDINGS
+    played = made.with_name("played") if is_packed else made / PAYLOAD
+    played /= RECORDINGS
     played.mkdir(parents=True)
     steps = sum(e.steps for each in inputs.recordings for e in each.episodes)
     taken = 0
-    rewards: dict[str, NDArray[Any]] = {}
 
-    def count_steps(more: int) -> None:
+    def count_step() -> None:
         nonlocal taken
-        taken += more
+        taken += 1
         counter(min(taken, steps - 1), steps)
 
     with np.load(folder / ARRAYS_FILE, allow_pickle=False) as arrays:
@@ -145,20 +149,20 @@ def _make(request: Mapping[str, Any], say: _Say) -> None:
             arrays=arrays,
             trust=frozenset(request["trust"]),
             sources=folder,
-            only_counted=level is Level.STATS,
             notes=notes,
-            on_steps=count_steps,
+            on_step=count_step,
         )
         for recording in inputs.recordings:
             try:
-                rewards |= play_recording(recording, making)
+                play_recording(recording, making)
             except NotRecreated as error:
                 # A part of a recording proves nothing.
                 for path in iter_monitor_files(played, hidden=True):
                     if infix_of(path.name) == recording.infix:
                         path.unlink()
                 episodes = max(1, len(recording.episodes))
-                notes.add(recording.name, error.excuse, str(error), count=episodes)
+                excuse, reason = error.excuse, str(error)
+                notes.append(note(recording.name, excuse, reason, count=episodes))
     if any(recording.was_killed for recording in inputs.recordings):
         recover(played)
     choose_for_evaluations(inputs.recordings, played, notes)
@@ -179,21 +183,19 @@ def _make(request: Mapping[str, Any], say: _Say) -> None:
     if is_packed:
         pack_folder(played, made, packing_options(inputs.packing))
     (made / PAYLOAD / RECORDINGS).mkdir(parents=True, exist_ok=True)
-    if level is Level.STATS:
-        np.savez(made / REWARDS_FILE, **rewards)  # type: ignore[arg-type]  # its stub takes no mapping
-    notes.write(made)
+    write_notes(made, notes)
 
 
 def _compare(request: Mapping[str, Any], say: _Say) -> None:
     from .compare import Comparison
 
     comparison = Comparison(
-        Path(request["given"]),
-        Path(request["made"]),
+        Path(request["folder"], GIVEN),
+        Path(request["folder"], MADE),
         level=Level(request["level"]),
         sampled=request["sample"] is not None,
         allow=request["allow"],
-        on_progress=_Counter(say),
+        on_progress=_counter(say),
     )
     for finding in comparison:
         say(finding=to_json(finding))

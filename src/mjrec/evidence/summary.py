@@ -8,12 +8,11 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 from .. import json_text
 from ..formats.monitor_directory import FILE_PREFIX
-from ..plain_text import counted
+from ..plain_text import counted, listed
 from .findings import (
     Excuse,
     ExcuseKind,
@@ -34,6 +33,14 @@ _ORDER: Final = (
     Outcome.WITHIN_TOLERANCE,
     Outcome.RECREATED,
 )
+# Whether a verdict or an outcome is good, open or bad.
+STYLES: Final[Mapping[str, str]] = {
+    **dict.fromkeys(map(str, (Verdict.PASS, Outcome.RECREATED)), "pass"),
+    **dict.fromkeys(
+        map(str, (Verdict.PARTLY, Outcome.WITHIN_TOLERANCE, Outcome.BELIEVED)), "open"
+    ),
+    **dict.fromkeys(map(str, (Verdict.FAIL, Outcome.DIFFERENT)), "fail"),
+}
 _NOT_LOOKED_AT: Final = "not looked at"
 # The outcome at the level "files".
 _UNCHANGED: Final = "unchanged"
@@ -45,8 +52,7 @@ _UNITS: Final = {
 }
 
 
-@dataclass(frozen=True)
-class Line:
+class Line(NamedTuple):
     """The result for one topic.
 
     Attributes:
@@ -174,25 +180,19 @@ def _said(finding: Finding) -> str:
 def _excuse(excuse: Excuse, verification: Verification) -> str:
     if excuse.refuted:
         return f"{_claim(excuse)}: refuted, because its effects would be visible"
-    found = [
-        each
-        for each in verification.findings
-        if each.excuse == excuse.name
-        and each.outcome is not Outcome.NOTED
-        and each.unit != "value"
-    ]
-    counts: Counter[tuple[str, str]] = Counter()
-    for each in found:
-        counts[each.unit, each.outcome] += each.count
+    groups: dict[tuple[str, str], list[Finding]] = {}
+    for each in verification.findings:
+        if each.excuse == excuse.name and each.outcome is not Outcome.NOTED:
+            groups.setdefault((each.unit, each.outcome), []).append(each)
     costs = [
-        f"{counted(count, unit)} {outcome}"
-        + max(_worst(each) for each in found if (each.unit, each.outcome) == key)
-        for key, count in counts.items()
-        for unit, outcome in (key,)
+        f"{counted(sum(each.count for each in found), unit)} {outcome}"
+        f"{max(map(_worst, found))}"
+        for (unit, outcome), found in groups.items()
+        if unit != "value"
     ]
     # If recordings are named, their files need not be.
     items = tuple(i for i in excuse.items if not i.startswith(FILE_PREFIX))
-    of = f" of {_some(items or excuse.items)}" if excuse.items else ""
+    of = f" of {listed(items or excuse.items, _MOST_ITEMS)}" if excuse.items else ""
     allowed = ", allowed" if excuse.allowed else ""
     told = f"; {', '.join(costs)}" if costs else ""
     return f"{_claim(excuse)}{of}{allowed}: {excuse.costs}{told}"
@@ -211,12 +211,6 @@ def _worst(finding: Finding) -> str:
     if "psnr" in figures:
         return f", the worst {figures['psnr']:.1f} dB"
     return f", at most {figures['maximum']:.1g} apart" if "maximum" in figures else ""
-
-
-def _some(items: tuple[str, ...]) -> str:
-    more = len(items) - _MOST_ITEMS
-    shown = ", ".join(items[:_MOST_ITEMS])
-    return f"{shown} and {more} more" if more > 0 else shown
 
 
 def _short(value: Any) -> str:

@@ -17,19 +17,10 @@ from ..atomic_files import write_text
 from ..errors import MissingDependency
 from ..plain_text import counted, spelled_out
 from . import summary
-from .findings import Finding, Outcome, Topic, Verdict, Verification
+from .findings import Finding, Outcome, Topic, Verification
 
 _TEMPLATE: Final = "verification_report.html.jinja"
 
-_STYLES: Final = {
-    str(Verdict.PASS): "pass",
-    str(Verdict.PARTLY): "open",
-    str(Verdict.FAIL): "fail",
-    str(Outcome.RECREATED): "pass",
-    str(Outcome.WITHIN_TOLERANCE): "open",
-    str(Outcome.BELIEVED): "open",
-    str(Outcome.DIFFERENT): "fail",
-}
 _MEANINGS: Final = {
     Topic.IDENTITY: "The environment and the model match their names.",
     Topic.BEGINNING: "Seeds and options lead to each episode's first state.",
@@ -91,7 +82,7 @@ def _page(verification: Verification) -> dict[str, Any]:
     return {
         "name": verification.path.name or str(verification.path),
         "verdict": str(verification.verdict),
-        "styles": _STYLES,
+        "styles": summary.STYLES,
         "headline": summary.headline(verification),
         "remarks": summary.remarks(verification)[:_MOST_LISTED],
         "different": different[:_MOST_LISTED],

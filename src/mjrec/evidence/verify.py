@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import contextlib
-import importlib
 import importlib.metadata
 import operator
 import os
@@ -13,7 +12,7 @@ import shutil
 import stat
 import tempfile
 import time
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -25,13 +24,14 @@ from ..errors import (
     UnknownName,
     UnreadableArchive,
 )
-from ..formats.dataclass_json import from_json
+from ..formats.json_fields import from_json
 from ..formats.locks import Lock, is_locked
 from ..machine import machine_fingerprint
 from ..sandbox import Sandbox
 from .excuses import with_allowed
 from .findings import Excuse, Finding, Level, Outcome, Topic, Verification
-from .stages import MODULE
+from .stages import GIVEN, INPUTS, MADE, MODULE
+from .verification_report import write_verification_report
 
 _PACKAGES = ("mjrec", "mujoco", "numpy", "gymnasium", "dm-control", "imageio-ffmpeg")
 # Compiling a model may take 300 s.
@@ -44,7 +44,7 @@ _LOCK = "lock"
 _A_MOMENT_S = 60.0
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class VerificationProgress:
     """Progress of a verification.
 
@@ -116,155 +116,114 @@ def verify(
     }
     with_allowed((), allow)
     page = None if report is None else Path(report).absolute()
-    write_report = None if page is None else _report_writer(page)
+    if page is not None and not page.parent.is_dir():
+        raise DirectoryNotWritable(page.parent, "no such directory")
     given = Path(path)
     if not given.exists():
         raise UnreadableArchive(given, "no such file or directory")
     with _working_folder() as folder:
-        verifying = _Verifying(given.absolute(), folder, asked, on_progress)
-        verifying.run(deepest)
+        heard = _run_all(given.absolute(), folder, asked, on_progress)
         verification = Verification(
             path=given,
             level=deepest,
-            findings=tuple(verifying.findings),
-            excuses=tuple(verifying.excuses),
-            inputs=verifying.inputs,
+            findings=tuple(heard["findings"]),
+            excuses=tuple(from_json(Excuse, each) for each in heard["excuses"]),
+            inputs=heard["inputs"],
             facts={
-                "archive": verifying.facts,
+                "archive": heard["facts"],
                 **{key: asked[key] for key in ("sample", "seed", "trust", "allow")},
                 "versions": dict(_versions()),
                 "machine": dict(machine_fingerprint()),
             },
         )
-        if write_report is not None:
-            write_report(verification, page)
+        if page is not None:
+            write_verification_report(verification, page)
     return verification
 
 
-class _Verifying:
-    """The three processes of a verification and their results.
+def _run_all(
+    path: Path,
+    folder: Path,
+    asked: Mapping[str, Any],
+    on_progress: Callable[[VerificationProgress], object] | None,
+) -> dict[str, Any]:
+    """Run the processes that the level needs, until one fails.
 
     Args:
         path: the path given to `verify`.
         folder: an empty folder for the processes' files.
         asked: the level, the sample and so on.
         on_progress: called with the progress.
+
+    Returns:
+        What they sent: `findings`, `excuses`, `inputs` and `facts`.
     """
-
-    def __init__(
-        self,
-        path: Path,
-        folder: Path,
-        asked: Mapping[str, Any],
-        on_progress: Callable[[VerificationProgress], object] | None,
-    ) -> None:
-        self.findings: list[Finding] = []
-        self.excuses: list[Excuse] = []
-        self.inputs: Mapping[str, Any] = {}
-        self.facts: Mapping[str, Any] = {}
-        self._path = path
-        self._folder = folder
-        # Each is in the folder that the process creating it may write to.
-        self._given = folder / "open" / "given"
-        self._inputs = folder / "open" / "inputs"
-        self._made = folder / "make" / "made"
-        self._asked = asked
-        self._progress = _Progress(on_progress)
-
-    def run(self, level: Level) -> None:
-        """Run the processes that the level needs, until one fails."""
-        given, inputs, made = self._given, self._inputs, self._made
-        if not self._stage("open", "reading", [self._path]) or level is Level.FILES:
-            return
-        if self._stage("make", "playing", [inputs]):
-            self._stage("compare", "comparing", [given, made])
-
-    def _stage(self, stage: str, phase: str, readable: list[Path]) -> bool:
-        """Run a process that may read only `readable`; return whether it succeeded."""
-        place = self._folder / stage
+    heard: dict[str, Any] = {"findings": [], "excuses": [], "inputs": {}, "facts": {}}
+    stages = {
+        "open": ("reading", [path]),
+        "make": ("playing", [folder / INPUTS]),
+        "compare": ("comparing", [folder / GIVEN, folder / MADE]),
+    }
+    for stage, (phase, readable) in stages.items():
+        if stage != "open" and asked["level"] is Level.FILES:
+            break
+        place = folder / stage
         place.mkdir()
-        request = {
-            **self._asked,
-            "stage": stage,
-            "path": str(self._path),
-            "place": str(place),
-            "given": str(self._given),
-            "inputs": str(self._inputs),
-            "made": str(self._made),
-        }
-        self._progress.begin(phase)
-        failure = None
-        with Sandbox(MODULE, request, place=place, readable=readable) as sandbox:
-            for said in sandbox.answers(_TIMEOUT_S):
-                if said is None:
-                    failure = f"it sent nothing for {_TIMEOUT_S:g} seconds"
-                    break
-                self._take(said)
-                if "done" in said:
-                    return True
-                failure = said.get("failure", failure)
-            failure = failure or f"its process {sandbox.last_words()}"
-        # The temporary folder means nothing to the reader.
-        failure = failure.replace(f"{self._folder}{os.sep}", "")
-        self.findings.append(
-            Finding(
-                topic=Topic.FILES,
-                item="",
-                outcome=Outcome.DIFFERENT,
-                reason=f"{phase} failed: {failure}",
-                unit="verification",
-                is_headline=True,
+        request = {**asked, "stage": stage, "path": str(path), "folder": str(folder)}
+        failure = _run(request, readable, place, phase, heard, on_progress)
+        if failure is not None:
+            # The temporary folder means nothing to the reader.
+            failure = failure.replace(f"{folder}{os.sep}", "")
+            reason, unit = f"{phase} failed: {failure}", "verification"
+            topic, outcome = Topic.FILES, Outcome.DIFFERENT
+            heard["findings"].append(
+                Finding(topic, "", outcome, reason, unit=unit, is_headline=True)
             )
-        )
-        return False
-
-    def _take(self, said: Mapping[str, Any]) -> None:
-        """Handle a message from a process."""
-        match said:
-            case {"refused": reason}:
-                raise UnreadableArchive(self._path, reason)
-            case {"error": text}:
-                raise Error(text)
-            case {"finding": finding}:
-                self.findings.append(from_json(Finding, finding))
-            case {"excuses": excuses}:
-                self.excuses = [from_json(Excuse, each) for each in excuses]
-            case {"inputs": inputs}:
-                self.inputs = inputs
-            case {"facts": facts}:
-                self.facts = facts
-            case {"phase": phase}:
-                self._progress.begin(phase)
-            case {"count": [int(done), int(total)]}:
-                self._progress.count(done, total)
+            break
+    return heard
 
 
-class _Progress:
-    """Reports progress with an estimate of the time left.
+def _run(
+    request: Mapping[str, Any],
+    readable: Sequence[Path],
+    place: Path,
+    phase: str,
+    heard: dict[str, Any],
+    on_progress: Callable[[VerificationProgress], object] | None,
+) -> str | None:
+    """Run a process and add what it sends to `heard`; return why it failed, or None."""
+    told = on_progress or (lambda _: None)
+    began, failure = time.monotonic(), None
 
-    Args:
-        told: called with each report.
-    """
-
-    def __init__(self, told: Callable[[VerificationProgress], object] | None) -> None:
-        self._told = told or (lambda _: None)
-        self._phase = ""
-        self._began = 0.0
-
-    def begin(self, phase: str) -> None:
-        """Begin a phase."""
-        self._phase, self._began = phase, time.monotonic()
-        self._told(VerificationProgress(phase=phase, done=0, total=1))
-
-    def count(self, done: int, total: int) -> None:
-        """Report the amount of work done in this phase."""
-        passed = time.monotonic() - self._began
+    def show(done: int, total: int) -> None:
+        passed = time.monotonic() - began
         left = passed * (total - done) / done if done > 0 else None
-        self._told(
-            VerificationProgress(
-                phase=self._phase, done=done, total=total, seconds_left=left
-            )
-        )
+        told(VerificationProgress(phase, done, total, left))
+
+    show(0, 1)
+    with Sandbox(MODULE, request, place=place, readable=readable) as sandbox:
+        for said in sandbox.answers(_TIMEOUT_S):
+            match said:
+                case None:
+                    return f"it sent nothing for {_TIMEOUT_S:g} seconds"
+                case {"refused": reason}:
+                    raise UnreadableArchive(Path(request["path"]), reason)
+                case {"error": text}:
+                    raise Error(text)
+                case {"done": _}:
+                    return None
+                case {"failure": reason}:
+                    failure = reason
+                case {"finding": finding}:
+                    heard["findings"].append(from_json(Finding, finding))
+                case {"phase": phase}:
+                    began = time.monotonic()
+                    show(0, 1)
+                case {"count": [int(done), int(total)]}:
+                    show(done, total)
+                case _:
+                    heard |= said
+        return failure or f"its process {sandbox.last_words()}"
 
 
 def _level(level: str) -> Level:
@@ -284,15 +243,6 @@ def _sample(sample: int | None) -> int | None:
             f"got {sample!r}. Leave it out to check all of them."
         )
     return operator.index(sample)
-
-
-def _report_writer(page: Path) -> Callable[..., object]:
-    if not page.parent.is_dir():
-        raise DirectoryNotWritable(page.parent, "no such directory")
-    # Imported here, because reports need an extra.
-    module = importlib.import_module(".verification_report", __package__)
-    writer: Callable[..., object] = module.write_verification_report
-    return writer
 
 
 def _versions() -> Iterator[tuple[str, str]]:

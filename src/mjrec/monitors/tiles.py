@@ -17,7 +17,7 @@ from ..recorder.options import OFF, WARN, RecorderOptions
 from ..recorder.recorded_environment import EpisodeFrames
 from ..recorder.recorder import Recorder
 from ..recorder.video_recorder import can_give_frames
-from ..rendering.views import plain_camera
+from ..rendering.jobs import plain_camera
 from ..schedules import disable_videos, to_schedule
 
 _RGB_ARRAY = "rgb_array"

@@ -20,7 +20,7 @@ from ..errors import Error, ResetNeeded, ResetNotAllowed
 from ..formats.monitor_directory import infix_of, iter_monitor_files
 from ..recorder.opening import made_directory
 from ..recorder.options import RecorderOptions
-from ..rendering.background import Background
+from ..rendering.background import Background, Share
 from .base import MonitorBase, call_all
 from .gymnasium_monitor import GymnasiumMonitor
 from .tiles import TiledVideo, has_videos, vector_tiles
@@ -123,7 +123,7 @@ class VectorMonitor(MonitorBase, gymnasium.vector.VectorWrapper):
                     **view,
                     env_id=env_id,
                     env_index=index,
-                    rendering=None if shared is None else lambda _: shared.share(),
+                    rendering=None if shared is None else lambda _: Share(shared),
                     close_environment=lambda env: closing["by"](env),
                 )
                 for index, each in enumerate(envs)

@@ -51,8 +51,6 @@ class EpisodeChoice:
         kept = self._kept = options.trajectory_callable
         if callable(kept):
             self._kept = functools.lru_cache(maxsize=1)(kept)
-        stated = options.statements
-        self._only_counted = stated is not None and stated.only_counted
 
     def will_choose(self, episode_id: int) -> bool:
         """Return whether an episode is already certain to get a video.
@@ -73,8 +71,6 @@ class EpisodeChoice:
             has_video: whether the episode gets a video.
         """
         kept = self._kept
-        if self._only_counted:
-            return has_video
         if kept is None:
             return has_video or episode_type == _EVALUATION
         return kept(episode_id) if callable(kept) else kept

@@ -25,7 +25,7 @@ from typing import Any
 
 from ..engines.jobs import JobOutcome, Run, Work
 from ..errors import DirectoryNotWritable, FileNotWritten
-from ..formats.dataclass_json import from_json, to_json
+from ..formats.json_fields import from_json, to_json
 from ..formats.second_names import give_all_second_names
 from ..formats.spans import log_paths, remove_if_done
 from ..results.manifest_writing import update_manifests
@@ -70,7 +70,10 @@ def finish(
     """
     has_failed = False
     wanted = recordings(directory) if keys is None else keys
-    jobs = [VideoJob.finishing(directory, key, strict=strict) for key in wanted]
+    jobs = [
+        VideoJob(directory=directory, recording=key.shown_name, strict=strict)
+        for key in wanted
+    ]
     for result in do_jobs(
         jobs, directory, workers=workers, engine=engine, on_progress=on_progress
     ):

@@ -15,7 +15,6 @@ from typing import Literal
 from ..errors import UnreadableFile
 from ..formats.locks import is_locked
 from ..formats.monitor_directory import (
-    Infix,
     VideoName,
     final_name,
     is_note,
@@ -68,7 +67,7 @@ def has_leftovers(files: MonitorFiles) -> bool:
     return is_left or lacks_results(files)
 
 
-def is_at_work(directory: Path, infix: Infix) -> bool:
+def is_at_work(directory: Path, infix: str) -> bool:
     """Return whether an encoder or renderer still works on a dead monitor's files."""
     files = files_of(directory, infix)
     hidden = [path for path in files.paths if path.name.startswith(".")]
@@ -120,13 +119,10 @@ def _kind_of(path: Path, files: MonitorFiles) -> Kind | None:
     # A clip's video may have the name of an episode's video.
     clips = f".openaigym.clip.{files.infix}."
     locks = [p for p in files.paths if p.name.startswith(clips)]
-    if any(map(is_locked, [*unfinished_files(mp4), *locks, _lock_of(mp4)])):
+    locks.append(mp4.with_name(f".{mp4.stem}.lock"))
+    if any(map(is_locked, [*unfinished_files(mp4), *locks])):
         return None
     return "text" if name.is_episodes and name.ending == "json" else "stale"
-
-
-def _lock_of(video: Path) -> Path:
-    return video.with_name(f".{video.stem}.lock")
 
 
 def lacks_results(files: MonitorFiles) -> bool:

@@ -30,14 +30,13 @@ from typing import Any
 
 from ..errors import Error, InvalidArgument
 from ..frames import Frame, grid_frame, grid_shape
-from ..messages import carried
-from ..parent import Parent
+from ..messages import Parent, carried
 from ..simulation.gl_probe import draw_test_scene
 from ..simulation.recorded_scene import GivenStates, RecordedScene
 from ..simulation.renderer import Canvas, SceneRenderer
 from ..simulation.warnings import log_mujoco_warnings
+from .jobs import PlainCamera, View
 from .recorded_facts import check_has_frames, open_for_rendering
-from .views import PlainCamera, View
 
 _NICE = 10
 _LOOKS_FOR_RECORDING = 100

@@ -20,7 +20,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from .. import json_text
-from ..formats.appending import AppendOnlyFile
+from ..atomic_files import AppendOnlyFile
 from ..formats.monitor_directory import FILE_PREFIX
 from ..recorder.tracking import FinishedEpisode, Run, Tracker
 

@@ -1,0 +1,178 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Judging of all equal and different items by the excuses, and their totals."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from typing import Any, Final
+
+from .differences import Aspect, Difference, Place, Same
+from .excuses import (
+    COMPUTED,
+    NUMERIC,
+    finding_under,
+    is_fed,
+    is_same_family,
+    outcome_under,
+)
+from .findings import Excuse, ExcuseKind, Finding, Outcome, Topic
+
+_MOST_FAILURES: Final = 100
+# The largest share of frames that may be bitwise equal: with another rasterizer, few;
+# with the same one on another CPU, those that rounding did not change.
+_MOST_EQUAL_FRAMES: Final = {"gl": 0.5, "machine": 0.8}
+_ELSEWHERE: Final = (ExcuseKind.VERSION, ExcuseKind.HARDWARE)
+
+
+class Trial:
+    """Judges all equal and different items, and tests the excuses against them.
+
+    Findings with the same result for several items are merged into one with a count.
+
+    Args:
+        excuses: the claimed excuses.
+    """
+
+    def __init__(self, excuses: Sequence[Excuse]) -> None:
+        self._excuses = excuses
+        self._scopes = [frozenset(excuse.items) for excuse in excuses]
+        self._used: Counter[int] = Counter()
+        # By excuse and unit.
+        self._equal: Counter[tuple[int, str]] = Counter()
+        self._other: Counter[tuple[int, str]] = Counter()
+        self._sums: dict[tuple[Any, ...], Finding] = {}
+        self._counts: Counter[tuple[Any, ...]] = Counter()
+        self._failures: Counter[Topic] = Counter()
+        self._is_other_code = False
+
+    def believe(self, note: Finding) -> None:
+        """Count a note, and mark the excuses with its name as used."""
+        for index, excuse in enumerate(self._excuses):
+            self._used[index] += excuse.name == note.excuse
+        self._add(note)
+
+    def take(self, found: Same | Difference | Finding) -> Finding | None:
+        """Count what a comparator found; return a contradiction to list separately."""
+        if isinstance(found, Same):
+            if not self._proves_nothing(found):
+                count, unit, outcome = found.count, found.unit, Outcome.RECREATED
+                self._add(
+                    Finding(found.topic, found.item, outcome, count=count, unit=unit)
+                )
+            return None
+        finding = self.judge(found) if isinstance(found, Difference) else found
+        if finding is None:
+            return None
+        if isinstance(found, Finding) or finding.outcome is not Outcome.DIFFERENT:
+            self._add(finding)
+            return None
+        self._is_other_code |= found.aspect in COMPUTED
+        self._failures[finding.topic] += 1
+        return finding if self._failures[finding.topic] <= _MOST_FAILURES else None
+
+    def judge(self, found: Difference) -> Finding | None:
+        """Return the finding for a difference; None if it need not be reported."""
+        if found.aspect is Aspect.STATEMENT:
+            return None
+        for index in self._reaching(found):
+            excuse = self._excuses[index]
+            outcome = outcome_under(excuse, found)
+            if outcome is None:
+                continue
+            self._other[index, found.unit] += found.count
+            if outcome is not Outcome.NOTED:
+                self._used[index] += found.count
+            return finding_under(excuse, found, outcome)
+        return finding_under(None, found, Outcome.DIFFERENT)
+
+    def totals(self) -> Iterator[Finding]:
+        """Yield the refuted claims, the merged findings, and what they mean."""
+        for index, excuse in enumerate(self._excuses):
+            if (reason := self._refutation(index)) is not None:
+                yield Finding(
+                    Topic.IDENTITY,
+                    ", ".join(excuse.items[:3]),
+                    Outcome.DIFFERENT,
+                    f"{excuse.name} is claimed to be {excuse.claimed} and is "
+                    f"{excuse.here} here, but {reason}",
+                    unit="claim",
+                )
+        for key, finding in self._sums.items():
+            yield dataclasses.replace(finding, count=self._counts[key])
+        for topic, count in self._failures.items():
+            if (more := count - _MOST_FAILURES) > 0:
+                reason, outcome = "more places differ", Outcome.DIFFERENT
+                yield Finding(topic, "", outcome, reason, count=more, unit="place")
+        if self._is_other_code and not any(e.name in NUMERIC for e in self.excuses):
+            yield Finding(
+                Topic.PHYSICS,
+                "",
+                Outcome.NOTED,
+                "it claims the same versions and machine as here, so the code or the "
+                "numbers must have been different",
+                unit="verification",
+                is_headline=True,
+            )
+
+    @property
+    def excuses(self) -> tuple[Excuse, ...]:
+        """The used and refuted excuses, and all those of versions and hardware."""
+        tried = (
+            dataclasses.replace(
+                excuse,
+                is_needed=self._used[index] > 0,
+                refuted=self._refutation(index) is not None,
+            )
+            for index, excuse in enumerate(self._excuses)
+        )
+        return tuple(
+            excuse
+            for excuse in tried
+            if excuse.is_needed or excuse.refuted or excuse.kind in _ELSEWHERE
+        )
+
+    def _proves_nothing(self, place: Same) -> bool:
+        """Count an equal item; return True if it was fed in and so proves nothing."""
+        fed = False
+        for index in self._reaching(place):
+            self._equal[index, place.unit] += place.count
+            fed |= is_fed(self._excuses[index].name, place.topic)
+        return fed
+
+    def _add(self, finding: Finding) -> None:
+        """Merge a finding with those for the same excuse, and keep the worst."""
+        is_within = finding.outcome is Outcome.WITHIN_TOLERANCE
+        reason = "" if is_within else finding.reason
+        key = (finding.topic, finding.outcome, finding.excuse, finding.unit, reason)
+        self._counts[key] += finding.count
+        known = self._sums.setdefault(key, finding)
+        worst = max(known, finding, key=lambda each: each.figures.get("maximum", 0.0))
+        is_one = known.item == finding.item
+        self._sums[key] = worst if is_one else dataclasses.replace(worst, item="")
+
+    def _reaching(self, place: Place) -> Iterator[int]:
+        scopes = place.scopes
+        for index, items in enumerate(self._scopes):
+            if not items or not items.isdisjoint(scopes):
+                yield index
+
+    def _refutation(self, index: int) -> str | None:
+        """Return why a claimed difference is refuted; None if it is not."""
+        excuse, equal = self._excuses[index], self._equal
+        frames, videos = equal[index, "frame"], equal[index, "encoding"]
+        if excuse.name == "mujoco" and equal[index, "compiled model"]:
+            return "the compiled model was written by the same version"
+        if excuse.name == "ffmpeg" and videos and self._other[index, "encoding"]:
+            return f"{videos} videos are equal byte for byte and others are not"
+        others = self._other[index, "frame hash"]
+        if excuse.name == "gl" and is_same_family(excuse):
+            return None
+        if excuse.name == "machine" and not others:
+            # It may be invisible: no step of the half cheetah depends on the CPU.
+            return None
+        most = _MOST_EQUAL_FRAMES.get(excuse.name)
+        if frames and most is not None and frames >= most * (frames + others):
+            return f"{frames} frames are equal bit for bit"
+        return None
