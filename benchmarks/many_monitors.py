@@ -33,7 +33,6 @@ from mjrec.formats.manifest import (
     write_stats_file,
 )
 from mjrec.formats.monitor_directory import (
-    Infix,
     journal_name,
     manifest_name,
     stats_prefix,
@@ -63,7 +62,7 @@ class _Written:
         episodes: number of episodes that it recorded.
     """
 
-    infix: Infix
+    infix: str
     seed: int
     first: int
     episodes: int
@@ -142,10 +141,9 @@ def results_of(task: str, *, monitors: int, episodes: int) -> Iterator[EpisodeRe
 
 
 def _trajectory_of(result: EpisodeResult) -> str:
-    infix = Infix.parse(str(result.monitor))
-    assert infix is not None
+    assert result.monitor is not None
     assert result.episode_id is not None
-    return trajectory_prefix(infix, result.episode_id)
+    return trajectory_prefix(result.monitor, result.episode_id)
 
 
 def _recorded_manifest() -> Manifest:
@@ -172,7 +170,7 @@ def _monitors(count: int, episodes: int) -> Iterator[_Written]:
     for number in range(count):
         process, monitor_id = divmod(number, _OF_ONE_PROCESS)
         yield _Written(
-            infix=Infix(monitor_id, str(_FIRST_PROCESS + process)),
+            infix=f"{monitor_id}.{_FIRST_PROCESS + process}",
             seed=0,
             first=number * episodes,
             episodes=episodes,
@@ -237,7 +235,7 @@ def _result(task: str, written: _Written, number: int) -> EpisodeResult:
         length=_STEPS,
         terminated=False,
         truncated=True,
-        monitor=str(written.infix),
+        monitor=written.infix,
         episode_id=number,
         start_time=_START + number,
         seconds=_SECONDS,

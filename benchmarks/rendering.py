@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import mjrec
-from mjrec.formats.dataclass_json import to_json
+from mjrec.formats.json_fields import to_json
 from mjrec.rendering.views import View
 
 from .children import call

@@ -13,7 +13,7 @@ from mjrec.evaluation.summaries import (
     default_score_range,
     summarize_results,
 )
-from mjrec.formats.dataclass_json import to_json
+from mjrec.formats.json_fields import to_json
 from mjrec.json_text import dumps
 from report_recordings import entry, write_journal
 

@@ -4,10 +4,10 @@
 import numpy as np
 from trajectories_by_hand import add_row
 
-from mjrec.formats.monitor_directory import Infix, trajectory_prefix
+from mjrec.formats.monitor_directory import trajectory_prefix
 from mjrec.formats.trajectory import packed, row_dtype
 
-INFIX = Infix(0, "1")
+INFIX = "0.1"
 NAME = trajectory_prefix(INFIX, 27)
 FACTS = {"env_id": "E-v0", "seed": 7, "limit": float("inf")}
 STATE = packed([("qpos", ("<f8", (2,))), ("time", ("<f8", (1,)))])

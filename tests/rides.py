@@ -14,7 +14,6 @@ import mujoco
 import numpy as np
 from trajectories_by_hand import add_row, new_logs
 
-from mjrec.formats.monitor_directory import Infix
 from mjrec.formats.trajectory import ModelChange, row_dtype
 from mjrec.simulation.cameras import resolve_camera
 from mjrec.simulation.captured_arrays import snapshot_dtype
@@ -111,7 +110,7 @@ def record(directory, *, camera="rider", fresh=False, count=FRAMES, facts=None):
     }
     store.finish()
     source = SnapshotSource(model, data, kind)
-    logs = new_logs(directory, Infix(0, "1"))
+    logs = new_logs(directory, "0.1")
     name = "openaigym.trajectory.0.1.episode000000"
     span = logs.begin(name, known, row_dtype(snapshot=kind))
     snapshot = np.empty(kind.itemsize // 8, np.uint64)

@@ -19,7 +19,6 @@ from trajectories_by_hand import write_log
 from waiting import wait_until
 
 from mjrec import Monitor
-from mjrec.formats.monitor_directory import Infix
 from mjrec.formats.spans import find_recording, is_in_flight
 from mjrec.formats.trajectory_file import open_trajectory
 from mjrec.rendering.background import Background
@@ -167,7 +166,7 @@ def test_several_monitors_share_one(tmp_path, start):
     background = start()
     shares = {}
     for number in (0, 1):
-        infix = Infix(number, "7")
+        infix = f"{number}.7"
         write_log(tmp_path, infix=infix)
         shares[number] = background.share()
         for log in in_flight(tmp_path)[number:]:

@@ -37,7 +37,7 @@ from mjrec.evidence.findings import (
     Verdict,
     Verification,
 )
-from mjrec.formats.dataclass_json import from_json, to_json
+from mjrec.formats.json_fields import from_json, to_json
 
 Edit = Callable[[Path], object]
 

@@ -21,7 +21,7 @@ from mjrec.evaluation.chunk_results import read_chunk
 from mjrec.evaluation.plan import Chunk, EvaluatedTask, EvaluationPlan
 from mjrec.evaluation.worker import EvaluationWorker
 from mjrec.formats.bundle import finished_trajectories
-from mjrec.formats.dataclass_json import to_json
+from mjrec.formats.json_fields import to_json
 from mjrec.formats.trajectory_file import open_trajectory
 from mjrec.recorder.options import RecorderOptions
 from mjrec.sessions import Session, record_session

@@ -9,7 +9,7 @@ import pytest
 from verifications import excuse, finding, verification
 
 from mjrec.evidence.findings import Excuse, Finding, Level, Outcome, Topic, Verdict
-from mjrec.formats.dataclass_json import from_json
+from mjrec.formats.json_fields import from_json
 
 MADE, WITHIN = finding(), finding(Outcome.WITHIN_TOLERANCE, excuse="gl")
 BELIEVED = finding(Outcome.BELIEVED, reason="actions were not kept")

@@ -30,7 +30,6 @@ import mjrec
 from forged_runs import ForgedRun
 from mjrec.evaluation.chunk_results import recorded_results
 from mjrec.evidence.findings import Outcome, Verdict, Verification
-from mjrec.formats.monitor_directory import Infix
 from mjrec.formats.trajectory import added_up
 from mjrec.formats.trajectory_file import open_trajectory
 from mjrec.formats.trajectory_hdf5 import write_hdf5
@@ -806,7 +805,7 @@ def evaluated_and_swapped(directory: Path) -> None:
     honest.evaluated(directory, keep="none")
     ended = [*recorded_results(directory)]
     folder, worst = min(ended, key=lambda each: each[1].total_reward or 0.0)
-    infix = Infix.parse(worst.monitor or "")
+    infix = worst.monitor
     assert infix is not None
     assert worst.episode_id is not None
     chosen = {RecordingKey(infix, worst.episode_id): ["best"]}

@@ -14,7 +14,6 @@ from mjrec.errors import ClosedError, FileNotWritten, UnreadableFile
 from mjrec.formats import journal
 from mjrec.formats.journal import (
     JournalEntry,
-    JournalReader,
     JournalWriter,
     read_journal,
 )
@@ -54,7 +53,7 @@ def changed(**facts):
 
 
 def read(path):
-    return list(read_journal(path))
+    return list(read_journal(path, warns=True))
 
 
 @pytest.mark.parametrize(
@@ -92,7 +91,7 @@ def test_options_of_any_type_and_size_do_not_stop_a_run(path, options, said):
     assert path.stat().st_size < 2000
 
 
-def test_events_are_reported_and_are_no_damage(path):
+def test_events_are_reported_and_are_no_damage(path, caplog):
     """In their order, the run first and once; what is no event is left out."""
     writer = JournalWriter(path, run={})
     writer.note("cut", {"episode_id": 2})
@@ -103,14 +102,14 @@ def test_events_are_reported_and_are_no_damage(path):
     with path.open("a") as file:
         file.write('{"party": {}}\n')
     events = []
-    reader = JournalReader(path, on_event=lambda *event: events.append(event))
-    assert list(reader) == [ENTRY, NEXT]
+    entries = read_journal(path, on_event=lambda *e: events.append(e), warns=True)
+    assert list(entries) == [ENTRY, NEXT]
+    assert "1 line left out" in caplog.text
     assert events == [
         ("run", {}),
         ("cut", {"episode_id": 2}),
         ("fault", {"what": "video"}),
     ]
-    assert reader.dropped == 1
 
 
 def test_a_last_line_cut_anywhere_is_left_out(path, caplog):
@@ -127,9 +126,9 @@ def test_a_last_line_cut_anywhere_is_left_out(path, caplog):
         assert f"{path}: 1 line left out: line 2" in record.getMessage()
         assert "cut off" in record.getMessage()
     assert "line 2 (episode 4)" in caplog.text
-    reader = JournalReader(path)
-    assert list(reader) == [ENTRY]
-    assert (reader.dropped, reader.last_episode_id) == (1, 4)
+    numbers = []
+    assert list(read_journal(path, on_damage=numbers.append)) == [ENTRY]
+    assert numbers == [4]
     write(path, later)
     assert read(path) == [ENTRY, later]
     path.write_bytes(whole.rstrip(b"\n"))

@@ -180,7 +180,7 @@ def test_a_recovery_killed_at_any_change_of_a_file_is_taken_up_again(
 RECORD = """
 import gymnasium, mjrec
 from conftest import Corridor
-import mjrec.formats.appending, mjrec.formats.row_log
+import mjrec.atomic_files, mjrec.formats.row_log
 from mjrec.formats import video_file, video_metadata, video_sink
 from mjrec.formats.journal import JournalWriter
 

@@ -18,7 +18,6 @@ from mjrec import (
     InvalidArgument,
     UnreadableFile,
 )
-from mjrec.formats.monitor_directory import Infix
 
 ANOTHER = "Ant-v5"
 
@@ -166,7 +165,7 @@ def test_joining_looks_at_no_other_files(tmp_path):
 def test_joining_leaves_killed_monitors_as_they_are(tmp_path, caplog):
     """`resume=True` recovers them."""
     env_id = ENV_INFO["env_id"]
-    dead = write_log(tmp_path, infix=Infix(0, "1"), ended=False, env_id=env_id)
+    dead = write_log(tmp_path, infix="0.1", ended=False, env_id=env_id)
     left = [path for path in tmp_path.iterdir() if ".states." in path.name]
     before = [path.read_bytes() for path in left]
     record(tmp_path, resume="join")

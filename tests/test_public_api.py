@@ -16,7 +16,7 @@ ROWS = (
         *("errors", "json_text", "rates", "frames", "schedules", "atomic_files"),
         *("worker_thread", "gl", "machine", "blank_frames", "timeouts", "signals"),
         *("annotation", "plain_text", "provenance"),
-        *("child_python", "messages", "parent", "sandbox", "confined"),
+        *("child_python", "messages", "sandbox", "confined"),
     },
     {"engines"},
     {"formats"},

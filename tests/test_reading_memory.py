@@ -13,7 +13,7 @@ from mjrec.formats.manifest import (
     write_manifest,
     write_stats_file,
 )
-from mjrec.formats.monitor_directory import Infix, manifest_name, stats_prefix
+from mjrec.formats.monitor_directory import manifest_name, stats_prefix
 from mjrec.reporting.gathering import gather
 
 MONITORS = 40
@@ -25,7 +25,7 @@ def write_monitors(directory, said):
     """Write what many monitors leave that recorded an episode each."""
     directory.mkdir()
     for number in range(MONITORS):
-        infix = Infix(number, "1")
+        infix = f"{number}.1"
         name = f"{stats_prefix(infix)}.stats.json"
         stats = StatsFile(1.79e9, (1.79e9 + number,), (3,), (1.0,), ("e",))
         write_stats_file(directory / name, stats)
@@ -61,5 +61,5 @@ def test_manifests_are_not_kept(tmp_path, read):
     """What all of them say takes no more than what a few do."""
     large = write_monitors(tmp_path / "large", PACKAGES)
     small = write_monitors(tmp_path / "small", {})
-    one = peak_of(read_manifest, large / manifest_name(Infix(0, "1")))
+    one = peak_of(read_manifest, large / manifest_name("0.1"))
     assert peak_of(read, large) - peak_of(read, small) < 4 * one

@@ -34,7 +34,6 @@ import mjrec
 from mjrec.commands import main
 from mjrec.formats.locks import Lock, is_locked, try_lock
 from mjrec.formats.monitor_directory import (
-    Infix,
     lock_name,
     log_name,
     video_lock_name,
@@ -504,7 +503,7 @@ def test_unfinished_files_of_a_dead_renderer_are_removed(tmp_path: Path) -> None
     # This may be an open monitor's.
     model = tmp_path / ".openaigym.model.0123456789abcdef.zip.0123abcd.part"
     model.touch()
-    monitor = Lock(tmp_path / lock_name(Infix(1, "7")), "")
+    monitor = Lock(tmp_path / lock_name("1.7"), "")
     recovery = mjrec.recover(tmp_path, timeout=0)
     assert sorted(file.name for file in recovery.files) == [p.name for p in dead]
     assert not any(part.exists() for part in dead)

@@ -31,7 +31,7 @@ from mjrec import (
     UnknownName,
     render_videos,
 )
-from mjrec.formats.dataclass_json import from_json, to_json
+from mjrec.formats.json_fields import from_json, to_json
 from mjrec.rendering.finish import VideoWorker
 from mjrec.rendering.jobs import Progress, RecordingKey, RenderedVideos, VideoJob
 from mjrec.rendering.recordings import claim

@@ -9,7 +9,6 @@ from trajectories_by_hand import write_finished, write_log
 
 import mjrec
 from mjrec.errors import UnreadableFile
-from mjrec.formats.monitor_directory import Infix
 
 
 def video(directory, infix, episode_id, suffix):
@@ -46,7 +45,7 @@ def test_an_episode_of_a_journal_has_its_files(tmp_path):
 @pytest.mark.parametrize("has_journal", [True, False])
 def test_pending_is_what_was_promised_and_is_not_there(tmp_path, has_journal):
     """In flight or finished; neither what is there, nor what failed or is live."""
-    infix = Infix(0, "7")
+    infix = "0.7"
     kinds = ["deferred", "deferred", "deferred", "deferred", "live"]
     pending = []
     if has_journal:

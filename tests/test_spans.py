@@ -271,7 +271,7 @@ def test_a_killed_process_loses_no_counted_row(
     def record(tell: Callable[[], object]) -> None:
         span = write(logs, 0)
         for step in itertools.count(1):
-            moment(span.log.rows)
+            moment(span.log)
             write(logs, step, first=step, span=span)
             tell()
 

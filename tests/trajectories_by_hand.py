@@ -17,7 +17,6 @@ import numpy as np
 from mjrec.formats.journal import JournalWriter, is_of_spans
 from mjrec.formats.manifest import Manifest, write_manifest
 from mjrec.formats.monitor_directory import (
-    Infix,
     journal_name,
     log_number,
     manifest_name,
@@ -32,7 +31,7 @@ from mjrec.formats.trajectory_file import finish_trajectory, open_trajectory
 from mjrec.rendering.views import View
 from mjrec.simulation.model_trust import directory_digest, note_models
 
-INFIX = Infix(0, "7")
+INFIX = "0.7"
 GREY_ROWS = row_dtype(
     state=packed([("qpos", ("<f8", (1,)))]),
     snapshot=packed([("geom_rgba", ("|u1", (1,)))]),
@@ -101,7 +100,7 @@ class Painter:
 
 
 def new_logs(
-    directory: Path, infix: Infix = INFIX, *, tail_bytes: int = TAIL_BYTES
+    directory: Path, infix: str = INFIX, *, tail_bytes: int = TAIL_BYTES
 ) -> SpanLogs:
     """Return what writes recordings beside those that others have written."""
     used = [log_number(path.name) or 0 for path in log_paths(directory, infix)]
@@ -132,7 +131,7 @@ def write_log(
     directory: Path,
     episode_id: int = 0,
     *,
-    infix: Infix = INFIX,
+    infix: str = INFIX,
     steps: int = 4,
     stride: int = 1,
     frames: bool = True,
@@ -204,7 +203,7 @@ def write_finished(directory: Path, episode_id: int = 0, **rest: Any) -> Path:
 
 
 def write_pending_manifest(
-    directory: Path, *episode_ids: int, infix: Infix = INFIX, **rest: Any
+    directory: Path, *episode_ids: int, infix: str = INFIX, **rest: Any
 ) -> Path:
     """Write the manifest of a closed monitor whose videos are all pending."""
     path = directory / manifest_name(infix)

@@ -72,7 +72,7 @@ def annotated(frame: Frame, caption: Caption) -> Frame:
         MissingDependency: Pillow is missing, is too old, or lacks FreeType.
     """
     check_annotation()
-    # Imported late, see `_pillow`.
+    # Imported late, see `check_annotation`.
     from PIL import Image, ImageDraw
 
     result = np.array(frame, order="C", subok=False)
@@ -98,26 +98,13 @@ def annotated(frame: Frame, caption: Caption) -> Frame:
     return result
 
 
-def check_annotation() -> None:
-    """Raise an error if frames cannot be annotated here.
-
-    Raises:
-        MissingDependency: Pillow is missing, is too old, or lacks FreeType.
-    """
-    _pillow()
-
-
-def pillow_version() -> str:
+@functools.cache
+def check_annotation() -> str:
     """Return the version of Pillow that draws the captions.
 
     Raises:
         MissingDependency: Pillow is missing, is too old, or lacks FreeType.
     """
-    return str(_pillow().__version__)
-
-
-@functools.cache
-def _pillow() -> Any:
     try:
         # Imported here because it is optional, and to keep mjrec quick to import.
         import PIL
@@ -131,7 +118,7 @@ def _pillow() -> Any:
             purpose="Annotating frames (annotate)",
             install="pip install 'mjrec[annotate]'",
         ) from error
-    return PIL
+    return PIL.__version__
 
 
 class _Layout(NamedTuple):

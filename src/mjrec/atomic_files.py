@@ -1,15 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Atomic file writes: a file appears complete or not at all.
+"""Atomic writes: of a file, or of a piece at its end, all appears or nothing does.
 
 A file is written under a temporary name in its own directory and then renamed, so an
 incomplete file never has the final name. The temporary name starts with a dot and ends
 in `.part`: `.<name>.<8 hex digits>.part`.
+
+A piece that is appended is a line of a journal, a row of a table or a TensorBoard
+record. An incomplete piece would corrupt the next one. Appended data survives the death
+of the process that wrote it.
 """
 
 from __future__ import annotations
 
 import contextlib
+import errno
 import hashlib
+import os
 import secrets
 from collections.abc import Iterator
 from pathlib import Path
@@ -25,6 +31,22 @@ def temporary_path(path: Path) -> Path:
     """
     name = path.name.removeprefix(".")
     return path.with_name(f".{name}.{secrets.token_hex(4)}.part")
+
+
+@contextlib.contextmanager
+def writing(path: Path, **advice: str) -> Iterator[None]:
+    """Turn any other `OSError` in the block into `FileNotWritten`.
+
+    Args:
+        path: the file that the block writes.
+        **advice: `then`, if `FileNotWritten` should give other advice.
+    """
+    try:
+        yield
+    except FileNotWritten:
+        raise
+    except OSError as error:
+        raise FileNotWritten(path, error.strerror or error, **advice) from error
 
 
 @contextlib.contextmanager
@@ -48,11 +70,8 @@ def write_text(path: Path, text: str) -> None:
     Raises:
         FileNotWritten: the disk is full, or the directory is missing or read-only.
     """
-    try:
-        with replacing(path) as temporary:
-            temporary.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise FileNotWritten(path, error.strerror) from error
+    with writing(path), replacing(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
 
 
 def make_directory(directory: Path) -> None:
@@ -65,6 +84,52 @@ def make_directory(directory: Path) -> None:
         directory.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise DirectoryNotWritable(directory, error.strerror) from error
+
+
+def open_for_appending(path: Path, *, new: bool = False) -> int:
+    """Open a file for `append_whole`, creating it if necessary.
+
+    Args:
+        path: the file.
+        new: whether to fail if the file already exists.
+
+    Returns:
+        A file descriptor.
+
+    Raises:
+        OSError: the file cannot be opened, or is a link.
+    """
+    flags = os.O_RDWR | os.O_APPEND | os.O_NOFOLLOW | os.O_CREAT
+    return os.open(path, flags | os.O_EXCL * new, 0o666)
+
+
+def append_whole(descriptor: int, piece: bytes, *, torn: bytes = b"") -> None:
+    """Append a piece to a file: either the whole piece or nothing.
+
+    Args:
+        descriptor: a descriptor from `open_for_appending`.
+        piece: the bytes to append.
+        torn: bytes to write before the piece if the file does not end with a line feed
+            (its last writer was killed in the middle of a line).
+
+    Raises:
+        OSError: the disk is full (then the file is unchanged), or the file was removed.
+    """
+    status = os.fstat(descriptor)
+    if status.st_nlink == 0:
+        # The file has no name any more: anything written to it would be lost.
+        raise FileNotFoundError(errno.ENOENT, "it was removed while it was written")
+    if torn and status.st_size:
+        is_torn = os.pread(descriptor, 1, status.st_size - 1) != b"\n"
+        piece = torn * is_torn + piece
+    written = os.write(descriptor, piece)
+    if written != len(piece):
+        # Only part of the piece was written. If another piece already follows it, the
+        # part stays, and readers skip it.
+        end = os.lseek(descriptor, 0, os.SEEK_CUR)
+        if os.fstat(descriptor).st_size == end:
+            os.ftruncate(descriptor, end - written)
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
 def file_sha256(path: Path) -> str:

@@ -209,10 +209,6 @@ class Child:
             return time.clock_gettime((~self.pid << 3) | 2)
         return 0.0
 
-    def terminate(self) -> None:
-        """Ask the child to end, without waiting for it."""
-        self._process.send_signal(signal.SIGTERM)
-
     def kill(self) -> None:
         """Kill the child and its children, which may hang too; `end` cleans up."""
         children = _pids_of_children(self.pid)
@@ -225,11 +221,6 @@ class Child:
         """End the child, by force if it does not end on its own. Idempotent."""
         _children.discard(self)
         self._end()
-
-    @property
-    def has_ended(self) -> bool:
-        """Whether `end` was called."""
-        return not self._end.alive
 
     def __enter__(self) -> Self:
         return self

@@ -247,13 +247,16 @@ def examine_package(name: str, program: str, install: str) -> Package:
         return Package(name, None, fix=f"To install it:\n  {install}")
     if not program:
         return Package(name, version)
-    failure = _run_in_child(program)
-    if failure is None:
-        return Package(name, version, works=True)
+    try:
+        done = _run(sys.executable, "-P", "-c", program, timeout=_PROGRAM_TIMEOUT)
+    except subprocess.TimeoutExpired:
+        failure = f"It did not finish within {_PROGRAM_TIMEOUT} seconds."
+    else:
+        if done.returncode == 0:
+            return Package(name, version, works=True)
+        failure = done.stderr.strip() or f"It exited with status {done.returncode}."
     known = diagnose(failure, environ=_WITHOUT_GL)
-    found = known or Diagnosis(
-        failure.strip().splitlines()[-1], f"Reinstall it:\n  {install}"
-    )
+    found = known or Diagnosis(failure.splitlines()[-1], f"Reinstall it:\n  {install}")
     return Package(name, version, works=False, cause=found.cause, fix=found.fix)
 
 
@@ -270,17 +273,12 @@ def _examine_extra(name: str, distributions: Sequence[str], install: str) -> Pac
 
 def _slurm() -> Package:
     try:
-        done = subprocess.run(
-            ["sbatch", "--version"],
-            stdin=subprocess.DEVNULL,
-            capture_output=True,
-            timeout=_COMMAND_TIMEOUT,
-            check=True,
-        )
+        done = _run("sbatch", "--version", timeout=_COMMAND_TIMEOUT)
+        done.check_returncode()
     except (OSError, subprocess.SubprocessError):
         fix = "Submit jobs from a login node of the cluster, where sbatch is installed."
         return Package("Slurm", None, fix=fix)
-    return Package("Slurm", done.stdout.decode(errors="replace").strip())
+    return Package("Slurm", done.stdout.strip())
 
 
 def _gpu() -> Package:
@@ -298,20 +296,14 @@ def _gpu() -> Package:
 _WITHOUT_GL = {"MUJOCO_GL": "off"}
 
 
-def _run_in_child(program: str) -> str | None:
-    """Run `program` and return its error output, or None if it succeeds."""
-    try:
-        done = subprocess.run(
-            [sys.executable, "-P", "-c", program],
-            env={**os.environ, **_WITHOUT_GL},
-            stdin=subprocess.DEVNULL,
-            capture_output=True,
-            timeout=_PROGRAM_TIMEOUT,
-            check=False,
-        )
-    except subprocess.TimeoutExpired:
-        return f"It did not finish within {_PROGRAM_TIMEOUT} seconds."
-    if done.returncode == 0:
-        return None
-    output = done.stderr.decode(errors="replace").strip()
-    return output or f"It exited with status {done.returncode}."
+def _run(*command: str, timeout: float) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        command,
+        env={**os.environ, **_WITHOUT_GL},
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        encoding="utf-8",
+        errors="replace",
+        timeout=timeout,
+        check=False,
+    )

@@ -31,7 +31,7 @@ from typing import Any
 
 from .child_python import Child
 from .machine import cpu_flags, cpu_model, machine_fingerprint, usable_cpus
-from .parent import Parent
+from .messages import Parent
 
 logger = logging.getLogger(__name__)
 

@@ -22,7 +22,7 @@ from . import json_text
 from .child_python import Child, places_of_main
 from .confined import VARIABLE
 from .errors import Error
-from .parent import Parent
+from .messages import Parent
 from .provenance import is_of_drawing
 
 logger = logging.getLogger(__name__)

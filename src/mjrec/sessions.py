@@ -22,7 +22,7 @@ from .environments.names import parse_environment_name, working_directory_import
 from .environments.policies import load_policy, policy_file
 from .errors import GLError, InvalidArgument
 from .formats.manifest import read_manifest
-from .formats.monitor_directory import Infix, infix_of, manifest_name
+from .formats.monitor_directory import infix_of, manifest_name
 from .gl import use_gl
 from .monitors.monitor import monitored
 from .recorder.options import DEFERRED, LIVE, OFF, RecorderOptions
@@ -185,9 +185,7 @@ def with_chosen_videos(episodes: Sequence[SessionEpisode]) -> list[SessionEpisod
     video = next((each.video for each in episodes if each.video), None)
     if video is None:
         return list(episodes)
-    infix = Infix.parse(infix_of(video.name) or "")
-    assert infix is not None
-    manifest = read_manifest(video.with_name(manifest_name(infix)))
+    manifest = read_manifest(video.with_name(manifest_name(infix_of(video.name) or "")))
     chosen = (manifest.mjrec or {})["schedule"]["recorded"]
     return [
         each if each.episode_id in chosen else replace(each, video=None)

@@ -3,8 +3,8 @@
 
 from __future__ import annotations
 
-import collections
 import os
+import queue
 import threading
 from collections.abc import Callable
 from typing import Generic, TypeVar
@@ -43,15 +43,13 @@ class WorkerThread(Generic[T]):
     ) -> None:
         self._consume = consume
         self._finish = finish
-        self._capacity = capacity
         self._name = name
-        self._waiting: collections.deque[T] = collections.deque()
-        # Reentrant, because a garbage collection while the thread holds it may run a
-        # finalizer that calls `leave`. Acquire the lock directly, not through the
-        # condition: its `__enter__` is Python code, and Ctrl-C at its end would leave
-        # the lock held.
-        self._lock = threading.RLock()
-        self._changed = threading.Condition(self._lock)
+        # These queues are reentrant, so a finalizer that a garbage collection runs in
+        # the middle of a call may call `leave`, and Ctrl-C leaves no lock held.
+        self._waiting: queue.SimpleQueue[tuple[T] | None] = queue.SimpleQueue()
+        self._room: queue.SimpleQueue[None] = queue.SimpleQueue()
+        for _ in range(capacity):
+            self._room.put(None)
         self._closing = False
         self._aborted = False
         self._error: BaseException | None = None
@@ -83,13 +81,16 @@ class WorkerThread(Generic[T]):
                 f"{self._name} belongs to process {self._process_id} and cannot be "
                 "used after a fork: create it in the process that uses it."
             )
-        with self._lock:
-            self._changed.wait_for(self._has_room_or_ended)
+        try:
+            self._room.get()
             self._raise_error()
             if self._closing:
                 raise ClosedError(f"{self._name} is closed.")
-            self._waiting.append(item)
-            self._changed.notify_all()
+            self._waiting.put((item,))
+        except BaseException:
+            # The next call must not wait for the room that this one took.
+            self._room.put(None)
+            raise
 
     def close(self) -> None:
         """Wait until every item is consumed and the thread has ended.
@@ -112,9 +113,9 @@ class WorkerThread(Generic[T]):
 
         Never blocks.
         """
-        with self._lock:
-            self._closing = True
-            self._changed.notify_all()
+        self._closing = True
+        self._waiting.put(None)
+        self._room.put(None)
 
     def abort(self) -> None:
         """Drop waiting items, wait for the current item, and end the thread.
@@ -122,9 +123,7 @@ class WorkerThread(Generic[T]):
         Idempotent; raises nothing. If the function may be blocked, unblock it first.
         If called on the thread itself, it does not wait.
         """
-        with self._lock:
-            self._aborted = True
-            self._waiting.clear()
+        self._aborted = True
         self.leave()
         self._wait_for_end()
 
@@ -135,9 +134,6 @@ class WorkerThread(Generic[T]):
             self._has_ended.wait()
             self._thread.join()
 
-    def _has_room_or_ended(self) -> bool:
-        return self._closing or self.failed or len(self._waiting) < self._capacity
-
     def _raise_error(self) -> None:
         if self._error is not None:
             self._error_was_raised = True
@@ -145,25 +141,15 @@ class WorkerThread(Generic[T]):
 
     def _work(self) -> None:
         try:
-            while (item := self._next()) is not None:
-                self._consume(item[0])
+            while (item := self._waiting.get()) is not None:
+                self._room.put(None)
+                if not self._aborted:
+                    self._consume(*item)
             if self._finish is not None and not self._aborted:
                 self._finish()
         # All errors are kept for the caller, because on this thread they would be lost.
         except BaseException as error:
-            with self._lock:
-                self._error = error
-                self._waiting.clear()
-                self._changed.notify_all()
+            self._error = error
+            self._room.put(None)
         finally:
             self._has_ended.set()
-
-    def _next(self) -> tuple[T] | None:
-        """Wait for the next item and return it in a tuple, or None after the last."""
-        with self._lock:
-            self._changed.wait_for(lambda: self._closing or bool(self._waiting))
-            if not self._waiting:
-                return None
-            item = self._waiting.popleft()
-            self._changed.notify_all()
-            return (item,)

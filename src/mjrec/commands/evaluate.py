@@ -25,7 +25,7 @@ from ..evaluation.plan import PLAN_NAME
 from ..evaluation.statistics import Interval
 from ..evaluation.summaries import TaskSummary
 from ..evaluation.task_sets import tasks_from
-from ..formats.dataclass_json import to_json
+from ..formats.json_fields import to_json
 from ..monitors.progress import ShowProgress, progress_bar
 from ..plain_text import counted
 from ..recorder.keep_rules import keep_rule

@@ -16,7 +16,6 @@ from ..errors import InvalidArgument
 from ..evaluation.chunk_results import recorded_results
 from ..evaluation.evaluation import is_evaluation
 from ..formats.monitor_directory import (
-    Infix,
     recording_directories,
     trajectory_prefix,
 )
@@ -173,7 +172,7 @@ def _places(target: Path, episode: int | None) -> tuple[list[Path], int | None]:
 
 def _trajectories(directory: Path, episode: int) -> Iterator[Path]:
     for folder, result in recorded_results(directory):
-        infix = Infix.parse(result.monitor or "")
+        infix = result.monitor
         if result.episode == episode and infix and result.episode_id is not None:
             yield folder / f"{trajectory_prefix(infix, result.episode_id)}.h5"
 

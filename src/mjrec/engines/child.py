@@ -35,8 +35,7 @@ from pathlib import Path
 from typing import Any, cast
 
 from ..gl.devices import render_on_given_gpu
-from ..messages import carried
-from ..parent import Parent
+from ..messages import Parent, carried
 from . import worker
 
 # Not `__name__`, which is `__main__`.

@@ -21,7 +21,7 @@ from typing import Any
 
 from ..child_python import Child, wait_for_news
 from ..gl.devices import CUDA_VISIBLE_DEVICES
-from ..parent import Parent
+from ..messages import Parent
 
 # The file in a run's folder that describes the work. It exists as long as the run.
 WORK = "work.json"

@@ -19,7 +19,7 @@ from typing import Any
 
 from ..child_python import Child
 from ..errors import EnvironmentNotMade, Error, MissingDependency
-from ..parent import Parent
+from ..messages import Parent
 
 _VERSION = re.compile(r"-v([0-9]+)$", re.ASCII)
 _SUITE = "dm_control"

@@ -24,7 +24,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from ..formats.journal import JournalEntry, JournalReader
+from ..formats.journal import JournalEntry, read_journal
 from ..formats.json_fields import field as field_of
 from ..formats.json_fields import integer, mapping, number, optional, text, unreadable
 from ..formats.monitor_directory import infix_of, monitor_directories_in
@@ -109,7 +109,7 @@ def _read(path: Path, task: str, found: ChunkResults) -> None:
             found.results.setdefault(failed.unit, failed)
 
     with unreadable(path):
-        for entry in JournalReader(path, on_event=note):
+        for entry in read_journal(path, on_event=note):
             if entry.evaluation is not None:
                 running.clear()
                 found.is_drawn_live |= entry.recording == "live"

@@ -29,10 +29,9 @@ from ..errors import (
     PolicyError,
 )
 from ..formats.bundle import FINISHED, finished_trajectories
-from ..formats.dataclass_json import to_json
+from ..formats.json_fields import to_json
 from ..formats.locks import try_lock
 from ..formats.monitor_directory import (
-    Infix,
     iter_monitor_files,
     names_in,
     trajectory_prefix,
@@ -456,8 +455,7 @@ class _Files:
         self._names: set[str] = set()
 
     def __call__(self, result: EpisodeResult) -> EpisodeFiles:
-        infix = Infix.parse(result.monitor or "")
-        chunk = self._plan.chunk_of(result.unit)
+        infix, chunk = result.monitor, self._plan.chunk_of(result.unit)
         if infix is None or chunk is None or result.episode_id is None:
             return EpisodeFiles()
         folder = f"{self._folders[result.task]}/{chunk.folder}"

@@ -26,20 +26,21 @@ from functools import partial
 from pathlib import Path
 from typing import Any, TextIO
 
-from ..atomic_files import replacing, write_text
-from ..errors import FileNotWritten, UnreadableFile
-from ..formats.dataclass_json import from_json, to_json
+from ..atomic_files import replacing, write_text, writing
+from ..errors import UnreadableFile
 from ..formats.json_fields import (
     field,
+    from_json,
     integer,
     list_of,
     mapping,
     optional,
     read_object,
     text,
+    to_json,
     unreadable,
 )
-from ..formats.monitor_directory import Infix, video_prefix
+from ..formats.monitor_directory import video_prefix
 from ..formats.notebook import shown
 from ..formats.spans import find_trajectory
 from ..json_text import dumps
@@ -161,11 +162,11 @@ class Evaluation:
 
         Return None if both files are missing.
         """
-        infix = Infix.parse(result.monitor or "")
+        infix = result.monitor
         if infix is None or result.episode_id is None:
             return None
         folders = {of: folder for folder, of in self.by_task[result.task].places}
-        folder = self.directory / folders[str(infix)]
+        folder = self.directory / folders[infix]
         video = folder / f"{video_prefix(infix, result.episode_id)}.mp4"
         for each in (video, video.with_suffix(".json")):
             if each.exists():
@@ -294,14 +295,12 @@ def read_summaries(directory: Path) -> Evaluation:
 
 
 def _write(path: Path, write: Callable[[TextIO], None]) -> None:
-    try:
-        with (
-            replacing(path) as temporary,
-            temporary.open("w", encoding="utf-8", newline="") as file,
-        ):
-            write(file)
-    except OSError as error:
-        raise FileNotWritten(path, error.strerror) from error
+    with (
+        writing(path),
+        replacing(path) as temporary,
+        temporary.open("w", encoding="utf-8", newline="") as file,
+    ):
+        write(file)
 
 
 def _why_missing(directory: Path) -> str:

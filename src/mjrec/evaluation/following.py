@@ -18,7 +18,6 @@ from typing import Any
 
 from ..engines.jobs import Run
 from ..errors import EnvironmentNotMade, Error
-from ..formats.monitor_directory import Infix
 from ..messages import unpacked
 from ..recorder.keep_rules import keep_rule
 from ..rendering.chosen_videos import write_choice
@@ -256,9 +255,8 @@ def choose_videos(
         kept = keep_rule(plan.keep).choose(begun)
         for result, role in kept:
             chunk = plan.chunk_of(result.unit)
-            infix = Infix.parse(result.monitor or "")
-            if chunk and infix and result.episode_id is not None:
-                key = RecordingKey(infix, result.episode_id)
+            if chunk and result.monitor and result.episode_id is not None:
+                key = RecordingKey(result.monitor, result.episode_id)
                 episode = ChosenEpisode(*result.unit, role)
                 chosen.setdefault(chunk.folder, {}).setdefault(key, []).append(episode)
         drawable: set[ChosenEpisode] = set()

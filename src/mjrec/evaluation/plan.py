@@ -15,8 +15,14 @@ from typing import Annotated, Any, Literal, TypeAlias
 from ..atomic_files import write_text
 from ..errors import DifferentEvaluation, UnreadableFile
 from ..formats import json_fields
-from ..formats.dataclass_json import from_json, to_json
-from ..formats.json_fields import base_name, one_of, positive, unreadable
+from ..formats.json_fields import (
+    base_name,
+    from_json,
+    one_of,
+    positive,
+    to_json,
+    unreadable,
+)
 from ..frames import QUALITIES
 from ..json_text import dumps
 

@@ -34,7 +34,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..formats.json_fields import unreadable
-from ..formats.monitor_directory import Infix, video_prefix
+from ..formats.monitor_directory import is_infix, video_prefix
 from ..formats.regular_files import open_regular
 from .episode_results import EpisodeResult
 from .plan import EvaluationPlan
@@ -277,13 +277,12 @@ def _read_timing(of: TaskResults, index: int, values: Sequence[str]) -> None:
             raise ValueError("an episode without a folder must not have files")
         return
     place = folder, monitor
-    infix = Infix.parse(monitor)
-    if infix is None or not _FOLDER.fullmatch(folder):
+    if not is_infix(monitor) or not _FOLDER.fullmatch(folder):
         raise ValueError(f"{monitor!r:.80} in {folder!r:.80} is not a monitor")
     row["monitor"] = of.places.setdefault(place, len(of.places))
     row["episode_id"] = number = _whole(episode_id)
     if video:
-        prefix = video_prefix(infix, number)
+        prefix = video_prefix(monitor, number)
         if video not in (f"{prefix}{end}" for end in (".mp4", ".json", ".avi")):
             raise ValueError(f"{video!r:.200} is not a video of its episode")
         of.videos[index] = video

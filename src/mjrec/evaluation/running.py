@@ -37,7 +37,7 @@ from ..environments.names import working_directory_importable
 from ..environments.policies import Policy, load_policy, policy_file, policy_from
 from ..environments.scenes import new_warnings, simulation_below
 from ..errors import Error, InvalidArgument, PolicyError
-from ..formats.monitor_directory import Infix, journal_name
+from ..formats.monitor_directory import journal_name
 from ..json_text import dumps
 from ..monitors import Monitor
 from ..monitors.base import rendering_choice
@@ -358,9 +358,7 @@ class _ChunkRun:
             self._monitor.recorder.bundle_trajectories()
             self._monitor.leave_environment_open()
             self._open.enter_context(self._monitor)
-            infix = Infix.parse(self._monitor.infix)
-            assert infix is not None
-            self._evaluator.journal = self._folder / journal_name(infix)
+            self._evaluator.journal = self._folder / journal_name(self._monitor.infix)
         return self._monitor
 
     def _renew_unless_it_fits(self, seed: int, *, continues: bool) -> None:

@@ -30,7 +30,7 @@ from typing import Any
 from ..atomic_files import make_directory
 from ..environments.scenes import simulation_below
 from ..errors import Error, GLError
-from ..formats.dataclass_json import from_json
+from ..formats.json_fields import from_json
 from ..formats.locks import wait_for_lock
 from ..gl import use_gl
 from ..messages import carried

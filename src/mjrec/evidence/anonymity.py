@@ -24,7 +24,6 @@ name; `remaining_identity` finds it.
 
 from __future__ import annotations
 
-import contextlib
 import gzip
 import io
 import logging
@@ -39,10 +38,10 @@ from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
-from ..atomic_files import replacing
-from ..errors import FileNotWritten, InvalidArgument, UnreadableFile
+from ..atomic_files import replacing, writing
+from ..errors import InvalidArgument, UnreadableFile
 from ..formats.json_fields import unreadable
-from ..formats.monitor_directory import FILE_PREFIX, Infix, infix_of, is_second_name
+from ..formats.monitor_directory import FILE_PREFIX, infix_of, is_second_name
 from ..formats.trajectory_file import amend_trajectories
 from ..json_text import dumps, loads
 from .identity import Identity
@@ -171,7 +170,7 @@ def _make_file_anonymous(path: Path, texts: _Texts, matcher: IdentityMatcher) ->
     elif name.endswith(".csv"):
         _rewrite(path, lambda data: b"".join(_csv_lines(data, texts)))
     elif name.endswith(".h5"):
-        with _writing(path):
+        with writing(path):
             amend_trajectories({path: texts.value})
     elif name.startswith(_MODEL) and name.endswith(".zip"):
         _rewrite(path, lambda data: anonymous_sources(data, matcher))
@@ -191,16 +190,8 @@ def _rewrite(path: Path, change: Callable[[bytes], bytes]) -> None:
         old = path.read_bytes()
         new = change(old)
     if new != old:
-        with _writing(path), replacing(path) as temporary:
+        with writing(path), replacing(path) as temporary:
             temporary.write_bytes(new)
-
-
-@contextlib.contextmanager
-def _writing(path: Path) -> Iterator[None]:
-    try:
-        yield
-    except OSError as error:
-        raise FileNotWritten(path, error.strerror or error) from error
 
 
 def _json_lines(data: bytes, texts: _Texts) -> Iterator[bytes]:
@@ -266,15 +257,15 @@ def _renamed_infixes(matcher: IdentityMatcher, names: list[str]) -> Mapping[str,
     taken = {infix for infix in old if matcher.replaced_in_name(infix) == infix}
     new: dict[str, str] = {}
     for infix in old:
-        parsed = Infix.parse(infix)
-        if infix in taken or parsed is None:
+        if infix in taken:
             continue
-        uid, number = matcher.replaced_in_name(parsed.uid), 1
-        candidate = Infix(parsed.monitor_id, uid)
-        while str(candidate) in taken:
+        monitor_id, _, uid = infix.partition(".")
+        uid, number = matcher.replaced_in_name(uid), 1
+        candidate = f"{monitor_id}.{uid}"
+        while candidate in taken:
             number += 1
-            candidate = Infix(parsed.monitor_id, f"{uid}-{number}")
-        new[infix] = str(candidate)
+            candidate = f"{monitor_id}.{uid}-{number}"
+        new[infix] = candidate
         taken.add(new[infix])
     return new
 

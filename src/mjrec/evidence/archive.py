@@ -17,6 +17,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import IO, Any
 
+from ..atomic_files import writing
 from ..errors import FileNotWritten, UnreadableArchive
 from ..formats.bundle import trajectories_in
 from ..formats.monitor_directory import (
@@ -204,19 +205,15 @@ def _check_room(size: int, into: Path, path: Path) -> None:
 def _write(folder: Path, name: str, source: IO[bytes], size: int) -> None:
     """Copy a file of exactly `size` bytes into a folder."""
     target, left = folder.joinpath(*portable_parts(name)), size
-    try:
+    with writing(target):
         target.parent.mkdir(parents=True, exist_ok=True)
         output = target.open("xb")
-    except OSError as error:
-        raise FileNotWritten(target, error.strerror) from error
     with output:
         while chunk := source.read(_CHUNK):
             left -= len(chunk)
             if left < 0:
                 break
-            try:
+            with writing(target):
                 output.write(chunk)
-            except OSError as error:
-                raise FileNotWritten(target, error.strerror) from error
     if left:
         raise ValueError(f"{target.name!r} does not have the declared size")

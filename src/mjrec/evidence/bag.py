@@ -23,7 +23,8 @@ import zipfile
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 
-from ..errors import FileNotWritten, PackError
+from ..atomic_files import writing
+from ..errors import PackError
 from ..formats.regular_files import read_regular
 from .archive import BAG_DECLARATION, digest_of
 from .findings import Finding, Outcome, Topic
@@ -113,16 +114,13 @@ def write_zip(folder: Path, path: Path) -> None:
     Raises:
         FileNotWritten: the disk is full.
     """
-    try:
-        with path.open("xb") as file:
-            with zipfile.ZipFile(file, "w") as archive:
-                for source in _files(folder):
-                    name = source.relative_to(folder.parent).as_posix()
-                    _add(archive, source, name)
-            file.flush()
-            os.fsync(file.fileno())
-    except OSError as error:
-        raise FileNotWritten(path, error.strerror or error, then=TRY_AGAIN) from error
+    with writing(path, then=TRY_AGAIN), path.open("xb") as file:
+        with zipfile.ZipFile(file, "w") as archive:
+            for source in _files(folder):
+                name = source.relative_to(folder.parent).as_posix()
+                _add(archive, source, name)
+        file.flush()
+        os.fsync(file.fileno())
 
 
 def check_bag(bag: Path, on_progress: _OnProgress) -> Iterator[Finding]:

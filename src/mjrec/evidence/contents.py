@@ -25,10 +25,10 @@ from typing import Any
 
 import numpy as np
 
+from ..atomic_files import writing
 from ..errors import (
     DirectoryInUse,
     DirectoryNotWritable,
-    FileNotWritten,
     InvalidArgument,
     PackError,
     UnfinishedRecordings,
@@ -365,8 +365,5 @@ def _copy(source: Path, target: Path) -> None:
         file = source.open("rb")
     except OSError as error:
         raise UnreadableFile(source, error.strerror) from error
-    try:
-        with file, target.open("xb") as copy:
-            shutil.copyfileobj(file, copy)
-    except OSError as error:
-        raise FileNotWritten(target, error.strerror, then=TRY_AGAIN) from error
+    with writing(target, then=TRY_AGAIN), file, target.open("xb") as copy:
+        shutil.copyfileobj(file, copy)

@@ -77,7 +77,7 @@ def _choose(
         notes.append(note(group[0].name, "rule", reason, count=count, unit="video"))
     for finished, chosen in sorted(choices.items()):
         for each in group:
-            own = {k: roles for k, roles in chosen.items() if k.infix == each.own_infix}
+            own = {k: roles for k, roles in chosen.items() if k.infix == each.infix}
             write_choice(directory, own, rule=rule, finished=finished, among=each.infix)
 
 
@@ -111,7 +111,9 @@ def _made_again(
             if isinstance(number, int):
                 failed = _Ended(_key(recording, number), None, None, None)
             ended[facts["seed"], facts["episode"]] = failed
-        for entry in read_journal(directory / journal_name(recording.infix)):
+        for entry in read_journal(
+            directory / journal_name(recording.infix), warns=True
+        ):
             unit, key = entry.evaluation or {}, _key(recording, entry.episode_id)
             ended[unit.get("seed"), unit.get("episode")] = _Ended(
                 key, entry.reward, entry.terminated, entry.success
@@ -127,7 +129,7 @@ def _made_again(
 
 
 def _key(recording: RecordingInputs, number: int) -> RecordingKey:
-    return RecordingKey(recording.own_infix, number)
+    return RecordingKey(recording.infix, number)
 
 
 def _count(facts: Mapping[str, object]) -> int:

@@ -18,7 +18,7 @@ from typing import Final, TypeAlias
 
 from .. import json_text
 from ..errors import InvalidArgument
-from ..formats.dataclass_json import from_json, to_json
+from ..formats.json_fields import from_json, to_json
 from .differences import Aspect, Difference
 from .findings import Excuse, ExcuseKind, Finding, Outcome, Topic
 from .frame_similarity import (

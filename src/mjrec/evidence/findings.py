@@ -15,7 +15,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Final
 
-from ..formats.dataclass_json import to_json
+from ..formats.json_fields import to_json
 
 _NOTHING: Final[Mapping[str, Any]] = MappingProxyType({})
 

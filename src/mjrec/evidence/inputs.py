@@ -19,8 +19,7 @@ from numpy.typing import NDArray
 
 from .. import json_text
 from ..environments.scenes import shown_wrappers
-from ..formats.dataclass_json import from_json, to_json
-from ..formats.monitor_directory import Infix
+from ..formats.json_fields import from_json, to_json
 
 INPUTS_FILE: Final = "inputs.json"
 ARRAYS_FILE: Final = "arrays.npz"
@@ -198,13 +197,6 @@ class RecordingInputs:
     def name(self) -> str:
         """The recording's name in findings."""
         return f"recording {self.infix}"
-
-    @property
-    def own_infix(self) -> Infix:
-        """The infix, parsed."""
-        infix = Infix.parse(self.infix)
-        assert infix is not None, "reading the inputs has checked it"
-        return infix
 
     def item(self, episode: EpisodeInputs) -> str:
         """Return the name of one of its episodes in findings."""

@@ -15,11 +15,16 @@ from numpy.typing import NDArray
 
 from .. import json_text
 from ..errors import Error, UnreadableFile
-from ..formats.dataclass_json import from_json
-from ..formats.journal import JournalEntry, JournalReader
-from ..formats.json_fields import base_name, facts_in, read_object, unreadable
+from ..formats.journal import JournalEntry, read_journal
+from ..formats.json_fields import (
+    base_name,
+    facts_in,
+    from_json,
+    read_object,
+    unreadable,
+)
 from ..formats.manifest import read_manifest
-from ..formats.monitor_directory import FILE_PREFIX, Infix, episode_of
+from ..formats.monitor_directory import FILE_PREFIX, episode_of
 from ..formats.regular_files import open_regular
 from ..formats.trajectory import TrajectoryReader
 from ..formats.trajectory_hdf5 import open_hdf5
@@ -128,8 +133,6 @@ def packing_options(said: Mapping[str, Any]) -> PackingOptions:
 
 
 def _recording(files: MonitorFiles, arrays: dict[str, NDArray[Any]]) -> RecordingInputs:
-    if Infix.parse(files.infix) is None:
-        raise ValueError(f"{files.infix!r} is not a valid infix of a monitor's files")
     journal = _Journal(files.journal)
     run: dict[str, Any] = next(reversed(journal.facts_of("run")), {})
     known = {key: run[key] for key in ("schedule", "first_episode_id") if key in run}
@@ -187,7 +190,7 @@ class _Journal:
             self.events.append((lines, kind, facts))
             lines += kind != "run"
 
-        for entry in JournalReader(path, on_event=note) if path else ():
+        for entry in read_journal(path, on_event=note) if path else ():
             lines += 1
             self.entries[entry.episode_id] = entry
             if len(self.entries) > _MOST_EPISODES:

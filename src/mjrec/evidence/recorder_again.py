@@ -74,7 +74,7 @@ def monitor_again(
             **{name: value for name, value in given.items() if name in _UNCHANGED},
             trackers=() if start is None else MonitorCsvTracker(clock=lambda: start),
             statements=Statements(
-                infix=recording.own_infix,
+                infix=recording.infix,
                 first_episode_id=recording.first_episode_id,
                 provenance=recording.provenance,
                 provenance_after=recording.provenance_after,

@@ -21,7 +21,7 @@ from ..atomic_files import write_text
 from ..errors import ArchiveTooLarge, InvalidArgument, PackError
 from ..formats.json_fields import read_object, unreadable
 from ..formats.manifest import read_manifest
-from ..formats.monitor_directory import Infix, episode_of, infix_of, is_manifest
+from ..formats.monitor_directory import episode_of, infix_of, is_manifest
 from ..formats.spans import find_trajectory
 from ..formats.video_metadata import metadata_path
 from ..machine import usable_cpus
@@ -153,7 +153,7 @@ def _redrawable(staged: Path) -> list[_Redrawable]:
     for video, metadata in videos:
         with unreadable(staged / metadata):
             said = dict(read_object(staged / metadata))
-        infix, number = Infix.parse(infix_of(video) or ""), episode_of(video)
+        infix, number = infix_of(video), episode_of(video)
         # The states of a clip are deleted once its video exists.
         if said.get("recording") == "deferred" and "first_step" not in said:
             assert infix is not None

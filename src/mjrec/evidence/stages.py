@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from ..errors import Error, FileNotWritten, UnreadableArchive
-from ..formats.dataclass_json import to_json
+from ..formats.json_fields import to_json
 from ..sandbox import enter
 from .findings import Finding, Level
 from .inputs import ARRAYS_FILE, Inputs

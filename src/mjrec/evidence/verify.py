@@ -24,7 +24,7 @@ from ..errors import (
     UnknownName,
     UnreadableArchive,
 )
-from ..formats.dataclass_json import from_json
+from ..formats.json_fields import from_json
 from ..formats.locks import Lock, is_locked
 from ..machine import machine_fingerprint
 from ..sandbox import Sandbox

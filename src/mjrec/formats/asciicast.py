@@ -13,13 +13,12 @@ import io
 import itertools
 import json
 import re
-from collections.abc import Iterator
 from fractions import Fraction
 from pathlib import Path
 from typing import IO
 
-from ..atomic_files import temporary_path
-from ..errors import FileNotWritten, InvalidFrame
+from ..atomic_files import temporary_path, writing
+from ..errors import InvalidFrame
 from ..json_text import loads
 from ..rates import rate_from_timestep
 from .json_fields import unreadable
@@ -75,7 +74,7 @@ class AsciicastWriter:
         self._width = max(self._width, *(_columns(line) for line in lines))
         self._height = max(self._height, len(lines))
         event = [float(1 / self._rate), _CLEAR_AND_HOME + "\r\n".join(lines)]
-        with self._naming_the_file():
+        with writing(self.path):
             if self._file is None:
                 self._file = self._part.open("w", encoding="utf-8")
             begin = ",\n" if self.frame_count else _BEGIN
@@ -101,7 +100,7 @@ class AsciicastWriter:
             "title": "mjrec recording",
             "env": {},
         }
-        with self._naming_the_file():
+        with writing(self.path):
             if not self._file.closed:
                 self._file.write("\n], " + json.dumps(facts)[1:] + "\n")
                 self._file.close()
@@ -119,13 +118,6 @@ class AsciicastWriter:
         """Close the unfinished file, which another process can finish."""
         if self._file is not None:
             self._file.close()
-
-    @contextlib.contextmanager
-    def _naming_the_file(self) -> Iterator[None]:
-        try:
-            yield
-        except OSError as error:
-            raise FileNotWritten(self.path, error.strerror) from error
 
 
 def unfinished_recording(path: Path) -> tuple[Fraction, list[str]]:

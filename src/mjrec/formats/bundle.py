@@ -25,7 +25,6 @@ from ..errors import UnreadableFile
 from ..json_text import dumps
 from .json_fields import field, integer, json_object, list_of, unreadable
 from .monitor_directory import (
-    Infix,
     bundle_name,
     episode_of,
     infix_of,
@@ -85,7 +84,7 @@ def trajectories_in(bundle: Path) -> list[Path]:
 
     The list is empty if the bundle cannot be read. To get the reason, open the bundle.
     """
-    infix = Infix.parse(infix_of(bundle.name) or "")
+    infix = infix_of(bundle.name)
     if infix is None:
         return []
     return [

@@ -25,7 +25,6 @@ any line. A reader skips and reports invalid lines, and keeps the rest.
 
 from __future__ import annotations
 
-import itertools
 import logging
 import os
 import re
@@ -34,11 +33,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
-from ..errors import ClosedError, FileNotWritten
+from ..atomic_files import append_whole, open_for_appending, writing
+from ..errors import ClosedError
 from ..json_text import dumps
-from .appending import append_whole, open_for_appending
-from .dataclass_json import from_json
-from .json_fields import integer, json_object, unreadable
+from .json_fields import from_json, integer, json_object, unreadable
 from .regular_files import open_regular
 
 logger = logging.getLogger(__name__)
@@ -97,8 +95,8 @@ class JournalEntry:
         evaluation: `seed`, `episode` and `warnings`, for an episode of an evaluation.
     """
 
-    episode_id: Annotated[int, _count]
-    length: Annotated[int, _count]
+    episode_id: Annotated[int, count]
+    length: Annotated[int, count]
     reward: float
     type: str
     start_time: float
@@ -194,10 +192,8 @@ class JournalWriter:
         lines = self._unwritten + line
         if later:
             self._unwritten = lines
-        try:
+        with writing(self.path):
             self._write(lines)
-        except OSError as error:
-            raise FileNotWritten(self.path, error.strerror or error) from error
         self._unwritten = b""
 
     def _write(self, lines: bytes) -> None:
@@ -234,124 +230,77 @@ def is_of_spans(line: bytes) -> bool:
     return line.startswith(_OF_SPANS)
 
 
-class JournalReader:
-    """A reader that yields a journal's entries in the order in which they were written.
+def read_journal(
+    path: Path,
+    *,
+    on_event: Callable[[str, Any], object] = lambda *_: None,
+    on_damage: Callable[[int], object] = lambda _: None,
+    warns: bool = False,
+) -> Iterator[JournalEntry]:
+    """Yield a journal's entries in the order in which they were written.
 
-    Iterate over it only once. Invalid lines are skipped and counted, and so are
-    episodes whose number has occurred before. After a line of 16 MiB or more, or after
-    too many damaged lines, the rest of the file is skipped.
+    Invalid lines are skipped, and so are episodes whose number has occurred before.
+    After a line of 16 MiB or more, or after too many damaged lines, the rest of the
+    file is skipped.
 
     Args:
         path: the file.
         on_event: called with the kind and the facts of every other event.
-
-    Attributes:
-        last_episode_id: the highest episode number so far, including damaged lines
-            whose number is readable; -1 before the first.
-        dropped: number of lines skipped so far.
-    """
-
-    def __init__(
-        self, path: Path, *, on_event: Callable[[str, Any], object] = lambda *_: None
-    ) -> None:
-        self._path = path
-        self._on_event = on_event
-        # The episode numbers so far. They are dense, so each is stored as one bit.
-        self._seen: dict[int, int] = {}
-        self._damaged = 0
-        self._first_reason = ""
-        self._gave_up = False
-        self.last_episode_id = -1
-        self.dropped = 0
-
-    def __iter__(self) -> Iterator[JournalEntry]:
-        """Yield the entries.
-
-        Raises:
-            UnreadableFile: the file is missing or cannot be read.
-        """
-        with unreadable(self._path):
-            file = open_regular(self._path)
-        with file:
-            for index in itertools.count(1):
-                # A disk can fail at any line.
-                with unreadable(self._path):
-                    line = file.readline(_LONGEST_LINE)
-                if not line:
-                    return
-                entry = self._entry(index, line)
-                if entry is not None:
-                    yield entry
-                if self._gave_up:
-                    return
-
-    def report(self) -> None:
-        """Log a warning about the lines that were skipped, if there were any."""
-        if not self.dropped:
-            return
-        rest = " and all that follows" if self._gave_up else ""
-        logger.warning(
-            "%s: %d %s%s left out: %s%s.",
-            self._path,
-            self.dropped,
-            "line" if self.dropped == 1 else "lines",
-            rest,
-            "" if self.dropped == 1 else "first ",
-            self._first_reason,
-        )
-
-    def _entry(self, index: int, line: bytes) -> JournalEntry | None:
-        if is_of_spans(line):
-            return None
-        try:
-            if len(line) >= _LONGEST_LINE:
-                self._gave_up = True
-                raise ValueError("it is too long for an episode")
-            values = json_object(line)
-            kind = next(iter(values)) if len(values) == 1 else None
-            if kind in EVENTS:
-                self._on_event(kind, values[kind])
-                return None
-            entry = entry_of(values)
-        except ValueError as error:
-            torn = not line.endswith(b"\n") and not self._gave_up
-            # Its writer was killed in the middle of the line, or is still writing it.
-            self._leave_out(index, line, "it was cut off" if torn else str(error))
-            self._damaged += 1
-            self._gave_up |= self._damaged >= _MOST_DAMAGED_LINES
-            return None
-        block, bit = divmod(entry.episode_id, _BLOCK)
-        if self._seen.get(block, 0) >> bit & 1:
-            self._leave_out(index, line, "its episode occurred before")
-            return None
-        self._seen[block] = self._seen.get(block, 0) | 1 << bit
-        self.last_episode_id = max(self.last_episode_id, entry.episode_id)
-        return entry
-
-    def _leave_out(self, index: int, line: bytes, reason: str) -> None:
-        begin = _BEGIN.match(line)
-        if begin is not None:
-            self.last_episode_id = max(self.last_episode_id, int(begin[1]))
-        if not self.dropped:
-            episode = f" (episode {int(begin[1])})" if begin else ""
-            self._first_reason = f"line {index}{episode}: {reason}"
-        self.dropped += 1
-
-
-def read_journal(path: Path) -> Iterator[JournalEntry]:
-    """Yield a journal's entries in the order in which they were written.
-
-    Invalid lines are skipped, as in `JournalReader`, and one warning about them is
-    logged at the end.
+        on_damage: called with the episode number of a skipped line, if it is readable.
+        warns: whether to log a warning about skipped lines at the end.
 
     Raises:
         UnreadableFile: the file is missing or cannot be read.
     """
-    reader = JournalReader(path)
-    try:
-        yield from reader
-    finally:
-        reader.report()
+    # The episode numbers so far. They are dense, so each is stored as one bit.
+    seen: dict[int, int] = {}
+    damaged = skipped = 0
+    first_reason = rest = ""
+    for index, line in enumerate(_lines(path), 1):
+        if is_of_spans(line):
+            continue
+        try:
+            if len(line) >= _LONGEST_LINE:
+                raise ValueError("it is too long for an episode")
+            values = json_object(line)
+            kind = next(iter(values)) if len(values) == 1 else None
+            if kind in EVENTS:
+                on_event(kind, values[kind])
+                continue
+            entry = entry_of(values)
+        except ValueError as error:
+            damaged += 1
+            if len(line) >= _LONGEST_LINE or damaged >= _MOST_DAMAGED_LINES:
+                rest = " and all that follows"
+            # Its writer was killed in the middle of the line, or is still writing it.
+            is_torn = not line.endswith(b"\n") and not rest
+            reason = "it was cut off" if is_torn else str(error)
+        else:
+            block, bit = divmod(entry.episode_id, _BLOCK)
+            if not seen.get(block, 0) >> bit & 1:
+                seen[block] = seen.get(block, 0) | 1 << bit
+                yield entry
+                continue
+            reason = "its episode occurred before"
+        skipped += 1
+        episode = ""
+        if (begin := _BEGIN.match(line)) is not None:
+            on_damage(int(begin[1]))
+            episode = f" (episode {int(begin[1])})"
+        first_reason = first_reason or f"line {index}{episode}: {reason}"
+        if rest:
+            break
+    if warns and skipped:
+        lines, first = f"{skipped} lines", "first "
+        if skipped == 1:
+            lines, first = "1 line", ""
+        reason = f"{lines}{rest} left out: {first}{first_reason}"
+        logger.warning("%s: %s.", path, reason)
+
+
+def _lines(path: Path) -> Iterator[bytes]:
+    with unreadable(path), open_regular(path) as file:
+        yield from iter(lambda: file.readline(_LONGEST_LINE), b"")
 
 
 def entry_of(values: Mapping[str, Any]) -> JournalEntry:
@@ -383,9 +332,10 @@ def missing_line(
     return "cut", {**choice, "reason": facts.get("reason", KILLED)}
 
 
-def _count(value: Any) -> int:
-    count = integer(value)
-    if not 0 <= count < MOST_EPISODES:
+def count(value: Any) -> int:
+    """Return a value from a journal as a number of episodes, steps or rows."""
+    number = integer(value)
+    if not 0 <= number < MOST_EPISODES:
         # Do not show its digits: there may be thousands.
         raise ValueError("it is negative or too large for a count")
-    return count
+    return number

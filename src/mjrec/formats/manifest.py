@@ -22,10 +22,10 @@ from typing import Annotated, Any
 
 from ..atomic_files import write_text
 from ..json_text import dumps
-from .dataclass_json import from_json
 from .json_fields import (
     base_name,
     field,
+    from_json,
     integer,
     list_of,
     mapping,

@@ -69,8 +69,6 @@ MANIFEST_PREFIX = f"{FILE_PREFIX}.manifest"
 
 _SHOWN = 5
 
-# Gym accepted any string as a uid.
-_INFIX = re.compile(r"(?P<number>[0-9]{1,18})\.(?P<uid>[^/\n\0]+)")
 _UID = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9_.-]{0,99}", re.ASCII)
 
 # The names that this package and all versions of gym have used. No other file in a
@@ -78,7 +76,10 @@ _UID = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9_.-]{0,99}", re.ASCII)
 #
 # Names are also read from files, which may be untrusted: a name with a slash would lead
 # out of the directory, and a number with a million digits takes minutes to parse.
-_INFIX_PART = r"(?P<infix>[^/\n\0]+)"
+#
+# Gym accepted any string as a uid.
+_INFIX_PART = r"(?P<infix>[0-9]{1,18}\.[^/\n\0]+)"
+_INFIX = re.compile(_INFIX_PART)
 _VIDEO = rf"openaigym\.video\.{_INFIX_PART}\.video(?P<episode>[0-9]{{6,18}})"
 _TRAJECTORY = (
     rf"openaigym\.trajectory\.{_INFIX_PART}\.episode(?P<episode>[0-9]{{6,18}})"
@@ -113,7 +114,7 @@ _VISIBLE = {
 _HIDDEN = (
     re.compile(rf"\.{_VIDEO}\.lock"),
     re.compile(rf"\.{_CLIP}\.lock"),
-    re.compile(r"\.openaigym\.render\.[0-9]+\.lock"),
+    re.compile(r"\.openaigym\.(recover|render\.[0-9]+)\.lock"),
     re.compile(rf"\.openaigym\.manifest\.{_INFIX_PART}\.lock"),
     re.compile(rf"\.openaigym\.{_INFIX_PART}\.lock"),
     re.compile(r"\.openaigym\.[^/\n\0]+\.part"),
@@ -136,56 +137,11 @@ _LONGEST_PART = 80
 _DIGEST = 8
 
 # The file names of Gymnasium's RecordVideo, for any portable `name_prefix`.
-_SECOND_NAME = re.compile(
-    r"(?!openaigym)[A-Za-z0-9_][A-Za-z0-9_.-]{0,99}-(episode|step)-[0-9]{1,18}\.mp4",
-    re.ASCII,
+_SECOND_STEM = (
+    r"(?!openaigym)[A-Za-z0-9_][A-Za-z0-9_.-]{0,99}-(episode|step)-[0-9]{1,18}"
 )
-
-
-@dataclass(frozen=True)
-class Infix:
-    """The part of file names that identifies one monitor.
-
-    Attributes:
-        monitor_id: the monitor's number, from 0.
-        uid: the user's name for the run, or the process id.
-    """
-
-    monitor_id: int
-    uid: str
-
-    def __str__(self) -> str:
-        return f"{self.monitor_id}.{self.uid}"
-
-    @classmethod
-    def parse(cls, text: str) -> Infix | None:
-        """Parse an infix, or return None if `text` is not a valid infix."""
-        match = _INFIX.fullmatch(text)
-        return None if match is None else cls(int(match["number"]), match["uid"])
-
-
-@dataclass(frozen=True)
-class ClipPart:
-    """The parsed name of a part of a clip.
-
-    Attributes:
-        infix: the monitor's infix.
-        first_step: number of steps that the monitor had recorded when the clip began.
-        number: the part's number, from 0.
-    """
-
-    infix: Infix
-    first_step: int
-    number: int
-
-    @classmethod
-    def parse(cls, name: str) -> ClipPart | None:
-        """Parse the name of a clip's part, or return None for any other name."""
-        match = _CLIP_PART.fullmatch(name)
-        infix = None if match is None else Infix.parse(match["infix"])
-        if match is None or infix is None:
-            return None
-        return cls(infix, int(match["step"]), int(match["part"]))
+_SECOND_NAME = re.compile(rf"{_SECOND_STEM}\.mp4", re.ASCII)
+_OF_SECOND_NAME = re.compile(rf"{_SECOND_STEM}(\.[^.]*)?\.(mp4|meta\.json)", re.ASCII)
 
 
 @dataclass(frozen=True)
@@ -237,6 +193,28 @@ class VideoName:
         return not self.view and self.first_step is None
 
 
+def clip_step(name: str) -> int | None:
+    """Return the step at which a clip began, from the name of one of its parts.
+
+    This is the number of steps that the monitor had recorded by then. For any other
+    name, it is None.
+    """
+    match = _CLIP_PART.fullmatch(name)
+    return None if match is None else int(match["step"])
+
+
+def is_infix(text: str) -> bool:
+    """Return whether `text` is a valid infix."""
+    return _INFIX.fullmatch(text) is not None
+
+
+def infix_order(infix: str) -> tuple[int, int, str]:
+    """Return a sort key that orders infixes by monitor id and process id."""
+    number, _, uid = infix.partition(".")
+    # Process ids are compared as numbers: 9 comes before 10.
+    return int(number), int(uid) if uid.isdecimal() else 0, uid
+
+
 def check_uid(uid: object) -> str:
     """Return `uid` as the string that goes into file names.
 
@@ -252,32 +230,32 @@ def check_uid(uid: object) -> str:
     return text
 
 
-def manifest_name(infix: Infix) -> str:
+def manifest_name(infix: str) -> str:
     """Return the manifest's name."""
     return f"{MANIFEST_PREFIX}.{infix}.manifest.json"
 
 
-def stats_prefix(infix: Infix) -> str:
+def stats_prefix(infix: str) -> str:
     """Return the statistics file's name without `.stats.json`."""
     return f"{FILE_PREFIX}.episode_batch.{infix}"
 
 
-def journal_name(infix: Infix | str) -> str:
+def journal_name(infix: str) -> str:
     """Return the journal's name."""
     return f"{FILE_PREFIX}.episodes.{infix}.jsonl"
 
 
-def video_prefix(infix: Infix | str, episode_id: int) -> str:
+def video_prefix(infix: str, episode_id: int) -> str:
     """Return the name of an episode's video without its extensions."""
     return f"{FILE_PREFIX}.video.{infix}.video{episode_id:06d}"
 
 
-def trajectory_prefix(infix: Infix, episode_id: int) -> str:
+def trajectory_prefix(infix: str, episode_id: int) -> str:
     """Return the name of an episode's trajectory without `.h5`."""
     return f"{FILE_PREFIX}.trajectory.{infix}.episode{episode_id:06d}"
 
 
-def bundle_name(infix: Infix | str) -> str:
+def bundle_name(infix: str) -> str:
     """Return the name of a monitor's bundle, the file that holds many trajectories."""
     return f"{FILE_PREFIX}.trajectories.{infix}.h5"
 
@@ -287,12 +265,12 @@ def is_bundle(name: str) -> bool:
     return _VISIBLE["trajectories"].fullmatch(name) is not None
 
 
-def video_lock_name(infix: Infix, episode_id: int) -> str:
+def video_lock_name(infix: str, episode_id: int) -> str:
     """Return the name of the lock file held while an episode is rendered."""
     return f".{video_prefix(infix, episode_id)}.lock"
 
 
-def clip_prefix(infix: Infix, first_step: int) -> str:
+def clip_prefix(infix: str, first_step: int) -> str:
     """Return the start of the names of a clip's parts.
 
     Args:
@@ -302,22 +280,22 @@ def clip_prefix(infix: Infix, first_step: int) -> str:
     return f"{FILE_PREFIX}.clip.{infix}.step{first_step:09d}"
 
 
-def clip_part_name(infix: Infix, first_step: int, number: int) -> str:
+def clip_part_name(infix: str, first_step: int, number: int) -> str:
     """Return the name of one of a clip's parts: one per episode, counted from 0."""
     return f"{clip_prefix(infix, first_step)}.part{number:06d}"
 
 
-def log_name(infix: Infix | str, number: int) -> str:
+def log_name(infix: str, number: int) -> str:
     """Return the name of a row log; its companion files have other suffixes."""
     return f"{FILE_PREFIX}.states.{infix}.{number:06d}.log"
 
 
-def clip_lock_name(infix: Infix, first_step: int) -> str:
+def clip_lock_name(infix: str, first_step: int) -> str:
     """Return the name of the lock file held while a clip is rendered."""
     return f".{clip_prefix(infix, first_step)}.lock"
 
 
-def clip_video_prefix(infix: Infix, episode_id: int, step: int | None) -> str:
+def clip_video_prefix(infix: str, episode_id: int, step: int | None) -> str:
     """Return the name of a clip's video without its extensions.
 
     Args:
@@ -335,12 +313,12 @@ def render_lock_name(number: int) -> str:
     return f".{FILE_PREFIX}.render.{number}.lock"
 
 
-def lock_name(infix: Infix) -> str:
+def lock_name(infix: str) -> str:
     """Return the name of the lock file that an open monitor holds."""
     return f".{FILE_PREFIX}.{infix}.lock"
 
 
-def manifest_lock_name(infix: Infix) -> str:
+def manifest_lock_name(infix: str) -> str:
     """Return the name of the lock file held while a manifest is rewritten.
 
     This is not the monitor's own lock, because a closed monitor stays closed.
@@ -361,15 +339,17 @@ def infix_of(name: str) -> str | None:
 
 def episode_of(name: str) -> int | None:
     """Return the episode number in a file's name, or None if it has none."""
-    match = _match(name)
-    number = None if match is None else match.groupdict().get("episode")
-    return None if number is None else int(number)
+    return _number(name, "episode")
 
 
 def log_number(name: str) -> int | None:
     """Return the number of the row log that a file belongs to, or None."""
+    return _number(name, "log")
+
+
+def _number(name: str, part: str) -> int | None:
     match = _match(name)
-    number = None if match is None else match.groupdict().get("log")
+    number = None if match is None else match.groupdict().get(part)
     return None if number is None else int(number)
 
 
@@ -549,16 +529,6 @@ def with_part(video: str, part: str) -> str:
     return f"{stem}.{part}{dot}{ending}"
 
 
-def without_part(video: str) -> str:
-    """Return the name of a video without the part before its ending.
-
-    >>> without_part("rl-video-episode-27.side.mp4")
-    'rl-video-episode-27.mp4'
-    """
-    stem, dot, ending = video.rpartition(".")
-    return f"{stem.rpartition('.')[0]}{dot}{ending}"
-
-
 def tiled_name(video: str) -> str:
     """Return the name of the video that shows all sub-environments at once.
 
@@ -582,6 +552,11 @@ def view_of(video: str) -> str:
 def is_second_name(name: str) -> bool:
     """Return whether `name` could be the second name of one of our videos."""
     return _SECOND_NAME.fullmatch(name) is not None
+
+
+def is_called_like_second(name: str) -> bool:
+    """Return whether `name` could be a second name of any file of our videos."""
+    return _OF_SECOND_NAME.fullmatch(name) is not None
 
 
 def second_name_of(name: str, second: str, *, first: str) -> str | None:

@@ -19,13 +19,12 @@ import mmap
 import os
 import struct
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import FileNotWritten
+from ..atomic_files import writing
 from .regular_files import open_regular
 
 TAIL_BYTES = 256 << 10
@@ -70,7 +69,7 @@ class RowLog:
         self.capacity = max(_LEAST_ROWS, tail_bytes // self.row_size)
         self.count = self._written = 0
         length = TAIL_HEAD + self.capacity * self.row_size
-        with self._naming_errors():
+        with writing(path):
             self._log = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666)
             try:
                 self._is_mapped = _may_be_mapped(self._log)
@@ -84,11 +83,6 @@ class RowLog:
         self.counter[1], self.counter[2] = row_words, self.capacity
         rows = np.frombuffer(self.memory, np.uint64, offset=TAIL_HEAD)
         self.slots: NDArray[np.uint64] = rows.reshape(self.capacity, row_words)
-
-    @property
-    def size(self) -> int:
-        """The size of all rows so far, in bytes."""
-        return self.count * self.row_size
 
     def make_room(self) -> None:
         """Write the rows that are not in the log yet, so that the next slot is free.
@@ -112,11 +106,6 @@ class RowLog:
     def is_open(self) -> bool:
         """Whether rows can be added."""
         return self._log >= 0
-
-    @property
-    def is_there(self) -> bool:
-        """Whether the log is open and its file was not removed."""
-        return self.is_open and os.fstat(self._log).st_nlink > 0
 
     def close(self) -> None:
         """Write the last rows and remove the tail. Idempotent.
@@ -146,7 +135,7 @@ class RowLog:
         Raises:
             FileNotWritten: the disk is full; the rows stay in memory.
         """
-        with self._naming_errors():
+        with writing(self.path):
             while self._written < self.count:
                 first = self._written % self.capacity
                 stop = min(self.capacity, first + self.count - self._written)
@@ -172,13 +161,6 @@ class RowLog:
             raise
         finally:
             os.close(tail)
-
-    @contextlib.contextmanager
-    def _naming_errors(self) -> Iterator[None]:
-        try:
-            yield
-        except OSError as error:
-            raise FileNotWritten(self.path, error.strerror or error) from error
 
 
 def tail_path(log: Path) -> Path:

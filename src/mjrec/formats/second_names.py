@@ -24,7 +24,6 @@ from .monitor_directory import (
     is_second_name,
     iter_monitor_files,
     second_name_of,
-    without_part,
 )
 from .video_metadata import finished_videos, metadata_of, metadata_path
 
@@ -71,15 +70,6 @@ def take_second_names(video: Path) -> None:
     for file, link in _second_names(video):
         if _is_same(file, link):
             link.unlink()
-
-
-def is_called_like_second(name: str) -> bool:
-    """Return whether `name` could be a second name, including a further camera's."""
-    for ending in (".mp4", ".meta.json"):
-        if name.endswith(ending):
-            video = f"{name.removesuffix(ending)}.mp4"
-            return is_second_name(video) or is_second_name(without_part(video))
-    return False
 
 
 def _second_names(video: Path) -> Iterator[tuple[Path, Path]]:

@@ -20,10 +20,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ..atomic_files import writing
 from ..errors import DirectoryNotWritable, FileNotWritten
 from .bundle import FINISHED
 from .journal import JournalWriter
-from .monitor_directory import Infix, log_name
+from .monitor_directory import log_name
 from .row_log import TAIL_BYTES, RowLog
 from .spans import LOOKS, Recording, remove_log
 from .trajectory import (
@@ -63,7 +64,7 @@ class SpanLogs:
     def __init__(
         self,
         directory: Path,
-        infix: Infix,
+        infix: str,
         *,
         journal: JournalWriter,
         numbers: Iterator[int],
@@ -173,19 +174,17 @@ def _begin(
         if key not in known or (known[key] is not value and known[key] != value)
     }
     line = {"name": name, "log": log.number, "rows": rows.number}
-    line |= {"row": log.rows.count, "look": log.look_size, "facts": own}
+    line |= {"row": log.count, "look": log.look_size, "facts": own}
     without = [key for key in known if key not in facts]
     return {**line, **({"without": without} if without else {})}
 
 
-class OpenLog:
-    """A row log that is being written.
+class OpenLog(RowLog):
+    """The row log of recordings, with the changes of their model.
 
     Attributes:
-        path: the log.
         number: the log's number.
         journal: the monitor's journal.
-        rows: the underlying `RowLog`.
         columns: views of the tail's slots by part: `state` as float64, `snapshot` as
             words, `action` and `observation`. Parts that the rows lack are missing.
         bodies: for each slot, all words after its head.
@@ -203,7 +202,8 @@ class OpenLog:
         *,
         tail_bytes: int,
     ) -> None:
-        self.path, self.number, self.journal = path, number, journal
+        super().__init__(path, dtype.itemsize // 8, tail_bytes=tail_bytes)
+        self.number, self.journal = number, journal
         self.is_alone = False
         self.look_size = 0
         # There are only a few. Reading them from the journal would take time and
@@ -211,9 +211,8 @@ class OpenLog:
         self.recordings: list[Recording] = []
         self._dtype = dtype
         self._looks: int | None = None
-        self.rows = RowLog(path, dtype.itemsize // 8, tail_bytes=tail_bytes)
-        slots = self.rows.slots
-        self.bodies = [slots[k, HEAD_WORDS:] for k in range(self.rows.capacity)]
+        slots = self.slots
+        self.bodies = [slots[k, HEAD_WORDS:] for k in range(self.capacity)]
         self.columns: dict[str, NDArray[Any]] = {}
         for name, (kind, offset, *_) in (dtype.fields or {}).items():
             words = slots[:, offset // 8 : (offset + kind.itemsize) // 8]
@@ -222,10 +221,16 @@ class OpenLog:
 
     def suits(self, dtype: np.dtype[Any]) -> bool:
         """Return whether a recording with this row layout can continue in this log."""
-        size = self.rows.size + self.look_size
-        is_short = size < _LONG and len(self.recordings) < _MANY
-        is_free = self.rows.is_there and not self.is_alone
-        return is_short and is_free and self._dtype == dtype
+        size = self.count * self.row_size + self.look_size
+        return (
+            size < _LONG
+            and len(self.recordings) < _MANY
+            and self._dtype == dtype
+            and not self.is_alone
+            and self.is_open
+            # Its file was not removed.
+            and os.fstat(self._log).st_nlink > 0
+        )
 
     def add_change(self, change: ModelChange) -> None:
         """Add a change of the model that takes effect at the next row.
@@ -234,16 +239,14 @@ class OpenLog:
             InvalidArgument: the change cannot be recorded.
             FileNotWritten: the disk is full; nothing was added.
         """
-        record = pack_change(self.rows.count, change)
+        record = pack_change(self.count, change)
         path = self.path.with_suffix(LOOKS)
-        try:
+        with writing(path):
             if self._looks is None:
                 self._looks = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666)
             if os.pwrite(self._looks, record, self.look_size) != len(record):
                 os.ftruncate(self._looks, self.look_size)
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        except OSError as error:
-            raise FileNotWritten(path, error.strerror or error) from error
         self.look_size += len(record)
 
     def close(self) -> None:
@@ -252,18 +255,17 @@ class OpenLog:
         Raises:
             FileNotWritten: the disk is full; the next call tries again.
         """
-        if not self.rows.is_open:
+        if not self.is_open:
             return
         try:
-            self.rows.write()
+            self.write()
             self.journal.note("full", self.number, later=False)
         except FileNotWritten:
             if not self.path.exists():
                 # The directory was removed, so there is nothing to retry.
                 self.release()
             raise
-        self.rows.close()
-        self.release()
+        super().close()
         if not any(recording.is_in_flight for recording in self.recordings):
             # Otherwise the finisher removes the files.
             self.remove()
@@ -276,7 +278,7 @@ class OpenLog:
 
     def release(self) -> None:
         """Close the files unchanged. Idempotent."""
-        self.rows.release()
+        super().release()
         self.bodies, self.columns = [], {}
         if self._looks is not None:
             os.close(self._looks)
@@ -302,7 +304,7 @@ class SpanWriter:
         self.log = log
         self._name = name
         own = {key: facts[key] for key in ("kept", "video") if key in facts}
-        row, look = log.rows.count, log.look_size
+        row, look = log.count, log.look_size
         self._recording = Recording(name, log.path, {}, own, row=row, look=look)
         log.recordings.append(self._recording)
         self.steps = self.frame_count = 0
@@ -314,7 +316,7 @@ class SpanWriter:
         Raises:
             FileNotWritten: the disk is full; all rows so far are kept.
         """
-        rows = self.log.rows
+        rows = self.log
         if rows.count >= rows.limit:
             rows.make_room()
         return rows.count % rows.capacity
@@ -343,7 +345,7 @@ class SpanWriter:
             FileNotWritten: the disk is full, and rows are written one by one. The row
                 is kept, and later calls retry.
         """
-        rows = self.log.rows
+        rows = self.log
         flags = (STEP if is_step else 0) | (FRAME if is_frame else 0)
         flags |= (TERMINATED if terminated else 0) | (TRUNCATED if truncated else 0)
         head = rows.slots[rows.count % rows.capacity, :HEAD_WORDS]
@@ -373,11 +375,7 @@ class SpanWriter:
         Raises:
             FileNotWritten: the disk is full; the end is written before the next line.
         """
-        said = {
-            "name": self._name,
-            "row": self.log.rows.count,
-            "facts": dict(facts),
-        }
+        said = {"name": self._name, "row": self.log.count, "facts": dict(facts)}
         self.log.journal.note("end", said)
         if self.log.is_alone:
             self.log.close()

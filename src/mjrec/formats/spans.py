@@ -38,12 +38,11 @@ import numpy as np
 
 from ..errors import DirectoryNotWritable, UnreadableFile
 from .bundle import FINISHED, is_finished
-from .journal import is_of_spans
+from .journal import count, is_of_spans
 from .json_fields import base_name, integer, json_object, mapping, unreadable
 from .locks import is_locked
 from .monitor_directory import (
-    ClipPart,
-    Infix,
+    clip_step,
     episode_of,
     infix_of,
     journal_name,
@@ -205,7 +204,7 @@ class _Spans:
             self.recordings[said["name"]].facts.update(mapping(said["facts"]))
         elif kind == "end":
             recording = self.recordings[said["name"]]
-            recording.stop = _count(said["row"])
+            recording.stop = count(said["row"])
             recording.facts.update(mapping(said["facts"]))
 
     def _begin(self, said: Mapping[str, Any]) -> None:
@@ -216,7 +215,7 @@ class _Spans:
         common = mapping(rows.get("facts", {})).items()
         facts = {k: v for k, v in common if k not in without}
         facts.update(mapping(said["facts"]))
-        first, look = _count(said["row"]), _count(said["look"])
+        first, look = count(said["row"]), count(said["look"])
         recording = Recording(name, log, rows, facts, row=first, look=look)
         others = self.logs.setdefault(log, [])
         if others:
@@ -229,18 +228,12 @@ class _Spans:
 
     def _log(self, number: Any) -> Path:
         infix = infix_of(self.journal.name)
-        return self.journal.with_name(log_name(infix or "", _count(number)))
+        return self.journal.with_name(log_name(infix or "", count(number)))
 
 
-class _Known(threading.local):
-    """This thread's cache. A shared cache would need a lock, which is bad with fork."""
-
-    def __init__(self) -> None:
-        self.spans: dict[Path, _Spans] = {}
-
-
-# Cached because a journal only grows, and recordings are looked up one at a time.
-_known = _Known()
+# Cached because a journal only grows, and recordings are looked up one at a time. Each
+# thread has its own: a shared cache would need a lock, which is bad with fork.
+_known = threading.local()
 _MOST_KNOWN = 64
 
 
@@ -250,7 +243,7 @@ def _read(journal: Path) -> _Spans:
     Raises:
         UnreadableFile: the journal cannot be read.
     """
-    known = _known.spans
+    known: dict[Path, _Spans] = vars(_known).setdefault("spans", {})
     # Removed from the cache first, so that an interrupted reading starts over.
     spans = known.pop(journal, None) or _Spans(journal)
     with unreadable(journal):
@@ -275,13 +268,13 @@ def _journal_of(path: Path) -> Path:
 
 def infix_of_recording(name: str) -> str | None:
     """Return the infix in a recording's name, or None for any other name."""
-    if ClipPart.parse(name) is not None:
+    if clip_step(name) is not None:
         return infix_of(name)
     path = f"{name}{FINISHED}"
     return None if episode_of(path) is None else infix_of(path)
 
 
-def log_paths(directory: Path, infix: Infix | str | None = None) -> Iterator[Path]:
+def log_paths(directory: Path, infix: str | None = None) -> Iterator[Path]:
     """Yield the paths of all logs in a directory, or of one monitor's logs.
 
     A log is included if any of its files exists.
@@ -291,7 +284,7 @@ def log_paths(directory: Path, infix: Infix | str | None = None) -> Iterator[Pat
         for name in names_in(directory)
         if (number := log_number(name)) is not None
         and (own := infix_of(name)) is not None
-        and (infix is None or own == str(infix))
+        and (infix is None or own == infix)
     }
     yield from sorted(logs)
 
@@ -329,14 +322,9 @@ def find_recording(path: Path) -> Recording | None:
     return recording
 
 
-def find_trajectory(
-    directory: Path, infix: Infix | str, episode_id: int
-) -> Path | None:
+def find_trajectory(directory: Path, infix: str, episode_id: int) -> Path | None:
     """Return the path of an episode's own file, or None if it was not recorded."""
-    known = infix if isinstance(infix, Infix) else Infix.parse(infix)
-    if known is None:
-        return None
-    path = directory / f"{trajectory_prefix(known, episode_id)}{FINISHED}"
+    path = directory / f"{trajectory_prefix(infix, episode_id)}{FINISHED}"
     return path if is_recorded(path) else None
 
 
@@ -360,9 +348,7 @@ def is_in_flight(path: Path) -> bool:
     return find_recording(path) is not None
 
 
-def recordings_in_flight(
-    directory: Path, infix: Infix | str | None = None
-) -> list[Recording]:
+def recordings_in_flight(directory: Path, infix: str | None = None) -> list[Recording]:
     """Return the recordings of all monitors, or of one, that exist only in logs.
 
     Unreadable logs are skipped; `recordings_in` reports the reason.
@@ -411,16 +397,9 @@ def remove_log(log: Path) -> None:
 
 
 def _is_open(log: Path) -> bool:
-    infix = Infix.parse(infix_of(log.name) or "")
+    infix = infix_of(log.name)
     try:
         return infix is not None and is_locked(log.parent / lock_name(infix))
     except OSError:
         # This is unknown, so leave the log's files alone.
         return True
-
-
-def _count(value: Any) -> int:
-    number = integer(value)
-    if number < 0:
-        raise ValueError(f"{number} is not a valid count")
-    return number

@@ -29,8 +29,8 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from ..atomic_files import replacing
-from ..errors import FileNotWritten, UnreadableFile
+from ..atomic_files import replacing, writing
+from ..errors import UnreadableFile
 from ..json_text import dumps
 from .bundle import file_of, group_of, index_of, index_size, trajectories_in
 from .json_fields import json_object, unreadable
@@ -162,20 +162,21 @@ def _new_file(
     Raises:
         FileNotWritten: the disk is full, or the directory was removed.
     """
-    try:
-        with replacing(path) as temporary, temporary.open("x+b", buffering=0) as output:
-            unfailing = _Unfailing(output)
-            with (
-                _signals_waiting(on_signal),
-                h5py.File(unfailing, "w", libver=_LIBVER, **options) as file,
-            ):
-                yield file, unfailing
-            if unfailing.error is not None:
-                raise unfailing.error
-            # The log is removed next, so the data must not be in a cache only.
-            os.fsync(output.fileno())
-    except OSError as error:
-        raise FileNotWritten(path, error.strerror or error) from error
+    with (
+        writing(path),
+        replacing(path) as temporary,
+        temporary.open("x+b", buffering=0) as output,
+    ):
+        unfailing = _Unfailing(output)
+        with (
+            _signals_waiting(on_signal),
+            h5py.File(unfailing, "w", libver=_LIBVER, **options) as file,
+        ):
+            yield file, unfailing
+        if unfailing.error is not None:
+            raise unfailing.error
+        # The log is removed next, so the data must not be in a cache only.
+        os.fsync(output.fileno())
 
 
 @contextlib.contextmanager

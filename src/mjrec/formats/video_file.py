@@ -5,17 +5,16 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from pathlib import Path
 from typing import Any, TextIO
 
-from ..atomic_files import file_sha256
+from ..atomic_files import file_sha256, writing
 from ..errors import (
     DirectoryNotWritable,
     EncoderError,
-    FileNotWritten,
     FrameCountError,
 )
 from ..frames import Frame, pad_to_even
@@ -139,7 +138,7 @@ class Encoding:
                 header = frame_hash_header(
                     height=file.height, width=file.width, fps=file.fps
                 )
-                with self._naming_the_hashes():
+                with writing(file.frame_hash_path):
                     # Use line buffering, so that each line reaches the operating system
                     # before the next one is written.
                     self._hashes = hashes.open("w", encoding="ascii", buffering=1)
@@ -211,7 +210,7 @@ class Encoding:
             # result is cached.
             ffmpeg_sha256()
         if self._hashes is not None:
-            with self._naming_the_hashes():
+            with writing(frame_hash_path(self._file.path)):
                 self._hashes.write(frame_hash_line(self._encoded, frame))
         self._process.write(pad_to_even(frame))
         self._encoded += 1
@@ -263,12 +262,3 @@ class Encoding:
         for part in self._parts:
             part.unlink(missing_ok=True)
         self._lock.release()
-
-    @contextlib.contextmanager
-    def _naming_the_hashes(self) -> Iterator[None]:
-        try:
-            yield
-        except OSError as error:
-            raise FileNotWritten(
-                frame_hash_path(self._file.path), error.strerror
-            ) from error

@@ -96,7 +96,9 @@ def timing_facts(
         stride: the usual number of steps from one frame to the next.
         frames_per_step: number of frames per step; must be 1 unless the stride is 1.
     """
-    speed = playback_speed(fps, timestep, Fraction(stride, frames_per_step))
+    speed = None
+    if fps is not None and timestep is not None:
+        speed = float(fps * timestep * Fraction(stride, frames_per_step))
     return {
         "fps": str(fps),
         "timestep": None if timestep is None else str(timestep),
@@ -105,15 +107,6 @@ def timing_facts(
         "frame_count": steps.total,
         "frame_steps": steps.ranges,
     }
-
-
-def playback_speed(
-    fps: Fraction | None, timestep: Fraction | None, steps_per_frame: Fraction
-) -> float | None:
-    """Return the simulated seconds per second of video, or None if unknown."""
-    if fps is None or timestep is None:
-        return None
-    return float(fps * timestep * steps_per_frame)
 
 
 def file_facts(file: VideoFile) -> dict[str, Any]:
@@ -220,10 +213,9 @@ def metadata_of(video: Path) -> Mapping[str, Any]:
 
 
 def _read_or_nothing(path: Path) -> Mapping[str, Any]:
-    try:
+    with contextlib.suppress(OSError, ValueError):
         return read_object(path)
-    except (OSError, ValueError):
-        return {}
+    return {}
 
 
 def _is_further(name: str, video: Path) -> bool:
@@ -259,10 +251,7 @@ def forget_failure(video: Path) -> None:
 
 def reason_of(video: Path) -> str | None:
     """Return the reason why a video could not be rendered, or None if unknown."""
-    try:
-        reason = read_object(failure_path(video)).get("reason")
-    except (OSError, ValueError):
-        return None
+    reason = _read_or_nothing(failure_path(video)).get("reason")
     return reason if isinstance(reason, str) else None
 
 

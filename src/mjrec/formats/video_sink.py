@@ -17,7 +17,7 @@ from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
-from ..annotation import Caption, annotated, pillow_version
+from ..annotation import Caption, annotated, check_annotation
 from ..atomic_files import write_text
 from ..blank_frames import BlankFrames
 from ..frames import Frame
@@ -150,7 +150,7 @@ class VideoSink:
             return {"encoder_version": {"backend": "TextEncoder", "version": 1}}
         facts = {**file_facts(self.file), **self.blank.facts()}
         if self._is_annotated:
-            facts["annotated"] = {"pillow": pillow_version()}
+            facts["annotated"] = {"pillow": check_annotation()}
         return facts
 
     def _write_note(self, note: _Note, height: int, width: int) -> None:

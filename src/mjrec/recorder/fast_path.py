@@ -95,7 +95,7 @@ def gathering(
             the step took the expected simulated time.
         stride: number of steps per frame. The last step gets a frame in any case.
     """
-    log, bodies = span.log.rows, span.log.bodies
+    log, bodies = span.log, span.log.bodies
     take, both = WORDS.take, STEP | FRAME
     # The simulation evicts our code from the CPU's caches. In that case, assigning an
     # item is cheaper than `struct`.

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Protocol
 
-from ..formats.monitor_directory import ClipPart
+from ..formats.monitor_directory import clip_step
 
 
 class Finisher(Protocol):
@@ -69,7 +69,7 @@ class LaterFinisher:
         # Imported here because it loads h5py, which the simulation does not need.
         from ..formats.trajectory_file import bundle_trajectories, finish_trajectories
 
-        waiting = [each for each in self._waiting if ClipPart.parse(each.name) is None]
+        waiting = [each for each in self._waiting if clip_step(each.name) is None]
         self._waiting = []
         finish = bundle_trajectories if self.bundles else finish_trajectories
         failures = finish(waiting)

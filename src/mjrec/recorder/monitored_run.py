@@ -145,7 +145,7 @@ class MonitoredRun:
         self._lines = 0
         self._provenance = None if options.statements else look_around()
         self._environment_facts = {
-            "infix": str(self.infix),
+            "infix": self.infix,
             "env_id": env.env_id,
             "environment": env.environment,
             "versions": dict(versions()),
@@ -154,7 +154,7 @@ class MonitoredRun:
         self.trackers = Trackers(
             tracking.Run(
                 directory=self.directory,
-                infix=str(self.infix),
+                infix=self.infix,
                 env_id=env.env_id,
                 env_index=env.env_index,
             ),

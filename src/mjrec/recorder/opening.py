@@ -26,7 +26,6 @@ from ..errors import (
 )
 from ..formats.locks import Lock, is_locked
 from ..formats.monitor_directory import (
-    Infix,
     check_uid,
     infix_of,
     iter_monitor_files,
@@ -62,7 +61,7 @@ class Statements:
             it.
     """
 
-    infix: Infix
+    infix: str
     first_episode_id: int
     provenance: Mapping[str, Any] | None
     provenance_after: int
@@ -83,7 +82,7 @@ class OpenDirectory:
     """
 
     path: Path
-    infix: Infix
+    infix: str
     first_episode_id: int
     lock: Lock
     run: Mapping[str, Any]
@@ -199,10 +198,9 @@ def _next_episode_id(path: Path, *, uid: str | None) -> int:
     """Return the episode number after the highest number of all closed monitors."""
     highest = -1
     for files in monitors_of(path):
-        infix = Infix.parse(files.infix)
-        if infix is None or (uid is not None and infix.uid != uid):
+        if uid is not None and files.infix.partition(".")[2] != uid:
             continue
-        if not is_locked(path / lock_name(infix)):
+        if not is_locked(path / lock_name(files.infix)):
             highest = max(highest, _last_episode_id(files))
     return highest + 1
 
@@ -233,7 +231,7 @@ def _last_counted(results: MonitorResults) -> int:
 
 def _claim(
     path: Path, *, uid: str | None, run: Mapping[str, Any], looks: bool
-) -> tuple[Infix, Lock]:
+) -> tuple[str, Lock]:
     """Claim a new infix for this monitor, and return the infix with its lock.
 
     Args:
@@ -249,7 +247,7 @@ def _claim(
     of_directory = itertools.count()
     while True:
         number = next(_monitor_ids if uid is None else of_directory)
-        infix = Infix(number, uid or str(os.getpid()))
+        infix = f"{number}.{uid or os.getpid()}"
         if _is_taken(path, infix, looks=looks):
             continue
         try:
@@ -266,13 +264,13 @@ def _claim(
 
 
 def _is_taken(
-    path: Path, infix: Infix, *, looks: bool, besides: str | None = None
+    path: Path, infix: str, *, looks: bool, besides: str | None = None
 ) -> bool:
     # A pid or uid is rarely used twice. Every monitor that closed has left a manifest,
     # so usually there is no need to list the whole directory.
     if (path / manifest_name(infix)).exists() or (path / journal_name(infix)).exists():
         return True
     return looks and any(
-        file.name != besides and infix_of(file.name) == str(infix)
+        file.name != besides and infix_of(file.name) == infix
         for file in iter_monitor_files(path, hidden=True)
     )

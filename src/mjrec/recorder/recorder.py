@@ -102,7 +102,7 @@ class Recorder:
             schedule=self._choice.schedule_name,
             rule=None if selection is None else selection.name,
         )
-        self.directory, self.infix = self.run.directory, str(self.run.infix)
+        self.directory, self.infix = self.run.directory, self.run.infix
         self.episode_id = self.run.first_episode_id
         self.stats_recorder = self.run.stats
         self._states = [

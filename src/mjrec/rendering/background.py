@@ -36,8 +36,7 @@ from ..child_python import Child, wait_for_news
 from ..errors import Error
 from ..formats.monitor_directory import infix_of
 from ..machine import check_workers
-from ..messages import log_message
-from ..parent import Parent
+from ..messages import Parent, log_message
 from ..timeouts import Timeout, timeout_s
 from .jobs import Progress, VideoJob, key_of
 

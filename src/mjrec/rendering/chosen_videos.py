@@ -20,11 +20,10 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from ..errors import FileNotWritten
 from ..formats.bundle import FINISHED, is_finished
 from ..formats.frame_hashes import frame_hash_path
 from ..formats.journal import JournalWriter
-from ..formats.monitor_directory import Infix, infix_of, journal_name
+from ..formats.monitor_directory import infix_of, journal_name
 from ..formats.trajectory_file import amend_trajectories
 from ..formats.trajectory_hdf5 import open_hdf5
 from ..formats.video_metadata import amend_metadata, finished_videos, metadata_path
@@ -61,7 +60,7 @@ def write_choice(
     facts = {"rule": rule, "decided": True, "scope": EVALUATION, "finished": finished}
     drawable: set[RecordingKey] = set()
     for path in sorted(folder.glob(journal_name(among))):
-        infix = Infix.parse(infix_of(path.name) or "")
+        infix = infix_of(path.name)
         if infix is None:
             continue
         run = Run.read(path)
@@ -142,14 +141,11 @@ def _remove_videos(video: Path) -> None:
             each.unlink(missing_ok=True)
 
 
-def _note(folder: Path, infix: Infix, events: Iterable[tuple[str, Any]]) -> None:
+def _note(folder: Path, infix: str, events: Iterable[tuple[str, Any]]) -> None:
     path = folder / journal_name(infix)
     with (
         manifest_lock(folder, infix),
         contextlib.closing(JournalWriter(path)) as writer,
     ):
         for kind, facts in events:
-            try:
-                writer.note(kind, facts)
-            except OSError as error:
-                raise FileNotWritten(path, error.strerror or error) from error
+            writer.note(kind, facts)

@@ -25,7 +25,7 @@ from typing import Any
 
 from ..engines.jobs import JobOutcome, Run, Work
 from ..errors import DirectoryNotWritable, FileNotWritten
-from ..formats.dataclass_json import from_json, to_json
+from ..formats.json_fields import from_json, to_json
 from ..formats.second_names import give_all_second_names
 from ..formats.spans import log_paths, remove_if_done
 from ..results.manifest_writing import update_manifests

@@ -15,11 +15,10 @@ from pathlib import Path
 from typing import Self
 
 from ..formats.monitor_directory import (
-    ClipPart,
-    Infix,
     VideoName,
     clip_lock_name,
     clip_part_name,
+    clip_step,
     episode_of,
     infix_of,
     trajectory_prefix,
@@ -59,7 +58,7 @@ class RecordingKey:
         is_clip: whether it is a clip.
     """
 
-    infix: Infix
+    infix: str
     number: int
     is_clip: bool = False
 
@@ -96,15 +95,13 @@ def key_of(name: str) -> RecordingKey | None:
 
     The video of a clip that began with an episode has the name of that episode's video.
     """
-    if (part := ClipPart.parse(name)) is not None:
-        return RecordingKey(part.infix, part.first_step, is_clip=True)
-    infix, number = Infix.parse(infix_of(name) or ""), episode_of(name)
+    infix, step, video = infix_of(name), clip_step(name), VideoName.parse(name)
+    if video is not None:
+        step = video.first_step
+    number = episode_of(name) if step is None else step
     if infix is None or number is None:
         return None
-    video = VideoName.parse(name)
-    if video is not None and video.first_step is not None:
-        return RecordingKey(infix, video.first_step, is_clip=True)
-    return RecordingKey(infix, number)
+    return RecordingKey(infix, number, is_clip=step is not None)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -22,14 +22,13 @@ from ..formats.bundle import FINISHED, is_finished
 from ..formats.journal import (
     KILLED,
     JournalEntry,
-    JournalReader,
     JournalWriter,
     entry_of,
     missing_line,
+    read_journal,
 )
 from ..formats.locks import try_lock
 from ..formats.monitor_directory import (
-    Infix,
     VideoName,
     episode_of,
     final_name,
@@ -104,7 +103,7 @@ class Report:
 
 
 def finish_killed_monitor(
-    directory: Path, infix: Infix, report: Report, *, bundles: bool
+    directory: Path, infix: str, report: Report, *, bundles: bool
 ) -> None:
     """Finish everything of one monitor except pending videos, unless it is open.
 
@@ -144,7 +143,7 @@ class _KilledMonitor:
     """A monitor that is not open; see `finish_killed_monitor`."""
 
     directory: Path
-    infix: Infix
+    infix: str
     report: Report
     bundles: bool
 
@@ -256,7 +255,7 @@ class _KilledMonitor:
                     if kind == "cut" and isinstance(facts, Mapping):
                         entries.setdefault(facts.get("episode_id", -1))
 
-                for entry in JournalReader(files.journal, on_event=note):
+                for entry in read_journal(files.journal, on_event=note):
                     if entry.episode_id in numbers:
                         entries[entry.episode_id] = entry
         return entries

@@ -15,7 +15,6 @@ from typing import Literal
 from ..errors import UnreadableFile
 from ..formats.locks import is_locked
 from ..formats.monitor_directory import (
-    Infix,
     VideoName,
     final_name,
     is_note,
@@ -68,7 +67,7 @@ def has_leftovers(files: MonitorFiles) -> bool:
     return is_left or lacks_results(files)
 
 
-def is_at_work(directory: Path, infix: Infix) -> bool:
+def is_at_work(directory: Path, infix: str) -> bool:
     """Return whether an encoder or renderer still works on a dead monitor's files."""
     files = files_of(directory, infix)
     hidden = [path for path in files.paths if path.name.startswith(".")]

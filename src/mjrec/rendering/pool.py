@@ -29,7 +29,7 @@ from ..errors import (
     Error,
     GLError,
 )
-from ..formats.dataclass_json import to_json
+from ..formats.json_fields import to_json
 from ..formats.locks import Lock, try_lock
 from ..formats.monitor_directory import render_lock_name
 from ..frames import Frame

@@ -34,8 +34,7 @@ from ..formats.json_fields import (
     unreadable,
 )
 from ..formats.monitor_directory import (
-    ClipPart,
-    Infix,
+    clip_step,
     clip_video_prefix,
     episode_of,
     further_parts,
@@ -103,15 +102,14 @@ def video_path(recording: Path, facts: Mapping[str, Any]) -> Path:
         UnreadableFile: the recording names no video, or one that is not its own.
     """
     name = str(video_facts(facts).get("name"))
-    clip = ClipPart.parse(recording.name)
-    infix = clip.infix if clip else Infix.parse(infix_of(recording.name) or "")
+    infix, step = infix_of(recording.name), clip_step(recording.name)
     # Only the name of a clip's video says in which episode it began.
-    episode = episode_of(name if clip else recording.name)
+    episode = episode_of(recording.name if step is None else name)
     own: set[str] = set()
     if infix is not None and episode is not None:
         own.add(f"{video_prefix(infix, episode)}.mp4")
-        if clip is not None:
-            own.add(f"{clip_video_prefix(infix, episode, clip.first_step)}.mp4")
+        if step is not None:
+            own.add(f"{clip_video_prefix(infix, episode, step)}.mp4")
     if name not in own:
         raise UnreadableFile(
             recording,

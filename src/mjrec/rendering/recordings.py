@@ -23,7 +23,8 @@ from ..formats.bundle import FINISHED, finished_trajectories, is_finished
 from ..formats.frame_hashes import frame_hash_path
 from ..formats.locks import Lock, is_locked, try_lock
 from ..formats.monitor_directory import (
-    ClipPart,
+    clip_step,
+    infix_order,
     lock_name,
     unfinished_files,
 )
@@ -96,7 +97,7 @@ class Recorded:
     @property
     def is_clip(self) -> bool:
         """Whether it is a clip."""
-        return ClipPart.parse(self.parts[0].name) is not None
+        return clip_step(self.parts[0].name) is not None
 
     @property
     def timing(self) -> Mapping[str, Any]:
@@ -135,15 +136,15 @@ def read_recording(parts: Sequence[Path]) -> Recorded:
     frame_counts: list[int] = []
     rewards: list[NDArray[np.float64]] = []
     for number, path in enumerate(parts):
-        clip = ClipPart.parse(path.name)
-        if clip is not None and clip.number != number:
+        is_part = clip_step(path.name) is not None
+        if is_part and not path.name.endswith(f".part{number:06d}"):
             raise UnreadableFile(path, f"part {number} of its video is missing")
         with open_for_rendering(path) as reader:
             facts.append(reader.facts)
             frame_counts.append(reader.frame_count)
             rewards.append(reader.rewards)
             steps = reader.frame_steps
-    if clip is not None:
+    if is_part:
         steps = np.arange(sum(frame_counts))
     all_rewards = np.concatenate(rewards)
     return Recorded(
@@ -163,10 +164,7 @@ def recordings(directory: Path) -> list[RecordingKey]:
     keys = {key_of(path.name) for path in (*finished, *in_flight)} - {None}
     return sorted(
         (key for key in keys if key is not None),
-        key=lambda key: (
-            *(key.is_clip, key.infix.monitor_id, key.infix.uid),
-            key.number,
-        ),
+        key=lambda key: (key.is_clip, infix_order(key.infix), key.number),
     )
 
 

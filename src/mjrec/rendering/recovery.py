@@ -12,7 +12,6 @@ from pathlib import Path
 
 from ..errors import DirectoryNotWritable, InvalidArgument
 from ..formats.locks import is_locked, wait_for_lock
-from ..formats.monitor_directory import Infix
 from ..formats.second_names import give_all_second_names
 from ..results.monitor_files import monitors_of
 from .leftovers import (
@@ -130,19 +129,16 @@ def recover(
     return Recovery(path, (*report.files,), (*report.failures,), open_monitors)
 
 
-def _dead_and_open(directory: Path) -> tuple[list[Infix], tuple[str, ...]]:
+def _dead_and_open(directory: Path) -> tuple[list[str], tuple[str, ...]]:
     """Return the dead monitors that need work, and the infixes of open monitors."""
-    dead: list[Infix] = []
+    dead: list[str] = []
     still_open: list[str] = []
     for files in monitors_of(directory):
-        infix = Infix.parse(files.infix)
         try:
-            if infix is None:
-                continue
             if files.is_open:
                 still_open.append(files.infix)
             elif has_leftovers(files):
-                dead.append(infix)
+                dead.append(files.infix)
         except OSError as error:
             raise DirectoryNotWritable(directory, error.strerror) from error
     return dead, tuple(still_open)

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 from numpy.typing import ArrayLike
 
 from ..errors import InvalidArgument
-from ..formats.dataclass_json import to_json
+from ..formats.json_fields import to_json
 from ..frames import Frame
 from .pool import WorkerPool
 from .recorded_facts import (

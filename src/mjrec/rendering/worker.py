@@ -30,8 +30,7 @@ from typing import Any
 
 from ..errors import Error, InvalidArgument
 from ..frames import Frame, grid_frame, grid_shape
-from ..messages import carried
-from ..parent import Parent
+from ..messages import Parent, carried
 from ..simulation.gl_probe import draw_test_scene
 from ..simulation.recorded_scene import GivenStates, RecordedScene
 from ..simulation.renderer import Canvas, SceneRenderer

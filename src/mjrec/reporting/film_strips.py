@@ -21,8 +21,8 @@ import numpy as np
 from imageio.v3 import imwrite
 
 from ..annotation import check_annotation
-from ..atomic_files import replacing
-from ..errors import FileNotWritten, InvalidArgument, UnreadableFile
+from ..atomic_files import replacing, writing
+from ..errors import InvalidArgument, UnreadableFile
 from ..formats.json_fields import field, integer, list_of, rate, read_object
 from ..formats.video_metadata import metadata_path
 from ..frames import Frame
@@ -127,13 +127,9 @@ def write_film_strip(path: str | os.PathLike[str], strip: Frame) -> None:
             f"{path.with_suffix('.png')}."
         )
     dpi = (_DOTS_PER_INCH, _DOTS_PER_INCH)
-    try:
-        with replacing(path) as temporary:
-            imwrite(temporary, strip, extension=".png", optimize=True, dpi=dpi)
-    except OSError as error:
-        raise FileNotWritten(
-            path, error.strerror or error, then="the same command writes it again"
-        ) from error
+    advice = "the same command writes it again"
+    with writing(path, then=advice), replacing(path) as temporary:
+        imwrite(temporary, strip, extension=".png", optimize=True, dpi=dpi)
 
 
 def _of_video(path: Path, count: int) -> tuple[Iterator[Frame], Sequence[float]]:

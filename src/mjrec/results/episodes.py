@@ -116,7 +116,9 @@ def episodes_of(results: MonitorResults) -> Iterator[Episode]:
         UnreadableFile: a file is damaged and no other file has the same episodes.
     """
     saved, journal, count = results.saved, results.files.journal, results.run.count
-    entries = read_journal(journal) if journal and (count or not saved) else iter(())
+    entries: Iterable[JournalEntry] = ()
+    if journal and (count or not saved):
+        entries = read_journal(journal, warns=True)
     if saved is None or count >= len(saved.timestamps):
         for entry in entries:
             yield _of_journal(results, entry)

@@ -14,10 +14,10 @@ import functools
 import logging
 import math
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from ..errors import UnreadableFile
 from ..formats.journal import JournalEntry, read_journal
@@ -25,6 +25,8 @@ from ..formats.json_fields import json_object
 from ..formats.manifest import Manifest, StatsFile, read_manifest, read_stats_file
 from .monitor_files import MonitorFiles
 from .run import Run
+
+T = TypeVar("T")
 
 logger = logging.getLogger(__name__)
 
@@ -56,14 +58,7 @@ class MonitorResults:
         Raises:
             UnreadableFile: the manifest is damaged and the journal is missing.
         """
-        path = self.files.manifest
-        if path is None:
-            return None
-        try:
-            return read_manifest(path)
-        except UnreadableFile as error:
-            self._without(error)
-            return None
+        return self._read(self.files.manifest, read_manifest)
 
     @functools.cached_property
     def saved(self) -> StatsFile | None:
@@ -76,13 +71,7 @@ class MonitorResults:
         path = self.files.stats
         if self.manifest is not None and self.files.manifest is not None:
             path = self.files.manifest.with_name(self.manifest.stats)
-        if path is None:
-            return None
-        try:
-            return read_stats_file(path)
-        except UnreadableFile as error:
-            self._without(error)
-            return None
+        return self._read(path, read_stats_file)
 
     @functools.cached_property
     def run(self) -> Run:
@@ -154,13 +143,17 @@ class MonitorResults:
         """
         saved, journal = self.saved, self.files.journal
         if journal is not None and self.is_behind:
-            return _stats_of([*read_journal(journal)], saved)
+            return _stats_of([*read_journal(journal, warns=True)], saved)
         return StatsFile(None, (), (), (), ()) if saved is None else saved
 
-    def _without(self, error: UnreadableFile) -> None:
-        if self.files.journal is None:
-            raise error
-        self._say(error, "journal")
+    def _read(self, path: Path | None, read: Callable[[Path], T]) -> T | None:
+        try:
+            return None if path is None else read(path)
+        except UnreadableFile as error:
+            if self.files.journal is None:
+                raise
+            self._say(error, "journal")
+            return None
 
     def _say(self, error: UnreadableFile, instead: str) -> None:
         if error.path not in self._said:

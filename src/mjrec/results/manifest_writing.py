@@ -31,8 +31,7 @@ from ..formats.manifest import (
     write_stats_file,
 )
 from ..formats.monitor_directory import (
-    ClipPart,
-    Infix,
+    clip_step,
     episode_of,
     infix_of,
     is_manifest,
@@ -96,7 +95,7 @@ def update_manifests(directory: Path) -> None:
     """
     damaged: UnreadableFile | None = None
     for path in iter_monitor_files(directory):
-        infix = Infix.parse(infix_of(path.name) or "")
+        infix = infix_of(path.name)
         if infix is not None and is_manifest(path.name):
             try:
                 # Other manifests are up to date, and gym's manifests lack this key.
@@ -110,7 +109,7 @@ def update_manifests(directory: Path) -> None:
 
 def write_manifest_and_stats(
     directory: Path,
-    infix: Infix,
+    infix: str,
     *,
     run: Run | None = None,
     stats: StatsFile | None = None,
@@ -146,7 +145,7 @@ def write_manifest_and_stats(
         # Find files by name, because a folder may contain thousands of monitors' files.
         names = (manifest_name(infix), name, journal_name(infix))
         paths = [directory / each for each in names if (directory / each).exists()]
-        results = MonitorResults(MonitorFiles(str(infix), paths))
+        results = MonitorResults(MonitorFiles(infix, paths))
         name = name if results.manifest is None else results.manifest.stats
         is_new_stats = False
         if stats is None:
@@ -164,7 +163,7 @@ def write_manifest_and_stats(
     return Written(manifest, stats, is_new_manifest, is_new_stats)
 
 
-def manifest_lock(directory: Path, infix: Infix) -> Lock:
+def manifest_lock(directory: Path, infix: str) -> Lock:
     """Wait for the lock to write a manifest or a closed monitor's journal.
 
     Raises:
@@ -173,7 +172,7 @@ def manifest_lock(directory: Path, infix: Infix) -> Lock:
     return wait_for_lock(directory / manifest_lock_name(infix))
 
 
-def _manifest(directory: Path, infix: Infix, run: Run, *, stats_name: str) -> Manifest:
+def _manifest(directory: Path, infix: str, run: Run, *, stats_name: str) -> Manifest:
     finished, broken = finished_and_broken(directory, infix, run)
     pending = _pending(directory, infix, run)
     keep, name, chosen = _keep(run), run.facts.get("schedule"), set(run.chosen)
@@ -221,7 +220,7 @@ def _keep(run: Run) -> dict[str, Any] | None:
 
 
 def finished_and_broken(
-    directory: Path, infix: Infix | str, run: Run
+    directory: Path, infix: str, run: Run
 ) -> tuple[list[tuple[str, str]], list[str]]:
     """Return finished videos with their metadata, and the metadata of broken videos.
 
@@ -248,7 +247,7 @@ def finished_and_broken(
     return sorted(finished), sorted(broken)
 
 
-def _pending(directory: Path, infix: Infix, run: Run) -> list[Mapping[str, Any]]:
+def _pending(directory: Path, infix: str, run: Run) -> list[Mapping[str, Any]]:
     """Return the manifest's entries for the videos that must still be rendered."""
     entries: list[Mapping[str, Any]] = [
         {
@@ -259,7 +258,9 @@ def _pending(directory: Path, infix: Infix, run: Run) -> list[Mapping[str, Any]]
         for number in sorted(run.promised)
     ]
     clips = [
-        clip for clip in run.clips.values() if ClipPart.parse(str(clip.get("clip")))
+        clip
+        for clip in run.clips.values()
+        if clip_step(str(clip.get("clip"))) is not None
     ]
     entries += [
         {key: clip[key] for key in ("episode_id", "clip", "video")}

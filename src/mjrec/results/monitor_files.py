@@ -13,17 +13,17 @@ from ..formats.bundle import trajectories_in
 from ..formats.journal import MOST_EPISODES
 from ..formats.locks import is_locked
 from ..formats.monitor_directory import (
-    Infix,
     VideoName,
     episode_of,
     infix_of,
+    infix_order,
     is_bundle,
+    is_called_like_second,
     is_manifest,
     iter_monitor_files,
     log_number,
     names_in,
 )
-from ..formats.second_names import is_called_like_second
 from ..formats.spans import LOG, recordings_in_flight
 
 logger = logging.getLogger(__name__)
@@ -77,9 +77,7 @@ class MonitorFiles:
         Raises:
             OSError: the lock cannot be opened.
         """
-        # Other locks have similar names.
-        is_monitor = Infix.parse(self.infix) is not None
-        return is_monitor and self.lock is not None and is_locked(self.lock)
+        return self.lock is not None and is_locked(self.lock)
 
     def _sort_in(self, path: Path) -> None:
         number = episode_of(path.name)
@@ -123,19 +121,19 @@ def monitors_of(directory: Path) -> list[MonitorFiles]:
     )
     return [
         MonitorFiles(infix, files.get(infix, ()), in_flight.get(infix, ()))
-        for infix in sorted({*files, *in_flight}, key=_order)
+        for infix in sorted({*files, *in_flight}, key=infix_order)
     ]
 
 
-def files_of(directory: Path, infix: Infix) -> MonitorFiles:
+def files_of(directory: Path, infix: str) -> MonitorFiles:
     """Return the current files of one monitor, including hidden ones."""
     # Test for the infix first, because all names in the directory are compared again
     # for each dead monitor.
     own = f".{infix}."
-    names = [n for n in names_in(directory) if own in n and infix_of(n) == str(infix)]
+    names = [n for n in names_in(directory) if own in n and infix_of(n) == infix]
     paths = [path for n in sorted(names) if (path := directory / n).is_file()]
     in_flight = [each.path for each in recordings_in_flight(directory, infix)]
-    return MonitorFiles(str(infix), paths, in_flight)
+    return MonitorFiles(infix, paths, in_flight)
 
 
 def _by_infix(paths: Iterable[Path]) -> dict[str, list[Path]]:
@@ -144,15 +142,6 @@ def _by_infix(paths: Iterable[Path]) -> dict[str, list[Path]]:
         if (infix := infix_of(path.name)) is not None:
             grouped.setdefault(infix, []).append(path)
     return grouped
-
-
-def _order(infix: str) -> tuple[int, int, int, str]:
-    parsed = Infix.parse(infix)
-    if parsed is None:
-        return (1, 0, 0, infix)
-    # Process ids are compared as numbers: 9 comes before 10.
-    number = int(parsed.uid) if parsed.uid.isdecimal() else 0
-    return (0, parsed.monitor_id, number, parsed.uid)
 
 
 def detect_training_manifests(

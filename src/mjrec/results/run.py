@@ -9,12 +9,13 @@ based on the same facts, whether they are created during the run or years later.
 from __future__ import annotations
 
 import contextlib
+import functools
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from ..formats.journal import MOST_EPISODES, JournalEntry, JournalReader
+from ..formats.journal import MOST_EPISODES, JournalEntry, read_journal
 from ..formats.json_fields import base_name
 from ..formats.manifest import Manifest
 from ..formats.monitor_directory import episode_of
@@ -66,10 +67,9 @@ class Run:
             UnreadableFile: the journal does not exist or cannot be read.
         """
         run = cls()
-        reader = JournalReader(journal, on_event=run.note)
-        for entry in reader:
+        began = functools.partial(run.begin, chosen=False)
+        for entry in read_journal(journal, on_event=run.note, on_damage=began):
             run.add(entry)
-        run.last_episode_id = max(run.last_episode_id, reader.last_episode_id)
         return run
 
     @classmethod

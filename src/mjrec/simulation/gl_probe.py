@@ -30,7 +30,7 @@ import numpy as np
 
 from ..gl.egl import egl_devices
 from ..machine import gpu_device_files
-from ..parent import Parent
+from ..messages import Parent
 
 _SIZE = 480
 _SMALL = 96

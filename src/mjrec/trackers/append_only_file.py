@@ -7,9 +7,13 @@ import os
 from collections.abc import Iterable
 from pathlib import Path
 
-from ..atomic_files import make_directory
-from ..errors import DirectoryNotWritable, FileNotWritten
-from ..formats.appending import append_whole, open_for_appending
+from ..atomic_files import (
+    append_whole,
+    make_directory,
+    open_for_appending,
+    writing,
+)
+from ..errors import DirectoryNotWritable
 
 
 class AppendOnlyFile:
@@ -49,10 +53,8 @@ class AppendOnlyFile:
         Raises:
             FileNotWritten: the disk has no room for the piece. The file is unchanged.
         """
-        try:
+        with writing(self.path):
             append_whole(self._file.fileno(), piece)
-        except OSError as error:
-            raise FileNotWritten(self.path, error.strerror) from error
 
     def close(self) -> None:
         """Close the file."""
