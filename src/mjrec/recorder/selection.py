@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 from ..errors import InvalidArgument
+from ..plain_text import listed
 from ..schedules import check_takes_one, schedule_name
 from .keep_rules import RULES, has_failed, keep_rule
 from .tracking import FinishedEpisode
@@ -194,8 +195,9 @@ def _ask(
     unknown = sorted(numbers.difference(known))
     if unknown:
         raise InvalidArgument(
-            f"keep={name} returned {_listed(unknown)}, but no finished episode has "
-            f"that number. The finished episodes are {_listed(known)}."
+            f"keep={name} returned {listed(unknown, 10)}, but no finished episode "
+            f"has that number. The finished episodes are "
+            f"{listed(known, 10) or 'none'}."
         )
     return numbers
 
@@ -205,9 +207,3 @@ def _number(value: Any) -> int:
         # Most likely the function returned flags, which would mean episodes 0 and 1.
         raise TypeError(f"{value} is not an episode number")
     return operator.index(value)
-
-
-def _listed(numbers: Sequence[int], most: int = 10) -> str:
-    shown = ", ".join(map(str, numbers[:most])) or "none"
-    more = len(numbers) - most
-    return f"{shown} and {more} more" if more > 0 else shown
