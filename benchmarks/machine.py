@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from mjrec.formats.ffmpeg import ffmpeg_version
-from mjrec.gl import probe
+from mjrec.gl.choice import probe
 from mjrec.machine import usable_cpus
 
 _PACKAGES = (

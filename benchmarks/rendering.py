@@ -14,7 +14,7 @@ from typing import Any
 
 import mjrec
 from mjrec.formats.json_fields import to_json
-from mjrec.rendering.views import View
+from mjrec.rendering.jobs import View
 
 from .children import call
 from .results import Reference, Result, at_least

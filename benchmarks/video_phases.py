@@ -11,6 +11,7 @@ from __future__ import annotations
 import fcntl
 import functools
 import hashlib
+import json
 import os
 import tempfile
 import threading
@@ -26,7 +27,7 @@ import mjrec
 from mjrec.child_python import Child
 from mjrec.formats.trajectory_file import open_trajectory
 from mjrec.formats.video_file import content_facts
-from mjrec.rendering.views import View
+from mjrec.rendering.jobs import View
 from mjrec.rendering.worker import trajectory_drawing
 from mjrec.simulation.renderer import Canvas
 
@@ -152,9 +153,9 @@ def _encode(frames: list[Any], path: Path) -> None:
 
 def _begin_process(directory: str) -> None:
     """Start the rendering process and wait until it is ready for a recording."""
-    arguments = (directory, "--workers", "1")
+    options = json.dumps({"directory": directory, "workers": 1, "strict": False})
     module = "mjrec.rendering.background"
-    with Child(module, *arguments, environ=os.environ) as child:
+    with Child(module, options, environ=os.environ) as child:
         # This recording does not exist, so the answer is that there is nothing to do.
         child.send(recording="openaigym.trajectory.0.1.episode000000.h5")
         for message in child.messages(60):

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import numpy as np
 
+from mjrec.evaluation.result_tables import ROW
 from mjrec.evaluation.statistics import Bootstrap
 from mjrec.evaluation.summaries import AcrossTasks, summarize_across, summarize_task
 from mjrec.reporting.contents import (
-    EPISODE,
     ReportContents,
     ReportTask,
     ReportVideo,
@@ -42,16 +42,15 @@ def task(
     """Return a task of equally many episodes of each seed, or of monitors (`runs`)."""
     count = len(returns)
     each = max(1, count // seeds)
-    episodes = np.zeros(count, EPISODE)
-    episodes["run"] = np.arange(count) // each
+    episodes = np.zeros(count, ROW)
+    episodes["seed"] = np.arange(count) // each
     episodes["episode"] = np.arange(count) % each
     episodes["total_reward"] = returns
     episodes["length"] = np.arange(count) % 7 + 10
-    episodes["end_time"] = 1.7e9 + np.arange(count)
-    episodes["outcome"] = 2
+    episodes["start_time"] = 1.7e9 + np.arange(count)
+    episodes["truncated"] = 1
     episodes["success"] = -1
     failed = list(failures or {})
-    episodes["outcome"][failed] = 4
     episodes["total_reward"][failed] = np.nan
     known = episodes["total_reward"]
     made = ReportTask(
@@ -61,7 +60,7 @@ def task(
         summary=summarize_task(
             name,
             total_rewards=known[np.isfinite(known)],
-            runs=len(np.unique(episodes["run"])),
+            runs=len(np.unique(episodes["seed"])),
             failed=len(failed),
             score_range=score_range,
             bootstrap=_FEW,

@@ -19,10 +19,9 @@ from trajectories_by_hand import (
 
 from mjrec import Monitor, clear_monitor_files
 from mjrec.commands import main
-from mjrec.rendering.jobs import RecordingKey
+from mjrec.rendering.jobs import RecordingKey, Variant, View
 from mjrec.rendering.recordings import claim
 from mjrec.rendering.render_videos import name_of_variant
-from mjrec.rendering.views import Variant, View
 
 VIDEO = "openaigym.video.0.7.video000000"
 

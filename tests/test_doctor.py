@@ -15,7 +15,9 @@ import pytest
 from rich.console import Console
 
 from mjrec.commands.doctor import show_report
-from mjrec.gl import Diagnosis, EglDevice, Probe
+from mjrec.gl.backends import Diagnosis
+from mjrec.gl.choice import Probe
+from mjrec.gl.egl import EglDevice
 from mjrec.machine_report import (
     Cpus,
     Ffmpeg,

@@ -30,7 +30,9 @@ def test_a_task_is_made_with_its_own_limit():
     assert limit("pendulum-swingup", max_steps=5000) == 1000
     assert limit("lqr-lqr_2_1", max_steps=5000) == 5000
     assert limit("pendulum-swingup", max_steps=5) == 5
-    limited = make_dm_control("ball_in_cup", "catch", EnvironmentOptions(max_steps=4))
+    limited = make_dm_control(
+        "dm_control/ball_in_cup-catch", EnvironmentOptions(max_steps=4)
+    )
     limited.reset()
     steps = [limited.step(np.zeros(2)) for _ in range(4)]
     assert [step.last() for step in steps] == [False, False, False, True]
@@ -45,7 +47,7 @@ def test_the_run_seeds_what_is_drawn_when_a_task_is_made():
 
     def springs(seed, **kwargs):
         options = EnvironmentOptions(seed=seed, kwargs=kwargs)
-        env = make_dm_control("lqr", "lqr_2_1", options)
+        env = make_dm_control("dm_control/lqr-lqr_2_1", options)
         return list(env.physics.model.jnt_stiffness)
 
     assert springs(1) == springs(1) != springs(2)
@@ -68,14 +70,17 @@ def test_arguments_reach_the_task_and_the_environment():
         "environment_kwargs": {"flat_observation": True},
         "visualize_reward": True,
     }
-    env = make_dm_control("cheetah", "run", EnvironmentOptions(kwargs=kwargs))
+    env = make_dm_control("dm_control/cheetah-run", EnvironmentOptions(kwargs=kwargs))
     assert list(env.reset().observation) == ["observations"]
     assert env.task.visualize_reward
     with pytest.raises(mjrec.UnknownName, match=r"'time_limit'.*task_kwargs"):
-        make_dm_control("cheetah", "run", EnvironmentOptions(kwargs={"time_limit": 1}))
+        make_dm_control(
+            "dm_control/cheetah-run", EnvironmentOptions(kwargs={"time_limit": 1})
+        )
     with pytest.raises(mjrec.EnvironmentNotMade, match=r"cheetah-run.*'q'") as e:
         make_dm_control(
-            "cheetah", "run", EnvironmentOptions(kwargs={"task_kwargs": {"q": 1}})
+            "dm_control/cheetah-run",
+            EnvironmentOptions(kwargs={"task_kwargs": {"q": 1}}),
         )
     assert isinstance(e.value.__cause__, TypeError)
 
@@ -168,7 +173,7 @@ def test_a_recording_says_with_what_its_task_was_made():
     options = EnvironmentOptions(
         seed=5, max_steps=3, kwargs={"task_kwargs": {"time_limit": 2}}
     )
-    env = make_dm_control("cartpole", "swingup", options)
+    env = make_dm_control("dm_control/cartpole-swingup", options)
     recorded = dm_control_scenes(env, env_id="dm_control/cartpole-swingup")
     assert recorded.environment["kwargs"] == {
         "task_kwargs": {"random": 5, "time_limit": 2}

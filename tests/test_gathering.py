@@ -11,6 +11,7 @@ from pathlib import Path
 import gymnasium
 import numpy as np
 import pytest
+import report_contents
 from engine_runs import run_python
 from parts import parametrize
 
@@ -21,7 +22,7 @@ from mjrec.errors import InvalidArgument, UnreadableFile
 from mjrec.evaluation.evaluation import read_results
 from mjrec.formats.monitor_directory import infix_of
 from mjrec.recorder.keep_rules import keep_rule
-from mjrec.reporting.contents import EPISODE, episodes_with_roles
+from mjrec.reporting.contents import end_times, episodes_with_roles, outcomes
 from mjrec.reporting.gathering import gather
 from report_recordings import GYM, entry, record, write_journal
 
@@ -106,7 +107,7 @@ def test_episodes_of_several_monitors_are_in_the_order_of_time(tmp_path):
     late = [entry(0, end_time=2.0e9, success=False), entry(1, end_time=np.nan)]
     write_journal(tmp_path, "1.b", "X-v0", late)
     [task] = gather(tmp_path).tasks
-    assert task.episodes[["run", "episode", "success"]].tolist() == [
+    assert task.episodes[["seed", "episode", "success"]].tolist() == [
         (0, 1, -1),
         (1, 0, 0),
         (0, 0, 1),
@@ -194,14 +195,11 @@ def test_an_evaluation_has_its_results(tmp_path):
     assert [task.name for task in contents.tasks] == ["a/x", "b/y", "X-v0"]
     task = contents.tasks[0]
     assert task.is_evaluation
-    assert task.episodes[["run", "outcome", "success"]].tolist() == [
-        (0, 2, 1),
-        (0, 2, 0),
-        (7, 4, -1),
-        (7, 2, 0),
-    ]
+    assert task.episodes["seed"].tolist() == [0, 0, 7, 7]
+    assert task.episodes["success"].tolist() == [1, 0, -1, 0]
+    assert outcomes(task).tolist() == [2, 2, 4, 2]
     assert task.failures == {2: "PolicyError: it gave <b>NaN</b>"}
-    assert task.episodes["end_time"][1] == 1.79e9 + 2
+    assert end_times(task.episodes)[1] == 1.79e9 + 2
     assert (task.summary.episodes, task.summary.failed) == (3, 1)
     assert contents.across.keys() == {str(tmp_path / "e")}
     assert ("Seeds", "0, 7") in task.provenance
@@ -287,10 +285,9 @@ def test_an_evaluation_without_results_is_shown_by_its_monitors(
 )
 def test_roles(rewards, failed, roles):
     """Of equals the earlier, of an even number the lower, no number is the worst."""
-    episodes = np.zeros(len(rewards), EPISODE)
-    episodes["total_reward"] = rewards
-    episodes["outcome"][failed] = 4
-    assert episodes_with_roles(episodes) == roles
+    given = report_contents.task("X", rewards, failures=dict.fromkeys(failed, "broke"))
+    given.episodes["total_reward"] = rewards
+    assert episodes_with_roles(given) == roles
 
 
 def test_roles_are_those_of_an_evaluation(tmp_path):
@@ -302,7 +299,7 @@ def test_roles_are_those_of_an_evaluation(tmp_path):
     for result, role in keep_rule("best,median,worst").choose(results):
         index = results.index(result)
         expected[index] = (*expected.get(index, ()), role)
-    assert episodes_with_roles(gather(tmp_path).tasks[0].episodes) == expected
+    assert episodes_with_roles(gather(tmp_path).tasks[0]) == expected
 
 
 def test_verdicts_are_found_and_given(tmp_path):

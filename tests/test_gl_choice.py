@@ -5,7 +5,7 @@ import pytest
 from other_python import run_python, without_gl
 from parts import parametrize
 
-from mjrec.gl import probe
+from mjrec.gl.choice import probe
 
 _SHOW = (
     "\nprint(answer, os.environ.get('MUJOCO_GL'), os.environ.get('PYOPENGL_PLATFORM'))"

@@ -7,8 +7,10 @@ import pytest
 from other_python import run_python, without_gl
 
 from mjrec.errors import InvalidArgument
-from mjrec.gl import EglDevice, probe, render_on_given_gpu, visible_gpus
-from mjrec.gl.devices import device_of_gpu
+from mjrec.gl import render_on_given_gpu
+from mjrec.gl.choice import probe
+from mjrec.gl.devices import device_of_gpu, visible_gpus
+from mjrec.gl.egl import EglDevice
 
 # As EGL told of them on a machine with one NVIDIA H100 (driver 580.159.04) while
 # CUDA_VISIBLE_DEVICES was not set, "0" or its UUID.

@@ -3,7 +3,7 @@
 
 import pytest
 
-from mjrec.gl import diagnose
+from mjrec.gl.backends import diagnose
 
 _PLATFORM = {"PYOPENGL_PLATFORM": "osmesa"}
 _CONTEXT = (

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 from other_python import without_gl
 
-from mjrec.gl import Probe, probe, probing
-from mjrec.gl.probing import probe_environment
+from mjrec.gl import choice
+from mjrec.gl.choice import Probe, probe, probe_environment
 from mjrec.simulation import gl_probe
 
 _EGL_PACKAGES = "libegl1 libegl-mesa0 libgl1-mesa-dri libopengl0"
@@ -133,11 +133,11 @@ def test_software_on_a_machine_with_a_gpu_is_odd(tmp_path, monkeypatch):
     hardware = Probe("egl", renders=True, gl_renderer="NVIDIA H200/PCIe/SSE2")
     assert software.software
     assert not hardware.software
-    monkeypatch.setattr(probing, "gpu_device_files", list)
+    monkeypatch.setattr(choice, "gpu_device_files", list)
     assert software.warning() == ""
     device = tmp_path / "nvidia0"
     device.touch()
-    monkeypatch.setattr(probing, "gpu_device_files", lambda: [str(device)])
+    monkeypatch.setattr(choice, "gpu_device_files", lambda: [str(device)])
     assert "llvmpipe (LLVM 15)" in software.warning()
     assert str(device) in software.warning()
     assert "NVIDIA_DRIVER_CAPABILITIES" in software.warning()
@@ -195,7 +195,7 @@ exec "$@"
 """
 _PROBE = """
 import dataclasses, json, sys
-from mjrec.gl import probe
+from mjrec.gl.choice import probe
 print(json.dumps(dataclasses.asdict(probe(sys.argv[1]))))
 """
 

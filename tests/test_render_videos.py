@@ -33,10 +33,16 @@ from mjrec import (
 )
 from mjrec.formats.json_fields import from_json, to_json
 from mjrec.rendering.finish import VideoWorker
-from mjrec.rendering.jobs import Progress, RecordingKey, RenderedVideos, VideoJob
+from mjrec.rendering.jobs import (
+    Progress,
+    RecordingKey,
+    RenderedVideos,
+    Variant,
+    VideoJob,
+    View,
+)
 from mjrec.rendering.recordings import claim
 from mjrec.rendering.render_videos import name_of_variant
-from mjrec.rendering.views import Variant, View
 from mjrec.simulation.model_trust import note_models
 
 VIDEO = "openaigym.video.0.7.video000000"

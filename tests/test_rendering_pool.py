@@ -23,8 +23,8 @@ from mjrec.child_python import Child
 from mjrec.errors import Error, UnreadableFile
 from mjrec.formats.trajectory_file import finish_trajectory
 from mjrec.rendering import pool as pool_module
+from mjrec.rendering.jobs import View
 from mjrec.rendering.pool import WorkerPool
-from mjrec.rendering.views import View
 
 
 @pytest.fixture(scope="module")

@@ -29,11 +29,10 @@ from mjrec.formats.trajectory_file import open_trajectory
 from mjrec.formats.video_metadata import is_done, metadata_path
 from mjrec.rendering.finish import bring_up_to_date, finish
 from mjrec.rendering.finisher import Finisher
-from mjrec.rendering.jobs import RecordingKey, VideoJob
+from mjrec.rendering.jobs import RecordingKey, Variant, VideoJob, View
 from mjrec.rendering.recorded_facts import captions, video_path
 from mjrec.rendering.recordings import look_at
 from mjrec.rendering.render_video import render_video
-from mjrec.rendering.views import Variant, View
 
 STEM = "openaigym.video.0.7.video000000"
 KEY = RecordingKey(INFIX, 0)

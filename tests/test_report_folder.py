@@ -17,7 +17,7 @@ import mjrec
 from mjrec.commands.report import report
 from mjrec.errors import DirectoryNotWritable, InvalidArgument
 from mjrec.reporting.gathering import gather
-from mjrec.reporting.media import ReportProgress, posters_of
+from mjrec.reporting.media import ReportProgress, add_images
 from mjrec.reporting.report_folder import write_report
 from report_recordings import GYM, entry, record, write_journal
 
@@ -101,9 +101,9 @@ def test_posters_show_the_middle(recordings):
                 writer.write(np.full((*size, 3), colour, np.uint8))
     contents = gather(recordings)
     sizes = []
-    for poster in posters_of(contents, lambda progress: None):
-        assert poster is not None
-        with Image.open(io.BytesIO(poster)) as image:
+    add_images(contents, lambda progress: None)
+    for video in contents.videos:
+        with Image.open(io.BytesIO(video.image)) as image:
             assert image.format == "JPEG"
             sizes.append(image.size)
             pixel = np.asarray(image)[20, 20]

@@ -28,7 +28,7 @@ from mjrec.formats.span_writer import SpanLogs, SpanWriter
 from mjrec.formats.spans import log_paths
 from mjrec.formats.trajectory import packed, row_dtype
 from mjrec.formats.trajectory_file import finish_trajectory, open_trajectory
-from mjrec.rendering.views import View
+from mjrec.rendering.jobs import View
 from mjrec.simulation.model_trust import directory_digest, note_models
 
 INFIX = "0.7"

@@ -21,7 +21,7 @@ from .evidence.verify import verify as verify
 from .formats.archive import write_archive as write_archive
 from .formats.video_writer import VideoWriter as VideoWriter
 from .formats.video_writer import save_video as save_video
-from .gl import use_gl as use_gl
+from .gl.choice import use_gl as use_gl
 from .monitors import Monitor as Monitor
 from .monitors.dm_env_monitor import DmEnvMonitor as DmEnvMonitor
 from .monitors.gymnasium_monitor import GymnasiumMonitor as GymnasiumMonitor

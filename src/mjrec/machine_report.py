@@ -16,8 +16,8 @@ from pathlib import Path
 from .errors import EncoderError, Error
 from .formats.encoder_settings import MUXERS, encoder_settings, try_encoding
 from .formats.ffmpeg import ffmpeg_executable, ffmpeg_version
-from .gl import BACKENDS, Diagnosis, Probe, choose, diagnose, probe
-from .gl.backends import platforms_contradict
+from .gl.backends import BACKENDS, Diagnosis, diagnose, platforms_contradict
+from .gl.choice import Probe, choose, probe
 from .machine import cgroup_cpu_quota, gpu_device_files, usable_cpus
 
 # Each entry: a distribution, a program that uses it as a recording does but does not

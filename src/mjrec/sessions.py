@@ -23,10 +23,10 @@ from .environments.policies import load_policy, policy_file
 from .errors import GLError, InvalidArgument
 from .formats.manifest import read_manifest
 from .formats.monitor_directory import infix_of, manifest_name
-from .gl import use_gl
+from .gl.choice import use_gl
 from .monitors.monitor import monitored
 from .recorder.options import DEFERRED, LIVE, OFF, RecorderOptions
-from .rendering.views import PlainCamera
+from .rendering.jobs import PlainCamera
 from .schedules import disable_videos, schedule_from_text
 from .simulation.find_simulation import simulation_in
 

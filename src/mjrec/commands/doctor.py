@@ -11,7 +11,8 @@ from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
-from ..gl import EglDevice, Probe
+from ..gl.choice import Probe
+from ..gl.egl import EglDevice
 from ..machine_report import Ffmpeg, MachineReport, Package, examine_machine
 from .terminal import print_json
 

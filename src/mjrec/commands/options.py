@@ -15,7 +15,7 @@ from ..engines.choice import engine_from
 from ..errors import InvalidArgument
 from ..frames import check_size
 from ..json_text import has_nan, loads
-from ..rendering.views import PlainCamera, plain_camera
+from ..rendering.jobs import PlainCamera, plain_camera
 from .help_text import flowing_help
 
 AsJson: TypeAlias = Annotated[bool, tyro.conf.arg(name="json")]

@@ -21,9 +21,8 @@ from ..formats.monitor_directory import (
 )
 from ..monitors.progress import render_progress
 from ..plain_text import counted
-from ..rendering.jobs import RenderedVideos
+from ..rendering.jobs import RenderedVideos, Variant, View
 from ..rendering.render_videos import iter_rendered_videos
-from ..rendering.views import Variant, View
 from .options import NO_ENGINE, AsJson, Engine, camera_of, size_of
 from .terminal import names_by, print_json, print_lines
 

@@ -3,11 +3,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from dm_control import suite
+from dm_control import suite as suite
 
 from ..errors import UnknownName
 from ..simulation.cameras import default_camera, resolve_camera
@@ -21,27 +21,20 @@ from .named_environment import (
     is_terminated,
     is_truncated,
 )
-from .names import DmControlName
+from .names import task_of_suite
 from .scenes import Scenes
 
 _ARGUMENTS = ("task_kwargs", "environment_kwargs", "visualize_reward")
 
 
-def tasks_of(domain: str) -> Sequence[str]:
-    """Return the tasks of a domain in the installed suite."""
-    tasks: Sequence[str] = suite.TASKS_BY_DOMAIN.get(domain, ())
-    return tasks
-
-
-def make_dm_control(domain: str, task: str, options: EnvironmentOptions) -> Any:
+def make_dm_control(env_id: str, options: EnvironmentOptions) -> Any:
     """Create a task of the suite.
 
     The camera and the size belong to each frame, not to the environment. Episodes end
     after `max_steps`, or after 1000 steps if the task has no time limit.
 
     Args:
-        domain: for example `cheetah`.
-        task: for example `run`.
+        env_id: `dm_control/<domain>-<task>`.
         options: the options. `kwargs` are arguments for `suite.load`: `{"task_kwargs":
             {...}, "environment_kwargs": {...}, "visualize_reward": true}`. `seed` seeds
             random choices made when a task is created, such as the springs of `lqr`,
@@ -53,39 +46,48 @@ def make_dm_control(domain: str, task: str, options: EnvironmentOptions) -> Any:
         EnvironmentNotMade: creating the task failed for another reason, which is
             chained.
     """
-    if domain not in suite.TASKS_BY_DOMAIN:
+    domain, task = task_of_suite(env_id)
+    tasks = suite.TASKS_BY_DOMAIN.get(domain)
+    if tasks is None:
         raise UnknownName(
             "dm_control domain",
             domain,
             suite.TASKS_BY_DOMAIN,
             hint="A dm_control environment's name is dm_control/<domain>-<task>.",
         )
-    if task not in tasks_of(domain):
-        raise UnknownName(f"task of dm_control's {domain}", task, tasks_of(domain))
-    arguments = _arguments(options.kwargs)
-    arguments["task_kwargs"] = {"random": options.seed, **arguments["task_kwargs"]}
-    name = DmControlName(domain, task)
+    if task not in tasks:
+        raise UnknownName(f"task of dm_control's {domain}", task, tasks)
+    for name in options.kwargs:
+        if name not in _ARGUMENTS:
+            raise UnknownName(
+                "argument of a dm_control environment",
+                name,
+                _ARGUMENTS,
+                hint='For example {"task_kwargs": {"time_limit": 5}}.',
+            )
+    # suite.load accepts None for task_kwargs, so users may pass it.
+    of_task = {"random": options.seed, **(options.kwargs.get("task_kwargs") or {})}
     try:
-        environment = load_task(name, arguments)
+        environment = load_task(env_id, {**options.kwargs, "task_kwargs": of_task})
     except Exception as error:
-        raise dm_control_failure(str(name), error) from error
+        raise dm_control_failure(env_id, error) from error
     environment._step_limit = options.limit(environment._step_limit)
     return environment
 
 
 def load_task(
-    name: DmControlName, kwargs: Mapping[str, Any] | None, *, limit: int | None = None
+    env_id: str, kwargs: Mapping[str, Any] | None, *, limit: int | None = None
 ) -> Any:
     """Create a task with `suite.load`.
 
     Args:
-        name: the task's name.
+        env_id: `dm_control/<domain>-<task>`.
         kwargs: arguments for `suite.load`; None if a recording does not have them. In
             that case, recordings of the returned environment do not have them either.
         limit: number of steps after which an episode ends as truncated, unless the task
             ends it earlier.
     """
-    environment = suite.load(name.domain, name.task, **(kwargs or {}))
+    environment = suite.load(*task_of_suite(env_id), **(kwargs or {}))
     if kwargs is not None:
         # An environment does not keep the arguments that it was created with.
         setattr(environment.task, MADE_WITH, kwargs)
@@ -99,7 +101,7 @@ class DmControlEnvironment(NamedEnvironment):
     """A task of the suite.
 
     Args:
-        name: the task's name.
+        env_id: `dm_control/<domain>-<task>`.
         options: the options; the camera and size are passed to the monitor.
 
     Raises:
@@ -107,8 +109,8 @@ class DmControlEnvironment(NamedEnvironment):
             camera.
     """
 
-    def __init__(self, name: DmControlName, options: EnvironmentOptions) -> None:
-        environment = make_dm_control(name.domain, name.task, options)
+    def __init__(self, env_id: str, options: EnvironmentOptions) -> None:
+        environment = make_dm_control(env_id, options)
         view: dict[str, Any] = {}
         if options.frames:
             camera = options.camera
@@ -118,18 +120,15 @@ class DmControlEnvironment(NamedEnvironment):
             view = {"camera": camera, **options.size}
         super().__init__(
             environment,
-            env_id=str(name),
+            env_id=env_id,
             step_limit=int(environment._step_limit),
             view=view,
         )
         self._made_with = getattr(environment.task, MADE_WITH)["task_kwargs"]["random"]
-        self._draws_when_made = not _is_fresh(self._generator(), self._made_with)
+        fresh = np.random.RandomState(self._made_with)
+        states = (each.get_state() for each in (self._generator(), fresh))
+        self.draws_when_made = not all(map(np.array_equal, *states))
         self._was_reset = False
-
-    @property
-    def draws_when_made(self) -> bool:
-        """Whether the model depends on the seed that created the environment."""
-        return self._draws_when_made
 
     def begin(self, around: Any, seeds: EpisodeSeeds, seed: int | None) -> Any:
         """Reset, and return the first observation.
@@ -167,22 +166,3 @@ class DmControlEnvironment(NamedEnvironment):
 
     def _generator(self) -> Any:
         return generator_of(self.environment)
-
-
-def _is_fresh(generator: Any, seed: Any) -> bool:
-    """Return whether a generator that was created with a seed is still unused."""
-    states = (each.get_state() for each in (generator, np.random.RandomState(seed)))
-    return all(map(np.array_equal, *states))
-
-
-def _arguments(kwargs: Mapping[str, Any]) -> dict[str, Any]:
-    for name in kwargs:
-        if name not in _ARGUMENTS:
-            raise UnknownName(
-                "argument of a dm_control environment",
-                name,
-                _ARGUMENTS,
-                hint='For example {"task_kwargs": {"time_limit": 5}}.',
-            )
-    # suite.load accepts None for task_kwargs, so users may pass it.
-    return {**kwargs, "task_kwargs": kwargs.get("task_kwargs") or {}}

@@ -77,8 +77,9 @@ def dm_control_scenes(
 ) -> Scenes:
     """Return how the states of a dm_control environment are recorded.
 
-    The frames are those of `physics.render()`. If it cannot draw them (see
-    `_drawn_by_physics`), they are other frames of the same scene.
+    The frames are those of `physics.render()`. It cannot draw frames that are larger
+    than the model's offscreen buffer or come from an `MjvCamera`: these are other
+    frames of the same scene, which are not drawn live.
 
     Args:
         env: an environment with dm_control's `physics`.
@@ -92,7 +93,9 @@ def dm_control_scenes(
         UnknownName: the model has no such camera.
         InvalidArgument: the camera's number or the size is invalid.
     """
-    height, width = _frame_size(height, width)
+    height, width = check_size(
+        _HEIGHT if height is None else height, _WIDTH if width is None else width
+    )
     by_physics = _drawn_by_physics(env.physics, camera, height, width)
     scene = _PhysicsScene(
         env,
@@ -112,39 +115,12 @@ def dm_control_scenes(
         obstacle=_obstacle(env.physics) if by_physics else None,
         environment=_environment(env, env_id),
         random_state=lambda: generator_state(generator_of(env)),
+        frames=(
+            PhysicsFrames(env, camera=camera, height=height, width=width)
+            if by_physics
+            else NoFrameSource(_NOT_BY_PHYSICS)
+        ),
     )
-
-
-def dm_control_frames(
-    env: Any,
-    *,
-    camera: Any = None,
-    height: int | None = None,
-    width: int | None = None,
-) -> PhysicsFrames | NoFrameSource:
-    """Return the source of a dm_control environment's live frames.
-
-    The frames are those of `physics.render()`. It cannot draw frames that are larger
-    than the model's offscreen buffer or come from an `MjvCamera`, so these are not
-    drawn live.
-
-    Args:
-        env: an environment with dm_control's `physics`.
-        camera: a name, a number or an `MjvCamera`; None for dm_control's default, the
-            free camera.
-        height: height in pixels; None for dm_control's default, 240.
-        width: width in pixels; None for dm_control's default, 320.
-
-    Raises:
-        UnknownName: the model has no such camera.
-        InvalidArgument: the camera's number or the size is invalid.
-    """
-    height, width = _frame_size(height, width)
-    if camera is not None:
-        resolve_camera(raw_model(env.physics.model), camera)
-    if not _drawn_by_physics(env.physics, camera, height, width):
-        return NoFrameSource(_NOT_BY_PHYSICS)
-    return PhysicsFrames(env, camera=camera, height=height, width=width)
 
 
 def generator_of(env: Any) -> Any:
@@ -278,17 +254,6 @@ class _PhysicsScene:
             width=width,
             label=camera_label(self._model, self._camera),
         )
-
-
-def _frame_size(height: int | None, width: int | None) -> tuple[int, int]:
-    """Return `(height, width)`, with dm_control's defaults in place of None.
-
-    Raises:
-        InvalidArgument: the size is invalid.
-    """
-    return check_size(
-        _HEIGHT if height is None else height, _WIDTH if width is None else width
-    )
 
 
 def _drawn_by_physics(physics: Any, camera: Any, height: int, width: int) -> bool:

@@ -71,7 +71,9 @@ def make_gymnasium(env_id: str, options: EnvironmentOptions) -> gymnasium.Env[An
     # The module in `module:Id` may be in the working directory, like a policy's.
     here = working_directory_importable() if ":" in env_id else contextlib.nullcontext()
     with here:
-        return _make_known(_spec(env_id), options)
+        spec = _spec(env_id)
+        with _failures_of(spec.id):
+            return _made(spec, options)
 
 
 class GymnasiumEnvironment(NamedEnvironment):
@@ -115,15 +117,38 @@ class GymnasiumEnvironment(NamedEnvironment):
         return gymnasium_scenes(self.environment)
 
 
-def _make_known(
+def _made(
     spec: registration.EnvSpec, options: EnvironmentOptions
 ) -> gymnasium.Env[Any, Any]:
     kwargs = dict(options.kwargs)
     kwargs["max_episode_steps"] = options.limit(_own_limit(spec, kwargs))
     if not options.frames:
-        return _make(spec, kwargs)
+        return gymnasium.make(spec.id, **kwargs)
     kwargs["render_mode"] = _render_mode(spec, kwargs)
-    return _make_drawn(spec, kwargs, options)
+    for name in options.size:
+        if name in kwargs:
+            raise InvalidArgument(
+                f"The {name} of the frames is given twice: as {options.size[name]} and "
+                f"among the environment's own arguments as {kwargs[name]!r}."
+            )
+    try:
+        env = gymnasium.make(spec.id, **{**kwargs, **options.size})
+    except TypeError as error:
+        unknown = (f"unexpected keyword argument {name!r}" for name in options.size)
+        if not any(text in str(error) for text in unknown):
+            raise
+        raise InvalidArgument(
+            f"{spec.id} takes no size: it chooses the size of its frames itself. "
+            "Only MuJoCo environments take a size."
+        ) from error
+    try:
+        if env.render_mode is None:
+            raise _not_drawn(spec.id, "it ignored render_mode")
+        _choose_camera(env, spec.id, kwargs, options.camera)
+    except BaseException:
+        env.close()
+        raise
+    return env
 
 
 def _own_limit(spec: registration.EnvSpec, kwargs: Mapping[str, Any]) -> int | None:
@@ -142,7 +167,14 @@ def _own_limit(spec: registration.EnvSpec, kwargs: Mapping[str, Any]) -> int | N
 def _spec(env_id: str) -> registration.EnvSpec:
     module, colon, name = env_id.rpartition(":")
     if colon:
-        _import_registering_module(module, env_id)
+        try:
+            importlib.import_module(module)
+        except Exception as error:
+            raise EnvironmentNotMade(
+                env_id,
+                f"importing the module {module!r} raised {_what_was_raised(error)}",
+                hint="It must be installed, or be in the working directory.",
+            ) from error
     newest = newest_versions(registration.registry)
     spec = registration.registry.get(newest.get(name, name))
     if spec is None:
@@ -157,24 +189,6 @@ def _spec(env_id: str) -> registration.EnvSpec:
     return spec
 
 
-def _import_registering_module(module: str, env_id: str) -> None:
-    try:
-        importlib.import_module(module)
-    except Exception as error:
-        raise EnvironmentNotMade(
-            env_id,
-            f"importing the module {module!r} raised {_what_was_raised(error)}",
-            hint="It must be installed, or be in the working directory.",
-        ) from error
-
-
-def _make(
-    spec: registration.EnvSpec, kwargs: Mapping[str, Any]
-) -> gymnasium.Env[Any, Any]:
-    with _failures_of(spec.id):
-        return gymnasium.make(spec.id, **kwargs)
-
-
 @contextlib.contextmanager
 def _failures_of(env_id: str) -> Iterator[None]:
     """Turn exceptions in third-party code into one of our errors."""
@@ -183,17 +197,14 @@ def _failures_of(env_id: str) -> Iterator[None]:
     except Error:
         raise
     except gymnasium.error.DependencyNotInstalled as error:
-        raise _missing_dependency(env_id, error) from error
+        commands = re.findall(r"`([^`]*pip install[^`]*)`", str(error))
+        if not commands:
+            raise EnvironmentNotMade(env_id, error) from error
+        package = getattr(error.__cause__, "name", None) or "a package"
+        install = " && ".join(commands)
+        raise MissingDependency(package, purpose=env_id, install=install) from error
     except Exception as error:
         raise EnvironmentNotMade(env_id, _what_was_raised(error)) from error
-
-
-def _missing_dependency(env_id: str, error: Exception) -> Error:
-    commands = re.findall(r"`([^`]*pip install[^`]*)`", str(error))
-    if not commands:
-        return EnvironmentNotMade(env_id, error)
-    package = getattr(error.__cause__, "name", None) or "a package"
-    return MissingDependency(package, purpose=env_id, install=" && ".join(commands))
 
 
 def _what_was_raised(error: Exception) -> str:
@@ -205,12 +216,11 @@ def _what_was_raised(error: Exception) -> str:
 
 
 def _render_mode(spec: registration.EnvSpec, kwargs: Mapping[str, Any]) -> str:
-    with _failures_of(spec.id):
-        creator: Any = spec.entry_point
-        if creator is None:
-            raise EnvironmentNotMade(spec.id, "only its vectorized form is registered")
-        if isinstance(creator, str):
-            creator = registration.load_env_creator(creator)
+    creator: Any = spec.entry_point
+    if creator is None:
+        raise EnvironmentNotMade(spec.id, "only its vectorized form is registered")
+    if isinstance(creator, str):
+        creator = registration.load_env_creator(creator)
     # A function has no metadata, and on a wrapper's class it is a property.
     metadata = getattr(creator, "metadata", None)
     modes = metadata.get("render_modes") if isinstance(metadata, dict) else None
@@ -250,41 +260,6 @@ def _check_pygame(env_id: str, extra: str, *, has_text: bool) -> None:
             purpose=f"Drawing {env_id}",
             install=f'pip install "gymnasium[{extra}]"{text_instead * has_text}',
         )
-
-
-def _make_drawn(
-    spec: registration.EnvSpec, kwargs: dict[str, Any], options: EnvironmentOptions
-) -> gymnasium.Env[Any, Any]:
-    env = _make_sized(spec, kwargs, options.size)
-    try:
-        if env.render_mode is None:
-            raise _not_drawn(spec.id, "it ignored render_mode")
-        _choose_camera(env, spec.id, kwargs, options.camera)
-    except BaseException:
-        env.close()
-        raise
-    return env
-
-
-def _make_sized(
-    spec: registration.EnvSpec, kwargs: dict[str, Any], size: dict[str, int]
-) -> gymnasium.Env[Any, Any]:
-    for name in size:
-        if name in kwargs:
-            raise InvalidArgument(
-                f"The {name} of the frames is given twice: as {size[name]} and "
-                f"among the environment's own arguments as {kwargs[name]!r}."
-            )
-    try:
-        return _make(spec, {**kwargs, **size})
-    except EnvironmentNotMade as error:
-        unknown = (f"unexpected keyword argument {name!r}" for name in size)
-        if not any(text in str(error.__cause__) for text in unknown):
-            raise
-        raise InvalidArgument(
-            f"{spec.id} takes no size: it chooses the size of its frames itself. "
-            "Only MuJoCo environments take a size."
-        ) from error.__cause__
 
 
 def _choose_camera(

@@ -9,57 +9,7 @@ from typing import Any
 
 import gymnasium
 
-from ..errors import InvalidArgument
 from ..simulation.find_simulation import simulation_in
-from .scenes import NoFrameSource, simulation_below
-
-_ANOTHER_VIEW = (
-    "with camera, height or width the frames differ from those of render(), and are "
-    "drawn from recorded states, never live. Create the environment with them "
-    "(camera_name=, height=, width=), or leave out render="
-)
-
-
-def gymnasium_frames(
-    env: gymnasium.Env[Any, Any],
-    *,
-    camera: Any = None,
-    height: int | None = None,
-    width: int | None = None,
-) -> EnvironmentFrames | NoFrameSource:
-    """Return the source of an environment's live frames, which is `env.render()`.
-
-    If camera, height or width is given, there are no live frames: workers draw the
-    frames from states.
-
-    Args:
-        env: the environment, as the user wrapped it.
-        camera: a name, a number or an `MjvCamera`; None for the camera that the
-            environment itself shows.
-        height: height in pixels; None for the environment's own.
-        width: width in pixels; None for the environment's own.
-
-    Raises:
-        UnknownName: the model has no such camera.
-        InvalidArgument: camera, height or width is given, but the environment has no
-            MuJoCo simulation.
-    """
-    if camera is None and height is None and width is None:
-        return EnvironmentFrames(env)
-    simulated = simulation_below(env)
-    if simulated is None:
-        raise InvalidArgument(
-            "camera, height and width require a MuJoCo environment, but "
-            f"{env} has no MuJoCo model and data. Create the environment itself with "
-            "the camera and size that the videos should have."
-        )
-    if camera is not None:
-        # Imported only here, where mujoco is already loaded. Its import chooses an
-        # OpenGL backend, which must not happen for an environment without MuJoCo.
-        from ..simulation.cameras import resolve_camera
-
-        resolve_camera(simulated.model, camera)
-    return NoFrameSource(_ANOTHER_VIEW)
 
 
 class EnvironmentFrames:

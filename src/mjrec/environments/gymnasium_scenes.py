@@ -11,8 +11,11 @@ from typing import TYPE_CHECKING, Any
 
 import gymnasium
 
+from ..errors import InvalidArgument
 from ..simulation.find_simulation import simulation_in
+from .gymnasium_frames import EnvironmentFrames
 from .scenes import (
+    NoFrameSource,
     Scenes,
     class_name,
     generator_state,
@@ -50,6 +53,12 @@ _DELEGATING = (
     ),
 )
 
+_ANOTHER_VIEW = (
+    "with camera, height or width the frames differ from those of render(), and are "
+    "drawn from recorded states, never live. Create the environment with them "
+    "(camera_name=, height=, width=), or leave out render="
+)
+
 _ROBOT_ENV = "gymnasium_robotics.envs.robot_env"
 
 # Wrappers whose `render` passes on the frame unchanged. RecordVideo does so for single
@@ -74,7 +83,8 @@ def gymnasium_scenes(
 
     Without a camera, height or width, the frames are those of `env.render()`, and
     anything that overrides `render` is an obstacle. If any of these is given, the
-    frames show only the scene, without anything that a wrapper draws on top.
+    frames show only the scene, without anything that a wrapper draws on top, and there
+    are no live frames.
 
     Args:
         env: the environment, as the user wrapped it.
@@ -85,7 +95,8 @@ def gymnasium_scenes(
 
     Raises:
         UnknownName: the model has no such camera.
-        InvalidArgument: the camera's number or the size is invalid.
+        InvalidArgument: the camera's number or the size is invalid, or one of them is
+            given although the environment has no MuJoCo simulation.
     """
     view = {"camera": camera, "height": height, "width": width}
     own_view = any(asked is not None for asked in view.values())
@@ -93,15 +104,26 @@ def gymnasium_scenes(
     # Our own environments describe themselves.
     own = getattr(type(base), "mjrec_scenes", None)
     scenes = own(base, **view) if own else _scenes(env, base, view)
+    if own_view and scenes.states is None:
+        raise InvalidArgument(
+            "camera, height and width require a MuJoCo environment, but "
+            f"{env} has no MuJoCo model and data. Create the environment itself with "
+            "the camera and size that the videos should have."
+        )
     obstacle = None if own_view else _override_above(env) or scenes.obstacle
     environment = scenes.environment
     if environment is not None:
         environment = {**environment, **around_gymnasium(env)}
-    return dataclasses.replace(scenes, obstacle=obstacle, environment=environment)
+    return dataclasses.replace(
+        scenes,
+        obstacle=obstacle,
+        environment=environment,
+        frames=NoFrameSource(_ANOTHER_VIEW) if own_view else EnvironmentFrames(env),
+    )
 
 
-def own_camera(env: gymnasium.Env[Any, Any]) -> int | str | None:
-    """Return the camera that an environment itself shows, or None for a free camera.
+def own_view(env: gymnasium.Env[Any, Any]) -> dict[str, Any]:
+    """Return the `own_camera` that an environment itself shows, unless it is free.
 
     The camera may differ from the environment's arguments, because it can be changed
     later.
@@ -110,11 +132,12 @@ def own_camera(env: gymnasium.Env[Any, Any]) -> int | str | None:
     chosen = getattr(getattr(shown, "mujoco_renderer", shown), "camera_id", None)
     if chosen is None and has_own_scenes(shown):
         chosen = shown.camera
-    return chosen if isinstance(chosen, int | str) and chosen != -1 else None
+    is_named = isinstance(chosen, int | str) and chosen != -1
+    return {"own_camera": chosen} if is_named else {}
 
 
 def set_own_camera(env: gymnasium.Env[Any, Any], camera: int | str) -> None:
-    """Set the camera that an environment itself shows to a result of `own_camera`."""
+    """Set the camera that an environment itself shows to a recorded `own_camera`."""
     shown = drawn_part(env.unwrapped)
     if has_own_scenes(shown):
         shown.camera = camera

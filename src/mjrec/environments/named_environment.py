@@ -111,7 +111,13 @@ class NamedEnvironment(abc.ABC):
         view: the `camera`, `height` and `width` to pass to the monitor; empty if the
             environment itself shows the requested view.
         not_drawn: why the environment cannot be drawn although frames were requested.
+
+    Attributes:
+        draws_when_made: whether the model depends on the seed that created the
+            environment.
     """
+
+    draws_when_made = False
 
     def __init__(
         self,
@@ -127,11 +133,6 @@ class NamedEnvironment(abc.ABC):
         self.step_limit = step_limit
         self.view = view or {}
         self.not_drawn = not_drawn
-
-    @property
-    def draws_when_made(self) -> bool:
-        """Whether the model depends on the seed that created the environment."""
-        return False
 
     def begin_episode(self, around: Any, seeds: EpisodeSeeds) -> Any:
         """Reset with an episode's seeds, and return the first observation."""

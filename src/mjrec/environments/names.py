@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The three kinds of environment names, and imports of modules that users name."""
+"""The names of environments, and imports of modules that users name."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeAlias
 
 from ..errors import InvalidArgument, UnknownName
 
@@ -17,50 +16,17 @@ _MJCF_SUFFIXES = (".xml", ".mjcf")
 
 
 @dataclass(frozen=True)
-class GymnasiumName:
-    """An environment in Gymnasium's registry.
+class EnvironmentName:
+    """A parsed name of an environment.
 
     Attributes:
-        env_id: the id, in any form that `gymnasium.make` takes, including `module:Id`.
+        framework: `"gymnasium"`, `"dm_control"` or `"mjcf"`.
+        text: an id in any form that `gymnasium.make` takes, including `module:Id`; a
+            task, `dm_control/<domain>-<task>`; or the path of an MJCF file.
     """
 
-    env_id: str
-
-    def __str__(self) -> str:
-        return self.env_id
-
-
-@dataclass(frozen=True)
-class DmControlName:
-    """A task of the dm_control suite.
-
-    Attributes:
-        domain: for example `humanoid_CMU`.
-        task: for example `run`.
-    """
-
-    domain: str
-    task: str
-
-    def __str__(self) -> str:
-        return f"{_DM_CONTROL}{self.domain}-{self.task}"
-
-
-@dataclass(frozen=True)
-class MjcfName:
-    """A model in a file.
-
-    Attributes:
-        path: the MJCF file.
-    """
-
-    path: Path
-
-    def __str__(self) -> str:
-        return str(self.path)
-
-
-EnvironmentName: TypeAlias = GymnasiumName | DmControlName | MjcfName
+    framework: str
+    text: str
 
 
 def parse_environment_name(text: str) -> EnvironmentName:
@@ -81,39 +47,42 @@ def parse_environment_name(text: str) -> EnvironmentName:
             "MJCF file (robot.xml). It is empty."
         )
     if text.startswith(_DM_CONTROL):
-        return _dm_control_name(text)
+        task_of_suite(text)
+        return EnvironmentName("dm_control", text)
     path = Path(text).expanduser()
-    if path.suffix.lower() in _MJCF_SUFFIXES:
-        return _mjcf_name(path)
+    is_mjcf = path.suffix.lower() in _MJCF_SUFFIXES
+    if is_mjcf and not path.is_file():
+        folder = path.parent
+        there = sorted(p for p in folder.glob("*") if p.is_file())
+        raise UnknownName(
+            "MJCF file",
+            str(path),
+            [str(p) for p in there if p.suffix.lower() in _MJCF_SUFFIXES],
+            hint=f"Looked in {folder.absolute()}.",
+        )
+    if is_mjcf:
+        return EnvironmentName("mjcf", str(path))
     if path.is_file():
         raise InvalidArgument(
             f"{text} is a file, but an MJCF file's name must end in .xml or .mjcf."
         )
-    return GymnasiumName(text)
+    return EnvironmentName("gymnasium", text)
 
 
-def _dm_control_name(text: str) -> DmControlName:
+def task_of_suite(name: str) -> tuple[str, str]:
+    """Return the domain and the task in `dm_control/<domain>-<task>`.
+
+    Raises:
+        InvalidArgument: the name has no task.
+    """
     # Domains and tasks are Python names, with underscores but without hyphens.
-    domain, hyphen, task = text.removeprefix(_DM_CONTROL).partition("-")
-    if not (domain and hyphen and task):
+    domain, _, task = name.removeprefix(_DM_CONTROL).partition("-")
+    if not (domain and task):
         raise InvalidArgument(
             "A dm_control environment's name must be dm_control/<domain>-<task>, for "
-            f"example dm_control/cheetah-run, not {text!r}."
+            f"example dm_control/cheetah-run, not {name!r}."
         )
-    return DmControlName(domain, task)
-
-
-def _mjcf_name(path: Path) -> MjcfName:
-    if path.is_file():
-        return MjcfName(path)
-    folder = path.parent
-    there = sorted(folder.iterdir()) if folder.is_dir() else []
-    raise UnknownName(
-        "MJCF file",
-        str(path),
-        [str(p) for p in there if p.suffix.lower() in _MJCF_SUFFIXES and p.is_file()],
-        hint=f"Looked in {folder.absolute()}.",
-    )
+    return domain, task
 
 
 @contextlib.contextmanager

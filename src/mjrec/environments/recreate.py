@@ -26,7 +26,6 @@ from numpy.typing import NDArray
 
 from ..formats.trajectory import columns_of
 from .gymnasium_scenes import drawn_part, random_state, set_own_camera
-from .names import DmControlName
 from .scenes import (
     class_name,
     generator_state,
@@ -330,8 +329,7 @@ def _mjcf(
 def _dm_control(
     env_id: str, kwargs: Mapping[str, Any] | None, limit: int | None
 ) -> Recreated:
-    name = _suite_name(env_id)
-    if name is None:
+    if not _is_in_suite(env_id):
         raise NotRecreated(
             f"{env_id!r:.100} is not a task of the installed dm_control suite, or "
             'dm_control does not work here: pip install "mjrec[dm-control]"'
@@ -347,12 +345,12 @@ def _dm_control(
 
     with _failures(env_id):
         task_kwargs = (kwargs or {}).get("task_kwargs") or {}
-        if name.domain == "lqr" and "random" not in task_kwargs:
+        if env_id.startswith("dm_control/lqr-") and "random" not in task_kwargs:
             raise NotRecreated(
-                f"{name} chooses its model at random when it is created, and the seed "
-                "for this is not recorded"
+                f"{env_id} chooses its model at random when it is created, and the "
+                "seed for this is not recorded"
             )
-        env = load_task(name, kwargs, limit=limit)
+        env = load_task(env_id, kwargs, limit=limit)
         return Recreated(environment=env, is_dm_env=True)
 
 
@@ -402,16 +400,15 @@ def _is_below(entry_point: Any, package: str) -> bool:
     return f"{module}.".startswith(f"{package}.")
 
 
-def _suite_name(env_id: str) -> DmControlName | None:
-    """Return the name of a task in the installed suite, or None if it is not there."""
+def _is_in_suite(env_id: str) -> bool:
+    """Return whether an id is that of a task in the installed suite."""
     # If dm_control does not work, none of its tasks counts as installed.
     with contextlib.suppress(Exception):
-        from .dm_control_environments import tasks_of
+        from .dm_control_environments import suite
 
         match = _SUITE_NAME.fullmatch(env_id)
-        if match and match[2] in tasks_of(match[1]):
-            return DmControlName(match[1], match[2])
-    return None
+        return bool(match and match.groups() in suite.ALL_TASKS)
+    return False
 
 
 @contextlib.contextmanager

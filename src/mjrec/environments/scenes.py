@@ -16,6 +16,7 @@ import numpy as np
 from ..simulation.find_simulation import simulation_in
 
 if TYPE_CHECKING:
+    from ..recorder.recorded_environment import EpisodeFrames
     from ..simulation.capture import Capture
 
 # Arguments that affect only how an environment is shown, not its states or rewards.
@@ -26,30 +27,6 @@ VIEW_ARGUMENTS: Final = frozenset(
     )
 )
 _MOST_CHARACTERS = 400
-
-
-@dataclass(frozen=True, kw_only=True)
-class Scenes:
-    """The recording of an environment's states, and whether they determine its frames.
-
-    Attributes:
-        states: the capture of the states; None if no MuJoCo simulation was found.
-        obstacle: why frames of the environment cannot be drawn from its states, as a
-            clause that names the overriding class; None if nothing but missing states
-            prevents it.
-        environment: the facts needed to recreate the environment: `framework`
-            (`"gymnasium"`, `"dm_control"` or `"mjcf"`), `id` and `kwargs` (None if they
-            are unknown, or JSON cannot represent them); None if the environment has no
-            name.
-        random_state: a function that returns the current state of the environment's
-            random generators as JSON-compatible values, or None if there is no
-            generator yet. It does not create a generator.
-    """
-
-    states: Capture | None = None
-    obstacle: str | None = None
-    environment: dict[str, Any] | None = None
-    random_state: Callable[[], Any] = lambda: None
 
 
 class NoFrameSource:
@@ -70,6 +47,35 @@ class NoFrameSource:
     def facts(self) -> dict[str, Any]:
         """Return an empty dict, because there is no video."""
         return {}
+
+
+_NO_FRAMES: Final = NoFrameSource("")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scenes:
+    """The recording of an environment's states, and whether they determine its frames.
+
+    Attributes:
+        states: the capture of the states; None if no MuJoCo simulation was found.
+        obstacle: why frames of the environment cannot be drawn from its states, as a
+            clause that names the overriding class; None if nothing but missing states
+            prevents it.
+        environment: the facts needed to recreate the environment: `framework`
+            (`"gymnasium"`, `"dm_control"` or `"mjcf"`), `id` and `kwargs` (None if they
+            are unknown, or JSON cannot represent them); None if the environment has no
+            name.
+        random_state: a function that returns the current state of the environment's
+            random generators as JSON-compatible values, or None if there is no
+            generator yet. It does not create a generator.
+        frames: the source of live frames.
+    """
+
+    states: Capture | None = None
+    obstacle: str | None = None
+    environment: dict[str, Any] | None = None
+    random_state: Callable[[], Any] = lambda: None
+    frames: EpisodeFrames = _NO_FRAMES
 
 
 def simulation_below(env: Any) -> Any:

@@ -307,7 +307,10 @@ def draw_videos(
         The paths of the finished videos, and a mapping from the paths of the missing
         videos to the reasons why they are missing.
     """
-    jobs = [VideoJob.finishing(folder, key) for folder, key in choice.videos]
+    jobs = [
+        VideoJob(directory=folder, recording=key.shown_name)
+        for folder, key in choice.videos
+    ]
     why = dict(choice.impossible)
 
     def show(now: Progress) -> None:

@@ -9,13 +9,14 @@ import json
 import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ..environments.episode_seeds import episode_seeds
 from ..environments.named_environment import EnvironmentOptions
-from ..environments.names import MjcfName, parse_environment_name
+from ..environments.names import parse_environment_name
 from ..errors import InvalidArgument, UnknownName
 from ..frames import check_quality
 from ..json_text import loads
@@ -239,9 +240,9 @@ def _with_folders(
 
 
 def _folder(name: str, taken: set[str]) -> str:
-    parsed = parse_environment_name(name)
+    is_file = parse_environment_name(name).framework == "mjcf"
     # The results must not reveal where a file was stored.
-    text = parsed.path.name if isinstance(parsed, MjcfName) else name
+    text = Path(name).name if is_file else name
     base = _OUTSIDE.sub(_encoded, text.replace("/", "-"))[:_LONGEST_FOLDER]
     # Avoids hidden folders and relative paths such as `..`.
     base = f"-{base}" if base.startswith(".") else base

@@ -235,7 +235,7 @@ class _ChunkRun:
             for unit in missing:
                 if deaths[unit] >= TRIES:
                     why = f"{TRIES} processes died in it"
-                    self._monitored(unit).recorder.note_event(
+                    self._monitored(unit).recorder.run.note(
                         "failed", _failed(unit, why)
                     )
             missing = [unit for unit in missing if deaths[unit] < TRIES]
@@ -280,7 +280,7 @@ class _ChunkRun:
         monitor.forget_frames()
         episode_id, start = monitor.episode_id, time.time()
         seed, number = unit
-        monitor.recorder.note_event("begun", {"seed": seed, "episode": number})
+        monitor.recorder.run.note("begun", {"seed": seed, "episode": number})
         journal = self._evaluator.journal
         assert journal is not None
 
@@ -306,7 +306,7 @@ class _ChunkRun:
                 raise
             logger.warning("An episode failed with this error:", exc_info=True)
             monitor.recorder.note_error(error)
-            monitor.recorder.note_event("failed", failed(_in_one_line(error)))
+            monitor.recorder.run.note("failed", failed(_in_one_line(error)))
             self._renew()
             return False
         return True

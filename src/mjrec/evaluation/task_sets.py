@@ -29,7 +29,7 @@ from ..environments.known_names import (
     suite_tasks,
     version_of,
 )
-from ..environments.names import GymnasiumName, parse_environment_name
+from ..environments.names import parse_environment_name
 from ..errors import InvalidArgument, MissingDependency, UnknownName
 
 TASK_SETS: Mapping[str, Callable[[], Sequence[str]]] = {
@@ -78,8 +78,8 @@ def _named(text: str) -> Sequence[str]:
     # The name of a file may contain brackets.
     if _WILD.search(text) and not Path(text).expanduser().is_file():
         return _matching(text)
-    name = parse_environment_name(text)
-    if not isinstance(name, GymnasiumName) or version_of(text) >= 0:
+    framework = parse_environment_name(text).framework
+    if framework != "gymnasium" or version_of(text) >= 0:
         return [text]
     module, colon, env_id = text.rpartition(":")
     # If the id is unknown, the error from creating the environment lists known ids.

@@ -32,7 +32,7 @@ from ..environments.scenes import simulation_below
 from ..errors import Error, GLError
 from ..formats.json_fields import from_json
 from ..formats.locks import wait_for_lock
-from ..gl import use_gl
+from ..gl.choice import use_gl
 from ..messages import carried
 from ..rendering.recovery import recover
 from ..simulation.model_trust import noting_models

@@ -12,10 +12,10 @@ import numpy as np
 
 from ..errors import Error
 from ..formats.trajectory_file import open_trajectory
+from ..rendering.jobs import View
 from ..rendering.pool import WorkerPool
 from ..rendering.recordings import look_at, recordings
 from ..rendering.render_videos import render_videos
-from ..rendering.views import View
 
 _OnProgress = Callable[[int, int], object]
 

@@ -201,7 +201,7 @@ class _Playing:
             self._say(*self._events.pop(0))
 
     def _say(self, kind: str, facts: Mapping[str, Any] | None) -> None:
-        self._monitor.recorder.note_event(kind, None if facts is None else dict(facts))
+        self._monitor.recorder.run.note(kind, None if facts is None else dict(facts))
         if kind == "failed" and facts is not None:
             self._note(
                 None,

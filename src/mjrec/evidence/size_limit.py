@@ -25,10 +25,9 @@ from ..formats.monitor_directory import episode_of, infix_of, is_manifest
 from ..formats.spans import find_trajectory
 from ..formats.video_metadata import metadata_path
 from ..machine import usable_cpus
-from ..rendering.jobs import Progress
+from ..rendering.jobs import Progress, Variant, View
 from ..rendering.pool import WorkerPool
 from ..rendering.render_video import render_video
-from ..rendering.views import Variant, View
 from .bag import STORED
 
 # Scales of width and height, tried in order until the archive is small enough.

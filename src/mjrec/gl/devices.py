@@ -20,9 +20,8 @@ from pathlib import Path
 
 from ..errors import GLError, InvalidArgument
 from .backends import backend_in_environment, rendering_is_off
-from .choice import conflict_with, set_backend
+from .choice import Probe, conflict_with, probe, set_backend
 from .egl import EglDevice
-from .probing import Probe, probe
 
 _LOG = logging.getLogger(__name__)
 

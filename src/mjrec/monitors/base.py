@@ -6,7 +6,7 @@ from __future__ import annotations
 import functools
 import logging
 import os
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar, Literal, NoReturn, Self, SupportsIndex, TypeVar
 
@@ -22,6 +22,7 @@ from ..recorder.options import (
     WARN,
     RecorderOptions,
     RenderingChoice,
+    type_of_mode,
 )
 from ..recorder.recorded_environment import RecordedEnvironment
 from ..recorder.recorder import Recorder
@@ -30,6 +31,7 @@ from ..recorder.stats_recorder import StatsRecorder
 from ..recorder.video_recorder import VideoRecorder, declared_rate
 from ..rendering.background import Background
 from ..simulation.find_simulation import simulation_time
+from .cameras import camera_frames, checked_cameras, recorded_view
 from .progress import render_progress
 
 logger = logging.getLogger(__name__)
@@ -72,7 +74,7 @@ class MonitorBase:
             InvalidArgument: `mode` is anything else.
         """
         for recorder in self._recorders:
-            recorder.set_mode(mode)
+            recorder.stats_recorder.type = type_of_mode(mode)
 
     def get_total_steps(self) -> int:
         """Return the total number of steps, including those of unfinished episodes."""
@@ -105,7 +107,7 @@ class MonitorBase:
             self._guard.close()
         failures: dict[str, str] = {}
         for recorder in self._recorders:
-            failures.update(recorder.failures())
+            failures.update(recorder.run.finisher.failures)
         if not wait or not failures or self._reported_failures:
             return
         self._reported_failures = True
@@ -238,7 +240,10 @@ class EnvironmentMonitor(MonitorBase):
         directory: str | os.PathLike[str],
         options: RecorderOptions,
         *,
-        scenes: Callable[[], Scenes],
+        scenes: Callable[..., Scenes],
+        camera: Any,
+        size: Mapping[str, int | None],
+        own_view: Mapping[str, Any] | None = None,
         close_environment: Callable[[Any], None],
         no_simulation: str = NO_SIMULATION,
         rendering: Callable[[Path], Finisher] | None = None,
@@ -250,16 +255,24 @@ class EnvironmentMonitor(MonitorBase):
             env: the environment.
             directory: the monitor directory.
             options: the monitor's options.
-            scenes: returns the scenes, whose states have a single reader.
+            scenes: returns the scenes for a camera and a size.
+            camera: the requested camera or cameras.
+            size: the requested `height` and `width`.
+            own_view: further facts about the view, for the journal.
             close_environment: closes `env`.
             no_simulation: the reason to give if the environment has no states.
             rendering: creates the finisher that renders videos; if None, the monitor
                 has its own background finisher.
             **subject: `env_id` and other arguments of `RecordedEnvironment`.
         """
-        known = scenes()
-        # Clips overlap with episodes, and a source of states has only one reader.
-        clip_states = scenes().states if options.has_clips else None
+        cameras = checked_cameras(camera, tiled=options.tiled)
+        known, *further = [scenes(camera=each, **size) for each in cameras]
+        clip_states = None
+        if options.has_clips:
+            # Clips overlap with episodes, and a source of states has only one reader.
+            clip_states = scenes(camera=cameras[0], **size).states
+        sources = [each.frames for each in (known, *further)]
+        view = {**recorded_view(camera, size), **(own_view or {})}
         choice = rendering_choice(
             options.render, known, subject["env_id"], no_simulation=no_simulation
         )
@@ -280,6 +293,8 @@ class EnvironmentMonitor(MonitorBase):
                 clip_states=clip_states,
                 environment=known.environment,
                 random_state=known.random_state,
+                view=view,
+                **camera_frames(cameras, sources, tiled=options.tiled),
                 **subject,
             ),
             options=options,

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from ..errors import InvalidArgument
@@ -11,46 +11,63 @@ from ..formats.monitor_directory import further_parts
 from ..frames import Frame, check_frame, grid_frame, grid_shape
 from ..recorder.recorded_environment import EpisodeFrames
 from ..recorder.video_recorder import can_give_frames
-from ..rendering.views import plain_camera
+from ..rendering.jobs import plain_camera
 
 _RGB_ARRAY = "rgb_array"
 
 
-def camera_frames(
-    camera: Any, frames_from: Callable[[Any], EpisodeFrames], *, tiled: bool
-) -> tuple[Any, dict[str, Any]]:
-    """Return the frames from one or several cameras.
+def checked_cameras(camera: Any, *, tiled: bool) -> list[Any]:
+    """Return the requested cameras as a list.
 
     Args:
         camera: a name, a number, an `mujoco.MjvCamera`, None for the environment's own
             view, or a list of these.
-        frames_from: returns the frames from one camera.
         tiled: whether to put several cameras side by side in one video.
-
-    Returns:
-        The only or first camera, which scenes are recorded with; and arguments for
-        `RecordedEnvironment`. These are `frames` and, with several cameras, `cameras`
-        and `further_frames` (only if the frames exist and are not tiled).
 
     Raises:
         InvalidArgument: the list is empty, contains a camera twice, or contains None
             after its first item; or `tiled` is True with a single camera.
-        UnknownName: the model has no such camera.
     """
-    several = isinstance(camera, Sequence) and not isinstance(camera, str)
-    cameras = list(camera) if several else [camera]
-    if several:
-        _check(cameras)
+    cameras = list(camera) if _are_several(camera) else [camera]
+    if not cameras:
+        raise InvalidArgument(
+            "camera=[] contains no camera: name one or more, or give None for the "
+            "environment's own view."
+        )
+    plain = _plain(cameras)
+    if None in plain[1:]:
+        raise InvalidArgument(
+            "In a list of cameras, only the first may be None (the environment's own "
+            f"view), got {cameras!r}."
+        )
+    twice = [each for place, each in enumerate(plain) if each in plain[:place]]
+    if twice:
+        raise InvalidArgument(f"The camera {twice[0]!r} appears twice in {cameras!r}.")
+    if tiled and len(cameras) == 1:
+        raise InvalidArgument(
+            "tiled=True puts the frames of several cameras, or of a vector "
+            "environment's sub-environments, side by side, but there is only one "
+            f"of each: got the camera {camera!r}. Give several cameras."
+        )
+    return cameras
+
+
+def camera_frames(
+    cameras: Sequence[Any], sources: Sequence[EpisodeFrames], *, tiled: bool
+) -> dict[str, Any]:
+    """Return the arguments for `RecordedEnvironment` about the frames of cameras.
+
+    These are `frames` and, with several cameras, `cameras` and `further_frames` (only
+    if the frames exist and are not tiled).
+
+    Args:
+        cameras: the cameras.
+        sources: the source of the frames of each camera.
+        tiled: whether to put several cameras side by side in one video.
+    """
     if len(cameras) == 1:
-        if tiled:
-            raise InvalidArgument(
-                "tiled=True puts the frames of several cameras, or of a vector "
-                "environment's sub-environments, side by side, but there is only one "
-                f"of each: got the camera {camera!r}. Give several cameras."
-            )
-        return cameras[0], {"frames": frames_from(cameras[0])}
-    plain = tuple(None if each is None else plain_camera(each) for each in cameras)
-    sources = [frames_from(each) for each in cameras]
+        return {"frames": sources[0]}
+    plain = _plain(cameras)
     view: dict[str, Any] = {"frames": sources[0], "cameras": plain}
     without = [source for source in sources if not can_give_frames(source)]
     if without:
@@ -61,49 +78,28 @@ def camera_frames(
     else:
         further = zip(further_parts(plain), sources[1:], strict=True)
         view["further_frames"] = dict(further)
-    return cameras[0], view
+    return view
 
 
-def recorded_view(
-    camera: Any, *, height: int | None, width: int | None, own: Any = None
-) -> dict[str, Any]:
-    """Return the journal's facts about a run's view, without default values.
+def recorded_view(camera: Any, size: Mapping[str, int | None]) -> dict[str, Any]:
+    """Return the requested cameras and sizes for the journal, without default values.
 
     Args:
-        camera: see `camera_frames`.
-        height: the requested height.
-        width: the requested width.
-        own: number or name of the camera that the environment itself shows.
+        camera: see `checked_cameras`.
+        size: the requested `height` and `width`.
     """
-    several = isinstance(camera, Sequence) and not isinstance(camera, str)
-    plain = [
-        None if each is None else plain_camera(each)
-        for each in (camera if several else [camera])
-    ]
-    view = {
-        "camera": plain if several else plain[0],
-        "height": None if height is None else int(height),
-        "width": None if width is None else int(width),
-        "own_camera": own,
-    }
+    plain = _plain(camera if _are_several(camera) else [camera])
+    view = {"camera": list(plain) if _are_several(camera) else plain[0]}
+    view |= {name: side and int(side) for name, side in size.items()}
     return {name: value for name, value in view.items() if value is not None}
 
 
-def _check(cameras: list[Any]) -> None:
-    if not cameras:
-        raise InvalidArgument(
-            "camera=[] contains no camera: name one or more, or give None for the "
-            "environment's own view."
-        )
-    plain = [None if each is None else plain_camera(each) for each in cameras]
-    if None in plain[1:]:
-        raise InvalidArgument(
-            "In a list of cameras, only the first may be None (the environment's own "
-            f"view), got {cameras!r}."
-        )
-    twice = [each for place, each in enumerate(plain) if each in plain[:place]]
-    if twice:
-        raise InvalidArgument(f"The camera {twice[0]!r} appears twice in {cameras!r}.")
+def _are_several(camera: Any) -> bool:
+    return isinstance(camera, Sequence) and not isinstance(camera, str)
+
+
+def _plain(cameras: Sequence[Any]) -> tuple[Any, ...]:
+    return tuple(None if each is None else plain_camera(each) for each in cameras)
 
 
 class Tiles:

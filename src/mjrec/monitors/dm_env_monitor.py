@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import functools
 import logging
 import operator
 import os
@@ -15,7 +16,6 @@ from ..environments.scenes import NoFrameSource, Scenes
 from ..errors import InvalidArgument
 from ..recorder.options import RecorderOptions
 from .base import EnvironmentMonitor
-from .cameras import camera_frames, recorded_view
 
 logger = logging.getLogger(__name__)
 
@@ -62,21 +62,15 @@ class DmEnvMonitor(EnvironmentMonitor, dm_env.Environment):  # type: ignore[misc
                 "episode_info adds to the info of Gymnasium's steps, but dm_env's time "
                 "steps have no info. The journal has every episode's return and length."
             )
-        size = {"height": height, "width": width}
-        first, frames = camera_frames(
-            camera,
-            lambda each: _frames(env, camera=each, **size),
-            tiled=options.tiled,
-        )
         self._open(
             env,
             directory,
             options,
-            scenes=lambda: _scenes(env, env_id=env_id, camera=first, **size),
+            scenes=functools.partial(_scenes, env, env_id),
+            camera=camera,
+            size={"height": height, "width": width},
             close_environment=operator.methodcaller("close"),
             env_id=env_id or _env_id(env),
-            view=recorded_view(camera, **size),
-            **frames,
         )
 
     def reset(self) -> dm_env.TimeStep:
@@ -155,27 +149,17 @@ class DmEnvMonitor(EnvironmentMonitor, dm_env.Environment):  # type: ignore[misc
         )
 
 
-def _frames(
-    env: dm_env.Environment, *, camera: Any, height: int | None, width: int | None
-) -> Any:
+def _scenes(env: dm_env.Environment, env_id: str | None, **view: Any) -> Scenes:
     if getattr(env, "physics", None) is not None:
-        from ..environments.dm_control_scenes import dm_control_frames
+        from ..environments.dm_control_scenes import dm_control_scenes
 
-        return dm_control_frames(env, camera=camera, height=height, width=width)
-    if (camera, height, width) != (None, None, None):
+        return dm_control_scenes(env, env_id=env_id, **view)
+    if any(asked is not None for asked in view.values()):
         raise InvalidArgument(
             "camera, height and width apply only to dm_control environments, but "
             f"{type(env).__name__} has no physics."
         )
-    return NoFrameSource(_NO_PHYSICS)
-
-
-def _scenes(env: dm_env.Environment, **known: Any) -> Scenes:
-    if getattr(env, "physics", None) is None:
-        return Scenes()
-    from ..environments.dm_control_scenes import dm_control_scenes
-
-    return dm_control_scenes(env, **known)
+    return Scenes(frames=NoFrameSource(_NO_PHYSICS))
 
 
 def _env_id(env: dm_env.Environment) -> str:

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import functools
 import logging
 import os
 import time
@@ -14,12 +15,11 @@ import gymnasium
 import numpy as np
 from gymnasium.envs.registration import EnvSpec
 
-from ..environments.gymnasium_frames import close_environment, gymnasium_frames
-from ..environments.gymnasium_scenes import gymnasium_scenes, own_camera
+from ..environments.gymnasium_frames import close_environment
+from ..environments.gymnasium_scenes import gymnasium_scenes, own_view
 from ..recorder.finishers import Finisher
 from ..recorder.options import RecorderOptions
 from .base import NO_SIMULATION, EnvironmentMonitor
-from .cameras import camera_frames, recorded_view
 
 logger = logging.getLogger(__name__)
 
@@ -59,24 +59,19 @@ class GymnasiumMonitor(EnvironmentMonitor, gymnasium.Wrapper[Any, Any, Any, Any]
         # gym's convention: the step that ends an episode starts the next one.
         self._same_step_autoreset = bool(env.metadata.get("semantics.autoreset"))
         self._next_step_autoreset = _has_autoreset(env)
-        size = {"height": height, "width": width}
-        first, frames = camera_frames(
-            camera,
-            lambda each: gymnasium_frames(env, camera=each, **size),
-            tiled=options.tiled,
-        )
         self._open(
             env,
             directory,
             options,
-            scenes=lambda: gymnasium_scenes(env, camera=first, **size),
+            scenes=functools.partial(gymnasium_scenes, env),
+            camera=camera,
+            size={"height": height, "width": width},
+            own_view=own_view(env),
             close_environment=close_environment,
             no_simulation=no_simulation,
             rendering=rendering,
             env_id=env_id or env_id_of(env),
             env_index=env_index,
-            view=recorded_view(camera, **size, own=own_camera(env)),
-            **frames,
         )
 
     # Gymnasium's own wrappers also override the attribute with a property.

@@ -3,20 +3,17 @@
 
 from __future__ import annotations
 
-import functools
 import logging
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from ..environments.gymnasium_frames import gymnasium_frames
+from ..environments.gymnasium_scenes import gymnasium_scenes
 from ..errors import InvalidArgument, NoPictures
 from ..formats.monitor_directory import video_prefix
 from ..recorder.ending_reasons import CLOSE, RESET, ending
-from ..recorder.live_videos import LiveVideos
+from ..recorder.live_videos import LiveVideos, live_recorder
 from ..recorder.options import OFF, WARN, RecorderOptions
-from ..recorder.video_recorder import VideoRecorder, declared_rate
 from ..schedules import disable_videos, to_schedule
-from ..simulation.find_simulation import simulation_time
 from .base import EnvironmentMonitor
 from .cameras import Tiles
 
@@ -56,7 +53,7 @@ def vector_tiles(
     camera = view["camera"]
     if isinstance(camera, list | tuple) and camera:
         view = {**view, "camera": camera[0]}
-    tiles = Tiles([gymnasium_frames(each, **view) for each in envs])
+    tiles = Tiles([gymnasium_scenes(each, **view).frames for each in envs])
     if tiles.render_mode is None:
         raise NoPictures(
             "tiled=True was requested, and a tiled video needs the frames of all "
@@ -73,21 +70,12 @@ class TiledVideo:
         first: the monitor of the first sub-environment, whose manifest lists the
             videos.
         tiles: the frames of all sub-environments.
-        options: the monitor's options.
-        env: the first sub-environment, which determines the frame rate.
     """
 
-    def __init__(
-        self,
-        first: EnvironmentMonitor,
-        tiles: Tiles,
-        options: RecorderOptions,
-        env: Any,
-    ) -> None:
+    def __init__(self, first: EnvironmentMonitor, tiles: Tiles) -> None:
         self._first = first
+        self._run = first.recorder.run
         self._tiles = tiles
-        self._options = options
-        self._env = env
         self._live: LiveVideos | None = None
         # The episode that the frames belong to.
         self._episode_id = -1
@@ -151,34 +139,23 @@ class TiledVideo:
     def _begin(self, episode_id: int) -> None:
         self._episode_id = episode_id
         self._ending = None
-        of_first, run = self._first.video_recorder, self._first.recorder.run
+        of_first, run = self._first.video_recorder, self._run
         if of_first is None or not of_first.enabled:
             return
-        video = VideoRecorder(
+        video = live_recorder(
+            run,
+            run.directory / f"{video_prefix(run.infix, episode_id)}.tiled",
             self._tiles,
-            base_path=run.directory / f"{video_prefix(run.infix, episode_id)}.tiled",
-            metadata={
-                **run.live_facts(),
-                "tiled": True,
-                "sub_environments": len(self._tiles.sources),
-                "length": 0,
-                "reward": 0.0,
-            },
-            fps=self._options.fps,
-            max_fps=self._options.max_fps,
-            frame_hashes=True,
-            clock=functools.partial(simulation_time, self._env),
-            declared=functools.partial(declared_rate, self._env),
-            facts=self._tiles.facts,
-            strict=self._options.strict,
+            tiled=True,
+            sub_environments=len(self._tiles.sources),
+            length=0,
+            reward=0.0,
         )
-        self._live = LiveVideos(
-            [video], tolerates=self._tolerates, retry_at_close=run.retry_at_close
-        )
+        self._live = LiveVideos(run, [video], tolerates=self._tolerates)
         self._live.begin()
 
     def _tolerates(self, error: Exception) -> bool:
-        if self._options.on_error != WARN:
+        if self._run.options.on_error != WARN:
             return False
         logger.warning("A tiled video in %s failed: %s", self._first.directory, error)
         return True
@@ -192,4 +169,4 @@ class TiledVideo:
             try:
                 live.end(facts)
             finally:
-                self._first.recorder.run.trackers.expect(live.path)
+                self._run.trackers.expect(live.path)

@@ -20,7 +20,7 @@ from ..errors import Error, ResetNeeded, ResetNotAllowed
 from ..formats.monitor_directory import infix_of, iter_monitor_files
 from ..recorder.opening import made_directory
 from ..recorder.options import RecorderOptions
-from ..rendering.background import Background
+from ..rendering.background import Background, Share
 from .base import NO_SIMULATION, MonitorBase, call_all
 from .gymnasium_monitor import GymnasiumMonitor
 from .tiles import TiledVideo, has_videos, vector_tiles
@@ -126,7 +126,7 @@ class VectorMonitor(MonitorBase, gymnasium.vector.VectorWrapper):
                     **view,
                     env_id=env_id,
                     env_index=index,
-                    rendering=None if shared is None else lambda _: shared.share(),
+                    rendering=None if shared is None else lambda _: Share(shared),
                     close_environment=lambda env: closing["by"](env),
                     no_simulation=NO_SIMULATION if inside else UNSEEN,
                 )
@@ -142,7 +142,7 @@ class VectorMonitor(MonitorBase, gymnasium.vector.VectorWrapper):
         options_of_close = self._closing
         closings: list[Callable[[], object]] = []
         if tiles is not None:
-            self._tiled = TiledVideo(self.monitors[0], tiles, options, envs[0])
+            self._tiled = TiledVideo(self.monitors[0], tiles)
             # Closed first, because the first monitor's manifest lists its videos.
             closings.append(self._tiled.close)
         if shared is not None:

@@ -26,7 +26,7 @@ def ending(error: BaseException | None, *, otherwise: str = CLOSE) -> dict[str, 
         `exception` holds the exception's `type` (its module and name, or only its name
         if it is built in) and its `message`.
     """
-    if error is None or _is_ordinary(error):
+    if error is None or type(error) is SystemExit:
         return {"reason": otherwise}
     if isinstance(error, KeyboardInterrupt | SystemExit | GeneratorExit):
         return {"reason": INTERRUPT}
@@ -48,10 +48,6 @@ def last_error() -> BaseException | None:
     # `last_exc` exists since Python 3.12.
     error = getattr(sys, "last_exc", None) or getattr(sys, "last_value", None)
     return error if isinstance(error, BaseException) else received()
-
-
-def _is_ordinary(error: BaseException) -> bool:
-    return type(error) is SystemExit
 
 
 def _name(kind: type) -> str:

@@ -34,14 +34,20 @@ class ExitGuard:
         *,
         at_exit: Callable[[], None] = lambda: None,
     ) -> None:
-        self._close = _in_process(os.getpid(), close)
-        self._finalize = weakref.finalize(owner, _aside, self._close)
+        self._close = close_here = _in_process(os.getpid(), close)
+        self._finalize = finalize = weakref.finalize(owner, _aside, close_here)
         # weakref registers its exit hook when it is first used in the process. Newer
         # hooks run first, so simulators would tear down OpenGL before this hook.
-        self._finalize.atexit = False
+        finalize.atexit = False
         self._first = False
-        self._at_exit = _one_after_the_other(at_exit, self._finalize)
-        atexit.register(self._at_exit)
+
+        def exit_hook() -> None:
+            if finalize.alive:
+                at_exit()
+                finalize()
+
+        self._at_exit = exit_hook
+        atexit.register(exit_hook)
 
     def run_first_at_exit(self) -> None:
         """Move this guard's exit hook before all hooks so far. Works only once."""
@@ -67,17 +73,6 @@ def _in_process(pid: int, close: Callable[[], None]) -> Callable[[], None]:
             close()
 
     return close_here
-
-
-def _one_after_the_other(
-    first: Callable[[], None], finalize: weakref.finalize[..., object]
-) -> Callable[[], None]:
-    def both() -> None:
-        if finalize.alive:
-            first()
-            finalize()
-
-    return both
 
 
 def _aside(close: Callable[[], None]) -> None:

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,25 +30,18 @@ _sum = float.__add__
 _LARGEST = 1 << 53
 
 
-class Step(Protocol):
-    """A function that records and counts a step."""
-
-    def __call__(
-        self, reward: Any, *, terminated: bool = ..., truncated: bool = ...
-    ) -> bool:
-        """Record a step, or return False if it is unusual and was not recorded."""
-
-
 class FastPath(NamedTuple):
     """The functions that record nearly all steps.
 
     Attributes:
         before_step: stores the action and returns whether a step may be taken.
-        step: records a step. The recorder itself handles the end of an episode.
+        step: counts and records a step, given its reward and, as keywords, whether it
+            was `terminated` or `truncated`. It returns False if the step is unusual and
+            was not recorded. The recorder itself handles the end of an episode.
     """
 
     before_step: Callable[[Any], bool]
-    step: Step
+    step: Callable[..., bool]
 
 
 def counting(stats: StatsRecorder) -> FastPath:

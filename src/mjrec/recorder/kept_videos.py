@@ -9,16 +9,12 @@ Dropped recordings are deleted immediately.
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Iterable
 from typing import Any
 
 from ..errors import Error, InvalidArgument
 from .recording import EpisodeRecording
 from .selection import Selection, Standing
-from .tracking import FinishedEpisode
-
-logger = logging.getLogger(__name__)
 
 
 class KeptVideos:
@@ -41,23 +37,6 @@ class KeptVideos:
         selection = self.selection
         facts = {"rule": selection.name, "decided": True}
         return {**facts, "finished": selection.finished}
-
-    def judge(self, episode_id: int, episode: FinishedEpisode | None) -> Standing:
-        """Return the standing of an episode that has just ended.
-
-        Args:
-            episode_id: the episode's number.
-            episode: the episode, or None if it was not completed.
-        """
-        if episode is not None:
-            if self.selection.holds_all and not self.selection.finished:
-                logger.info(
-                    "keep=%s chooses the episodes for videos at the end of the run. "
-                    "Until then, the recordings of all episodes are kept on disk.",
-                    self.selection.name,
-                )
-            self.selection.add(episode)
-        return self.selection.standing(episode_id)
 
     def hold(self, recording: EpisodeRecording) -> None:
         """Hold the recording of an ended episode until it is chosen or dropped."""

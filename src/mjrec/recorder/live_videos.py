@@ -8,12 +8,14 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from ..annotation import Caption
 from ..errors import DirectoryNotWritable, Error
 from ..formats.frame_hashes import frame_hash_path
 from ..formats.monitor_directory import second_name_of
 from ..formats.second_names import give_second_names
 from ..formats.video_metadata import amend_metadata
 from .monitored_run import MonitoredRun
+from .recorded_environment import EpisodeFrames
 from .video_recorder import VideoRecorder
 
 
@@ -21,11 +23,11 @@ class LiveVideos:
     """The live videos of one episode.
 
     Args:
+        run: the monitored run.
         recorders: the video recorders, in the order of the cameras. There must be at
             least one.
-        tolerates: function that returns whether to continue after an error.
-        retry_at_close: function that takes a function to call when the run closes. It
-            is used to write metadata for which the disk had no room.
+        tolerates: function that returns whether to continue after an error; None for
+            the run's own.
 
     Attributes:
         recorders: the video recorders.
@@ -33,14 +35,14 @@ class LiveVideos:
 
     def __init__(
         self,
+        run: MonitoredRun,
         recorders: Sequence[VideoRecorder],
         *,
-        tolerates: Callable[[Exception], bool],
-        retry_at_close: Callable[[Callable[[], None]], object],
+        tolerates: Callable[[Exception], bool] | None = None,
     ) -> None:
         self.recorders = recorders
-        self._tolerates = tolerates
-        self._retry_at_close = retry_at_close
+        self._run = run
+        self._tolerates = tolerates or functools.partial(run.tolerates, "video")
 
     @property
     def path(self) -> Path:
@@ -115,13 +117,15 @@ class LiveVideos:
                 if not self._tolerates(error):
                     failure = failure or error
         if not all(recorder.closed for recorder in self.recorders):
-            self._retry_at_close(functools.partial(self._end_again, facts))
+
+            def end_again() -> None:
+                self.end(facts)
+                self.name_again()
+
+            # The disk had no room for some metadata.
+            self._run.retry_at_close(end_again)
         if failure is not None:
             raise failure
-
-    def _end_again(self, facts: Mapping[str, Any]) -> None:
-        self.end(facts)
-        self.name_again()
 
     def name_again(self) -> None:
         """Give the finished videos their second names, if they have any."""
@@ -182,21 +186,13 @@ def live_videos(
         path: the path of the first camera's video, without the extension.
         second_name: the video's second name; see `MonitoredRun.second_name`.
     """
-    options, env = run.options, run.env
-    sources = {"": env.frames, **env.further_frames}
+    sources = {"": run.env.frames, **run.env.further_frames}
     recorders = [
-        VideoRecorder(
+        live_recorder(
+            run,
+            path.with_name(f"{path.name}.{name}" if name else path.name),
             frames,
-            base_path=path.with_name(f"{path.name}.{name}" if name else path.name),
-            metadata=run.live_facts(),
-            fps=options.fps,
-            max_fps=options.max_fps,
-            frame_hashes=True,
-            clock=env.clock,
-            declared=env.declared,
-            facts=frames.facts,
-            strict=options.strict,
-            caption=run.caption if options.annotate else None,
+            caption=run.caption if run.options.annotate else None,
         )
         for name, frames in sources.items()
     ]
@@ -211,8 +207,36 @@ def live_videos(
                 other.metadata["also_named"] = second_name_of(
                     name, second, first=first_name
                 )
-    return LiveVideos(
-        recorders,
-        tolerates=functools.partial(run.tolerates, "video"),
-        retry_at_close=run.retry_at_close,
+    return LiveVideos(run, recorders)
+
+
+def live_recorder(
+    run: MonitoredRun,
+    base_path: Path,
+    frames: EpisodeFrames,
+    *,
+    caption: Callable[[], Caption] | None = None,
+    **facts: Any,
+) -> VideoRecorder:
+    """Create the recorder of one live video with the run's options.
+
+    Args:
+        run: the monitored run.
+        base_path: path of the video, without the extension.
+        frames: the source of the frames.
+        caption: returns the text to write on the current frame, or None.
+        **facts: further facts for the metadata.
+    """
+    return VideoRecorder(
+        frames,
+        base_path=base_path,
+        metadata={**run.live_facts(), **facts},
+        fps=run.options.fps,
+        max_fps=run.options.max_fps,
+        frame_hashes=True,
+        clock=run.env.clock,
+        declared=run.env.declared,
+        facts=frames.facts,
+        strict=run.options.strict,
+        caption=caption,
     )

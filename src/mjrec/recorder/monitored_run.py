@@ -107,8 +107,10 @@ class MonitoredRun:
         rule: str | None,
     ) -> None:
         self.env, self.options, self.clock = env, options, options.clock
-        place = open_directory(
-            directory,
+        # Absolute, so that a later chdir does not scatter the files.
+        self.directory = Path(directory).absolute()
+        self.infix, self._lock, facts = open_directory(
+            self.directory,
             force=options.force,
             resume=options.resume,
             uid=options.uid,
@@ -123,8 +125,7 @@ class MonitoredRun:
             },
             statements=options.statements,
         )
-        self.directory, self.infix, self._lock = place.path, place.infix, place.lock
-        self.first_episode_id = place.first_episode_id
+        self.first_episode_id: int = facts["first_episode_id"]
         self.stats = StatsRecorder(
             self.directory,
             stats_prefix(self.infix),
@@ -133,11 +134,13 @@ class MonitoredRun:
         )
         self.stats.type = type_of_mode(options.mode)
         self.stats.clock = self.clock
-        self.finisher = LaterFinisher() if finisher is None else finisher(place.path)
+        self.finisher = (
+            LaterFinisher() if finisher is None else finisher(self.directory)
+        )
         self.selection = {} if rule is None else {"rule": rule, "decided": False}
-        self.events = Run(place.run)
+        self.events = Run(facts)
         path = self.directory / journal_name(self.infix)
-        self._journal = JournalWriter(path, run=place.run)
+        self._journal = JournalWriter(path, run=facts)
         self._faults: set[tuple[int | None, What, str]] = set()
         self._policy = _policy_facts(options)
         self._statements = options.statements

@@ -15,7 +15,6 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 from .. import json_text
@@ -35,7 +34,7 @@ from ..formats.monitor_directory import (
 )
 from ..results import clear_monitor_files
 from ..results.journal_or_stats import MonitorResults
-from ..results.monitor_files import MonitorFiles, monitors_of
+from ..results.monitor_files import monitors_of
 
 # The value of `resume` for recording next to monitors of the same environment without
 # reading their files.
@@ -69,39 +68,20 @@ class Statements:
     faults: Sequence[tuple[int, Mapping[str, Any]]] = ()
 
 
-@dataclass(frozen=True)
-class OpenDirectory:
-    """A monitor directory in which an infix has been claimed.
-
-    Attributes:
-        path: absolute path of the directory.
-        infix: the claimed infix.
-        first_episode_id: the number of the next episode.
-        lock: the lock, held until the monitor closes.
-        run: the run's facts.
-    """
-
-    path: Path
-    infix: str
-    first_episode_id: int
-    lock: Lock
-    run: Mapping[str, Any]
-
-
 def open_directory(
-    directory: str | os.PathLike[str],
+    path: Path,
     *,
     force: bool,
     resume: bool | str,
     uid: str | None,
     env_info: Mapping[str, str],
-    facts: Mapping[str, Any] = MappingProxyType({}),
-    statements: Statements | None = None,
-) -> OpenDirectory:
+    facts: Mapping[str, Any],
+    statements: Statements | None,
+) -> tuple[str, Lock, Mapping[str, Any]]:
     """Claim an infix in a directory, which is created if it is missing.
 
     Args:
-        directory: the monitor directory.
+        path: absolute path of the monitor directory.
         force: whether to delete existing monitor files. Overrides `resume`.
         resume: whether to add to existing recordings. Episode numbers continue after
             the highest number of all closed or dead monitors, or only of those with the
@@ -115,6 +95,10 @@ def open_directory(
             survive even if the process is killed before the journal has a line.
         statements: the original's facts if a run is being recreated.
 
+    Returns:
+        The claimed infix, its lock, which is held until the monitor closes, and the
+        run's facts, including the number of the first episode, `first_episode_id`.
+
     Raises:
         ExistingRecordings: the directory contains recordings, and neither `force` nor
             `resume` was given.
@@ -126,8 +110,6 @@ def open_directory(
         InvalidArgument: `uid` cannot be part of a file name.
     """
     wanted_uid = None if uid is None else check_uid(uid)
-    # Absolute, so that a later chdir does not scatter the files.
-    path = Path(directory).absolute()
     with made_directory(path):
         _check_existing(path, force=force, resume=resume, env_id=env_info["env_id"])
         joins = resume == JOIN and not force
@@ -142,7 +124,7 @@ def open_directory(
             lock = Lock(path / lock_name(infix), json_text.dumps({"run": run}))
         else:
             infix, lock = _claim(path, uid=wanted_uid, run=run, looks=not joins)
-    return OpenDirectory(path, infix, first, lock, run)
+    return infix, lock, run
 
 
 @contextlib.contextmanager
@@ -182,16 +164,10 @@ def _check_existing(
     existing = [file.name for file in iter_monitor_files(path, hidden=True)]
     if existing and not resume:
         raise ExistingRecordings(path, existing)
-    for recorded in _recorded_env_ids(path):
-        if recorded != env_id:
-            raise DifferentEnvironment(path, recorded, env_id)
-
-
-def _recorded_env_ids(path: Path) -> Iterator[str]:
     for files in monitors_of(path):
-        env_info = MonitorResults(files).env_info or {}
-        if isinstance(env_info.get("env_id"), str):
-            yield env_info["env_id"]
+        recorded = (MonitorResults(files).env_info or {}).get("env_id")
+        if isinstance(recorded, str) and recorded != env_id:
+            raise DifferentEnvironment(path, recorded, env_id)
 
 
 def _next_episode_id(path: Path, *, uid: str | None) -> int:
@@ -201,22 +177,16 @@ def _next_episode_id(path: Path, *, uid: str | None) -> int:
         if uid is not None and files.infix.partition(".")[2] != uid:
             continue
         if not is_locked(path / lock_name(files.infix)):
-            highest = max(highest, _last_episode_id(files))
+            # File names count as well, because an episode that was running when its
+            # process died also has a number.
+            results = MonitorResults(files)
+            last = (files.last_episode_id, results.run.last_episode_id)
+            highest = max(highest, *last, _last_counted(results))
     return highest + 1
 
 
-def _last_episode_id(files: MonitorFiles) -> int:
-    """Return the highest episode number in a monitor's files, or -1 for none."""
-    # File names count as well, because an episode that was running when its process
-    # died also has a number.
-    results = MonitorResults(files)
-    return max(
-        files.last_episode_id, results.run.last_episode_id, _last_counted(results)
-    )
-
-
 def _last_counted(results: MonitorResults) -> int:
-    """Return the last episode number that the manifest states or implies."""
+    """Return the last episode number that the manifest states or implies, or -1."""
     if results.manifest is None:
         return -1
     if results.manifest.mjrec is not None:

@@ -84,7 +84,7 @@ def check_frames(env: RecordedEnvironment) -> None:
     why = "" if env.rendering.reason is None else f" ({env.rendering.reason})"
     raise NoPictures(
         f"Videos were requested, but {env.env_id} provides no frames{why}: "
-        f"{what_is_missing(env.frames)}, or record statistics only with "
+        f"{_what_is_missing(env)}, or record statistics only with "
         "video_callable=False."
     )
 
@@ -109,16 +109,11 @@ def check_refusal(env: RecordedEnvironment, refusal: str) -> None:
         raise NoPictures(
             f"The videos of {env.env_id} cannot be rendered from its states: "
             f"{refusal}. They cannot be drawn live either: "
-            f"{what_is_missing(env.frames)}."
+            f"{_what_is_missing(env)}."
         )
 
 
-def what_is_missing(frames: FrameSource) -> str:
-    """Return a message that says why there are no frames and how to get them."""
-    mode = getattr(frames, "render_mode", None)
-    return getattr(
-        frames,
-        "missing",
-        f"its render_mode is {mode!r}. Create the environment with "
-        'render_mode="rgb_array"',
-    )
+def _what_is_missing(env: RecordedEnvironment) -> str:
+    mode = getattr(env.frames, "render_mode", None)
+    otherwise = f"its render_mode is {mode!r}. Create the environment with "
+    return getattr(env.frames, "missing", f'{otherwise}render_mode="rgb_array"')

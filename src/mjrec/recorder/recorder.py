@@ -15,10 +15,7 @@ from typing import Any, Final
 from ..errors import DirectoryNotWritable, Error, FileNotWritten
 from ..formats.bundle import FINISHED
 from ..formats.journal import JournalEntry
-from ..formats.monitor_directory import (
-    episode_of,
-    video_prefix,
-)
+from ..formats.monitor_directory import episode_of, video_prefix
 from ..formats.spans import recordings_in_flight
 from ..formats.video_metadata import note_failure, reason_of
 from ..results.manifest_writing import write_manifest_and_stats
@@ -29,7 +26,7 @@ from .fast_path import FastPath
 from .finishers import Finisher, LaterFinisher
 from .kept_videos import KeptVideos
 from .monitored_run import MonitoredRun
-from .options import DEFERRED, LIVE, OFF, RecorderOptions, type_of_mode
+from .options import DEFERRED, LIVE, OFF, RecorderOptions
 from .recorded_environment import RecordedEnvironment, check_frames
 from .recording import EpisodeRecording
 from .selection import Standing
@@ -140,17 +137,6 @@ class Recorder:
         assert isinstance(self.run.finisher, LaterFinisher)
         self.run.finisher.bundles = True
 
-    def set_mode(self, mode: str | None) -> None:
-        """Set the type of the episodes from the next reset on.
-
-        Args:
-            mode: "training", "evaluation", or None for training.
-
-        Raises:
-            InvalidArgument: `mode` is something else.
-        """
-        self.stats_recorder.type = type_of_mode(mode)
-
     def model_changed(self) -> None:
         """Note that textures, height fields or meshes have changed mid-episode."""
         for states in self._states:
@@ -235,14 +221,6 @@ class Recorder:
         if self.run.options.write_upon_reset:
             with self.run.tolerating("statistics", FileNotWritten, of_episode=False):
                 self._write_results()
-
-    def note_event(self, kind: str, facts: Any) -> None:
-        """Write an evaluation's event to the journal; see `formats.journal`.
-
-        Raises:
-            FileNotWritten: the disk is full.
-        """
-        self.run.note(kind, facts)
 
     def note_error(self, error: BaseException) -> None:
         """Note an exception raised by the environment's step or reset, or by its user.
@@ -387,10 +365,6 @@ class Recorder:
         failures.raise_first()
         logger.info("Finished writing results. They are in %s.", self.directory)
 
-    def failures(self) -> Mapping[str, str]:
-        """Return the reasons why videos could not be rendered, keyed by their names."""
-        return self.run.finisher.failures
-
     def check_process(self) -> None:
         """Raise `Error` in a process forked from the one that created the recorder."""
         if self._is_forked:
@@ -505,7 +479,9 @@ class Recorder:
             episode = FinishedEpisode(**known, total_steps=total)
         standing = Standing.CHOSEN
         if kept is not None:
-            standing = kept.judge(recording.episode_id, episode)
+            if episode is not None:
+                kept.selection.add(episode)
+            standing = kept.selection.standing(recording.episode_id)
         is_dropped = standing is Standing.DROPPED
         is_chosen = recording.is_chosen and standing is Standing.CHOSEN
         # Only once, even if this is interrupted: recovery completes the rest.
@@ -664,7 +640,7 @@ class Recorder:
         if self._kept is not None:
             self.run.note("keep", self._kept.details())
         self.run.note("closed", {"next_episode_id": self.episode_id})
-        for name, why in self.failures().items():
+        for name, why in self.run.finisher.failures.items():
             # Usually the failed process has already recorded the reason.
             video = self.directory / self._video_of(name)
             if video.suffix == ".mp4" and reason_of(video) is None:

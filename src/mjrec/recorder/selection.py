@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import enum
 import functools
+import logging
 import operator
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
@@ -18,6 +19,8 @@ from ..plain_text import listed
 from ..schedules import check_takes_one, schedule_name
 from .keep_rules import RULES, has_failed, keep_rule
 from .tracking import FinishedEpisode
+
+logger = logging.getLogger(__name__)
 
 
 class Standing(enum.Enum):
@@ -76,10 +79,6 @@ class Selection:
         self._candidates: dict[int, FinishedEpisode] = {}
         self._chosen: set[int] = set()
 
-    def facts(self) -> dict[str, Any]:
-        """Return the selection's facts for the journal."""
-        return {"rule": self.name}
-
     def __call__(self, episode_id: int) -> bool:
         """Return whether to record an episode as if it got a video."""
         return self._choose is not None or self._has_room
@@ -93,6 +92,12 @@ class Selection:
         number = episode.episode_id
         if number <= self._last_id:
             return
+        if self.holds_all and not self.finished:
+            logger.info(
+                "keep=%s chooses the episodes for videos at the end of the run. "
+                "Until then, the recordings of all episodes are kept on disk.",
+                self.name,
+            )
         self.finished += 1
         self._last_id = number
         if self._has_room and has_failed(episode):

@@ -3,8 +3,7 @@
 
 `Background` lives in the simulation's process and does next to nothing there: it adds
 no thread, no simulator and no OpenGL. It starts the process that does the work,
-`python -m mjrec.rendering.background DIRECTORY --workers N|auto [--strict]`, and sends
-it::
+`python -m mjrec.rendering.background OPTIONS` (a JSON object), and sends it::
 
     {"expected": "<name>"|null}     a video will have to be rendered; the name is that
                                     of the recording that begins now, if there is one
@@ -22,19 +21,20 @@ When the simulation's process ends, it ends at once and leaves the rest as it is
 
 from __future__ import annotations
 
-import argparse
 import contextlib
+import json
 import logging
 import os
 import signal
+import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..child_python import Child, wait_for_news
 from ..errors import Error
-from ..formats.monitor_directory import infix_of
 from ..machine import check_workers
 from ..messages import Parent, log_message
 from ..timeouts import Timeout, timeout_s
@@ -86,9 +86,8 @@ class Background:
         strict: bool = False,
     ) -> None:
         self._directory = Path(directory).absolute()
-        count = str(check_workers(workers) or "auto")
-        self._arguments = [str(self._directory), "--workers", count]
-        self._arguments += ["--strict"] * strict
+        options = {"workers": check_workers(workers), "strict": strict}
+        self._options = json.dumps({"directory": str(self._directory), **options})
         self._process_id = os.getpid()
         self._child: Child | None = None
         self._is_waited_for = self._is_prepared = False
@@ -99,10 +98,6 @@ class Background:
         self.failures: dict[str, str] = {}
         # A dict used as an ordered set.
         self.waiting: dict[str, None] = {}
-
-    def share(self) -> Share:
-        """Return a share of this object for one of several monitors."""
-        return Share(self)
 
     def expect(self, recording: Path | None = None) -> None:
         """Start all processes ahead of a video that must be rendered. Idempotent.
@@ -214,7 +209,7 @@ class Background:
         try:
             if self._child is None:
                 environ = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}
-                self._child = Child(_MODULE, *self._arguments, environ=environ)
+                self._child = Child(_MODULE, self._options, environ=environ)
         except OSError as error:
             self._replace(f"it could not be started: {error}")
             return
@@ -263,27 +258,11 @@ class Background:
 
 
 class Share:
-    """One monitor's share of a `Background` that several monitors use.
-
-    Its `stop` does not stop the `Background`.
-    """
+    """A `Background` that several monitors use; none of them stops it."""
 
     def __init__(self, background: Background) -> None:
-        self._background = background
-        self._infixes: set[str | None] = set()
-        self.expect = background.expect
-        self.wait = background.wait
-
-    @property
-    def failures(self) -> Mapping[str, str]:
-        """Reasons why videos of this monitor are missing, by base name."""
-        failures = self._background.failures.items()
-        return {name: why for name, why in failures if infix_of(name) in self._infixes}
-
-    def submit(self, recording: Path) -> None:
-        """Take over an ended recording; see `Background.submit`."""
-        self._infixes.add(infix_of(Path(recording).name))
-        self._background.submit(recording)
+        self.expect, self.submit = background.expect, background.submit
+        self.wait, self.failures = background.wait, background.failures
 
     def stop(self) -> None:
         """Do nothing, because other monitors still need the process."""
@@ -298,32 +277,23 @@ def main() -> None:
     # Not imported at the top: the simulation's process does not need it.
     from .pool import WorkerPool
 
-    parser = argparse.ArgumentParser()
-    parser.add_argument("directory", type=Path)
-    parser.add_argument("--workers", required=True)
-    parser.add_argument("--strict", action="store_true")
-    arguments = parser.parse_args()
-    directory = arguments.directory
-    workers = None if arguments.workers == "auto" else int(arguments.workers)
+    options = json.loads(sys.argv[1])
+    directory = Path(options["directory"])
     os.setpriority(os.PRIO_PROCESS, 0, max(_NICE, os.getpriority(os.PRIO_PROCESS, 0)))
     parent = Parent()
     parent.send_warnings()
     with contextlib.suppress(_Stopped, EOFError):
         signal.signal(signal.SIGTERM, _stop)
         first = parent.receive()
-        pool = WorkerPool(workers, directory=directory, forks=True)
-        with contextlib.closing(pool):
+        with WorkerPool(options["workers"], directory=directory, forks=True) as pool:
             if "expected" in first:
-                # Before a second thread exists, because a fork would lose it. Errors
-                # are reported when there is something to draw.
-                with contextlib.suppress(Error):
-                    pool.start()
+                # Before a second thread exists, because a fork would lose it.
+                pool.start()
             # The workers create their contexts while the rest is imported.
             from .finisher import Finisher
 
-            finisher = Finisher(pool)
             parent.listen(_leave)
-            _Work(finisher, directory, parent, strict=arguments.strict).do(first)
+            _Work(Finisher(pool), parent, directory, options["strict"]).do(first)
 
 
 def _stop(signum: int, frame: object) -> None:
@@ -340,26 +310,25 @@ def _leave() -> None:
     time.sleep(_SECONDS_TO_LEAVE)
 
 
+@dataclass
 class _Work:
     """The main loop of the process.
 
-    Args:
+    Attributes:
         finisher: finishes the recordings.
-        directory: the monitor directory.
         parent: the simulation's process.
+        directory: the monitor directory.
         strict: see `Background`.
+        is_waited_for: whether the parent waits.
+        last_report: the time of the last report.
     """
 
-    def __init__(
-        self, finisher: Finisher, directory: Path, parent: Parent, *, strict: bool
-    ) -> None:
-        self._finisher = finisher
-        self._directory = directory
-        self._parent = parent
-        self._strict = strict
-        self._is_waited_for = False
-        self._last_report = 0.0
-        finisher.on_progress = self._look_up
+    finisher: Finisher
+    parent: Parent
+    directory: Path
+    strict: bool
+    is_waited_for: bool = False
+    last_report: float = 0.0
 
     def do(self, first: Mapping[str, Any]) -> None:
         """Handle the parent's messages and send it the results, without returning.
@@ -367,53 +336,52 @@ class _Work:
         Args:
             first: the first message.
         """
-        finisher = self._finisher
+        finisher = self.finisher
+        finisher.on_progress = self._look_up
         self._take_in(first)
         while True:
             self._take_in_all()
             if not finisher:
-                self._take_in(self._parent.receive())
-            elif finisher.is_ready() or self._is_waited_for:
+                self._take_in(self.parent.receive())
+            elif finisher.is_ready() or self.is_waited_for:
                 job, result = finisher.do_next()
                 if not finisher:
                     # Before the parent is notified, because it may then end the
                     # process.
                     finisher.pool.rest()
-                self._parent.send(progress=vars(finisher.progress))
+                self.parent.send(progress=vars(finisher.progress))
                 failures = {**result.failures, **result.blank}
-                self._parent.send(done=job.recording, failures=failures)
+                self.parent.send(done=job.recording, failures=failures)
             else:
                 # The simulation is still writing the model.
                 time.sleep(_SECONDS_BETWEEN_LOOKS)
 
     def _take_in_all(self) -> None:
-        while self._parent.has_said_something:
-            self._take_in(self._parent.receive())
+        while self.parent.has_said_something:
+            self._take_in(self.parent.receive())
 
     def _take_in(self, message: Mapping[str, Any]) -> None:
-        self._is_waited_for = "waited_for" in message
+        self.is_waited_for = "waited_for" in message
         if "expected" in message:
-            self._finisher.start_workers()
+            self.finisher.pool.start()
             if (name := message["expected"]) is not None:
                 # It may still be running.
-                self._finisher.pool.prepare(self._directory / name)
+                self.finisher.pool.prepare(self.directory / name)
         elif "recording" in message:
-            name = message["recording"]
-            job = VideoJob(
-                directory=self._directory, recording=name, strict=self._strict
-            )
-            if key_of(name) is None or not self._finisher.add(job):
-                self._parent.send(done=name, failures={})
+            name, at = message["recording"], self.directory
+            job = VideoJob(directory=at, recording=name, strict=self.strict)
+            if key_of(name) is None or not self.finisher.add(job):
+                self.parent.send(done=name, failures={})
 
     def _look_up(self, progress: Progress) -> None:
         """Read the parent's messages and report progress while work is in progress."""
         now = time.monotonic()
-        if now - self._last_report >= _SECONDS_BETWEEN_REPORTS:
-            self._last_report = now
+        if now - self.last_report >= _SECONDS_BETWEEN_REPORTS:
+            self.last_report = now
             self._take_in_all()
             # The parent reads only while it waits, and a pipe's buffer is small.
-            if self._is_waited_for:
-                self._parent.send(progress=vars(progress))
+            if self.is_waited_for:
+                self.parent.send(progress=vars(progress))
 
 
 if __name__ == "__main__":

@@ -70,7 +70,10 @@ def finish(
     """
     has_failed = False
     wanted = recordings(directory) if keys is None else keys
-    jobs = [VideoJob.finishing(directory, key, strict=strict) for key in wanted]
+    jobs = [
+        VideoJob(directory=directory, recording=key.shown_name, strict=strict)
+        for key in wanted
+    ]
     for result in do_jobs(
         jobs, directory, workers=workers, engine=engine, on_progress=on_progress
     ):

@@ -7,7 +7,6 @@ leaves its recording as it was, and does not stop the others.
 
 from __future__ import annotations
 
-import contextlib
 import logging
 from collections.abc import Callable
 from dataclasses import replace
@@ -62,8 +61,7 @@ class Finisher:
         self.progress = Progress(frames=0)
         self.on_progress = on_progress
         self.pool = pool
-        # The plan is None if planning failed. The reason is reported by `do_next`.
-        self._waiting: dict[str, tuple[VideoJob, Plan | None]] = {}
+        self._waiting: dict[str, tuple[VideoJob, Plan]] = {}
         self._gl_failure: GLError | None = None
 
     def __len__(self) -> int:
@@ -75,39 +73,35 @@ class Finisher:
 
     def add(self, job: VideoJob) -> bool:
         """Add a job, and return whether there is anything to do."""
-        plan: Plan | None = None
-        with contextlib.suppress(Error, OSError):
+        try:
             plan = _plan(job)
-            if plan is None:
-                return False
+        except (Error, OSError):
+            # `do_next` reports the reason. Until then, the job counts as one video.
+            plan = Plan(parts=(), videos=(Path(job.shown_name),), frame_count=0)
+        if plan is None:
+            return False
         self._waiting[job.name] = job, plan
-        videos, frames = _work(plan)
-        if videos:
-            self._count(videos=videos, frames=frames)
-            self.start_workers()
+        if plan.videos:
+            self._count(videos=len(plan.videos), frames=plan.frame_count)
+            self.pool.start()
         return True
 
     def is_ready(self) -> bool:
         """Return whether the model of the next job exists."""
         _, plan = next(iter(self._waiting.values()))
-        return plan is None or plan.has_model
+        # A running simulation may still write it.
+        return plan.model_file is None or plan.model_file.exists()
 
     def do_next(self) -> tuple[VideoJob, RenderedVideos]:
         """Do the next job, and return it with its result."""
         job, plan = self._waiting.pop(next(iter(self._waiting)))
-        before, (videos, frames) = self.progress.frames_done, _work(plan)
+        # Count the frames that will not be drawn, too: they will not come any more.
+        frames_done = self.progress.frames_done + plan.frame_count
         result = self._do(job)
-        if videos:
-            # Count the frames that were not drawn, too: they will not come any more.
-            self.progress = replace(self.progress, frames_done=before + frames)
-            self._count(videos_done=videos)
+        if plan.videos:
+            self.progress = replace(self.progress, frames_done=frames_done)
+            self._count(videos_done=len(plan.videos))
         return job, result
-
-    def start_workers(self) -> None:
-        """Start the workers ahead of the first video. Idempotent."""
-        # Errors are reported when the video is drawn.
-        with contextlib.suppress(Error):
-            self.pool.start()
 
     def _count(self, **more: int) -> None:
         now = {name: getattr(self.progress, name) + more[name] for name in more}
@@ -201,8 +195,3 @@ def _plan(job: VideoJob) -> Plan | None:
         )
     frames = len(recorded.chosen(job.variant.max_fps).indices)
     return Plan(parts=(trajectory,), videos=(job.video,), frame_count=frames)
-
-
-def _work(plan: Plan | None) -> tuple[int, int]:
-    """Return a job's number of videos and of frames, if known."""
-    return (1, 0) if plan is None else (len(plan.videos), plan.frame_count)

@@ -45,7 +45,7 @@ from ..formats.spans import (
 )
 from ..formats.trajectory_file import (
     bundle_trajectories,
-    finish_trajectory,
+    finish_trajectories,
     open_trajectory,
 )
 from ..plain_text import counted
@@ -198,28 +198,22 @@ class _KilledMonitor:
         Raises:
             UnreadableFile: the journal does not say what is in the log. The log stays.
         """
-        in_flight = [each for each in recordings_in(log) if each.is_in_flight]
-        episodes = [each for each in in_flight if each.path.suffix == FINISHED]
-        if self.bundles:
-            self._bundle(each.path for each in episodes)
-        else:
-            for recording in episodes:
-                path = recording.path
-                with self.report.attempt(path.name), self._claimed(path) as is_ours:
-                    if is_ours and recording.is_in_flight:
-                        finish_trajectory(path)
-                        self.report.note(path.name, _how_long(path))
+        in_flight = [each.path for each in recordings_in(log) if each.is_in_flight]
+        episodes = [path for path in in_flight if path.suffix == FINISHED]
+        for paths in [episodes] if self.bundles else [[path] for path in episodes]:
+            self._finish_trajectories(paths)
         is_idle = not any(each.is_in_flight for each in recordings_in(log))
         if is_idle and any(map(Path.exists, files_beside(log))):
             remove_log(log)
             self.report.note(log.name, "nothing in flight, removed")
 
-    def _bundle(self, paths: Iterable[Path]) -> None:
-        """Put episodes into the monitor's bundle."""
+    def _finish_trajectories(self, paths: Iterable[Path]) -> None:
+        """Write episodes in their final form, or into the monitor's bundle."""
         with contextlib.ExitStack() as claims:
             ours = [p for p in paths if claims.enter_context(self._claimed(p))]
             ours = [path for path in ours if not is_finished(path)]
-            failures = bundle_trajectories(ours)
+            finish = bundle_trajectories if self.bundles else finish_trajectories
+            failures = finish(ours)
             for path in ours:
                 with self.report.attempt(path.name):
                     if path in failures:
@@ -263,10 +257,9 @@ class _KilledMonitor:
     def _facts(self, number: int | None) -> Mapping[str, Any]:
         """Return the facts in an episode's trajectory; empty if missing or damaged."""
         with contextlib.suppress(UnreadableFile):
-            if number is None:
-                return {}
-            path = find_trajectory(self.directory, self.infix, number)
-            if path is not None:
+            if number is not None and (
+                path := find_trajectory(self.directory, self.infix, number)
+            ):
                 return _facts_of(path)
         return {}
 

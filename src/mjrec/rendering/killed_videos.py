@@ -152,22 +152,18 @@ def _finish_files(part: Path, video: Path, facts: Mapping[str, Any]) -> dict[str
     is_same_ffmpeg = facts["encoder_version"].get("version") == ffmpeg_version()
     try:
         for hashes in _hashes(video):
-            _finish_hashes(hashes, frame_hash_path(video), found["frame_count"])
+            try:
+                # Some frames that have hashes may not have reached the file.
+                cut_frame_hashes(hashes, found["frame_count"])
+            except ValueError:
+                # Incomplete hashes are worse than none.
+                hashes.unlink()
+            else:
+                hashes.replace(frame_hash_path(video))
         part.replace(video)
     except OSError as error:
         raise DirectoryNotWritable(video.parent, error) from error
     return {**found, "ffmpeg_sha256": ffmpeg_sha256() if is_same_ffmpeg else None}
-
-
-def _finish_hashes(part: Path, final: Path, frame_count: int) -> None:
-    try:
-        # Some frames that have hashes may not have reached the file.
-        cut_frame_hashes(part, frame_count)
-    except ValueError:
-        # Incomplete hashes are worse than none.
-        part.unlink()
-    else:
-        part.replace(final)
 
 
 def _counted(count: int, metadata: Mapping[str, Any]) -> str:

@@ -119,13 +119,10 @@ def _kind_of(path: Path, files: MonitorFiles) -> Kind | None:
     # A clip's video may have the name of an episode's video.
     clips = f".openaigym.clip.{files.infix}."
     locks = [p for p in files.paths if p.name.startswith(clips)]
-    if any(map(is_locked, [*unfinished_files(mp4), *locks, _lock_of(mp4)])):
+    locks.append(mp4.with_name(f".{mp4.stem}.lock"))
+    if any(map(is_locked, [*unfinished_files(mp4), *locks])):
         return None
     return "text" if name.is_episodes and name.ending == "json" else "stale"
-
-
-def _lock_of(video: Path) -> Path:
-    return video.with_name(f".{video.stem}.lock")
 
 
 def lacks_results(files: MonitorFiles) -> bool:

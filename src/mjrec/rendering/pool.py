@@ -10,6 +10,7 @@ two workers are busy, not sixteen.
 from __future__ import annotations
 
 import collections
+import contextlib
 import itertools
 import logging
 import os
@@ -24,27 +25,23 @@ from typing import Any, Self
 import numpy as np
 
 from ..child_python import Child, wait_for_news
-from ..errors import (
-    ClosedError,
-    Error,
-    GLError,
-)
+from ..errors import ClosedError, Error, GLError
 from ..formats.json_fields import to_json
 from ..formats.locks import Lock, try_lock
 from ..formats.monitor_directory import render_lock_name
 from ..frames import Frame
-from ..gl import backend_for_children
 from ..gl.backends import (
     BACKENDS,
     backend_in_environment,
     environment_for,
     rendering_is_off,
 )
+from ..gl.choice import backend_for_children
 from ..machine import check_workers, usable_cpus
 from ..messages import log_message, unpacked
 from ..simulation.model_trust import ALL_MODELS, TRUST_VARIABLE
 from ..timeouts import Timeout
-from .views import PlainCamera, View, plain_camera
+from .jobs import PlainCamera, View, plain_camera
 
 logger = logging.getLogger(__name__)
 
@@ -128,13 +125,12 @@ class WorkerPool:
     def start(self) -> None:
         """Start the workers now, so that the first frame comes sooner. Idempotent.
 
-        Raises:
-            DirectoryNotWritable: a lock cannot be created in the directory.
-            Error: a worker cannot be started.
+        Errors are reported when there is something to draw.
         """
-        self._check_usable()
-        for worker in self._workers[: self._free()]:
-            self._start(worker)
+        with contextlib.suppress(Error):
+            self._check_usable()
+            for worker in self._workers[: self._free()]:
+                self._start(worker)
         self.rest()
 
     def prepare(self, trajectory: Path) -> None:

@@ -48,7 +48,7 @@ from ..formats.trajectory_file import open_trajectory
 from ..frames import QUALITIES
 from ..rates import stride_for, to_rate
 from ..simulation.foreign_files import open_vetted_trajectory
-from .views import PlainCamera, plain_camera
+from .jobs import PlainCamera, plain_camera
 
 logger = logging.getLogger(__name__)
 

@@ -67,11 +67,6 @@ class Plan:
     is_kept: bool = True
     model_file: Path | None = None
 
-    @property
-    def has_model(self) -> bool:
-        """Whether the model file exists; a running simulation may still write it."""
-        return self.model_file is None or self.model_file.exists()
-
 
 @dataclass(frozen=True, kw_only=True)
 class Recorded:

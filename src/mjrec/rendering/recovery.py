@@ -14,12 +14,7 @@ from ..errors import DirectoryNotWritable, InvalidArgument
 from ..formats.locks import is_locked, wait_for_lock
 from ..formats.second_names import give_all_second_names
 from ..results.monitor_files import monitors_of
-from .leftovers import (
-    RecoveredFile,
-    has_leftovers,
-    is_at_work,
-    stale_shared_files,
-)
+from .leftovers import RecoveredFile, has_leftovers, is_at_work, stale_shared_files
 
 # Only one process at a time recovers a directory.
 _LOCK = ".openaigym.recover.lock"

@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike
 from ..errors import InvalidArgument
 from ..formats.json_fields import to_json
 from ..frames import Frame
+from .jobs import View, plain_camera
 from .pool import WorkerPool
 from .recorded_facts import (
     check_has_frames,
@@ -23,7 +24,6 @@ from .recorded_facts import (
     open_for_rendering,
     warn_of_other_frames,
 )
-from .views import View, plain_camera
 
 if TYPE_CHECKING:
     from ..simulation.cameras import Camera

@@ -33,7 +33,7 @@ from ..frames import Frame, grid_shape
 from ..machine import machine_fingerprint
 from ..provenance import versions
 from ..rates import to_rate
-from .jobs import RenderedVideos
+from .jobs import PlainCamera, RenderedVideos, Variant, View, plain_camera
 from .pool import WorkerPool
 from .recorded_facts import (
     captions,
@@ -44,7 +44,6 @@ from .recorded_facts import (
     warn_of_other_frames,
 )
 from .recordings import Recorded, read_recording
-from .views import PlainCamera, Variant, View, plain_camera
 
 logger = logging.getLogger(__name__)
 

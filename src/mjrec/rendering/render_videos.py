@@ -27,9 +27,16 @@ from ..formats.spans import is_recorded
 from ..machine import check_workers, usable_cpus
 from ..simulation.model_trust import trusting_models
 from .finish import do_jobs, finish
-from .jobs import Progress, RecordingKey, RenderedVideos, VideoJob, key_of
+from .jobs import (
+    Progress,
+    RecordingKey,
+    RenderedVideos,
+    Variant,
+    VideoJob,
+    View,
+    key_of,
+)
 from .recordings import parts_of, recordings
-from .views import Variant, View
 
 _SHOWN = 20
 
@@ -100,12 +107,7 @@ def render_videos(
         Error: the engine cannot work.
     """
     variant = Variant(
-        view=View(
-            camera=camera,
-            height=height,
-            width=width,
-            quality=quality,
-        ),
+        view=View(camera=camera, height=height, width=width, quality=quality),
         max_fps=max_fps,
         fps=fps,
         annotate=annotate,

@@ -35,8 +35,8 @@ from ..simulation.gl_probe import draw_test_scene
 from ..simulation.recorded_scene import GivenStates, RecordedScene
 from ..simulation.renderer import Canvas, SceneRenderer
 from ..simulation.warnings import log_mujoco_warnings
+from .jobs import PlainCamera, View
 from .recorded_facts import check_has_frames, open_for_rendering
-from .views import PlainCamera, View
 
 _NICE = 10
 _LOOKS_FOR_RECORDING = 100

@@ -7,7 +7,7 @@ them.
 
 from __future__ import annotations
 
-from collections.abc import Container, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
@@ -15,7 +15,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from ..evaluation.result_tables import TaskResults
+from ..evaluation.result_tables import ROW
 from ..evaluation.statistics import Bootstrap
 from ..evaluation.summaries import (
     AcrossTasks,
@@ -25,29 +25,14 @@ from ..evaluation.summaries import (
 )
 from ..results.episodes import Episode
 
-# One episode, as a row, so that a million of them need little memory. `run` is the seed
-# of an evaluation, otherwise the monitor as an index into `ReportTask.runs`.
-# `total_reward` and `end_time` (wall clock, in seconds) are NaN if unknown. `outcome`
-# is a sum of the numbers below. `success` is 1, 0, or -1 if unknown.
-EPISODE: Final = np.dtype(
-    [
-        ("run", "i8"),
-        ("episode", "i8"),
-        ("total_reward", "f8"),
-        ("length", "i8"),
-        ("end_time", "f8"),
-        ("outcome", "u1"),
-        ("success", "i1"),
-    ]
-)
-TERMINATED: Final = 1
-TRUNCATED: Final = 2
+# An episode's outcome: this, or a sum of 1 (terminated) and 2 (truncated).
 FAILED: Final = 4
 
 ROLES: Final = ("best", "median", "worst")
 
 # The end of 1979. gym 0.21 and 0.22 counted seconds from an arbitrary moment.
 _EARLIEST: Final = 315_532_800.0
+_NO_MONITOR: Final = -2
 
 
 @dataclass(kw_only=True)
@@ -62,7 +47,8 @@ class ReportVideo:
         index: the index of that episode in `ReportTask.episodes`; None if unknown.
         file: the address of the copy relative to the page, or a `data:` URL; empty if
             the video is not part of the report.
-        poster: the address of a still image, in the same form; empty if there is none.
+        image: a still image, as a JPEG; None if there is none.
+        poster: the address of that image, in the same form as `file`.
         roles: which of `"best"`, `"median"`, `"worst"` its episode is.
         height: height of the frames in pixels; None if unknown.
         width: width of the frames in pixels; None if unknown.
@@ -82,6 +68,7 @@ class ReportVideo:
     episode_id: int | None = None
     index: int | None = None
     file: str = ""
+    image: bytes | None = None
     poster: str = ""
     roles: Sequence[str] = ()
     height: int | None = None
@@ -107,7 +94,9 @@ class ReportTask:
         is_evaluation: whether the episodes are those of an evaluation, whose runs are
             seeds. Otherwise they come from monitors, in order of time, as in training.
         summary: the summary of its episodes.
-        episodes: `(n,)` of dtype `EPISODE`.
+        episodes: `(n,)` of dtype `ROW`, so that a million of them need little memory.
+            Of monitors, `seed` is the index into `runs`, and `start_time` is the time
+            of the end.
         runs: the names of the runs, if they are monitors.
         failures: the reasons why episodes failed, by index.
         videos: its videos, in the order of their episodes.
@@ -170,59 +159,66 @@ class ReportContents:
         return [video for task in self.tasks for video in task.videos]
 
 
-def rows_of_monitor(
-    episodes: Iterable[Episode], *, run: int, wanted: Container[int | None]
-) -> tuple[NDArray[np.void], dict[int, int]]:
-    """Return a monitor's episodes as rows, and the row indices of some of them.
+def rows_of_monitor(episodes: Iterable[Episode], *, run: int) -> NDArray[np.void]:
+    """Return a monitor's episodes as rows.
 
     Args:
         episodes: the episodes, which are read one at a time and not kept.
         run: the monitor's index.
-        wanted: numbers of the episodes whose indices are returned.
     """
-    places: dict[int, int] = {}
 
-    def row(index: int, episode: Episode) -> tuple[float | None, ...]:
-        number = episode.episode_id
+    def row(episode: Episode) -> tuple[float | None, ...]:
+        number, truths = episode.episode_id, []
+        for truth in (episode.terminated, episode.truncated, episode.success):
+            truths.append(-1 if truth is None else int(truth))
         # An episode whose number is uncertain has no files, and gets no video.
-        files = episode.video or episode.metadata or episode.trajectory
-        if files and number in wanted:
-            places[number] = index
-        outcome = TERMINATED * bool(episode.terminated)
-        outcome += TRUNCATED * bool(episode.truncated)
-        success = -1 if episode.success is None else episode.success
-        reward, length, end = episode.reward, episode.length, episode.end_time
-        return run, number, reward, length, end, outcome, success
+        has_files = episode.video or episode.metadata or episode.trajectory
+        figures = run, number, episode.reward, episode.length, *truths
+        return *figures, episode.end_time, 0.0, run, number if has_files else -1
 
-    rows = (row(index, episode) for index, episode in enumerate(episodes))
-    return np.fromiter(rows, EPISODE), places
+    return np.fromiter(map(row, episodes), ROW)
 
 
-def in_time(rows: NDArray[np.void]) -> tuple[NDArray[np.void], NDArray[np.intp]]:
-    """Return episodes in the order in which they ended, and the new index of each.
+def in_time(rows: NDArray[np.void]) -> NDArray[np.void]:
+    """Return episodes of monitors in the order in which they ended.
 
     Episodes that ended at the same time keep their order. Those without a time come
     last.
     """
-    order = np.argsort(rows["end_time"], kind="stable")
-    now_at = np.empty_like(order)
-    now_at[order] = np.arange(len(order))
-    rows = rows[order]
-    rows["end_time"][rows["end_time"] < _EARLIEST] = np.nan
-    return rows, now_at
-
-
-def rows_of_results(results: TaskResults) -> NDArray[np.void]:
-    """Return the episodes of one task of an evaluation as rows, in the plan's order."""
-    given, rows = results.rows, np.empty(len(results), EPISODE)
-    rows["run"] = given["seed"]
-    for name in ("episode", "total_reward", "length", "success"):
-        rows[name] = given[name]
-    rows["end_time"] = given["start_time"] + given["seconds"]
-    rows["outcome"] = TERMINATED * (given["terminated"] == 1)
-    rows["outcome"] += (TRUNCATED * (given["truncated"] == 1)).astype(np.uint8)
-    rows["outcome"][results.failed] = FAILED
+    rows = rows[np.argsort(end_times(rows), kind="stable")]
+    rows["start_time"][rows["start_time"] < _EARLIEST] = np.nan
     return rows
+
+
+def end_times(rows: NDArray[np.void]) -> NDArray[np.float64]:
+    """Return when episodes ended, in seconds since the epoch; NaN if unknown."""
+    times: NDArray[np.float64] = rows["start_time"] + rows["seconds"]
+    return times
+
+
+def outcomes(task: ReportTask) -> NDArray[np.int64]:
+    """Return the outcome of each episode; see `FAILED`."""
+    terminated, truncated = (task.episodes[k] == 1 for k in ("terminated", "truncated"))
+    found: NDArray[np.int64] = terminated + 2 * truncated
+    found[list(task.failures)] = FAILED
+    return found
+
+
+def find_episodes(
+    videos: Iterable[ReportVideo], rows: NDArray[np.void], monitors: Sequence[str]
+) -> None:
+    """Set the indices of the videos' episodes.
+
+    Args:
+        videos: the videos.
+        rows: the episodes.
+        monitors: the infixes of the monitors that recorded them.
+    """
+    number = {infix: index for index, infix in enumerate(monitors)}
+    for video in videos:
+        of_monitor = rows["monitor"] == number.get(video.infix, _NO_MONITOR)
+        [found] = np.nonzero(of_monitor & (rows["episode_id"] == video.episode_id))
+        video.index = int(found[0]) if len(found) else None
 
 
 def summary_of_rows(
@@ -239,26 +235,26 @@ def summary_of_rows(
     return summarize_task(
         name,
         total_rewards=rows["total_reward"],
-        runs=len(np.unique(rows["run"])),
+        runs=len(np.unique(rows["seed"])),
         lengths=rows["length"],
-        terminated=rows["outcome"] & TERMINATED,
-        truncated=rows["outcome"] & TRUNCATED,
+        terminated=rows["terminated"] == 1,
+        truncated=rows["truncated"] == 1,
         success=np.where(success < 0, np.nan, success),
         score_range=default_score_range(name),
         bootstrap=bootstrap,
     )
 
 
-def episodes_with_roles(rows: NDArray[np.void]) -> dict[int, tuple[str, ...]]:
+def episodes_with_roles(task: ReportTask) -> dict[int, tuple[str, ...]]:
     """Return the roles of the best, the median and the worst episode, by index.
 
     Among equal returns, the first episode counts. The median of an even number is the
     lower one. NaN is the worst return. Failed episodes have no role.
     """
-    completed = np.flatnonzero(rows["outcome"] != FAILED)
+    completed = np.delete(np.arange(len(task.episodes)), list(task.failures))
     if not len(completed):
         return {}
-    returns = rows["total_reward"][completed]
+    returns = task.episodes["total_reward"][completed]
     is_number = ~np.isnan(returns)
     values = np.where(is_number, returns, 0.0)
     # NaNs come first.

@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..evaluation.summaries import AcrossTasks, TaskSummary
 from ..plain_text import counted
-from .contents import ReportTask
+from .contents import ReportTask, end_times
 from .page_text import decimals_for, interval_text, number
 
 _Floats: TypeAlias = NDArray[np.float64]
@@ -165,7 +165,7 @@ def _drawable(task: ReportTask) -> tuple[NDArray[np.int64], _Floats, _Floats]:
     """
     known = task.episodes[np.isfinite(task.episodes["total_reward"])]
     returns = np.clip(known["total_reward"], -_LARGEST, _LARGEST)
-    return known["run"], returns, known["end_time"]
+    return known["seed"], returns, end_times(known)
 
 
 def _running(

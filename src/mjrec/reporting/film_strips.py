@@ -26,6 +26,7 @@ from ..errors import InvalidArgument, UnreadableFile
 from ..formats.json_fields import field, integer, list_of, rate, read_object
 from ..formats.video_metadata import metadata_path
 from ..frames import Frame
+from ..rendering.jobs import View
 from ..rendering.pool import WorkerPool
 from ..rendering.recorded_facts import (
     captions,
@@ -33,7 +34,6 @@ from ..rendering.recorded_facts import (
     open_for_rendering,
     warn_of_other_frames,
 )
-from ..rendering.views import View
 from .video_stream import frames_at, read_stream, video_kind
 
 _TRAJECTORY: Final = ".h5"

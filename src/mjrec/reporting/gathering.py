@@ -41,19 +41,19 @@ from .contents import (
     ReportVideo,
     Verdict,
     episodes_with_roles,
+    find_episodes,
     in_time,
     rows_of_monitor,
-    rows_of_results,
     summary_of_rows,
 )
-from .provenance import (
+from .monitor_facts import (
     joined,
     machine_of,
     pairs_of_monitor,
     pairs_of_results,
+    recorded_videos,
     recorded_when,
 )
-from .recorded_videos import recorded_videos
 
 _package_logger = logging.getLogger(__package__.partition(".")[0])
 
@@ -61,7 +61,6 @@ Directories = str | os.PathLike[str] | Iterable[str | os.PathLike[str]]
 
 _UNKNOWN_ENVIRONMENT: Final = "unknown environment"
 _LONGEST_NAME: Final = 1000
-_NO_MONITOR: Final = -2
 
 # The file of a verdict, in a directory with recordings.
 _VERIFICATION_NAME: Final = "verification.json"
@@ -197,16 +196,18 @@ def _add_monitors(
         name = (monitor.env_info or {}).get("env_id")
         known = name[:_LONGEST_NAME] if isinstance(name, str) else ""
         recorded = by_name.setdefault(known or _UNKNOWN_ENVIRONMENT, _Recorded())
-        _add_monitor(contents, recorded, monitor, place)
+        recorded.videos += recorded_videos(monitor, place, contents.problems)
+        episodes = _readable_episodes(contents, monitor)
+        recorded.rows.append(rows_of_monitor(episodes, run=len(recorded.runs)))
+        recorded.runs.append(monitor.files.infix)
+        recorded.provenance |= dict.fromkeys(pairs_of_monitor(monitor))
     # Monitors of which nothing could be read are not an environment.
     unknown = by_name.get(_UNKNOWN_ENVIRONMENT)
     if unknown and not unknown.videos and not any(map(len, unknown.rows)):
         del by_name[_UNKNOWN_ENVIRONMENT]
     for name, recorded in by_name.items():
-        rows, now_at = in_time(np.concatenate(recorded.rows))
-        for video in recorded.videos:
-            if video.index is not None:
-                video.index = int(now_at[video.index])
+        rows = in_time(np.concatenate(recorded.rows))
+        find_episodes(recorded.videos, rows, recorded.runs)
         contents.tasks.append(
             ReportTask(
                 name=name,
@@ -246,24 +247,6 @@ def _monitors(
                 yield place, MonitorResults(files)
 
 
-def _add_monitor(
-    contents: ReportContents, recorded: _Recorded, monitor: MonitorResults, place: Path
-) -> None:
-    videos = recorded_videos(monitor, place, contents.problems)
-    wanted = {video.episode_id for video in videos}
-    before = sum(map(len, recorded.rows))
-    rows, found = rows_of_monitor(
-        _readable_episodes(contents, monitor), run=len(recorded.runs), wanted=wanted
-    )
-    for video in videos:
-        if video.episode_id in found:
-            video.index = before + found[video.episode_id]
-    recorded.runs.append(monitor.files.infix)
-    recorded.rows.append(rows)
-    recorded.videos += videos
-    recorded.provenance |= dict.fromkeys(pairs_of_monitor(monitor))
-
-
 def _readable_episodes(
     contents: ReportContents, monitor: MonitorResults
 ) -> Iterator[Episode]:
@@ -282,7 +265,7 @@ def _complete(task: ReportTask) -> None:
     renderers = [("OpenGL renderer", video.renderer or "") for video in task.videos]
     when = ("Recorded", recorded_when(task.episodes))
     task.provenance = joined([*task.provenance, *renderers, when])
-    roles = episodes_with_roles(task.episodes)
+    roles = episodes_with_roles(task)
     # Sorting is stable, so the order of cameras stays.
     task.videos = sorted(task.videos, key=lambda v: (v.index is None, v.index or 0))
     for video in task.videos:
@@ -323,7 +306,7 @@ def _add_evaluation(contents: ReportContents, directory: Path) -> None:
                 source=str(directory),
                 is_evaluation=True,
                 summary=summary,
-                episodes=rows_of_results(results.by_task[task]),
+                episodes=results.by_task[task].rows,
                 failures=results.by_task[task].failures,
                 videos=videos,
                 provenance=provenance,
@@ -351,12 +334,7 @@ def _videos_of_task(
     for place, monitor in _monitors(contents, _places_of_task(folder)):
         videos += recorded_videos(monitor, place, contents.problems)
         provenance.append(machine_of(monitor))
-    number = {infix: index for index, infix in enumerate(columns.monitors)}
-    for video in videos:
-        given = columns.rows
-        of_monitor = given["monitor"] == number.get(video.infix, _NO_MONITOR)
-        [rows] = np.nonzero(of_monitor & (given["episode_id"] == video.episode_id))
-        video.index = int(rows[0]) if len(rows) else None
+    find_episodes(videos, columns.rows, columns.monitors)
     shown = [video for video in videos if video.index is not None]
     missing = len(columns.videos.keys() - {video.index for video in shown})
     if missing:

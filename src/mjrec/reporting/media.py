@@ -10,11 +10,11 @@ from __future__ import annotations
 import base64
 import hashlib
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, BinaryIO, Final
+from typing import Any, Final
 
 from imageio.v3 import imwrite
 
@@ -65,30 +65,27 @@ def is_own_name(name: str) -> bool:
     return _OWN_NAME.fullmatch(name) is not None
 
 
-def posters_of(contents: ReportContents, on_progress: OnProgress) -> list[bytes | None]:
-    """Return a JPEG for each video; None for text recordings and broken videos.
+def add_images(contents: ReportContents, on_progress: OnProgress) -> None:
+    """Set the image of each video, except of text recordings and broken videos.
 
     Missing durations of videos are filled in. Videos that cannot be decoded are added
     to the problems.
 
     Args:
         contents: the contents, whose videos still have their recorded files.
-        on_progress: called after each poster.
+        on_progress: called after each image.
     """
     moving = [video for video in contents.videos if video.path.suffix != _TEXT]
-    posters: dict[int, bytes | None] = {}
-    # Each poster is a short run of ffmpeg on one CPU.
+    # Each image is a short run of ffmpeg on one CPU.
     with ThreadPoolExecutor(usable_cpus()) as pool:
-        for video, made in zip(moving, pool.map(_poster, moving), strict=True):
-            posters[id(video)] = made if isinstance(made, bytes) else None
-            if isinstance(made, Error):
-                contents.problems.append(f"A video has no poster: {made}")
-            on_progress(ReportProgress(POSTERS, len(posters), len(moving)))
-    return [posters.get(id(video)) for video in contents.videos]
+        for number, error in enumerate(pool.map(_add_image, moving), 1):
+            if error is not None:
+                contents.problems.append(f"A video has no poster: {error}")
+            on_progress(ReportProgress(POSTERS, number, len(moving)))
 
 
-def _poster(video: ReportVideo) -> bytes | Error:
-    """Return the middle frame of a video as a JPEG, or the error.
+def _add_image(video: ReportVideo) -> Error | None:
+    """Set a video's image, the middle frame as a JPEG; return the error, if any.
 
     The first frame often shows the initial pose, which is the same in all videos of a
     task, and the last one a fall. The action is in between.
@@ -102,37 +99,33 @@ def _poster(video: ReportVideo) -> bytes | Error:
     except Error as error:
         return error
     image: Any = imwrite("<bytes>", frame, extension=".jpg", quality=_POSTER_QUALITY)
-    return bytes(image)
+    video.image = bytes(image)
+    return None
 
 
 def copy_videos(
-    contents: ReportContents,
-    posters: Sequence[bytes | None],
-    folder: Path,
-    on_progress: OnProgress,
+    contents: ReportContents, folder: Path, on_progress: OnProgress
 ) -> None:
-    """Copy videos and posters into a folder, and set their names in the contents.
+    """Copy videos and images into a folder, and set their names in the contents.
 
     Args:
         contents: the contents, whose videos still have their recorded files.
-        posters: the posters of the videos, in order.
         folder: the page's folder.
         on_progress: called after each video.
 
     Raises:
         OSError: the disk is full.
     """
-    named = zip(_named(contents), posters, strict=True)
-    for number, ((stem, video), poster) in enumerate(named, 1):
+    for number, (stem, video) in enumerate(_named(contents), 1):
         try:
             file = f"{VIDEOS}/{stem}{_ending(video.path)}"
             _put(contents, video, file, _copy(video.path, folder / file))
         except UnreadableFile as error:
             _leave_out(contents, video, error)
-        if poster is not None:
+        if video.image is not None:
             video.poster = f"{POSTERS}/{stem}.jpg"
-            (folder / video.poster).write_bytes(poster)
-        on_progress(ReportProgress(VIDEOS, number, len(posters)))
+            (folder / video.poster).write_bytes(video.image)
+        on_progress(ReportProgress(VIDEOS, number, len(contents.videos)))
 
 
 def _named(contents: ReportContents) -> Iterator[tuple[str, ReportVideo]]:
@@ -181,18 +174,15 @@ def write_replays(
         on_progress(ReportProgress(REPLAYS, number, len(wanted)))
 
 
-def with_embedded_videos(
-    contents: ReportContents, posters: Sequence[bytes | None], *, room: int
-) -> ReportContents:
+def with_embedded_videos(contents: ReportContents, *, room: int) -> ReportContents:
     """Return contents with as many embedded videos as fit.
 
-    All posters come first, then the videos in order. A video that does not fit is shown
-    by its poster, with a note.
+    All images come first, then the videos in order. A video that does not fit is shown
+    by its image, with a note.
 
     Args:
         contents: the contents, whose videos have their recorded files. They are not
             changed.
-        posters: the posters of the videos, in order.
         room: maximum number of characters for all embedded data.
     """
     contents = replace(
@@ -203,9 +193,9 @@ def with_embedded_videos(
             for task in contents.tasks
         ],
     )
-    for video, poster in zip(contents.videos, posters, strict=True):
-        if poster is not None and _length_of_url(len(poster)) <= room:
-            video.poster = _data_url("image/jpeg", poster)
+    for video in contents.videos:
+        if video.image is not None and _length_of_url(len(video.image)) <= room:
+            video.poster = _data_url("image/jpeg", video.image)
             room -= len(video.poster)
     left_out = 0
     for video in contents.videos:
@@ -252,15 +242,14 @@ def _copy(source: Path, target: Path) -> str:
     with unreadable(source):
         file = open_regular(source)
     with file, target.open("xb") as copy:
-        while block := _read(file, source):
+        while True:
+            # A full disk is not an error of the source.
+            with unreadable(source):
+                block = file.read(_READ_SIZE)
+            if not block:
+                return digest.hexdigest()
             digest.update(block)
             copy.write(block)
-    return digest.hexdigest()
-
-
-def _read(file: BinaryIO, source: Path) -> bytes:
-    with unreadable(source):
-        return file.read(_READ_SIZE)
 
 
 def _leave_out(

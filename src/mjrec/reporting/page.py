@@ -27,10 +27,10 @@ from ..errors import MissingDependency
 from ..evaluation.statistics import PERCENTILE_BOOTSTRAP, Bootstrap, Interval
 from ..evaluation.summaries import TaskSummary
 from ..plain_text import counted, spelled_out
-from .contents import FAILED, ROLES, ReportContents, ReportTask, ReportVideo
+from .contents import ROLES, ReportContents, ReportTask, ReportVideo, outcomes
 from .curves import SERIES, evaluation_curve, learning_curve, profile_curve
+from .monitor_facts import SELECTION
 from .page_text import NOTHING, address, decimals_for, interval_text, number, page_json
-from .provenance import SELECTION
 
 _LONGEST_NAME: Final = 120
 _LONGEST_REASON: Final = 300
@@ -43,14 +43,8 @@ _MOST_PLAYERS: Final = 300
 _MOST_FIGURES: Final = 120
 _MOST_PROBLEMS: Final = 200
 
-# By the number in `outcome`: none, TERMINATED, TRUNCATED, both, FAILED.
-_OUTCOMES: Final = (
-    "",
-    "terminated",
-    "truncated",
-    "terminated and truncated",
-    "failed",
-)
+# See `contents.outcomes`.
+_OUTCOMES: Final = ("", "terminated", "truncated", "terminated and truncated", "failed")
 _SUCCESS: Final = {1: ", success", 0: ", no success", -1: ""}
 
 _Pairs = Sequence[tuple[str, str]]
@@ -86,26 +80,17 @@ def page_of(contents: ReportContents) -> str:
         script=script,
         style_hash=_hash(style),
         script_hash=_hash(script),
-        subtitle=_subtitle(contents),
         most_problems=_MOST_PROBLEMS,
         bars=[_bar(task.summary) for task in contents.tasks],
         intervals=intervals,
         notes=_notes(contents.tasks, methods, intervals),
         percent=f"{how.confidence * 100:.4g}\N{NO-BREAK SPACE}%",
-        across=[
-            {
-                "name": name,
-                "series": index % SERIES,
-                "scores": each,
-                "method": _in_words(each.interval_method, how),
-            }
-            for index, (name, each) in enumerate(contents.across.items())
-        ],
+        num_series=SERIES,
+        method_of=lambda scores: _in_words(scores.interval_method, how),
         profile=_profile(contents),
         figures=list(_figures(contents.tasks)),
-        figures_left_out=len(contents.tasks[_MOST_FIGURES:]),
+        most_figures=_MOST_FIGURES,
         cards=cards,
-        players_left_out=len(contents.videos) - len(cards),
         roles=[role for role in ROLES if any(role in c["video"].roles for c in cards)],
         selection=_selection(contents.tasks),
         episodes=page_json(_episodes(contents, shown)),
@@ -129,9 +114,7 @@ def _environment() -> Any:
         import jinja2
     except ImportError as error:
         raise MissingDependency(
-            "Jinja2",
-            purpose="Writing a report",
-            install="pip install 'mjrec[report]'",
+            "Jinja2", purpose="Writing a report", install="pip install 'mjrec[report]'"
         ) from error
     from markupsafe import Markup, escape
 
@@ -164,21 +147,12 @@ def _environment() -> Any:
         ),
         sorted_by=lambda v: "" if v is None or math.isnan(v) else repr(float(v)),
     )
-    environment.globals["decimals_of"] = _decimals_of
+    environment.globals.update(decimals_of=_decimals_of, counted=counted)
     return environment
 
 
 def _decimals_of(task: ReportTask) -> int:
     return decimals_for((task.summary.minimum, task.summary.maximum))
-
-
-def _subtitle(contents: ReportContents) -> str:
-    tasks = contents.tasks
-    episodes = sum(len(task.episodes) for task in tasks)
-    parts = [counted(len(tasks), "task"), counted(episodes, "episode")]
-    if failed := sum(task.summary.failed for task in tasks):
-        parts.append(f"{failed} of them failed")
-    return ", ".join([*parts, counted(len(contents.videos), "video")])
 
 
 # --- The summary ------------------------------------------------------------------
@@ -289,10 +263,10 @@ def _card(
     if video.index is not None:
         episode = task.episodes[video.index]
         reward = float(episode["total_reward"])
-        run = int(episode["run"])
+        run = int(episode["seed"])
         where = f"run {task.runs[run]}" if task.runs else f"seed {run}"
         which = f"{where}, episode {episode['episode']}"
-        outcome = _OUTCOMES[int(episode["outcome"])]
+        outcome = _OUTCOMES[outcomes(task)[video.index]]
         success = _SUCCESS[int(episode["success"])]
         facts += [
             ("Episode", which),
@@ -370,7 +344,7 @@ def _most_telling(
     returns = task.episodes["total_reward"]
     order = np.argsort(returns, kind="stable")[: np.isfinite(returns).sum()]
     with_videos = np.array(sorted(videos)[:most], np.intp)
-    failed = np.flatnonzero(task.episodes["outcome"] == FAILED)[:most]
+    failed = np.array(sorted(task.failures)[:most], np.intp)
     return np.unique(np.concatenate((order[:most], order[-most:], with_videos, failed)))
 
 
@@ -380,12 +354,15 @@ def _columns(
     decimals = _decimals_of(task)
     at = {int(row): i for i, row in enumerate(rows)}
     chosen = task.episodes[rows]
-    names = ("run", "episode", "length", "outcome", "success")
     return {
         "name": spelled_out(task.name, _LONGEST_NAME),
         "decimals": decimals,
         "runs": [spelled_out(run, _LONGEST_NAME) for run in task.runs] or None,
-        **{name: chosen[name].tolist() for name in names},
+        "run": chosen["seed"].tolist(),
+        "episode": chosen["episode"].tolist(),
+        "length": chosen["length"].tolist(),
+        "outcome": outcomes(task)[rows].tolist(),
+        "success": chosen["success"].tolist(),
         "total_reward": _json_numbers(chosen["total_reward"], decimals),
         "failures": {
             at[i]: spelled_out(reason, _LONGEST_REASON)

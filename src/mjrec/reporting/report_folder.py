@@ -20,7 +20,7 @@ import contextlib
 import os
 import re
 import shutil
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Final
 
@@ -35,9 +35,9 @@ from .media import (
     REPLAYS,
     VIDEOS,
     OnProgress,
+    add_images,
     copy_videos,
     is_own_name,
-    posters_of,
     with_embedded_videos,
     write_replays,
 )
@@ -108,16 +108,16 @@ def write_report(
     _check_target(target, is_page=is_page)
     tell = on_progress or (lambda progress: None)
     contents = gather(directories, title=title, verifications=verifications)
-    posters = posters_of(contents, tell)
+    add_images(contents, tell)
     if single_file:
-        page = _single_page(contents, posters, max_single_file_bytes)
+        page = _single_page(contents, max_single_file_bytes)
         if is_page:
             make_directory(target.parent)
             write_text(target, page)
             return Path(path)
     with _replacing_folder(target) as folder:
         if not single_file:
-            copy_videos(contents, posters, folder, tell)
+            copy_videos(contents, folder, tell)
             if replays:
                 write_replays(contents, folder, tell)
             page = page_of(contents)
@@ -125,12 +125,10 @@ def write_report(
     return Path(path) / PAGE_NAME
 
 
-def _single_page(
-    contents: ReportContents, posters: Sequence[bytes | None], most_bytes: int
-) -> str:
+def _single_page(contents: ReportContents, most_bytes: int) -> str:
     room = most_bytes
     while True:
-        page = page_of(with_embedded_videos(contents, posters, room=room))
+        page = page_of(with_embedded_videos(contents, room=room))
         size = len(page.encode())
         if size <= most_bytes:
             return page

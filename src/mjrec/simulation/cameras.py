@@ -21,13 +21,18 @@ FREE_CAMERA = -1
 
 # Plain integers, because since mujoco 3.12 a member of a MuJoCo enum is not equal to
 # the NumPy integer with the same value.
+_FREE = int(mujoco.mjtCamera.mjCAMERA_FREE)
+_FIXED = int(mujoco.mjtCamera.mjCAMERA_FIXED)
+_TRACKING = int(mujoco.mjtCamera.mjCAMERA_TRACKING)
 _TRACK = int(mujoco.mjtCamLight.mjCAMLIGHT_TRACK)
 _PLANE = int(mujoco.mjtGeom.mjGEOM_PLANE)
 _TRACKCOM = int(mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM)
-_TRAVELLING_JOINTS = (
-    int(mujoco.mjtJoint.mjJNT_FREE),
-    int(mujoco.mjtJoint.mjJNT_SLIDE),
+# The members of a camera that is not fixed, for the metadata.
+_POSE = (
+    *("type", "trackbodyid", "lookat", "distance", "azimuth", "elevation"),
+    "orthographic",
 )
+_TRAVELLING_JOINTS = (int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_SLIDE))
 
 
 def raw_model(model: Any) -> mujoco.MjModel:
@@ -98,16 +103,12 @@ def check_camera(model: mujoco.MjModel, camera: mujoco.MjvCamera) -> None:
     Raises:
         InvalidArgument: the model does not have it, or the camera's type is invalid.
     """
-    fixed, tracking = (
-        mujoco.mjtCamera.mjCAMERA_FIXED,
-        mujoco.mjtCamera.mjCAMERA_TRACKING,
-    )
     numbered = {
-        int(fixed): ("fixedcamid", model.ncam),
-        int(tracking): ("trackbodyid", model.nbody),
+        _FIXED: ("fixedcamid", model.ncam),
+        _TRACKING: ("trackbodyid", model.nbody),
     }
     kind = int(camera.type)
-    if kind == int(mujoco.mjtCamera.mjCAMERA_FREE):
+    if kind == _FREE:
         return
     if kind not in numbered:
         raise InvalidArgument(
@@ -123,8 +124,7 @@ def check_camera(model: mujoco.MjModel, camera: mujoco.MjvCamera) -> None:
 
 def is_tracking(camera: object) -> bool:
     """Return whether a camera moves part of the way toward a body in each frame."""
-    tracking = int(mujoco.mjtCamera.mjCAMERA_TRACKING)
-    return isinstance(camera, mujoco.MjvCamera) and int(camera.type) == tracking
+    return isinstance(camera, mujoco.MjvCamera) and int(camera.type) == _TRACKING
 
 
 def tracking_camera(model: Any) -> str | int | None:
@@ -141,14 +141,10 @@ def tracking_camera(model: Any) -> str | int | None:
         the robot.
     """
     model = raw_model(model)
-    modes = model.cam_mode.tolist()
-    bodies = model.cam_bodyid.tolist()
-    candidates = [index for index, mode in enumerate(modes) if mode == _TRACKCOM]
-    candidates += [
-        index
-        for index, mode in enumerate(modes)
-        if mode == _TRACK and _travels(model, bodies[index])
-    ]
+    candidates = np.flatnonzero(model.cam_mode == _TRACKCOM).tolist()
+    for index in np.flatnonzero(model.cam_mode == _TRACK).tolist():
+        if _travels(model, model.cam_bodyid[index]):
+            candidates.append(index)
     return _name_of(model, candidates[0]) if candidates else None
 
 
@@ -182,16 +178,8 @@ def camera_label(model: mujoco.MjModel, camera: Any) -> str | int | dict[str, An
     if isinstance(camera, Mapping):
         camera = resolve_camera(model, camera)
     if isinstance(camera, mujoco.MjvCamera):
-        if int(camera.type) != int(mujoco.mjtCamera.mjCAMERA_FIXED):
-            return {
-                "type": int(camera.type),
-                "trackbodyid": int(camera.trackbodyid),
-                "lookat": camera.lookat.tolist(),
-                "distance": float(camera.distance),
-                "azimuth": float(camera.azimuth),
-                "elevation": float(camera.elevation),
-                "orthographic": int(camera.orthographic),
-            }
+        if int(camera.type) != _FIXED:
+            return {name: np.array(getattr(camera, name)).tolist() for name in _POSE}
         camera = camera.fixedcamid
     return _name_of(model, int(camera))
 

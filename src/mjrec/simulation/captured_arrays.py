@@ -48,9 +48,7 @@ _DRAWN_SENSORS = ("mjSENS_RANGEFINDER", "mjSENS_GEOMFROMTO")
 
 
 def snapshot_dtype(
-    model: mujoco.MjModel,
-    data: mujoco.MjData,
-    option: mujoco.MjvOption | None = None,
+    model: mujoco.MjModel, data: mujoco.MjData, option: mujoco.MjvOption | None = None
 ) -> np.dtype[Any]:
     """Return the dtype of a snapshot of a simulation's data.
 

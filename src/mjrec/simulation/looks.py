@@ -62,9 +62,6 @@ class Looks:
         for is_watched, arrays in _pieces(model):
             pieces = self._watched if is_watched else self._others
             pieces.append(_ArrayPiece(arrays, is_watched=is_watched))
-        pieces = [*self._watched, *self._others]
-        self._stored = [piece.stored for piece in pieces]
-        self._now = [piece.raw for piece in pieces]
         self._view: list[_Piece] = []
         self._structs: dict[str, Any] = {}
         self.seen: list[bytearray] = []
@@ -101,9 +98,6 @@ class Looks:
 
         The current values count as seen.
         """
-        is_seen = all(piece.seen is piece.stored for piece in self._others)
-        if is_seen and self._stored == self._now and self.seen == self.present:
-            return {}
         names: list[str] = []
         for piece in (*self._watched, *self._others):
             names += piece.look_from_stored()

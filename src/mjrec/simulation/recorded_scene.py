@@ -54,7 +54,12 @@ class RecordedScene:
         facts = reader.facts
         try:
             self.view = view_from_facts(facts["scene"])
-            self.previous_cameras = _positions(facts["scene"].get("previous_cameras"))
+            previous = facts["scene"].get("previous_cameras")
+            self.previous_cameras = np.zeros((2, 3))
+            if previous is not None:
+                self.previous_cameras = np.asarray(previous, np.float64)
+            if self.previous_cameras.shape != (2, 3):
+                raise ValueError(f"previous_cameras is {previous!r:.200}")
         # NumPy and the bindings may reject values that were not checked beforehand.
         except (AttributeError, TypeError, ValueError, OverflowError) as error:
             raise UnreadableFile(reader.path, f"in its scene: {error}") from error
@@ -204,12 +209,3 @@ class GivenStates:
 
     def close(self) -> None:
         """Do nothing, because the files belong to the caller."""
-
-
-def _positions(previous: Any) -> NDArray[np.float64]:
-    if previous is None:
-        return np.zeros((2, 3))
-    positions = np.asarray(previous, np.float64)
-    if positions.shape != (2, 3):
-        raise InvalidArgument(f"previous_cameras is {previous!r:.200}")
-    return positions

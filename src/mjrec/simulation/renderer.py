@@ -373,14 +373,11 @@ def _kept_of(model: mujoco.MjModel) -> bytes:
 def _with_settings(
     model: mujoco.MjModel, height: int, width: int, quality: str
 ) -> mujoco.MjModel:
-    """Return `model`, or a copy of it with a larger buffer or the draft settings."""
-    buffer = model.vis.global_
-    is_large_enough = height <= buffer.offheight and width <= buffer.offwidth
-    if is_large_enough and quality == "full":
-        return model
+    """Return a copy of `model` with a large enough buffer, and the draft settings."""
     changed = copy.copy(model)
-    changed.vis.global_.offheight = max(height, buffer.offheight)
-    changed.vis.global_.offwidth = max(width, buffer.offwidth)
+    buffer = changed.vis.global_
+    buffer.offheight = max(height, buffer.offheight)
+    buffer.offwidth = max(width, buffer.offwidth)
     if quality == "draft":
         settings = changed.vis.quality
         settings.offsamples = 0

@@ -201,10 +201,7 @@ def _check_paths(model: mujoco.MjModel, data: mujoco.MjData) -> None:
 
 
 def scene_difference(
-    model: mujoco.MjModel,
-    data: mujoco.MjData,
-    row: Any,
-    view: SceneView,
+    model: mujoco.MjModel, data: mujoco.MjData, row: Any, view: SceneView
 ) -> str | None:
     """Return how a frame from a snapshot would differ from one of the live data.
 
