@@ -151,13 +151,9 @@ def recordings(directory: Path) -> list[RecordingKey]:
     """Return the episodes with a trajectory, then the clips in flight, in order."""
     finished = finished_trajectories(directory)
     in_flight = (recording.path for recording in recordings_in_flight(directory))
-    keys = {key_of(path.name) for path in (*finished, *in_flight)} - {None}
+    keys = {key for path in (*finished, *in_flight) if (key := key_of(path.name))}
     return sorted(
-        (key for key in keys if key is not None),
-        key=lambda key: (
-            *(key.is_clip, key.infix.monitor_id, key.infix.uid),
-            key.number,
-        ),
+        keys, key=lambda k: (k.is_clip, k.infix.monitor_id, k.infix.uid, k.number)
     )
 
 
