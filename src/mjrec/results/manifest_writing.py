@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Functions that write statistics files and manifests from a monitor's other files.
 
-Only this module writes them, and only if their content changes, at these moments:
+In a monitor directory, only this module writes them, and only if their content changes,
+at these moments:
 
 - A monitor closes or, with `write_upon_reset`, begins an episode (`recorder.recorder`).
 - A process has rendered pending videos (`rendering.finish`).
