@@ -13,7 +13,7 @@ from typing import Any
 
 from ..environments.recreate import NotRecreated, Recreated
 from ..errors import Error, InvalidArgument
-from ..monitors.base import EnvironmentMonitor
+from ..monitors.monitor import monitored
 from ..recorder.keep_rules import RULES, keep_rule
 from ..recorder.opening import JOIN, Statements
 from ..recorder.options import RecorderOptions
@@ -44,7 +44,7 @@ def monitor_again(
     *,
     clock: Callable[[], float],
     notes: list[Finding],
-) -> EnvironmentMonitor:
+) -> Any:
     """Return a monitor with the options of the recording's monitor.
 
     Args:
@@ -82,7 +82,7 @@ def monitor_again(
                 faults=recording.faults,
             ),
         )
-        return _monitor_class(recreated)(
+        return monitored(
             recreated.environment,
             directory,
             options,
@@ -93,17 +93,6 @@ def monitor_again(
         raise NotRecreated(
             f"it cannot be recorded with its options: {error!s:.300}"
         ) from error
-
-
-def _monitor_class(recreated: Recreated) -> Callable[..., EnvironmentMonitor]:
-    # Each monitor imports its framework, and dm_env may not be installed.
-    if recreated.is_dm_env:
-        from ..monitors.dm_env_monitor import DmEnvMonitor
-
-        return DmEnvMonitor
-    from ..monitors.gymnasium_monitor import GymnasiumMonitor
-
-    return GymnasiumMonitor
 
 
 def _schedule(recording: RecordingInputs, notes: list[Finding]) -> Schedule | None:
