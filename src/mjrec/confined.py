@@ -76,17 +76,14 @@ def confine(
     ruleset = _libc.syscall(_CREATE, packed, ctypes.c_size_t(len(packed)), 0)
     if ruleset < 0:
         return
-    for path in {*_SYSTEM, *_python(), *readable} - {*hidden}:
+    python = {sys.prefix, sys.base_prefix, *filter(None, sys.path)}
+    for path in {*_SYSTEM, *python, *readable} - {*hidden}:
         _allow(ruleset, path, _READ)
     for path in {"/dev", *writable}:
         _allow(ruleset, path, files)
     _libc.prctl(_NO_NEW_PRIVILEGES, 1, 0, 0, 0)
     _libc.syscall(_RESTRICT, ruleset, 0)
     os.close(ruleset)
-
-
-def _python() -> set[str]:
-    return {sys.prefix, sys.base_prefix, *filter(None, sys.path)}
 
 
 def _leave_network() -> None:

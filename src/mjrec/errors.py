@@ -326,9 +326,9 @@ class UnfinishedRecordings(PackError):
     def __init__(self, directory: Path, names: Sequence[str], *, advice: str) -> None:
         self.directory = directory
         self.names = list(names)
+        shown = listed(names, 5)
         super().__init__(
-            f"The recordings in {directory} are not finished: {listed(names, 5)}. "
-            f"{advice}"
+            f"The recordings in {directory} are not finished: {shown}. {advice}"
         )
 
 
@@ -365,10 +365,9 @@ class IdentityLeft(PackError):
 
     def __init__(self, found: Sequence[tuple[str, str]]) -> None:
         self.found = list(found)
-        places = [f"{name}: {what}" for name, what in found]
+        shown = listed([f"{name}: {what}" for name, what in found], 10, between="; ")
         super().__init__(
-            "The packed run would not be anonymous, so it was not written: "
-            f"{listed(places, 10, between='; ')}. "
+            f"The packed run would not be anonymous, so it was not written: {shown}. "
             "Change the title, record again without these names (uid, camera, body), "
             "or leave out the episodes that contain them."
         )

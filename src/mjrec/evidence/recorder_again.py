@@ -9,10 +9,11 @@ import re
 from collections.abc import Callable
 from fractions import Fraction
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from ..environments.recreate import NotRecreated, Recreated
 from ..errors import Error, InvalidArgument
+from ..monitors.base import EnvironmentMonitor
 from ..monitors.monitor import monitored
 from ..recorder.keep_rules import RULES, keep_rule
 from ..recorder.opening import JOIN, Statements
@@ -44,7 +45,7 @@ def monitor_again(
     *,
     clock: Callable[[], float],
     notes: list[Finding],
-) -> Any:
+) -> EnvironmentMonitor:
     """Return a monitor with the options of the recording's monitor.
 
     Args:
@@ -82,13 +83,11 @@ def monitor_again(
                 faults=recording.faults,
             ),
         )
-        return monitored(
-            recreated.environment,
-            directory,
-            options,
-            **{name: given.get(name) for name in ("camera", "height", "width")},
-            env_id=recording.env_id,
-        )
+        view = {name: given.get(name) for name in ("camera", "height", "width")}
+        env, env_id = recreated.environment, recording.env_id
+        monitor = monitored(env, directory, options, env_id=env_id, **view)
+        # A recording never has a vector environment.
+        return cast("EnvironmentMonitor", monitor)
     except (Error, TypeError, ValueError) as error:
         raise NotRecreated(
             f"it cannot be recorded with its options: {error!s:.300}"

@@ -24,7 +24,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from ..child_python import Child, wait_for_news
+from ..child_python import Child, changed_environ, wait_for_news
 from ..errors import ClosedError, Error, GLError
 from ..formats.json_fields import to_json
 from ..formats.locks import Lock, try_lock
@@ -263,20 +263,16 @@ class WorkerPool:
     def _main_of_fork(self, environ: Mapping[str, str]) -> Callable[[], object] | None:
         if not self._forks or threading.active_count() > 1:
             return None
-        before = dict(os.environ)
-        # mujoco reads them when it is imported.
-        os.environ.update(environ)
         try:
-            # Not imported at the top: other processes that have a pool never draw.
-            from .worker import main
+            # mujoco reads them when it is imported. If this backend fails, the user's
+            # own choice is looked up again.
+            with changed_environ(environ):
+                # Not imported at the top: other processes that have a pool never draw.
+                from .worker import main
         except Exception:
             # A separate worker process reports the reason, or another backend works.
             self._forks = False
             return None
-        finally:
-            # If this backend fails, the user's own choice is looked up again.
-            os.environ.clear()
-            os.environ.update(before)
         return main
 
     def _choose_backend(self) -> None:
@@ -400,19 +396,9 @@ class WorkerPool:
             f"it drew nothing for {seconds:g} seconds and was ended; the log shows "
             "where it hung"
         )
-        # If nothing was ever drawn, this frame is not the cause.
-        kind = Error if self._has_drawn else GLError
-        self._lose(worker, job, "hung", how, kind=kind)
+        self._lose(worker, job, "hung", how)
 
-    def _lose(
-        self,
-        worker: _Worker,
-        job: _Job,
-        what: str,
-        how: str,
-        *,
-        kind: type[Error] = Error,
-    ) -> None:
+    def _lose(self, worker: _Worker, job: _Job, what: str, how: str) -> None:
         """End a worker's process; the second loss at the same frame is an error."""
         worker.end()
         if not worker.is_tried:
@@ -421,6 +407,8 @@ class WorkerPool:
         position = worker.owes.start
         if worker.lost_at == position:
             source = job.drawing.get("trajectory", "the given states")
+            # If nothing was ever drawn, this frame is not the cause of a hang.
+            kind = Error if self._has_drawn or what == "died" else GLError
             worker.error = kind(
                 f"A worker {what} while drawing frame {job.indices[position]} of "
                 f"{source} for the second time: {how}"

@@ -288,7 +288,5 @@ def _what_is_in(path: Path) -> str:
         names = sorted({*finished, *in_flight})
     if not names:
         return f"{path} is a {kind} without trajectories."
-    return (
-        f"{path} is a {kind}. Name one of the trajectories in it: "
-        f"{listed(names, _SHOWN)}."
-    )
+    shown = listed(names, _SHOWN)
+    return f"{path} is a {kind}. Name one of the trajectories in it: {shown}."
