@@ -23,7 +23,6 @@ import numpy as np
 from ..formats.json_fields import unreadable
 from ..formats.regular_files import open_regular, read_regular
 from .compare_json import Rules, lines_of
-from .decoded_video import decoded_video, has_messages, has_usual_colours
 from .differences import Aspect, Difference, Same, differs, short
 from .findings import Topic
 from .frame_similarity import (
@@ -35,7 +34,14 @@ from .frame_similarity import (
     planes_of,
     similarity,
 )
-from .mp4_boxes import Box, read_boxes, shown_times
+from .mp4_videos import (
+    Box,
+    decoded_video,
+    has_messages,
+    has_usual_colours,
+    read_boxes,
+    shown_times,
+)
 
 # Boxes that a different encoder, or different frames, may change.
 _ENCODED: Final = frozenset(
