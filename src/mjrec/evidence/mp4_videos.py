@@ -172,29 +172,26 @@ def _table(boxes: Sequence[Box], name: str) -> NDArray[np.int64]:
     return np.repeat(runs[:, 1].astype(">u4").view(">i4").astype(np.int64), runs[:, 0])
 
 
-def has_usual_colours(path: Path) -> bool:
-    """Return whether a video has mjrec's colour tags.
-
-    Raises:
-        EncoderError: the video cannot be read.
-    """
-    hashes = [
-        _stream(path, filters, "-f", "hash", "-hash", "sha256")
-        for filters in ("h264_mp4toannexb", f"h264_mp4toannexb,{_TAGS}")
-    ]
-    return hashes[0] == hashes[1]
-
-
-def has_messages(path: Path) -> bool:
-    """Return whether a video's stream contains messages, such as captions.
+def odd_contents(path: Path) -> Iterator[tuple[str, str, str]]:
+    """Yield the unusual contents of a video's stream: colour tags and captions.
 
     x264's own message does not count.
 
+    Yields:
+        The place, what it has, and what it should have.
+
     Raises:
         EncoderError: the video cannot be read.
     """
+    tagged, usual = (
+        _stream(path, filters, "-f", "hash", "-hash", "sha256")
+        for filters in ("h264_mp4toannexb", f"h264_mp4toannexb,{_TAGS}")
+    )
+    if tagged != usual:
+        yield "colour tags", "other tags", "BT.709"
     beside = _stream(path, _BESIDE_FRAMES, "-f", "data", "-fs", str(_MOST_BESIDE))
-    return bool(beside) and not _is_by_x264(beside)
+    if beside and not _is_by_x264(beside):
+        yield "the stream", "frames and messages", "frames"
 
 
 def _is_by_x264(units: bytes) -> bool:
