@@ -437,3 +437,21 @@ def _is_of_main(entry: str) -> bool:
     return entry == "" or (
         file is not None and Path(entry).resolve() == Path(file).resolve().parent
     )
+
+
+@contextlib.contextmanager
+def changed_environ(changes: Mapping[str, str | None]) -> Iterator[None]:
+    """Set or, for None, remove environment variables in the block.
+
+    Afterwards all variables are restored, including those that the block itself set.
+    """
+    before = dict(os.environ)
+    for name in changes:
+        os.environ.pop(name, None)
+    os.environ.update({name: v for name, v in changes.items() if v is not None})
+    try:
+        yield
+    finally:
+        for name in set(os.environ) - set(before):
+            del os.environ[name]
+        os.environ.update(before)

@@ -13,6 +13,9 @@ import rich.table
 
 from .. import json_text
 
+# Exit statuses. The second is what shells report for a process that Ctrl-C ended.
+FAILED, INTERRUPTED = 1, 130
+
 _LOG_WIDTH = 160
 # The number of rows from which the column widths of a long table are measured.
 _ROWS_MEASURED = 1000
@@ -60,13 +63,13 @@ def print_json(value: object) -> None:
     sys.stdout.write(json_text.dumps(value) + "\n")
 
 
-def table(names: Iterable[str], *, left: Iterable[str] = ("task",)) -> rich.table.Table:
-    """Return an empty table of numbers; the columns in `left` hold text."""
+def table(names: Iterable[str]) -> rich.table.Table:
+    """Return an empty table of numbers; only the column `task` holds text."""
     made = rich.table.Table(
         box=rich.box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False
     )
     for name in names:
-        is_text = name in left
+        is_text = name == "task"
         made.add_column(name, justify="left" if is_text else "right", overflow="fold")
     return made
 
