@@ -104,7 +104,7 @@ class Corridor(gymnasium.Env):
 
 
 @pytest.fixture(autouse=True)
-def free_dm_control_contexts(request):
+def free_dm_control_scenes(request):
     """Free the OpenGL contexts of dm_control on the thread that made them.
 
     Its environments are garbage in cycles. Where a later test's other thread happens

@@ -16,8 +16,7 @@ from dm_control import suite
 from dm_control.mujoco import Physics
 from dm_control.suite.wrappers import action_noise, pixels
 
-from mjrec.environments.dm_control_contexts import ContextsOnDemand
-from mjrec.environments.dm_control_scenes import dm_control_scenes
+from mjrec.environments.dm_control_scenes import ContextsOnDemand, dm_control_scenes
 from mjrec.environments.wrapping import around_dm_env
 
 pytestmark = pytest.mark.dm_control
@@ -116,7 +115,7 @@ from dm_control import composer, suite
 from dm_control.locomotion.arenas import bowl
 from dm_control.locomotion.tasks import escape
 from dm_control.locomotion.walkers import rodent
-from mjrec.environments.dm_control_contexts import ContextsOnDemand
+from mjrec.environments.dm_control_scenes import ContextsOnDemand
 
 def quadruped():
     return suite.load("quadruped", "escape", task_kwargs={"random": 0})

@@ -16,8 +16,7 @@ from mjrec.environments.recreate import (
     recreate,
 )
 from mjrec.environments.scenes import generator_state
-from mjrec.environments.stand_ins import RecordedSteps
-from mjrec.environments.wrapping import around_gymnasium
+from mjrec.environments.wrapping import RecordedSteps, around_gymnasium
 from mjrec.formats.trajectory_hdf5 import open_hdf5
 
 PENDULUM = "InvertedPendulum-v5"

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mjrec.errors import InvalidArgument
-from mjrec.recorder.selection import Standing, selection_from
+from mjrec.recorder.keep_rules import Standing, selection_from
 from mjrec.recorder.tracking import FinishedEpisode
 
 

@@ -28,13 +28,12 @@ from ..evaluation.summaries import TaskSummary
 from ..evaluation.task_sets import tasks_from
 from ..formats.json_fields import to_json
 from ..monitors.progress import ShowProgress, progress_bar
-from ..plain_text import counted
+from ..plain_text import counted, listed
 from ..recorder.keep_rules import keep_rule
 from .options import NO_ENGINE, AsJson, Engine, camera_of, kwargs_of, size_of
 from .terminal import (
     FAILED,
     INTERRUPTED,
-    and_more,
     names_by,
     print_json,
     print_lines,
@@ -345,7 +344,7 @@ def _lines(evaluation: Evaluation, short: Mapping[str, str]) -> Iterator[str]:
         yield f"{counted(len(pending), 'video')} could not be rendered:"
         reasons = {path.name: reason for path, reason in pending.items()}
         for reason, names in names_by(reasons).items():
-            yield f"  {and_more(names)}: {printable(reason)}"
+            yield f"  {listed(names, 1)}: {printable(reason)}"
     yield f"The results are in {evaluation.directory.absolute()}"
 
 
@@ -374,13 +373,13 @@ def _failure_lines(evaluation: Evaluation) -> Iterator[str]:
         yield f"{len(failed)} of {total} failed:"
         reasons = names_by({_name(each): str(each.failure) for each in failed})
         for reason, names in [*reasons.items()][:_SHOWN]:
-            yield f"  {printable(and_more(names))}: {printable(reason)}"
+            yield f"  {printable(listed(names, 1))}: {printable(reason)}"
         if len(reasons) > _SHOWN:
             yield f"  and {len(reasons) - _SHOWN} more reasons, in results.csv"
     if not_finite := evaluation.not_finite:
         yield (
             f"NaN or infinite: {counted(len(not_finite), 'return')} (--allow-nan "
-            f"accepts them): {and_more([*map(_name, not_finite)])}"
+            f"accepts them): {listed([*map(_name, not_finite)], 1)}"
         )
 
 

@@ -38,12 +38,6 @@ def printable(text: str) -> str:
     return "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
 
 
-def and_more(names: Sequence[str]) -> str:
-    """Return the first name, and how many more there are."""
-    more = len(names) - 1
-    return f"{names[0]} and {more} more" if more else names[0]
-
-
 def names_by(reasons: Mapping[str, str]) -> dict[str, list[str]]:
     """Group names by their reason."""
     names: dict[str, list[str]] = {}

@@ -21,8 +21,8 @@ from .scenes import (
     generator_state,
     has_own_method,
     is_defined_by,
-    overriding_class,
     plain_arguments,
+    render_override,
 )
 from .wrapping import around_gymnasium
 
@@ -31,7 +31,6 @@ if TYPE_CHECKING:
     from ..simulation.model_sources import AuthoredModel
     from .viewer_scene import ViewerScene
 
-_MUJOCO_ENV = ("gymnasium.envs.mujoco.mujoco_env", "MujocoEnv.render")
 _RENDERING = "gymnasium.envs.mujoco.mujoco_rendering"
 _RENDERER = (_RENDERING, "MujocoRenderer.render")
 
@@ -60,6 +59,11 @@ _ANOTHER_VIEW = (
 )
 
 _ROBOT_ENV = "gymnasium_robotics.envs.robot_env"
+# The functions that draw nothing but the simulation.
+_DRAWING = (
+    ("gymnasium.envs.mujoco.mujoco_env", "MujocoEnv.render"),
+    (_ROBOT_ENV, "MujocoRobotEnv.render"),
+)
 
 # Wrappers whose `render` passes on the frame unchanged. RecordVideo does so for single
 # frames; array conversion changes the array type, not the values.
@@ -178,12 +182,9 @@ def _override_above(env: gymnasium.Env[Any, Any]) -> str | None:
     """Return the reason why a wrapper changes the environment's frames, or None."""
     mode = env.render_mode
     while isinstance(env, gymnasium.Wrapper):
-        if has_own_method(env, "render"):
-            return f"the wrapper {class_name(type(env))} overrides render()"
-        render = type(env).render
-        if not any(is_defined_by(render, *known) for known in _PASSING_ON):
-            kind = overriding_class(type(env), "render")
-            return f"the wrapper {kind} overrides render()"
+        override = render_override("wrapper", env, _PASSING_ON)
+        if override is not None:
+            return override
         env = env.env
     return _wrong_mode(mode)
 
@@ -195,13 +196,11 @@ def _obstacle(base: Any, shown: Any) -> str | None:
         base: the environment without its wrappers.
         shown: the part of it that is drawn.
     """
-    for part in (base, shown):
-        if has_own_method(part, "render"):
-            return f"the environment {class_name(type(part))} overrides render()"
-    render = type(shown).render
-    if not (_is_robot(shown) or is_defined_by(render, *_MUJOCO_ENV)):
-        kind = overriding_class(type(shown), "render")
-        return f"the environment {kind} overrides render()"
+    delegating = [(module, function) for module, function, _ in _DELEGATING]
+    override = render_override("environment", base, [*delegating, *_DRAWING])
+    override = override or render_override("environment", shown, _DRAWING)
+    if override is not None:
+        return override
     renderer = getattr(shown, "mujoco_renderer", None)
     return _wrong_mode(shown.render_mode) or _foreign_renderer(renderer)
 

@@ -43,7 +43,10 @@ def suite_tasks(tag: str) -> tuple[str, ...]:
     answer = _ask(_SUITE, tag)
     if "names" in answer:
         return tuple(answer["names"])
-    raise dm_control_failure(f"dm_control:{tag}", _as_raised(answer))
+    raised, text = ImportError, str(answer.get("text"))
+    if answer.get("kind") == ModuleNotFoundError.__name__:
+        raised = ModuleNotFoundError
+    raise dm_control_failure(f"dm_control:{tag}", raised(text, name=answer.get("name")))
 
 
 def gymnasium_ids(module: str | None = None) -> tuple[str, ...]:
@@ -123,14 +126,6 @@ def _ask(*arguments: str) -> dict[str, Any]:
         return {"kind": "its process", "text": child.last_words()}
 
 
-def _as_raised(answer: dict[str, Any]) -> Exception:
-    """Return an error like the one that the child process raised."""
-    text = str(answer.get("text"))
-    if answer.get("kind") == ModuleNotFoundError.__name__:
-        return ModuleNotFoundError(text, name=answer.get("name"))
-    return ImportError(text)
-
-
 def _main(arguments: Sequence[str]) -> None:
     parent = Parent()
     try:
@@ -142,7 +137,10 @@ def _main(arguments: Sequence[str]) -> None:
 
 def _names(framework: str, what: str) -> list[str]:
     if framework == _SUITE:
-        return _suite_names(what)
+        from dm_control import suite
+
+        tasks = suite.ALL_TASKS if what == "all" else getattr(suite, what.upper())
+        return sorted(f"dm_control/{domain}-{task}" for domain, task in tasks)
     from gymnasium.envs import registration
 
     if not what:
@@ -185,13 +183,6 @@ def _module_being_imported() -> str:
     while frame is not None and frame.f_code.co_name != "<module>":
         frame = frame.f_back
     return "" if frame is None else str(frame.f_globals.get("__name__"))
-
-
-def _suite_names(tag: str) -> list[str]:
-    from dm_control import suite
-
-    tasks = suite.ALL_TASKS if tag == "all" else getattr(suite, tag.upper())
-    return sorted(f"dm_control/{domain}-{task}" for domain, task in tasks)
 
 
 if __name__ == "__main__":

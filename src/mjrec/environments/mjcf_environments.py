@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import re
-from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +21,7 @@ from ..simulation.mjcf import MjcfSimulation, load_mjcf
 from ..simulation.model_sources import authored_from_file
 from ..simulation.renderer import SceneRenderer
 from .named_environment import EnvironmentOptions
-from .scenes import Scenes, generator_state, has_own_method, overriding_class
+from .scenes import Scenes, generator_state, render_override
 from .viewer_scene import ViewerScene
 
 _SIDE = 480
@@ -122,7 +121,9 @@ class MjcfEnvironment(gymnasium.Env[NDArray[np.float64], NDArray[np.float64]]):
         self.simulation = MjcfSimulation(model)
         self.camera = default_camera(model) if camera is None else camera
         resolve_camera(model, self.camera)
-        self.metadata = {**self.metadata, "render_fps": _plain(self._frame_rate)}
+        rate = self.simulation.frame_rate
+        fps = rate.numerator if rate.denominator == 1 else float(rate)
+        self.metadata = {**self.metadata, "render_fps": fps}
         self.spec = _spec(self.path)
         self.observation_space = gymnasium.spaces.Box(
             -np.inf, np.inf, (model.nq + model.nv + model.na,), np.float64
@@ -132,7 +133,7 @@ class MjcfEnvironment(gymnasium.Env[NDArray[np.float64], NDArray[np.float64]]):
 
     def control_timestep(self) -> float:
         """Return the duration of a frame in simulated seconds."""
-        return float(1 / self._frame_rate)
+        return float(1 / self.simulation.frame_rate)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -192,11 +193,6 @@ class MjcfEnvironment(gymnasium.Env[NDArray[np.float64], NDArray[np.float64]]):
             height=self.height if height is None else height,
             width=self.width if width is None else width,
         )
-        obstacle = None
-        is_own = type(self).render is MjcfEnvironment.render
-        if not is_own or has_own_method(self, "render"):
-            kind = overriding_class(type(self), "render")
-            obstacle = f"the environment {kind} overrides render()"
         return Scenes(
             states=Capture(
                 lambda: (simulation.model, simulation.data),
@@ -205,7 +201,9 @@ class MjcfEnvironment(gymnasium.Env[NDArray[np.float64], NDArray[np.float64]]):
                 at_frame=scene.at_frame,
                 authored=lambda: authored_from_file(self.path),
             ),
-            obstacle=obstacle,
+            obstacle=render_override(
+                "environment", self, [(__name__, "MjcfEnvironment.render")]
+            ),
             environment={
                 "framework": "mjcf",
                 "id": self.spec.id if self.spec else None,
@@ -226,10 +224,6 @@ class MjcfEnvironment(gymnasium.Env[NDArray[np.float64], NDArray[np.float64]]):
             self._renderer.close()
             self._renderer = None
 
-    @property
-    def _frame_rate(self) -> Fraction:
-        return self.simulation.frame_rate
-
     def _checked(self, action: Any) -> NDArray[np.float64]:
         ctrl = np.asarray(action, dtype=np.float64)
         shape = self.action_space.shape
@@ -238,10 +232,6 @@ class MjcfEnvironment(gymnasium.Env[NDArray[np.float64], NDArray[np.float64]]):
                 f"An action must be finite numbers of shape {shape}, not {action!r}."
             )
         return ctrl
-
-
-def _plain(rate: Fraction) -> int | float:
-    return rate.numerator if rate.denominator == 1 else float(rate)
 
 
 def _spec(path: Path) -> EnvSpec:

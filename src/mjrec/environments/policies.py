@@ -24,6 +24,7 @@ import copy
 import importlib
 import inspect
 import logging
+import operator
 import sys
 import traceback
 from collections.abc import Callable, Iterator, Mapping
@@ -177,7 +178,7 @@ def load_policy(
             with _failures_named(f"Reading the policy {text}"):
                 chosen = policy_in_file(path, environment, **kwargs)
             return _ForeignPolicy(environment, text, chosen)
-        return policy_from(*_found(text), environment, kwargs)
+        return policy_from(_found(text), text, environment, kwargs)
 
 
 def policy_from(
@@ -201,27 +202,22 @@ def policy_from(
             result is not a policy.
     """
     if inspect.isclass(chosen) or name.endswith("()"):
-        _check_takes_environment(name, chosen, environment, kwargs)
+        try:
+            inspect.signature(chosen).bind(environment, **kwargs)
+        except TypeError as error:
+            parameter = f"that{' and for --policy-kwargs' if kwargs else ''}"
+            raise PolicyError(
+                f"The policy {name} cannot be called with the environment: {error}. "
+                f"Give it a parameter for {parameter}."
+            ) from error
+        except ValueError:
+            # Some classes written in C have no signature.
+            pass
         with _failures_named(f"Building the policy {name} with the environment"):
             chosen = chosen(environment, **kwargs)
     else:
         _check_no_arguments(name, kwargs)
     return _ForeignPolicy(environment, name, chosen)
-
-
-def _check_takes_environment(
-    name: str, chosen: Callable[..., Any], environment: Any, kwargs: Mapping[str, Any]
-) -> None:
-    try:
-        inspect.signature(chosen).bind(environment, **kwargs)
-    except TypeError as error:
-        raise PolicyError(
-            f"The policy {name} cannot be called with the environment: {error}. Give "
-            f"it a parameter for that{' and for --policy-kwargs' if kwargs else ''}."
-        ) from error
-    except ValueError:
-        # Some classes written in C have no signature.
-        return
 
 
 def policy_file(text: str) -> Path | None:
@@ -248,18 +244,24 @@ def _check_no_arguments(name: str, kwargs: Mapping[str, Any]) -> None:
         )
 
 
-def _found(text: str) -> tuple[Any, str]:
-    """Return the object that `text` names, and `text`."""
+def _found(text: str) -> Any:
+    """Return the object that `text` names."""
     module_name, colon, name = text.partition(":")
-    if not (module_name and colon and name.removesuffix("()")):
+    attribute = name.removesuffix("()")
+    if not (module_name and colon and attribute):
         raise UnknownName("policy", text, _BUILT_IN, hint=_FORMS)
-    found = _find(_import(module_name, text), name.removesuffix("()"))
-    if name.endswith("()") and not callable(found):
+    module = _import(module_name, text)
+    try:
+        found = operator.attrgetter(attribute)(module)
+    except AttributeError as error:
+        kind = f"name in {module.__name__}"
+        raise UnknownName(kind, attribute, _offered(module)) from error
+    if attribute != name and not callable(found):
         raise PolicyError(
-            f"The policy {text} must be callable, but {name[:-2]} is {found!r}. "
+            f"The policy {text} must be callable, but {attribute} is {found!r}. "
             f"Remove the parentheses: {text[:-2]}."
         )
-    return found, text
+    return found
 
 
 def _import(module_name: str, text: str) -> ModuleType:
@@ -278,15 +280,6 @@ def _import(module_name: str, text: str) -> ModuleType:
                 ),
                 hint=f"Looked in {Path.cwd()} and in the installed packages.",
             ) from error
-
-
-def _find(module: ModuleType, name: str) -> Any:
-    found: Any = module
-    for part in name.split("."):
-        if not hasattr(found, part):
-            raise UnknownName(f"name in {module.__name__}", name, _offered(module))
-        found = getattr(found, part)
-    return found
 
 
 def _offered(module: ModuleType) -> list[str]:

@@ -32,7 +32,7 @@ from .scenes import (
     set_generator_state,
     simulation_below,
 )
-from .stand_ins import StandIn, stand_ins
+from .wrapping import StandIn, stand_ins
 
 # Packages of the registry's entry points that are trusted by default.
 _TRUSTED = (
@@ -117,15 +117,6 @@ class Recreated:
     def seed(self, seed: int) -> None:
         """Seed dm_control's generator; for Gymnasium, `reset` does this."""
         self._dm_generator().seed(seed)
-
-    def warnings(self) -> dict[str, int]:
-        """Return the number of MuJoCo's warnings since the last reset, by kind."""
-        simulated = simulation_below(self.environment)
-        if simulated is None:
-            return {}
-        from ..simulation.warnings import warning_counts  # This loads MuJoCo.
-
-        return warning_counts(simulated)
 
     def seed_behind(self, state: Any) -> int | None:
         """Return the seed of a generator that has not been used yet, or None.

@@ -7,7 +7,7 @@ import itertools
 import math
 import sys
 import weakref
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
@@ -87,8 +87,20 @@ def simulation_below(env: Any) -> Any:
     return simulation_in(base) or simulation_in(getattr(base, "simulation", None))
 
 
-def new_warnings(before: Mapping[str, int], after: Mapping[str, int]) -> dict[str, int]:
-    """Return MuJoCo's new warnings by kind, given `warning_counts` before and after."""
+def mujoco_warnings(env: Any) -> dict[str, int]:
+    """Return the number of MuJoCo's warnings since the last reset, by kind."""
+    simulated = simulation_below(env)
+    if simulated is None:
+        return {}
+    # Imported here because it loads MuJoCo, which some environments do not need.
+    from ..simulation.warnings import warning_counts
+
+    return warning_counts(simulated)
+
+
+def new_warnings(before: Mapping[str, int], env: Any) -> dict[str, int]:
+    """Return MuJoCo's new warnings by kind since `mujoco_warnings` gave `before`."""
+    after = mujoco_warnings(env)
     # MuJoCo may reset an unstable simulation, and the counts with it.
     counts = {name: n - before.get(name, 0) for name, n in after.items()}
     counts = {name: n if n >= 0 else after[name] for name, n in counts.items()}
@@ -135,9 +147,24 @@ def has_own_method(instance: Any, name: str) -> bool:
     return of_class is None or not (is_bound and function is of_class)
 
 
-def overriding_class(kind: type, name: str) -> str:
-    """Return the full name of the class that defines the method `name` of `kind`."""
-    return class_name(next((k for k in kind.__mro__ if name in vars(k)), kind))
+def render_override(
+    what: str, drawn: Any, known: Iterable[tuple[str, str]]
+) -> str | None:
+    """Return the reason why frames may differ, if `render` is overridden, or None.
+
+    Args:
+        what: what `drawn` is, for the reason.
+        drawn: the object whose `render` is called.
+        known: the modules and qualified names of the functions that do not count as
+            overriding `render`.
+    """
+    # A weak proxy's type is not the object's class.
+    kind = drawn.__class__
+    if not has_own_method(drawn, "render"):
+        if any(is_defined_by(kind.render, *each) for each in known):
+            return None
+        kind = next((k for k in kind.__mro__ if "render" in vars(k)), kind)
+    return f"the {what} {class_name(kind)} overrides render()"
 
 
 def class_name(kind: type) -> str:

@@ -49,7 +49,7 @@ from ..environments.from_name import environment_from_name
 from ..environments.named_environment import EnvironmentOptions, NamedEnvironment
 from ..environments.names import working_directory_importable
 from ..environments.policies import Policy, load_policy, policy_file, policy_from
-from ..environments.scenes import new_warnings, simulation_below
+from ..environments.scenes import mujoco_warnings, new_warnings, simulation_below
 from ..errors import Error, GLError, InvalidArgument, PolicyError
 from ..formats.json_fields import from_json
 from ..formats.locks import wait_for_lock
@@ -335,10 +335,10 @@ class _ChunkRun:
 
         def count_warnings() -> None:
             # Not every reset clears the warning counts.
-            before.update(_warnings(acting.named.environment))
+            before.update(mujoco_warnings(acting.named.environment))
 
         def facts() -> Mapping[str, Any]:
-            new = new_warnings(before, _warnings(acting.named.environment))
+            new = new_warnings(before, acting.named.environment)
             return {**own, "warnings": new}
 
         monitor.recorder.evaluation_facts = facts
@@ -426,16 +426,6 @@ def _play(
         while not done:
             observation, _, *ends = named.step(env, policy(observation))
             done = any(ends)
-
-
-def _warnings(environment: Any) -> dict[str, int]:
-    simulation = simulation_below(environment)
-    if simulation is None:
-        return {}
-    # Imported here because it loads MuJoCo, which some tasks do not need.
-    from ..simulation.warnings import warning_counts
-
-    return warning_counts(simulation)
 
 
 def _uid(folder: Path) -> str:

@@ -24,12 +24,12 @@ from typing import Any
 from numpy.typing import NDArray
 
 from ..environments.recreate import NotRecreated, Recreated, checked_options, recreate
-from ..environments.scenes import new_warnings
-from ..environments.stand_ins import RecordedSteps
+from ..environments.scenes import mujoco_warnings, new_warnings
+from ..environments.wrapping import RecordedSteps
 from ..errors import Error, UnreadableFile
 from ..formats.journal import KILLED
 from ..plain_text import counted
-from ..recorder.ending_reasons import EXCEPTION, INTERRUPT, RESET
+from ..recorder.endings import EXCEPTION, INTERRUPT, RESET
 from ..simulation.model_sources import read_authored
 from .excuses import note, read_notes, write_notes
 from .findings import Finding
@@ -163,7 +163,7 @@ class _Playing:
                     self._evaluation_facts, episode.evaluation or {}
                 )
             self._begin(episode)
-            self._warned = self._recreated.warnings()
+            self._warned = mujoco_warnings(self._recreated.environment)
             if episode.has_actions:
                 self._play(episode)
             elif episode.cut is None or episode.steps:
@@ -211,7 +211,7 @@ class _Playing:
             )
 
     def _evaluation_facts(self, said: Mapping[str, Any]) -> Mapping[str, Any]:
-        warnings = new_warnings(self._warned, self._recreated.warnings())
+        warnings = new_warnings(self._warned, self._recreated.environment)
         return {**said, "warnings": warnings}
 
     def _begin(self, episode: EpisodeInputs) -> None:

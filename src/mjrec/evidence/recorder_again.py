@@ -9,11 +9,12 @@ import re
 from collections.abc import Callable
 from fractions import Fraction
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from ..environments.recreate import NotRecreated, Recreated
 from ..errors import Error, InvalidArgument
 from ..monitors.base import EnvironmentMonitor
+from ..monitors.monitor import monitored
 from ..recorder.keep_rules import RULES, keep_rule
 from ..recorder.opening import JOIN, Statements
 from ..recorder.options import RecorderOptions
@@ -82,28 +83,15 @@ def monitor_again(
                 faults=recording.faults,
             ),
         )
-        return _monitor_class(recreated)(
-            recreated.environment,
-            directory,
-            options,
-            **{name: given.get(name) for name in ("camera", "height", "width")},
-            env_id=recording.env_id,
-        )
+        view = {name: given.get(name) for name in ("camera", "height", "width")}
+        env, env_id = recreated.environment, recording.env_id
+        monitor = monitored(env, directory, options, env_id=env_id, **view)
+        # A recording never has a vector environment.
+        return cast("EnvironmentMonitor", monitor)
     except (Error, TypeError, ValueError) as error:
         raise NotRecreated(
             f"it cannot be recorded with its options: {error!s:.300}"
         ) from error
-
-
-def _monitor_class(recreated: Recreated) -> Callable[..., EnvironmentMonitor]:
-    # Each monitor imports its framework, and dm_env may not be installed.
-    if recreated.is_dm_env:
-        from ..monitors.dm_env_monitor import DmEnvMonitor
-
-        return DmEnvMonitor
-    from ..monitors.gymnasium_monitor import GymnasiumMonitor
-
-    return GymnasiumMonitor
 
 
 def _schedule(recording: RecordingInputs, notes: list[Finding]) -> Schedule | None:

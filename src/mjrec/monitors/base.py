@@ -12,8 +12,7 @@ from typing import Any, ClassVar, Literal, NoReturn, Self, SupportsIndex, TypeVa
 
 from ..environments.scenes import Scenes
 from ..errors import NotPicklable, PicturesDiffer, RenderError
-from ..recorder.ending_reasons import last_error
-from ..recorder.exit_guard import ExitGuard
+from ..recorder.endings import ExitGuard, last_error
 from ..recorder.finishers import Finisher
 from ..recorder.options import (
     DEFERRED,
@@ -31,8 +30,8 @@ from ..recorder.stats_recorder import StatsRecorder
 from ..recorder.video_recorder import VideoRecorder, declared_rate
 from ..rendering.background import Background
 from ..simulation.find_simulation import simulation_time
-from .cameras import camera_frames, checked_cameras, recorded_view
 from .progress import render_progress
+from .tiles import camera_frames, checked_cameras, recorded_view
 
 logger = logging.getLogger(__name__)
 
@@ -241,11 +240,9 @@ class EnvironmentMonitor(MonitorBase):
         options: RecorderOptions,
         *,
         scenes: Callable[..., Scenes],
-        camera: Any,
-        size: Mapping[str, int | None],
+        view: Mapping[str, Any],
         own_view: Mapping[str, Any] | None = None,
         close_environment: Callable[[Any], None],
-        no_simulation: str = NO_SIMULATION,
         rendering: Callable[[Path], Finisher] | None = None,
         **subject: Any,
     ) -> None:
@@ -256,15 +253,14 @@ class EnvironmentMonitor(MonitorBase):
             directory: the monitor directory.
             options: the monitor's options.
             scenes: returns the scenes for a camera and a size.
-            camera: the requested camera or cameras.
-            size: the requested `height` and `width`.
+            view: the requested `camera` (or cameras), `height` and `width`.
             own_view: further facts about the view, for the journal.
             close_environment: closes `env`.
-            no_simulation: the reason to give if the environment has no states.
             rendering: creates the finisher that renders videos; if None, the monitor
                 has its own background finisher.
             **subject: `env_id` and other arguments of `RecordedEnvironment`.
         """
+        camera, size = view.get("camera"), {k: view.get(k) for k in ("height", "width")}
         cameras = checked_cameras(camera, tiled=options.tiled)
         known, *further = [scenes(camera=each, **size) for each in cameras]
         clip_states = None
@@ -272,9 +268,11 @@ class EnvironmentMonitor(MonitorBase):
             # Clips overlap with episodes, and a source of states has only one reader.
             clip_states = scenes(camera=cameras[0], **size).states
         sources = [each.frames for each in (known, *further)]
-        view = {**recorded_view(camera, size), **(own_view or {})}
         choice = rendering_choice(
-            options.render, known, subject["env_id"], no_simulation=no_simulation
+            options.render,
+            known,
+            subject["env_id"],
+            no_simulation=getattr(env, "no_simulation", NO_SIMULATION),
         )
         if choice.mode != DEFERRED or options.workers == 0:
             rendering = None
@@ -293,7 +291,7 @@ class EnvironmentMonitor(MonitorBase):
                 clip_states=clip_states,
                 environment=known.environment,
                 random_state=known.random_state,
-                view=view,
+                view={**recorded_view(camera, size), **(own_view or {})},
                 **camera_frames(cameras, sources, tiled=options.tiled),
                 **subject,
             ),
@@ -307,7 +305,9 @@ class EnvironmentMonitor(MonitorBase):
             [
                 self._recorder.close,
                 *(each.close for each in states),
-                functools.partial(_close_each, close_environment, environments),
+                lambda: call_all(
+                    functools.partial(close_environment, each) for each in environments
+                ),
             ]
         )
 
@@ -368,11 +368,6 @@ def call_all(calls: Iterable[Callable[[], object]]) -> None:
             first = first or error
     if first is not None:
         raise first
-
-
-def _close_each(close: Callable[[Any], None], environments: Iterable[Any]) -> None:
-    for environment in environments:
-        close(environment)
 
 
 def _note_last_error(recorders: Sequence[Recorder]) -> None:

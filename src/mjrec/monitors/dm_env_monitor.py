@@ -50,10 +50,8 @@ class DmEnvMonitor(EnvironmentMonitor, dm_env.Environment):  # type: ignore[misc
         directory: str | os.PathLike[str],
         options: RecorderOptions,
         *,
-        camera: Any = None,
-        height: int | None = None,
-        width: int | None = None,
         env_id: str | None = None,
+        **view: Any,
     ) -> None:
         self._env = env
         self.seed: Any = None
@@ -67,8 +65,7 @@ class DmEnvMonitor(EnvironmentMonitor, dm_env.Environment):  # type: ignore[misc
             directory,
             options,
             scenes=functools.partial(_scenes, env, env_id),
-            camera=camera,
-            size={"height": height, "width": width},
+            view=view,
             close_environment=operator.methodcaller("close"),
             env_id=env_id or _env_id(env),
         )

@@ -19,7 +19,7 @@ from ..environments.gymnasium_frames import close_environment
 from ..environments.gymnasium_scenes import gymnasium_scenes, own_view
 from ..recorder.finishers import Finisher
 from ..recorder.options import RecorderOptions
-from .base import NO_SIMULATION, EnvironmentMonitor
+from .base import EnvironmentMonitor
 
 logger = logging.getLogger(__name__)
 
@@ -46,14 +46,11 @@ class GymnasiumMonitor(EnvironmentMonitor, gymnasium.Wrapper[Any, Any, Any, Any]
         directory: str | os.PathLike[str],
         options: RecorderOptions,
         *,
-        camera: Any = None,
-        height: int | None = None,
-        width: int | None = None,
         env_id: str | None = None,
         env_index: int | None = None,
         rendering: Callable[[Path], Finisher] | None = None,
         close_environment: Callable[[Any], None] = close_environment,
-        no_simulation: str = NO_SIMULATION,
+        **view: Any,
     ) -> None:
         super().__init__(env)
         # gym's convention: the step that ends an episode starts the next one.
@@ -64,11 +61,9 @@ class GymnasiumMonitor(EnvironmentMonitor, gymnasium.Wrapper[Any, Any, Any, Any]
             directory,
             options,
             scenes=functools.partial(gymnasium_scenes, env),
-            camera=camera,
-            size={"height": height, "width": width},
+            view=view,
             own_view=own_view(env),
             close_environment=close_environment,
-            no_simulation=no_simulation,
             rendering=rendering,
             env_id=env_id or env_id_of(env),
             env_index=env_index,

@@ -184,19 +184,11 @@ def Monitor(  # noqa: N802  named like gym's class
     """
     # This must come first: `locals()` must contain only the arguments.
     options = dict(locals())
-    for name in ("env", "directory", "camera", "height", "width", "env_id"):
-        del options[name]
+    del options["env"], options["directory"]
+    view = {name: options.pop(name) for name in ("camera", "height", "width", "env_id")}
     if allow_early_reset is None:
         options["allow_early_reset"] = _monitor_class(env).allows_early_reset
-    return monitored(
-        env,
-        directory,
-        RecorderOptions(**options),
-        camera=camera,
-        height=height,
-        width=width,
-        env_id=env_id,
-    )
+    return monitored(env, directory, RecorderOptions(**options), **view)
 
 
 def monitored(

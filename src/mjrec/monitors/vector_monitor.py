@@ -21,7 +21,7 @@ from ..formats.monitor_directory import infix_of, iter_monitor_files
 from ..recorder.opening import made_directory
 from ..recorder.options import RecorderOptions
 from ..rendering.background import Background, Share
-from .base import NO_SIMULATION, MonitorBase, call_all
+from .base import MonitorBase, call_all
 from .gymnasium_monitor import GymnasiumMonitor
 from .tiles import TiledVideo, has_videos, vector_tiles
 from .vector_slots import (
@@ -88,10 +88,8 @@ class VectorMonitor(MonitorBase, gymnasium.vector.VectorWrapper):
         directory: str | os.PathLike[str],
         options: RecorderOptions,
         *,
-        camera: Any = None,
-        height: int | None = None,
-        width: int | None = None,
         env_id: str | None = None,
+        **view: Any,
     ) -> None:
         super().__init__(env)
         self._mode = autoreset_mode(env)
@@ -100,7 +98,6 @@ class VectorMonitor(MonitorBase, gymnasium.vector.VectorWrapper):
         self._frames = Frames(env)
         inside = environments_inside(env)
         self._is_inside = inside is not None
-        view = {"camera": camera, "height": height, "width": width}
         if inside is None:
             check_outside(env, options.render, view)
         envs: Sequence[Env] = inside or slots_outside(env, self._frames)
@@ -128,7 +125,6 @@ class VectorMonitor(MonitorBase, gymnasium.vector.VectorWrapper):
                     env_index=index,
                     rendering=None if shared is None else lambda _: Share(shared),
                     close_environment=lambda env: closing["by"](env),
-                    no_simulation=NO_SIMULATION if inside else UNSEEN,
                 )
                 for index, each in enumerate(envs)
             ],
@@ -142,7 +138,7 @@ class VectorMonitor(MonitorBase, gymnasium.vector.VectorWrapper):
         options_of_close = self._closing
         closings: list[Callable[[], object]] = []
         if tiles is not None:
-            self._tiled = TiledVideo(self.monitors[0], tiles)
+            self._tiled = TiledVideo(self.monitors[0].recorder, tiles)
             # Closed first, because the first monitor's manifest lists its videos.
             closings.append(self._tiled.close)
         if shared is not None:
@@ -417,7 +413,7 @@ def _options_of(
     """
     changed: dict[str, Any] = {
         # With several cameras, each sub-environment has its own tiled video of them.
-        "tiled": options.tiled and isinstance(view["camera"], list | tuple),
+        "tiled": options.tiled and isinstance(view.get("camera"), list | tuple),
         "tail_bytes": min(options.tail_bytes, _TAILS // count),
     }
     if index > 0:

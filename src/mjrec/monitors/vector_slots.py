@@ -127,6 +127,8 @@ class SubEnvironment(Env):
     """
 
     control_timestep: Callable[[], float] | None = None
+    # The reason why states cannot be recorded.
+    no_simulation = UNSEEN
 
     def __init__(
         self, env: VectorEnv, frames: Frames, index: int, *, timestep: float | None

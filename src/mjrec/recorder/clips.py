@@ -100,7 +100,8 @@ class Clips:
 
     def _start(self, steps: int | None) -> None:
         self._clip = _Clip(self._run, steps)
-        self._clip.begin()
+        if self._clip.live is not None:
+            self._clip.live.begin()
 
     def _end(self, facts: Mapping[str, Any]) -> None:
         clip, self._clip = self._clip, None
@@ -136,8 +137,8 @@ class _Clip:
         self._parts = 0
         start = None
         if run.env.rendering.mode == DEFERRED:
-            assert run.env.clip_states is not None
-            start = run.env.clip_states.begin_episode()
+            assert run.of_clips.capture is not None
+            start = run.of_clips.capture.begin_episode()
             start = start if run.can_be_deferred(start) else None
         if start is not None:
             self._pending_video = run.pending_video(
@@ -150,18 +151,13 @@ class _Clip:
             self._video = self.live.path
             self.live.say(first_step=self._first_step, last_episode_id=self._episode_id)
 
-    def begin(self) -> None:
-        """Take the first frame if the clip is drawn live."""
-        if self.live is not None:
-            self.live.begin()
-
     def reset(self) -> None:
         """Take the first frame of an episode and begin a new part."""
         self._last_episode_id = self._run.episode.episode_id
         if self.live is not None:
             self.live.say(last_episode_id=self._last_episode_id)
             self.live.begin()
-        part, capture = self._part, self._run.env.clip_states
+        part, capture = self._part, self._run.of_clips.capture
         if part is None or part.broken_reason is not None:
             return
         assert capture is not None
@@ -192,28 +188,27 @@ class _Clip:
         """End the clip and submit it."""
         run = self._run
         known = {**facts, "length": self.steps, "reward": self.reward}
-        said = {"episode_id": self._episode_id, "video": self._video.name}
-        if self.live is not None:
-            try:
+        try:
+            if self.live is not None:
                 try:
                     self.live.take_last()
                 finally:
                     self.live.end(known)
-            finally:
+            elif self._part is not None:
+                last = {"last_episode_id": self._last_episode_id}
+                self._part.end({**known, **last, "end_time": run.clock()})
+        finally:
+            said = {"episode_id": self._episode_id, "video": self._video.name}
+            if self.live is not None:
                 run.note("clip", {**said, "recording": LIVE})
                 run.trackers.expect(self._video)
                 self.live.name_again()
-        elif self._part is not None:
-            try:
-                last = {"last_episode_id": self._last_episode_id}
-                self._part.end({**known, **last, "end_time": run.clock()})
-            finally:
-                # Otherwise the disk was too full for even a single row, and there will
-                # be no video.
-                if self._parts > 1 or self._part.is_there:
-                    run.note("clip", {**said, "clip": self._name(0)})
-                    run.trackers.expect(self._video)
-                    run.submit(run.directory / self._name(0))
+            # Otherwise the disk was too full for even a single row, and there will be
+            # no video.
+            elif self._parts > 1 or (self._part is not None and self._part.is_there):
+                run.note("clip", {**said, "clip": self._name(0)})
+                run.trackers.expect(self._video)
+                run.submit(run.directory / self._name(0))
 
     def _begin_part(self, start: EpisodeStart) -> None:
         """Begin a new part."""
@@ -229,14 +224,9 @@ class _Clip:
         self._part = StateRecorder(
             run,
             self._name(self._parts),
-            logs=run.clip_logs,
-            what="video",
-            facts={**run.recording_facts(start), **facts},
-            capture=run.env.clip_states,
+            facts=facts,
             start=start,
-            # Frames do not depend on actions. `max_fps` is left out, because the frames
-            # of all parts are counted together, and are selected when they are drawn.
-            has_actions=False,
+            is_clip=True,
         )
         self._parts += 1
 

@@ -13,8 +13,8 @@ from ..schedules import (
     schedule_name,
     to_schedule,
 )
+from .keep_rules import Selection, selection_from
 from .options import RecorderOptions
-from .selection import Selection, selection_from
 
 _EVALUATION = "e"
 
@@ -59,13 +59,6 @@ class EpisodeChoice:
         only for the default schedule.
         """
         return self._is_default and capped_cubic_video_schedule(episode_id)
-
-    def may_keep_trajectory(self, episode_type: str) -> bool:
-        """Return whether an episode of this type may keep its trajectory.
-
-        This can be called before `decide`.
-        """
-        return self.has_videos or self.keeps_without_video(episode_type)
 
     def keeps_trajectory(
         self, episode_id: int, episode_type: str, has_video: bool

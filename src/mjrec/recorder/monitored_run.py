@@ -9,8 +9,9 @@ import itertools
 import logging
 import os
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, Protocol
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 from ..annotation import Caption
 from ..atomic_files import file_sha256
@@ -34,20 +35,50 @@ from .tracking import Trackers
 from .video_recorder import VideoRecorder
 
 if TYPE_CHECKING:
-    from ..simulation.capture import EpisodeStart
+    from ..simulation.capture import Capture, EpisodeStart
 
 logger = logging.getLogger(__name__)
 
 
-class RunningEpisode(Protocol):
-    """The facts that an `EpisodeRecording` has about its episode."""
+class RunningEpisode(NamedTuple):
+    """The facts about an episode that are known when it begins.
+
+    Attributes:
+        episode_id: the episode's number.
+        type: `"t"` for training, `"e"` for evaluation.
+        start_time: time just before the reset, in seconds since the Unix epoch.
+        seed: the seed given to `reset`.
+        options: the options given to `reset`.
+        random_state: state of the environment's random generator before the reset, as
+            JSON values; None if unknown or not needed.
+        reset_clock: simulated time of the reset, if frames show the time.
+    """
 
     episode_id: int
     type: str
     start_time: float
     seed: Any
     options: Any
+    random_state: Any
     reset_clock: float | None
+
+
+@dataclass
+class Track:
+    """The states of episodes, or those of clips, which overlap with episodes.
+
+    Attributes:
+        logs: the logs for the rows.
+        capture: captures the states; None if no simulation is accessible.
+        action: the buffer for actions that the last recording used.
+        pace: the rate, timestep and stride of the last recording; None before the
+            first recording.
+    """
+
+    logs: SpanLogs
+    capture: Capture | None
+    action: StepArray | None = None
+    pace: Mapping[str, Any] | None = None
 
 
 What = Literal["video", "trajectory", "statistics", "journal", "model", "tracker"]
@@ -87,12 +118,8 @@ class MonitoredRun:
         events: the journal's content so far, including events that could not be written
             because the disk was full.
         trackers: the trackers, which are notified of episodes and finished videos.
-        logs: logs for the rows of episodes.
-        clip_logs: logs for the rows of clips.
-        actions: for each of the two kinds of logs, the buffer for actions that the last
-            recording used.
-        paces: for each of the two kinds of logs, the rate, timestep and stride of the
-            last recording.
+        of_episodes: the states of episodes.
+        of_clips: the states of clips.
         no_video: a disabled recorder for episodes without a video.
     """
 
@@ -167,18 +194,19 @@ class MonitoredRun:
             ),
         )
         numbers = itertools.count()
-        self.logs, self.clip_logs = (
-            SpanLogs(
-                self.directory,
-                self.infix,
-                journal=self._journal,
-                numbers=numbers,
-                tail_bytes=options.tail_bytes,
+        self.of_episodes, self.of_clips = self._tracks = [
+            Track(
+                SpanLogs(
+                    self.directory,
+                    self.infix,
+                    journal=self._journal,
+                    numbers=numbers,
+                    tail_bytes=options.tail_bytes,
+                ),
+                capture,
             )
-            for _ in range(2)
-        )
-        self.actions: dict[SpanLogs, StepArray | None] = {}
-        self.paces: dict[SpanLogs, Mapping[str, Any]] = {}
+            for capture in (env.states, env.clip_states)
+        ]
         # Functions to call when the run closes, because the disk was full.
         self._late: list[Callable[[], None]] = []
         self.no_video = VideoRecorder(env.frames, enabled=False)
@@ -296,8 +324,8 @@ class MonitoredRun:
         Raises:
             FileNotWritten: the disk is full. The next call tries again.
         """
-        self.logs.close()
-        self.clip_logs.close()
+        for track in self._tracks:
+            track.logs.close()
         late, self._late = self._late, []
         try:
             while late:
@@ -307,8 +335,8 @@ class MonitoredRun:
 
     def leave(self) -> None:
         """Release the journal, the logs and the lock as they are. Idempotent."""
-        for logs in (self.logs, self.clip_logs):
-            logs.release()
+        for track in self._tracks:
+            track.logs.release()
         self._journal.close()
         self._lock.release()
 

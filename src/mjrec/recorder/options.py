@@ -6,7 +6,7 @@ from __future__ import annotations
 import os
 import re
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
@@ -20,79 +20,14 @@ from ..formats.row_log import TAIL_BYTES
 from ..frames import check_quality
 from ..rates import to_rate
 from ..schedules import check_takes_one, schedule_name
+from .keep_rules import selection_from
 from .opening import JOIN, Statements
-from .selection import selection_from
 from .tracking import FinishedEpisode, Tracker
 
 DEFERRED, LIVE, OFF = "deferred", "live", "off"
 RAISE, WARN = "raise", "warn"
-
-
-def _is_bool(value: object) -> bool:
-    return isinstance(value, bool)
-
-
-def _is_whole(least: int) -> Callable[[object], bool]:
-    """Return a check for None and whole numbers from `least`."""
-
-    def is_valid(value: object) -> bool:
-        is_whole = isinstance(value, int | np.integer) and not isinstance(value, bool)
-        return value is None or (is_whole and value >= least)  # type: ignore[operator]
-
-    return is_valid
-
-
 # Gym's own prefix is excluded, because such files would look like monitor files.
 _NAME_PREFIX = re.compile(r"(?!openaigym)[A-Za-z0-9_][A-Za-z0-9_.-]{0,99}", re.ASCII)
-# For each option, the check of its value, and the rest of a message about
-# a value that is invalid.
-_VALID: Mapping[str, tuple[Callable[[Any], bool], str]] = {
-    **dict.fromkeys(
-        ("observations", "strict", "episode_info", "annotate", "tiled"),
-        (_is_bool, "must be True or False"),
-    ),
-    "resume": (
-        lambda value: _is_bool(value) or value == JOIN,
-        'must be True, False, or "join" to record next to other monitors without '
-        "reading their files",
-    ),
-    "render": (
-        lambda value: value in (None, DEFERRED, LIVE, OFF),
-        'must be "deferred", "live", "off", or None for the best that the environment '
-        "allows",
-    ),
-    "workers": (
-        _is_whole(0),
-        "must be a whole number of processes (0 to render nothing now) or None for one "
-        "per usable CPU",
-    ),
-    "on_error": (
-        lambda value: value in (RAISE, WARN),
-        'must be "raise", or "warn" to continue when something cannot be recorded',
-    ),
-    "trajectory_callable": (
-        lambda value: value is None or _is_bool(value) or callable(value),
-        "must be True, False, None, or a function that takes an episode number and "
-        "returns a bool",
-    ),
-    "step_trigger": (
-        lambda value: value is None or callable(value),
-        "must be a function that takes the number of steps so far and returns a bool",
-    ),
-    "video_length": (
-        _is_whole(1),
-        "must be a positive whole number, or None for videos until the end of the "
-        "episode",
-    ),
-    "name_prefix": (
-        lambda value: (
-            value is None
-            or (isinstance(value, str) and bool(_NAME_PREFIX.fullmatch(value)))
-        ),
-        "becomes part of file names. It must consist of 1 to 100 letters, digits, '_', "
-        "'-' and '.', begin with a letter, digit or '_', and not begin with openaigym",
-    ),
-}
 # Switches that affect the content of files.
 _SWITCHES = ("observations", "annotate", "tiled")
 _MODES = {None: "t", "training": "t", "evaluation": "e"}
@@ -143,59 +78,100 @@ class RecorderOptions:
         for name in ("fps", "max_fps"):
             if getattr(self, name) is not None:
                 to_rate(getattr(self, name), name=name)
-        check_quality(self.quality)
-        for name, (is_valid, valid) in _VALID.items():
-            value = getattr(self, name)
-            if not is_valid(value):
-                raise InvalidArgument(f"{name} {valid}, but it is {value!r}.")
-        if self.step_trigger is not None:
-            check_takes_one(self.step_trigger, "step_trigger", "the number of steps")
-        if self.keep is not None:
-            selection_from(self.keep)
-        for is_so, conflict in self._conflicts():
-            if is_so:
-                raise InvalidArgument(conflict)
-        self._check_trackers()
-        given = self.policy_file
-        if given is not None and not (
-            isinstance(given, str | os.PathLike) and Path(given).is_file()
-        ):
+        for name in ("observations", "strict", "episode_info", "annotate", "tiled"):
+            if not isinstance(getattr(self, name), bool):
+                raise InvalidArgument(
+                    f"{name} must be True or False, but it is {getattr(self, name)!r}."
+                )
+        if not (isinstance(self.resume, bool) or self.resume == JOIN):
             raise InvalidArgument(
-                "policy_file must be the path of the policy's file, because the "
-                f"manifest contains its SHA-256, but {given!r} is not a file."
+                'resume must be True, False, or "join" to record next to other '
+                f"monitors without reading their files, but it is {self.resume!r}."
             )
+        check_quality(self.quality)
+        if self.render not in (None, DEFERRED, LIVE, OFF):
+            raise InvalidArgument(
+                'render must be "deferred", "live", "off", or None for the best that '
+                f"the environment allows, but it is {self.render!r}."
+            )
+        workers = self.workers
+        if workers is not None and (not _is_whole(workers) or workers < 0):
+            raise InvalidArgument(
+                "workers must be a whole number of processes (0 to render nothing now) "
+                f"or None for one per usable CPU, but it is {workers!r}."
+            )
+        if self.on_error not in (RAISE, WARN):
+            raise InvalidArgument(
+                'on_error must be "raise", or "warn" to continue when something cannot '
+                f"be recorded, but it is {self.on_error!r}."
+            )
+        chosen = self.trajectory_callable
+        if not (chosen is None or isinstance(chosen, bool) or callable(chosen)):
+            raise InvalidArgument(
+                "trajectory_callable must be True, False, None, or a function that "
+                "takes an episode number and returns a bool, but it is "
+                f"{chosen!r}."
+            )
+        self._check_clips()
+        self._check_keep()
+        self._check_trackers()
+        self._check_policy_file()
         if self.annotate:
             check_annotation()
 
-    def _conflicts(self) -> Iterator[tuple[bool, str]]:
-        """Yield whether options are given that exclude each other, and the message."""
-        yield (
-            self.step_trigger is not None and self.video_callable is not None,
-            "step_trigger chooses videos by step, and video_callable chooses them by "
-            "episode. Give only one of them.",
-        )
-        yield (
-            self.has_clips and self.render == OFF,
-            "step_trigger and video_length configure videos, but "
-            'render="off" disables videos. Leave one of them out.',
-        )
+    def _check_clips(self) -> None:
+        if self.step_trigger is not None:
+            if not callable(self.step_trigger):
+                raise InvalidArgument(
+                    "step_trigger must be a function that takes the number of steps "
+                    f"so far and returns a bool, but it is {self.step_trigger!r}."
+                )
+            check_takes_one(self.step_trigger, "step_trigger", "the number of steps")
+            if self.video_callable is not None:
+                raise InvalidArgument(
+                    "step_trigger chooses videos by step, and video_callable chooses "
+                    "them by episode. Give only one of them."
+                )
+        length = self.video_length
+        if length is not None and (not _is_whole(length) or length < 1):
+            raise InvalidArgument(
+                "video_length must be a positive whole number, or None for videos "
+                f"until the end of the episode, but it is {length!r}."
+            )
+        if self.has_clips and self.render == OFF:
+            raise InvalidArgument(
+                "step_trigger and video_length configure videos, but "
+                'render="off" disables videos. Leave one of them out.'
+            )
+        prefix = self.name_prefix
+        if prefix is not None and not (
+            isinstance(prefix, str) and _NAME_PREFIX.fullmatch(prefix)
+        ):
+            raise InvalidArgument(
+                "name_prefix becomes part of file names. It must consist of 1 to 100 "
+                "letters, digits, '_', '-' and '.', begin with a letter, digit or '_', "
+                f"and not begin with openaigym, but it is {prefix!r}."
+            )
+
+    def _check_keep(self) -> None:
         if self.keep is None:
             return
-        yield (
-            self.video_callable is not None,
-            "keep chooses episodes after they have ended, and video_callable before "
-            "they begin. Give only one of them.",
-        )
-        yield (
-            self.has_clips,
-            "keep chooses videos of whole episodes, but step_trigger and video_length "
-            "record clips, counted in steps. Give only one of them.",
-        )
-        yield (
-            self.render == OFF,
-            "keep chooses which episodes get a video, but "
-            'render="off" disables videos. Leave one of them out.',
-        )
+        selection_from(self.keep)
+        if self.video_callable is not None:
+            raise InvalidArgument(
+                "keep chooses episodes after they have ended, and video_callable "
+                "before they begin. Give only one of them."
+            )
+        if self.has_clips:
+            raise InvalidArgument(
+                "keep chooses videos of whole episodes, but step_trigger and "
+                "video_length record clips, counted in steps. Give only one of them."
+            )
+        if self.render == OFF:
+            raise InvalidArgument(
+                "keep chooses which episodes get a video, but "
+                'render="off" disables videos. Leave one of them out.'
+            )
 
     def _check_trackers(self) -> None:
         given = self.trackers
@@ -210,6 +186,16 @@ class RecorderOptions:
             raise InvalidArgument(
                 f"The same tracker appears twice in {given!r} and would get every call "
                 "twice. Give each tracker once."
+            )
+
+    def _check_policy_file(self) -> None:
+        given = self.policy_file
+        if given is None:
+            return
+        if not isinstance(given, str | os.PathLike) or not Path(given).is_file():
+            raise InvalidArgument(
+                "policy_file must be the path of the policy's file, because the "
+                f"manifest contains its SHA-256, but {given!r} is not a file."
             )
 
     @property
@@ -279,3 +265,7 @@ def type_of_mode(mode: str | None) -> str:
             f'mode must be "training", "evaluation" or None, but it is {mode!r}.'
         )
     return _MODES[mode]
+
+
+def _is_whole(value: object) -> bool:
+    return isinstance(value, int | np.integer) and not isinstance(value, bool)

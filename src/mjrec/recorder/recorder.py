@@ -13,23 +13,19 @@ from pathlib import Path
 from typing import Any, Final
 
 from ..errors import DirectoryNotWritable, Error, FileNotWritten
-from ..formats.bundle import FINISHED
 from ..formats.journal import JournalEntry
-from ..formats.monitor_directory import episode_of, video_prefix
 from ..formats.spans import recordings_in_flight
-from ..formats.video_metadata import note_failure, reason_of
 from ..results.manifest_writing import write_manifest_and_stats
 from .clips import Clips
-from .ending_reasons import CLOSE, RESET, ending
+from .endings import CLOSE, RESET, ending
 from .episode_choice import EpisodeChoice
 from .fast_path import FastPath
 from .finishers import Finisher, LaterFinisher
-from .kept_videos import KeptVideos
-from .monitored_run import MonitoredRun
+from .keep_rules import Standing
+from .monitored_run import MonitoredRun, RunningEpisode
 from .options import DEFERRED, LIVE, OFF, RecorderOptions
 from .recorded_environment import RecordedEnvironment, check_frames
-from .recording import EpisodeRecording
-from .selection import Standing
+from .recording import EpisodeRecording, KeptVideos
 from .states import DeferredVideo
 from .stats_recorder import reward_to_float
 from .tracking import FinishedEpisode
@@ -169,7 +165,8 @@ class Recorder:
             self._take_last_frame()
         self._reset_time = now
         self._random_state = None
-        if self._choice.may_keep_trajectory(self.stats_recorder.type):
+        kind = self.stats_recorder.type
+        if self._choice.has_videos or self._choice.keeps_without_video(kind):
             self._random_state = self.run.env.random_state()
 
     def reset(
@@ -197,16 +194,20 @@ class Recorder:
             self._cut_episode(RESET)
         self._ending = None
         self.stats_recorder.after_reset()
-        # The previous episode's recording is over, even if the schedule raises.
-        recording = self._recording = EpisodeRecording(
-            self.run,
-            episode_id=self.episode_id,
-            start_time=self._reset_time,
-            seed=seed,
-            options=options,
-            random_state=self._random_state,
+        env = self.run.env
+        self.run.begin(
+            RunningEpisode(
+                episode_id=self.episode_id,
+                type=self.stats_recorder.episode_type,
+                start_time=self._reset_time,
+                seed=seed,
+                options=options,
+                random_state=self._random_state,
+                reset_clock=env.clock() if self.run.options.annotate else None,
+            )
         )
-        self.run.begin(recording)
+        # The previous episode's recording is over, even if the schedule raises.
+        recording = self._recording = EpisodeRecording(self.run)
         self.episode_id += 1
         try:
             self._begin_episode(recording, observation)
@@ -380,7 +381,7 @@ class Recorder:
         return stats.done is False and stats.steps == 0 and self._ending is None
 
     def _begin_episode(self, recording: EpisodeRecording, observation: Any) -> None:
-        choice, number = self._choice, recording.episode_id
+        choice, (number, kind, *_) = self._choice, recording.episode
         wanted = recording.is_chosen = self.run.ask("video", choice.decide, number)
         if self._clips is not None:
             self._clips.reset(is_chosen=wanted)
@@ -388,13 +389,13 @@ class Recorder:
         # With clips the episode has no video of its own.
         wanted = wanted and self._clips is None
         keeps = self.run.ask(
-            "trajectory", choice.keeps_trajectory, number, recording.type, wanted
+            "trajectory", choice.keeps_trajectory, number, kind, wanted
         )
         recording.begin(
             observation,
             wants_video=wanted,
             keeps=keeps,
-            stays=choice.keeps_without_video(recording.type),
+            stays=choice.keeps_without_video(kind),
         )
 
     def _take_last_frame(self) -> None:
@@ -450,7 +451,7 @@ class Recorder:
         recording.leave()
         # The span may now reach to the log's last row, so the next episode needs a
         # new log.
-        self.run.logs.release()
+        self.run.of_episodes.logs.release()
 
     def _end_episode(
         self,
@@ -470,6 +471,7 @@ class Recorder:
         """
         recording, is_complete = self._recording, facts["complete"]
         assert recording is not None, "there was no reset"
+        episode_id = recording.episode.episode_id
         # A schedule's decision is final.
         kept = self._kept if recording.is_chosen else None
         known = self._results(facts, success) if is_complete else None
@@ -481,7 +483,7 @@ class Recorder:
         if kept is not None:
             if episode is not None:
                 kept.selection.add(episode)
-            standing = kept.selection.standing(recording.episode_id)
+            standing = kept.selection.standing(episode_id)
         is_dropped = standing is Standing.DROPPED
         is_chosen = recording.is_chosen and standing is Standing.CHOSEN
         # Only once, even if this is interrupted: recovery completes the rest.
@@ -492,12 +494,17 @@ class Recorder:
                 states.settle()
             # Before any drawing, so that a failing video cannot lose the episode.
             with failures:
-                self._journal_end(
-                    {"episode_id": recording.episode_id, "reason": facts.get("reason")},
-                    known,
-                    chosen=is_chosen,
-                    recording=None if is_dropped else recording.mode,
-                )
+                choice: dict[str, Any] = {
+                    "chosen": is_chosen,
+                    "recording": None if is_dropped else recording.mode,
+                }
+                if known is None:
+                    cut = {"episode_id": episode_id, "reason": facts["reason"]}
+                    self.run.note("cut", {**cut, **choice})
+                else:
+                    evaluation = self.evaluation_facts()
+                    entry = JournalEntry(**known, **choice, evaluation=evaluation)
+                    self.run.add(entry)
             take()
             if is_dropped and not recording.stays:
                 with failures:
@@ -531,29 +538,20 @@ class Recorder:
         self, flags: Mapping[str, Any], success: bool | None
     ) -> dict[str, Any]:
         """Return the facts about a complete episode that are known at its end."""
-        stats, recording = self.stats_recorder, self.run.episode
+        stats, begun = self.stats_recorder, self.run.episode
         return {
-            "episode_id": recording.episode_id,
+            "episode_id": begun.episode_id,
             "length": stats.episode_lengths[-1],
             "reward": stats.episode_rewards[-1],
-            "type": recording.type,
-            "start_time": recording.start_time,
+            "type": begun.type,
+            "start_time": begun.start_time,
             "end_time": stats.timestamps[-1],
-            "seed": recording.seed,
-            "options": recording.options,
+            "seed": begun.seed,
+            "options": begun.options,
             "terminated": flags["terminated"],
             "truncated": flags["truncated"],
             "success": success,
         }
-
-    def _journal_end(
-        self, cut: Mapping[str, Any], known: Mapping[str, Any] | None, **choice: Any
-    ) -> None:
-        if known is None:
-            self.run.note("cut", {**cut, **choice})
-        else:
-            evaluation = self.evaluation_facts()
-            self.run.add(JournalEntry(**known, **choice, evaluation=evaluation))
 
     def _end_recordings(self) -> None:
         """End all running recordings, even if some of them fail. Idempotent."""
@@ -622,17 +620,11 @@ class Recorder:
     def _say_what_is_left(self, pending: int) -> None:
         """Log the command that renders or finishes the rest."""
         if pending:
-            videos = "video" if pending == 1 else "videos"
-            logger.warning(
-                "%d %s pending: mjrec render %s", pending, videos, self.directory
-            )
+            what = f"{pending} {'video' if pending == 1 else 'videos'}"
+            logger.warning("%s pending: mjrec render %s", what, self.directory)
         elif in_logs := len(recordings_in_flight(self.directory, self.infix)):
-            logger.warning(
-                "%d %s in a log: mjrec recover %s",
-                in_logs,
-                "trajectory" if in_logs == 1 else "trajectories",
-                self.directory,
-            )
+            what = f"{in_logs} {'trajectory' if in_logs == 1 else 'trajectories'}"
+            logger.warning("%s in a log: mjrec recover %s", what, self.directory)
 
     def _write_last_results(self) -> int:
         """Write the run's final results; return the number of pending videos."""
@@ -640,22 +632,7 @@ class Recorder:
         if self._kept is not None:
             self.run.note("keep", self._kept.details())
         self.run.note("closed", {"next_episode_id": self.episode_id})
-        for name, why in self.run.finisher.failures.items():
-            # Usually the failed process has already recorded the reason.
-            video = self.directory / self._video_of(name)
-            if video.suffix == ".mp4" and reason_of(video) is None:
-                note_failure(video, why)
         return self._write_results()
-
-    def _video_of(self, name: str) -> str:
-        """Return the video's name, given the name of a recording or of the video."""
-        for video, clip in self.run.events.clips.items():
-            if clip.get("clip") == name:
-                return video
-        number = episode_of(name)
-        if number is None or not name.endswith(FINISHED):
-            return name
-        return f"{video_prefix(self.run.infix, number)}.mp4"
 
     def _write_results(self) -> int:
         listing = write_manifest_and_stats(

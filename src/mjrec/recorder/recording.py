@@ -1,16 +1,24 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The recording of one episode, with or without states and videos."""
+"""The recording of one episode, with or without states and videos.
+
+If videos are chosen after their episodes have ended, every episode is recorded as if it
+got a video. The recordings for which no decision has been made are held, and the log
+marks each of them as a candidate. While the monitor is open, other processes leave
+candidates alone. After that, any process may render them. Dropped recordings are
+deleted immediately.
+"""
 
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..errors import FileNotWritten
+from ..errors import Error, FileNotWritten, InvalidArgument
 from ..formats.monitor_directory import trajectory_prefix, video_prefix
 from .fast_path import FastPath, counting
+from .keep_rules import Selection, Standing
 from .live_videos import LiveVideos, live_videos
 from .monitored_run import MonitoredRun
 from .options import DEFERRED, LIVE
@@ -25,17 +33,10 @@ class EpisodeRecording:
     """Records one episode from its reset to its end, and then keeps or drops it.
 
     Args:
-        run: the monitored run.
-        episode_id: the episode's number.
-        start_time: time just before the reset, in seconds since the Unix epoch.
-        seed: the seed given to `reset`.
-        options: the options given to `reset`.
-        random_state: state of the environment's random generator before the reset, as
-            JSON values; None if unknown or not needed.
+        run: the monitored run, in which the episode is running.
 
     Attributes:
-        type: `"t"` for training, `"e"` for evaluation.
-        reset_clock: simulated time of the reset, if frames show the time.
+        episode: the facts about the episode.
         is_chosen: whether the schedule chose the episode.
         video: the live or deferred video recorder. It is disabled if the episode gets
             no video.
@@ -45,27 +46,14 @@ class EpisodeRecording:
         is_over: whether the episode has ended.
     """
 
-    def __init__(
-        self,
-        run: MonitoredRun,
-        *,
-        episode_id: int,
-        start_time: float,
-        seed: Any,
-        options: Any,
-        random_state: Any,
-    ) -> None:
-        self.episode_id, self.start_time = episode_id, start_time
-        self.seed, self.options = seed, options
-        self.type = run.stats.episode_type
-        self.reset_clock = run.env.clock() if run.options.annotate else None
+    def __init__(self, run: MonitoredRun) -> None:
+        self.episode = run.episode
         self.video: VideoRecorder | DeferredVideo = run.no_video
         self.states: StateRecorder | None = None
         self.live: LiveVideos | None = None
         self.is_chosen = self.stays = self.is_over = False
         self._run = run
-        self._random_state = random_state
-        self._name = trajectory_prefix(run.infix, episode_id)
+        self._name = trajectory_prefix(run.infix, self.episode.episode_id)
         # The facts about the video for the log; None if the episode gets no video.
         self._pending_video: Mapping[str, Any] | None = None
 
@@ -87,9 +75,9 @@ class EpisodeRecording:
             keeps: whether its trajectory is kept.
             stays: whether the trajectory is kept even if the video is dropped.
         """
-        run, capture = self._run, self._run.env.states
+        run, capture = self._run, self._run.of_episodes.capture
         if keeps or wants_video:
-            self._path = run.logs.path_of(self._name)
+            self._path = run.of_episodes.logs.path_of(self._name)
         deferred = wants_video and run.env.rendering.mode == DEFERRED
         if deferred:
             # The finisher starts while the model is inspected.
@@ -98,8 +86,8 @@ class EpisodeRecording:
         if capture is not None and (keeps or deferred):
             start = capture.begin_episode()
             deferred = deferred and run.can_be_deferred(start)
-        name = video_prefix(run.infix, self.episode_id)
-        second_name = run.second_name("episode", self.episode_id)
+        name = video_prefix(run.infix, self.episode.episode_id)
+        second_name = run.second_name("episode", self.episode.episode_id)
         if keeps or deferred:
             if wants_video:
                 mode = DEFERRED if deferred else LIVE
@@ -213,7 +201,7 @@ class EpisodeRecording:
         if self.stays:
             self.states.amend({"candidate": False, "video": None})
             self._submit()
-            self._run.note("dropped", self.episode_id)
+            self._run.note("dropped", self.episode.episode_id)
         else:
             self.states.drop()
 
@@ -226,9 +214,8 @@ class EpisodeRecording:
         self, start: EpisodeStart | None, observation: Any, name: str, *, is_kept: bool
     ) -> StateRecorder:
         run = self._run
-        facts = {
-            **run.recording_facts(start),
-            "random_state": self._random_state,
+        facts: dict[str, Any] = {
+            "random_state": self.episode.random_state,
             "kept": is_kept,
             "video": self._pending_video,
         }
@@ -241,14 +228,98 @@ class EpisodeRecording:
         return StateRecorder(
             run,
             self._name,
-            logs=run.logs,
-            what="trajectory",
             facts=facts,
-            capture=None if start is None else run.env.states,
             start=start,
-            max_fps=run.options.max_fps,
             observation=observation if run.options.observations else None,
             # A candidate needs its own log, because it may be dropped while other
             # episodes are kept.
             is_alone=is_candidate,
         )
+
+
+class KeptVideos:
+    """Holds, submits or deletes recordings as a selection decides.
+
+    Args:
+        selection: the object that chooses the episodes that get a video.
+    """
+
+    def __init__(self, selection: Selection) -> None:
+        self.selection = selection
+        self._held: dict[int, EpisodeRecording] = {}
+        self._is_decided = False
+        # The reason why no decision could be made, and the episodes kept because of it.
+        self._failure: str | None = None
+        self._left: list[int] = []
+
+    def chosen_facts(self) -> dict[str, Any]:
+        """Return the facts that mark a video as chosen."""
+        selection = self.selection
+        facts = {"rule": selection.name, "decided": True}
+        return {**facts, "finished": selection.finished}
+
+    def hold(self, recording: EpisodeRecording) -> None:
+        """Hold the recording of an ended episode until it is chosen or dropped."""
+        self._held[recording.episode.episode_id] = recording
+
+    def settle(self) -> None:
+        """Submit the recordings that are already chosen, and delete dropped ones.
+
+        Raises:
+            DirectoryNotWritable, FileNotWritten: see `EpisodeRecording.choose` and
+                `drop`. A failure does not affect the other recordings.
+        """
+        if len(self._held) > self.selection.undecided:
+            self._hand_on(list(self._held))
+
+    def decide(self) -> None:
+        """Decide about all held recordings at the end of the run.
+
+        Raises:
+            InvalidArgument: the user's function could not choose. All held episodes are
+                kept, and their videos are pending or already exist.
+            DirectoryNotWritable, FileNotWritten: see `settle`.
+        """
+        if self._is_decided or self._failure is not None:
+            return
+        try:
+            self.selection.close()
+        except InvalidArgument as error:
+            self._failure = str(error)
+            self._left = list(self._held)
+            for recording in self._held.values():
+                recording.expect()
+            raise
+        self._is_decided = True
+        # Chosen recordings come first, so that they survive if the process is killed.
+        chosen = set(self.selection.chosen)
+        self._hand_on(sorted(self._held, key=lambda number: number not in chosen))
+
+    def details(self) -> dict[str, Any]:
+        """Return the facts about the final choice for the journal."""
+        failure = {} if self._failure is None else {"failure": self._failure}
+        return {
+            "rule": self.selection.name,
+            "decided": self._is_decided,
+            "chosen": self.selection.chosen,
+            "finished": self.selection.finished,
+            "recorded": self._left or self.selection.chosen,
+            **failure,
+        }
+
+    def _hand_on(self, episode_ids: Iterable[int]) -> None:
+        failure: Error | None = None
+        for episode_id in episode_ids:
+            standing = self.selection.standing(episode_id)
+            if standing is Standing.CANDIDATE:
+                continue
+            recording = self._held.pop(episode_id)
+            try:
+                if standing is Standing.CHOSEN:
+                    recording.choose(self.chosen_facts())
+                else:
+                    recording.drop()
+            except Error as error:
+                failure = failure or error
+        if failure is not None:
+            raise failure

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import FileNotWritten, PicturesDiffer
-from ..formats.span_writer import SpanLogs, SpanWriter
+from ..formats.span_writer import SpanWriter
 from ..formats.trajectory import ModelChange, row_dtype
 from ..rates import rate_from_timestep, stride_for
 from .fast_path import FastPath, gathering
@@ -23,7 +23,7 @@ from .monitored_run import MonitoredRun, What
 from .step_arrays import StepArray, action_array, step_array
 
 if TYPE_CHECKING:
-    from ..simulation.capture import Capture, EpisodeStart
+    from ..simulation.capture import EpisodeStart
 
 logger = logging.getLogger(__name__)
 
@@ -42,14 +42,13 @@ class StateRecorder:
     Args:
         run: the monitored run.
         name: name of the resulting file, without suffix.
-        logs: the logs that its rows are written to.
-        what: the part of the run that is lost if rows cannot be written, for messages.
-        facts: the facts known at the beginning.
-        capture: captures states; None if no simulation is accessible.
-        start: the value that `capture.begin_episode` returned.
-        max_fps: maximum frames per second; None takes a frame at every step.
+        facts: the facts known at the beginning, in addition to the run's.
+        start: the value that `begin_episode` of the capture returned; None if no states
+            are accessible.
         observation: the reset's observation; None if observations are not recorded.
-        has_actions: whether actions are recorded.
+        is_clip: whether it is a part of a clip. Its frames do not depend on actions, so
+            these are left out. The frames of all parts are counted together, so
+            `max_fps` selects them when they are drawn.
         is_alone: whether it may be deleted separately; it then gets its own log.
 
     Attributes:
@@ -62,27 +61,23 @@ class StateRecorder:
         run: MonitoredRun,
         name: str,
         *,
-        logs: SpanLogs,
-        what: What,
         facts: Mapping[str, Any],
-        capture: Capture | None,
         start: EpisodeStart | None,
-        max_fps: float | Fraction | None = None,
         observation: Any = None,
-        has_actions: bool = True,
+        is_clip: bool = False,
         is_alone: bool = False,
     ) -> None:
         self.is_stopped = False
         self.broken_reason: str | None = None
         self._run = run
         self._name = name
-        self._logs = logs
-        self._what = what
-        self._facts = facts
-        self._capture = capture
+        track = self._track = run.of_clips if is_clip else run.of_episodes
+        capture = self._capture = None if start is None else track.capture
+        self._what: What = "video" if is_clip else "trajectory"
+        self._facts = {**run.recording_facts(start), **facts}
         self._start = start
-        self._max_fps = max_fps
-        self._has_actions = has_actions
+        self._max_fps = None if is_clip else run.options.max_fps
+        self._has_actions = not is_clip
         self._is_alone = is_alone
         self._takes_frames = start is not None and start.snapshot is not None
         self._span: SpanWriter | None = None
@@ -108,11 +103,9 @@ class StateRecorder:
                 snapshot = np.empty(start.snapshot.itemsize // 8, np.uint64)
                 self._first_change = capture.capture_snapshot(snapshot)
                 self._first["snapshot"] = snapshot
-        self._pace = run.paces.get(logs)
-        self._action: StepArray | None = None
-        if has_actions:
-            self._use_action(run.actions.get(logs))
-        if self._pace is not None and (not has_actions or self._action is not None):
+        self._pace = track.pace
+        self._use_action(track.action)
+        if self._pace is not None and (is_clip or self._action is not None):
             # Most likely nothing has changed since the last recording. If the row
             # cannot be written, the first step reports it.
             with contextlib.suppress(FileNotWritten):
@@ -190,7 +183,11 @@ class StateRecorder:
                     is_frame = self._write_snapshot(span, slot, number)
             finally:
                 # Even after an exception: a reader stops at the first missing step.
-                self._write_arrays(span, slot)
+                columns = span.log.columns
+                if self._action is not None:
+                    columns["action"][slot] = self._action.values
+                if self._observation is not None:
+                    columns["observation"][slot] = self._observation.values
                 span.commit(
                     number,
                     reward,
@@ -327,7 +324,7 @@ class StateRecorder:
         if self._span is None:
             self._begin(pace)
         elif pace != self._pace:
-            self._run.paces[self._logs] = self._pace = pace
+            self._track.pace = self._pace = pace
             self._fast = None
             self.note(**pace)
         assert self._span is not None
@@ -340,8 +337,8 @@ class StateRecorder:
     def _begin(self, pace: Mapping[str, Any]) -> None:
         """Begin the span and write the reset's row."""
         action, start = self._action, self._start
-        self._run.paces[self._logs] = self._pace = pace
-        self._run.actions[self._logs] = action
+        self._track.pace, self._track.action = pace, action
+        self._pace = pace
         facts = {**self._facts, **self._parts(), **pace}
         if action is not None and action.given is not None:
             self._action_dtypes = [[0, _dtype_name(action.given)]]
@@ -352,7 +349,7 @@ class StateRecorder:
             action=None if action is None else action.kind,
             observation=None if self._observation is None else self._observation.kind,
         )
-        span = self._logs.begin(self._name, facts, dtype, alone=self._is_alone)
+        span = self._track.logs.begin(self._name, facts, dtype, alone=self._is_alone)
         try:
             own = None if start is None else start.model_fields
             for fields in (own, self._first_change):
@@ -397,13 +394,6 @@ class StateRecorder:
             span.log.add_change(ModelChange(step=number, fields=changed))
         return self._takes_frames
 
-    def _write_arrays(self, span: SpanWriter, slot: int) -> None:
-        columns = span.log.columns
-        if self._action is not None:
-            columns["action"][slot] = self._action.values
-        if self._observation is not None:
-            columns["observation"][slot] = self._observation.values
-
     def _parts(self) -> dict[str, Any]:
         """Return names and shapes of the arrays that were joined into one vector."""
         arrays = {"action": self._action, "observation": self._observation}
@@ -435,7 +425,7 @@ class StateRecorder:
             logger.warning(
                 "%s: from step %d on, the %s have a different type or shape and are "
                 "recorded as zeros.",
-                self._logs.path_of(self._name).name,
+                self._track.logs.path_of(self._name).name,
                 self.steps,
                 what,
             )

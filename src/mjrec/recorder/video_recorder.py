@@ -333,7 +333,9 @@ class VideoRecorder:
         """Open the video once the frames of two steps show the duration of a step."""
         if self._sink is not None or self._first is None:
             return
-        self._timestep = _time_of_a_step(self._first, (step, self._clock()))
+        (first, start), now = self._first, self._clock()
+        if start is not None and now is not None and now > start:
+            self._timestep = 1 / rate_from_timestep((now - start) / (step - first))
         self._frames_per_step = max(frames, 1)
         real_time: Callable[[], Fraction] = self._declared
         if self._timestep is not None and frames:
@@ -420,16 +422,6 @@ class VideoRecorder:
         )
 
 
-def _time_of_a_step(
-    earlier: tuple[int, float | None], later: tuple[int, float | None]
-) -> Fraction | None:
-    """Return the duration of a step, given two pairs of a step and a clock time."""
-    (first, start), (last, end) = earlier, later
-    if start is None or end is None or end <= start:
-        return None
-    return 1 / rate_from_timestep((end - start) / (last - first))
-
-
 _DEFAULT_RATE = Fraction(30)
 
 
@@ -443,14 +435,17 @@ def declared_rate(env: object) -> Fraction:
     Raises:
         InvalidArgument: `render_fps` is not a valid rate.
     """
-    timestep = _declared_timestep(env)
-    if timestep:
-        return rate_from_timestep(timestep)
+    base = getattr(env, "unwrapped", env)
+    simulation = simulation_in(env)
+    if callable(timestep := getattr(base, "control_timestep", None)):
+        return rate_from_timestep(float(timestep()))
+    if simulation is not None and (dt := getattr(base, "dt", None)):
+        return rate_from_timestep(float(dt))
     fps = (getattr(env, "metadata", None) or {}).get("render_fps")
     if fps is not None:
         return to_rate(fps, name=f'metadata["render_fps"] of {type(env).__name__}')
     can_be_drawn = getattr(env, "render_mode", None) is not None
-    if can_be_drawn or simulation_in(env) is not None:
+    if can_be_drawn or simulation is not None:
         logger.warning(
             "%s does not declare a frame rate (no control timestep, no render_fps). "
             "Its videos use %d frames per second; set fps= to choose another rate.",
@@ -458,14 +453,3 @@ def declared_rate(env: object) -> Fraction:
             _DEFAULT_RATE,
         )
     return _DEFAULT_RATE
-
-
-def _declared_timestep(env: object) -> float | None:
-    base = getattr(env, "unwrapped", env)
-    control_timestep = getattr(base, "control_timestep", None)
-    if callable(control_timestep):
-        return float(control_timestep())
-    if simulation_in(env) is None:
-        return None
-    dt = getattr(base, "dt", None)
-    return float(dt) if dt else None

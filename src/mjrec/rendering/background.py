@@ -35,6 +35,7 @@ from typing import TYPE_CHECKING, Any
 
 from ..child_python import Child, wait_for_news
 from ..errors import Error
+from ..formats.video_metadata import note_failure, reason_of
 from ..machine import check_workers
 from ..messages import Parent, log_message
 from ..timeouts import Timeout, timeout_s
@@ -169,6 +170,11 @@ class Background:
         if self.waiting:
             reason = f"the rendering process is gone: {self._deaths[-1]}"
             self.failures.update(dict.fromkeys(self.waiting, reason))
+            for key in filter(None, map(key_of, self.waiting)):
+                video = self._directory / key.shown_name
+                # Usually the process has already recorded the reason.
+                if reason_of(video) is None:
+                    note_failure(video, reason)
             self.waiting.clear()
 
     @contextlib.contextmanager

@@ -21,9 +21,8 @@ from tensorboard.compat.proto import event_pb2, summary_pb2, tensor_pb2, types_p
 from tensorboard.plugins.text.metadata import create_summary_metadata
 from tensorboard.summary.writer.record_writer import RecordWriter
 
-from ..atomic_files import make_directory
+from ..atomic_files import AppendOnlyFile, make_directory
 from ..errors import DirectoryNotWritable
-from .append_only_file import AppendOnlyFile
 
 # Format and offset of the width and height in a GIF.
 _GIF_SIZE = struct.Struct("<HH")

@@ -20,9 +20,9 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from .. import json_text
+from ..atomic_files import AppendOnlyFile
 from ..formats.monitor_directory import FILE_PREFIX
 from ..recorder.tracking import FinishedEpisode, Run, Tracker
-from .append_only_file import AppendOnlyFile
 
 # Stable-Baselines3 reads every file in a directory whose name ends like this.
 _ENDING = "monitor.csv"

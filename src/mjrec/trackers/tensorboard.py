@@ -59,7 +59,11 @@ class TensorBoardTracker(Tracker):
         require("tensorboard", purpose="TensorBoardTracker")
         # Absolute, because the working directory may change before the path is used.
         self._log_dir = None if log_dir is None else Path(log_dir).absolute()
-        self._runs: dict[Run, _TensorBoardRun] = {}
+        self._files: dict[Run, EventFile] = {}
+        self._last_episodes: dict[Run, FinishedEpisode] = {}
+        # Threads that create previews. A thread is started by the run's first video,
+        # because most runs of a vector environment have no video.
+        self._previews: dict[Run, WorkerThread[Callable[[], None]]] = {}
 
     def begin(self, run: Run) -> None:
         """Create the run's event file.
@@ -68,7 +72,10 @@ class TensorBoardTracker(Tracker):
             DirectoryNotWritable: the run's directory cannot be created.
             FileNotWritten: the disk is full.
         """
-        self._runs[run] = _TensorBoardRun(self._directory(run))
+        # Imported late, because it imports tensorboard.
+        from .event_file import EventFile
+
+        self._files[run] = EventFile(self._directory(run))
 
     def episode(self, run: Run, episode: FinishedEpisode) -> None:
         """Write the episode's scalars.
@@ -76,7 +83,12 @@ class TensorBoardTracker(Tracker):
         Raises:
             FileNotWritten: the disk is full.
         """
-        self._runs[run].write_episode(episode)
+        self._last_episodes[run] = episode
+        group = group_of(episode)
+        values = {f"{group}/{k}": v for k, v in scalars_of(episode).items()}
+        self._files[run].write_scalars(
+            values, step=episode.total_steps, wall_time=episode.end_time
+        )
 
     def video(self, run: Run, video: FinishedVideo) -> None:
         """Write the video's name, and start creating its preview.
@@ -86,54 +98,15 @@ class TensorBoardTracker(Tracker):
             EncoderError: ffmpeg failed to create this or an earlier video's preview.
             UnreadableFile: the video's metadata is damaged.
         """
-        self._runs[run].write_video(video)
-
-    def end(self, run: Run) -> None:
-        """Wait for the previews, and close the run's event file.
-
-        Raises:
-            Error: one of the remaining previews failed; see `video`.
-        """
-        self._runs.pop(run).close()
-
-    def _directory(self, run: Run) -> Path:
-        name = run.infix if run.env_index is None else f"{run.infix}.env{run.env_index}"
-        if self._log_dir is None:
-            return run.directory / "tensorboard" / name
-        # Monitors in one process may have the same infix in different directories.
-        return self._log_dir / f"{run.directory.name}.{name}"
-
-
-class _TensorBoardRun:
-    """A run's event file, and the thread that creates its previews."""
-
-    def __init__(self, directory: Path) -> None:
-        # Imported late, because it imports tensorboard.
-        from .event_file import EventFile
-
-        self._file: EventFile = EventFile(directory)
-        self._last_episode: FinishedEpisode | None = None
-        # Started by the first video, because most runs of a vector environment have no
-        # video.
-        self._previews: WorkerThread[Callable[[], None]] | None = None
-
-    def write_episode(self, episode: FinishedEpisode) -> None:
-        self._last_episode = episode
-        group = group_of(episode)
-        values = {f"{group}/{k}": v for k, v in scalars_of(episode).items()}
-        self._file.write_scalars(
-            values, step=episode.total_steps, wall_time=episode.end_time
-        )
-
-    def write_video(self, video: FinishedVideo) -> None:
-        episode = video.episode or self._last_episode
+        file = self._files[run]
+        episode = video.episode or self._last_episodes.get(run)
         tag = f"{group_of(episode)}/{name_of(video)}"
         step = episode.total_steps if episode else 0
         with unreadable(video.metadata_path):
             metadata = read_object(video.metadata_path)
             fps = Fraction(field(metadata, "fps", text))
             frame_count = field(metadata, "frame_count", integer)
-        self._file.write_text(
+        file.write_text(
             f"{tag}_file",
             f"episode {video.episode_id}: `{video.path.name}`, {frame_count} frames "
             f"at {float(fps):g} fps, in `{video.path.parent}`",
@@ -143,20 +116,34 @@ class _TensorBoardRun:
 
         def write_preview() -> None:
             gif = animated_gif(video.path, frame_count=frame_count, fps=fps)
-            self._file.write_gif(tag, gif, step=step, wall_time=time.time())
+            file.write_gif(tag, gif, step=step, wall_time=time.time())
 
-        if self._previews is None:
-            self._previews = WorkerThread(
+        if run not in self._previews:
+            self._previews[run] = WorkerThread(
                 lambda write: write(), capacity=_MOST_WAITING, name="previews"
             )
-        self._previews.put(write_preview)
+        self._previews[run].put(write_preview)
 
-    def close(self) -> None:
+    def end(self, run: Run) -> None:
+        """Wait for the previews, and close the run's event file.
+
+        Raises:
+            Error: one of the remaining previews failed; see `video`.
+        """
+        self._last_episodes.pop(run, None)
+        file, previews = self._files.pop(run), self._previews.pop(run, None)
         try:
-            if self._previews is not None:
-                self._previews.close()
+            if previews is not None:
+                previews.close()
         finally:
-            self._file.close()
+            file.close()
+
+    def _directory(self, run: Run) -> Path:
+        name = run.infix if run.env_index is None else f"{run.infix}.env{run.env_index}"
+        if self._log_dir is None:
+            return run.directory / "tensorboard" / name
+        # Monitors in one process may have the same infix in different directories.
+        return self._log_dir / f"{run.directory.name}.{name}"
 
 
 def animated_gif(path: Path, *, frame_count: int, fps: Fraction) -> bytes:

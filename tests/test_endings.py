@@ -10,7 +10,7 @@ from recordings import frames_in, in_flight, manifest_of, metadata_of, stats_of
 
 import mjrec
 from mjrec import Monitor
-from mjrec.recorder.ending_reasons import ending
+from mjrec.recorder.endings import ending
 
 
 class Breaking(gymnasium.Wrapper):
