@@ -312,10 +312,7 @@ def find_recording(path: Path) -> Recording | None:
         UnreadableFile: the journal of its monitor cannot be read.
     """
     name = path.name.removesuffix(FINISHED)
-    infix = infix_of_recording(name)
-    if infix is None:
-        return None
-    recording = _read(path.with_name(journal_name(infix))).recordings.get(name)
+    recording = _read(_journal_of(path)).recordings.get(name)
     if recording is None or recording.is_gone or not recording.log.exists():
         return None
     return recording
