@@ -19,7 +19,7 @@ import gymnasium
 
 import mjrec
 from mjrec.evaluation.episode_results import EpisodeResult
-from mjrec.evaluation.evaluation import write_results
+from mjrec.evaluation.evaluation import Evaluation, write_results
 from mjrec.evaluation.plan import Chunk, EvaluatedTask, EvaluationPlan, write_plan
 from mjrec.evaluation.result_tables import EpisodeFiles
 from mjrec.evaluation.statistics import Bootstrap
@@ -114,10 +114,9 @@ def write_evaluation(
     folders = {task.name: f"{task.folder}/{_CHUNK}" for task in planned}
     few = Bootstrap(resamples=10)
     write_plan(directory, plan)
-    write_results(
-        directory,
+    evaluation = Evaluation(
+        directory=directory,
         plan=plan,
-        results=[result for each in results.values() for result in each],
         summaries=[
             summarize_results(task, each, bootstrap=few)
             for task, each in results.items()
@@ -126,7 +125,11 @@ def write_evaluation(
         bootstrap=few,
         selection={},
         versions={},
-        files=lambda result: EpisodeFiles(
+    )
+    write_results(
+        evaluation,
+        [result for each in results.values() for result in each],
+        lambda result: EpisodeFiles(
             folder=folders[result.task],
             trajectory=f"{_trajectory_of(result)}.h5",
         ),

@@ -18,8 +18,8 @@ from typing import Any
 import gymnasium
 
 import mjrec
-from mjrec.evaluation.chunk_results import read_chunk
-from mjrec.evaluation.evaluation import write_results
+from mjrec.evaluation.episode_results import read_chunk
+from mjrec.evaluation.evaluation import Evaluation, write_results
 from mjrec.evaluation.plan import EvaluatedTask, EvaluationPlan
 from mjrec.evaluation.statistics import Bootstrap
 from mjrec.evaluation.summaries import summarize_results
@@ -116,16 +116,16 @@ def hold(results: int) -> list[float]:
     def work() -> None:
         held = list(results_of(TASK, monitors=results, episodes=1))
         with tempfile.TemporaryDirectory() as place:
-            write_results(
-                Path(place),
+            evaluation = Evaluation(
+                directory=Path(place),
                 plan=plan,
-                results=held,
                 summaries=[summarize_results(TASK, held)],
                 across=None,
                 bootstrap=Bootstrap(),
                 selection={},
                 versions={},
             )
+            write_results(evaluation, held)
 
     return _measured(work)
 

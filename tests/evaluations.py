@@ -4,7 +4,7 @@
 import re
 
 from mjrec.evaluation.episode_results import EpisodeResult
-from mjrec.evaluation.evaluation import ChosenEpisode, write_results
+from mjrec.evaluation.evaluation import ChosenEpisode, Evaluation, write_results
 from mjrec.evaluation.plan import EvaluatedTask, EvaluationPlan
 from mjrec.evaluation.result_tables import EpisodeFiles
 from mjrec.evaluation.statistics import Bootstrap
@@ -79,10 +79,9 @@ def write_evaluation(
         video = videos.get(result.task) if is_first else None
         return EpisodeFiles(folders[result.task] if monitor else None, video=video)
 
-    write_results(
-        directory,
+    evaluation = Evaluation(
+        directory=directory,
         plan=asked,
-        results=[result for each in results.values() for result in each],
         summaries=[
             summarize_results(
                 task,
@@ -98,8 +97,8 @@ def write_evaluation(
         bootstrap=bootstrap,
         selection={task: [ChosenEpisode(asked.seeds[0], 0, "best")] for task in videos},
         versions=versions or {},
-        files=files,
     )
+    write_results(evaluation, [r for each in results.values() for r in each], files)
     return directory
 
 

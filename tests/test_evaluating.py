@@ -33,7 +33,7 @@ from mjrec import (
     UnknownName,
 )
 from mjrec.engines.choice import engine_from
-from mjrec.evaluation.chunk_results import recorded_results
+from mjrec.evaluation.episode_results import recorded_results
 from mjrec.evaluation.evaluating import evaluate
 from mjrec.evaluation.evaluation import read_results
 from mjrec.evaluation.plan import EvaluationPlan

@@ -17,7 +17,7 @@ import mjrec
 from conftest import Corridor
 from mjrec.environments.episode_seeds import episode_seeds
 from mjrec.environments.named_environment import EnvironmentOptions
-from mjrec.evaluation.chunk_results import read_chunk
+from mjrec.evaluation.episode_results import read_chunk
 from mjrec.evaluation.plan import Chunk, EvaluatedTask, EvaluationPlan
 from mjrec.evaluation.worker import EvaluationWorker
 from mjrec.formats.bundle import finished_trajectories

@@ -28,7 +28,7 @@ import honest_runs as honest
 import lying_environments as lying
 import mjrec
 from forged_runs import ForgedRun
-from mjrec.evaluation.chunk_results import recorded_results
+from mjrec.evaluation.episode_results import recorded_results
 from mjrec.evidence.findings import Outcome, Verdict, Verification
 from mjrec.formats.trajectory import added_up
 from mjrec.formats.trajectory_file import open_trajectory

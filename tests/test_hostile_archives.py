@@ -105,6 +105,43 @@ def two_entries_over_the_same_bytes(path: Path) -> None:
     path.write_bytes(data)
 
 
+def with_two_tables(path: Path) -> None:
+    """Python follows a record of large archives; others see none, for it hides."""
+    evil = "run/data/evil"
+    begin = 30 + len(GOOD) + 1  # the second file, which holds the table that all see
+    table = begin + 30 + len(evil)
+    hidden_size = 46 + len(GOOD) + 46 + len(evil)
+    extra = struct.pack("<2H", 0x5455, hidden_size + 56 + 20)
+    seen = listing(GOOD, b"1", 0, len(extra) + hidden_size + 56 + 20) + extra
+    hidden = listing(GOOD, b"1", 0) + listing(evil, seen, begin)
+    place = table + len(seen)
+    path.write_bytes(
+        stored(GOOD, b"1")
+        + stored(evil, seen)
+        + hidden
+        + struct.pack(
+            "<4sQ2H2L4Q", b"PK\6\6", 44, 45, 45, 0, 0, 2, 2, hidden_size, place
+        )
+        + struct.pack("<4sLQL", b"PK\6\7", 0, place + hidden_size, 1)
+        + struct.pack(
+            "<4s4H2LH",
+            *(b"PK\5\6", 0, 0, 1, 1, len(seen) + hidden_size + 56 + 20, table, 0),
+        )
+    )
+
+
+def stored(name: str, content: bytes) -> bytes:
+    facts = (0, 0, 33, zlib.crc32(content), len(content), len(content), len(name), 0)
+    head = struct.pack("<4s2H3H3L2H", b"PK\3\4", 20, 0, *facts)
+    return head + name.encode() + content
+
+
+def listing(name: str, content: bytes, offset: int, extra: int = 0) -> bytes:
+    sizes = (zlib.crc32(content), len(content), len(content), len(name), extra)
+    facts = (20, 20, 0, 0, 0, 33, *sizes, 0, 0, 0, 0, offset)
+    return struct.pack("<4s6H3L5H2L", b"PK\1\2", *facts) + name.encode()
+
+
 def rare_compression(path: Path) -> None:
     with zipfile.ZipFile(path, "w", zipfile.ZIP_BZIP2) as file:
         file.writestr(GOOD, b"1")
@@ -192,6 +229,7 @@ HARMS: list[tuple[Make, str]] = [
     (bomb, "zip bomb"),
     (many_files, "more than the limit"),
     (two_entries_over_the_same_bytes, "overlaps"),
+    (with_two_tables, "two tables"),
     (rare_compression, "unsupported compression"),
     (lambda path: write(path, ("run/readme.txt", b"1")), "data/recordings"),
     (linked_folder, "neither a file nor a folder"),

@@ -10,6 +10,7 @@ from mjrec import UnreadableFile
 from mjrec.evaluation.episode_results import EpisodeResult
 from mjrec.evaluation.evaluation import (
     ChosenEpisode,
+    Evaluation,
     is_evaluation,
     read_results,
     write_results,
@@ -71,20 +72,20 @@ RESULTS = [
 
 def written(directory, **changed):
     facts = {
+        "directory": directory,
         "plan": PLAN,
-        "results": RESULTS,
         "summaries": [SUMMARY],
         "across": ACROSS,
         "bootstrap": Bootstrap(resamples=10),
         "selection": {"a,b-v0": [ChosenEpisode(7, 0, "best")]},
         "versions": {"mujoco": "3.4"},
-        "files": files,
     }
-    write_results(directory, **{**facts, **changed})
+    results, files = changed.pop("results", RESULTS), changed.pop("files", files_of)
+    write_results(Evaluation(**{**facts, **changed}), results, files)
     return directory
 
 
-def files(result):
+def files_of(result):
     if result.monitor is None:
         return EpisodeFiles()
     return EpisodeFiles(

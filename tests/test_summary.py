@@ -9,7 +9,7 @@ import pytest
 import rich.console
 from verifications import HOSTILE, excuse, finding, verification
 
-from mjrec.commands.verification_screen import show_verification
+from mjrec.commands.verify import show_verification
 from mjrec.evidence import summary
 from mjrec.evidence.findings import Finding, Level, Outcome, Topic, Verification
 from mjrec.plain_text import counted

@@ -55,7 +55,7 @@ class Child:
         module: the module to run.
         arguments: its command-line arguments.
         environ: its environment variables, except the module search path.
-        cwd: its working directory; if None, the parent's.
+        cwd: its working directory, if it is not forked; if None, the parent's.
         is_heard: whether the caller reads the output from the pipe `words`. If False,
             the output is kept in memory, and `last_words` includes its end.
         fork: a function to call in a fork of this process, instead of running the
@@ -88,11 +88,22 @@ class Child:
         pipes = (their_orders, their_answers)
         environ = {**environ, PIPES_VARIABLE: f"{their_orders} {their_answers}"}
         try:
-            if fork is None:
-                command = [*python_command(module), *arguments]
-                self.pid = _started(command, pipes, printed, environ, cwd)
+            if fork is not None:
+                self.pid = _forked(fork, pipes, printed, environ)
             else:
-                self.pid = _forked(fork, pipes, printed, environ, cwd)
+                process = subprocess.Popen(
+                    [*python_command(module), *arguments],
+                    env=environment_of_child(environ),
+                    cwd=cwd,
+                    stdin=subprocess.DEVNULL,
+                    stdout=printed,
+                    stderr=printed,
+                    pass_fds=pipes,
+                    start_new_session=True,
+                )
+                # `_Process` waits for it, so `subprocess` must not.
+                process.returncode = 0
+                self.pid = process.pid
         except BaseException:
             for descriptor in (words, orders, answers):
                 os.close(descriptor)
@@ -327,41 +338,17 @@ def _memory() -> tuple[int, int]:
     return words, os.dup(words)
 
 
-def _started(
-    command: list[str],
-    pipes: tuple[int, int],
-    printed: int,
-    environ: Mapping[str, str],
-    cwd: str | None,
-) -> int:
-    process = subprocess.Popen(
-        command,
-        env=environment_of_child(environ),
-        cwd=cwd,
-        stdin=subprocess.DEVNULL,
-        stdout=printed,
-        stderr=printed,
-        pass_fds=pipes,
-        start_new_session=True,
-    )
-    # `_Process` waits for it, so `subprocess` must not.
-    process.returncode = 0
-    return process.pid
-
-
 def _forked(
     run: Callable[[], object],
     pipes: tuple[int, int],
     printed: int,
     environ: Mapping[str, str],
-    cwd: str | None,
 ) -> int:
     pid = os.fork()
     if pid:
         return pid
     try:
         os.setsid()
-        os.chdir(cwd or ".")
         os.environ.update(environ)
         # Undo what was set in the process that this one is a copy of.
         signal.signal(signal.SIGTERM, signal.SIG_DFL)
@@ -450,3 +437,21 @@ def _is_of_main(entry: str) -> bool:
     return entry == "" or (
         file is not None and Path(entry).resolve() == Path(file).resolve().parent
     )
+
+
+@contextlib.contextmanager
+def changed_environ(changes: Mapping[str, str | None]) -> Iterator[None]:
+    """Set or, for None, remove environment variables in the block.
+
+    Afterwards all variables are restored, including those that the block itself set.
+    """
+    before = dict(os.environ)
+    for name in changes:
+        os.environ.pop(name, None)
+    os.environ.update({name: v for name, v in changes.items() if v is not None})
+    try:
+        yield
+    finally:
+        for name in set(os.environ) - set(before):
+            del os.environ[name]
+        os.environ.update(before)

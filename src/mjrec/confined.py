@@ -51,8 +51,8 @@ _libc = ctypes.CDLL(None, use_errno=True)
 
 def confine(
     readable: Iterable[str], writable: Iterable[str], hidden: Iterable[str] = ()
-) -> dict[str, bool]:
-    """Permanently confine this process and the processes it starts.
+) -> None:
+    """Permanently confine this process and its children, as far as the kernel can.
 
     Args:
         readable: files and folders that may be read, in addition to Python's and the
@@ -60,15 +60,11 @@ def confine(
         writable: folders that may be written to.
         hidden: folders that modules must not be imported from, such as the folder of
             the caller's script.
-
-    Returns:
-        `files` and `network`: whether the kernel blocks access to other files and to
-        the network.
     """
-    without_network = _leave_network()
+    _leave_network()
     version = _libc.syscall(_CREATE, None, ctypes.c_size_t(0), 1)
     if version < 1:
-        return {"files": False, "network": without_network}
+        return
     files = (1 << _RIGHTS.get(version, 16)) - 1
     rules = [files]
     # Older kernels expect a shorter structure.
@@ -79,28 +75,24 @@ def confine(
     packed = struct.pack(f"={len(rules)}Q", *rules)
     ruleset = _libc.syscall(_CREATE, packed, ctypes.c_size_t(len(packed)), 0)
     if ruleset < 0:
-        return {"files": False, "network": without_network}
-    for path in {*_SYSTEM, *_python(), *readable} - {*hidden}:
+        return
+    python = {sys.prefix, sys.base_prefix, *filter(None, sys.path)}
+    for path in {*_SYSTEM, *python, *readable} - {*hidden}:
         _allow(ruleset, path, _READ)
     for path in {"/dev", *writable}:
         _allow(ruleset, path, files)
     _libc.prctl(_NO_NEW_PRIVILEGES, 1, 0, 0, 0)
-    is_confined = _libc.syscall(_RESTRICT, ruleset, 0) == 0
+    _libc.syscall(_RESTRICT, ruleset, 0)
     os.close(ruleset)
-    return {"files": is_confined, "network": without_network}
 
 
-def _python() -> set[str]:
-    return {sys.prefix, sys.base_prefix, *filter(None, sys.path)}
-
-
-def _leave_network() -> bool:
+def _leave_network() -> None:
     user, group = os.getuid(), os.getgid()
     # A process without the privilege may have it inside its own user namespace.
     if _libc.unshare(_CLONE_NEWNET) == 0:
-        return True
+        return
     if _libc.unshare(_CLONE_NEWUSER | _CLONE_NEWNET) != 0:
-        return False
+        return
     with contextlib.suppress(OSError):
         for name, text in (
             ("setgroups", "deny"),
@@ -108,7 +100,6 @@ def _leave_network() -> bool:
             ("gid_map", f"{group} {group} 1"),
         ):
             Path("/proc/self", name).write_text(text)
-    return True
 
 
 def _allow(ruleset: int, path: str, rights: int) -> None:
@@ -126,9 +117,7 @@ def _allow(ruleset: int, path: str, rights: int) -> None:
 
 def main() -> None:
     """Confine this process as its environment variable requests, and run the module."""
-    said = json.loads(os.environ.pop(VARIABLE))
-    holds = confine(**said)
-    os.environ[f"{VARIABLE}_HOLDS"] = json.dumps(holds)
+    confine(**json.loads(os.environ.pop(VARIABLE)))
     module = sys.argv.pop(1)
     runpy.run_module(module, run_name="__main__", alter_sys=True)
 

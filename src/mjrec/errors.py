@@ -47,6 +47,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from .plain_text import listed
+
 
 class Error(Exception):
     """Base class of all errors that mjrec raises on purpose."""
@@ -66,13 +68,6 @@ def rebuilt(kind: type[Error], message: str, facts: Mapping[str, Any]) -> Error:
 
 
 _MOST_NAMES = 20
-
-
-def _first_of(names: Sequence[str], count: int, *, between: str = ", ") -> str:
-    """Return the first few names, and the number of the others."""
-    more = len(names) - count
-    shown = between.join(names[:count])
-    return f"{shown} and {more} more" if more > 0 else shown
 
 
 class InvalidArgument(Error, ValueError):
@@ -122,7 +117,7 @@ class ExistingRecordings(Error):
         self.directory = directory
         self.names = list(names)
         super().__init__(
-            f"{directory} already contains recordings: {_first_of(names, 5)}. Use a "
+            f"{directory} already contains recordings: {listed(names, 5)}. Use a "
             "separate directory for each run, resume=True (--resume) to add to these "
             "recordings, or force=True (--force) to delete them."
         )
@@ -331,9 +326,9 @@ class UnfinishedRecordings(PackError):
     def __init__(self, directory: Path, names: Sequence[str], *, advice: str) -> None:
         self.directory = directory
         self.names = list(names)
-        listed = _first_of(names, 5)
+        shown = listed(names, 5)
         super().__init__(
-            f"The recordings in {directory} are not finished: {listed}. {advice}"
+            f"The recordings in {directory} are not finished: {shown}. {advice}"
         )
 
 
@@ -370,11 +365,9 @@ class IdentityLeft(PackError):
 
     def __init__(self, found: Sequence[tuple[str, str]]) -> None:
         self.found = list(found)
-        listed = _first_of(
-            [f"{name}: {what}" for name, what in found], 10, between="; "
-        )
+        shown = listed([f"{name}: {what}" for name, what in found], 10, between="; ")
         super().__init__(
-            f"The packed run would not be anonymous, so it was not written: {listed}. "
+            f"The packed run would not be anonymous, so it was not written: {shown}. "
             "Change the title, record again without these names (uid, camera, body), "
             "or leave out the episodes that contain them."
         )

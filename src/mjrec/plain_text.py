@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Text for people: counts with units, and escaped text from untrusted sources."""
+"""Text for people: counts, short lists, and escaped text from untrusted sources."""
 
 from __future__ import annotations
 
@@ -38,14 +38,21 @@ def counted(count: int, unit: str) -> str:
     return f"{count:,} {unit}{'es' if unit.endswith('sh') else 's'}"
 
 
-def listed(items: Sequence[object], most: int, *, count: int | None = None) -> str:
+def listed(
+    items: Sequence[object],
+    most: int,
+    *,
+    count: int | None = None,
+    between: str = ", ",
+) -> str:
     """Return the first few items: "a, b and 2 more".
 
     Args:
         items: the items, or only the first of them.
         most: maximum number of items to list.
         count: the number of items, if not all are given.
+        between: the text between two items.
     """
-    shown = ", ".join(map(str, items[:most]))
+    shown = between.join(map(str, items[:most]))
     more = (len(items) if count is None else count) - most
     return f"{shown} and {more} more" if more > 0 else shown

@@ -54,6 +54,9 @@ _SECONDS_FOR_GIT = 5.0
 # Short, so that a program ends quickly.
 _SECONDS_AT_THE_END = 2.0
 
+# The command line that recordings name. A worker sets that of the evaluation.
+command = sys.orig_argv
+
 
 def is_of_drawing(variable: str) -> bool:
     """Return whether frames or the last bits of numbers may depend on a variable."""
@@ -71,7 +74,7 @@ class Provenance:
         self._root = root
         self._found: dict[str, Any] | None = None
         # These can change later, so they are read at once.
-        self._command = list(sys.orig_argv)
+        self._command = list(command)
         self._directory = str(Path.cwd())
         self._variables = {
             name: value

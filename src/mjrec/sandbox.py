@@ -67,9 +67,8 @@ class Sandbox(Child):
         limits: resource limits, by their names in `resource`.
         more_environ: environment variables in addition to this process's.
         readable: if given, the process can read only Python, the system and these
-            paths, can write only to `place` and `writable`, and has no network or home
-            folder, if `confined` can enforce this here.
-        writable: additional folders that the process can write to.
+            paths, can write only to `place`, and has no network or home folder, if
+            `confined` can enforce this here.
 
     Raises:
         Error: the process cannot be started.
@@ -86,7 +85,6 @@ class Sandbox(Child):
         limits: Mapping[str, int] = LIMITS,
         more_environ: Mapping[str, str] = _NOTHING,
         readable: Sequence[Path] | None = None,
-        writable: Sequence[Path] = (),
     ) -> None:
         environ = {k: v for k, v in os.environ.items() if k != _TRUST_VARIABLE}
         command = [module]
@@ -94,7 +92,7 @@ class Sandbox(Child):
             environ = {k: v for k, v in environ.items() if k in _KEPT or _is_kept(k)}
             paths = {
                 "readable": [str(path) for path in readable],
-                "writable": [str(path) for path in (place, *writable)],
+                "writable": [str(place)],
                 "hidden": places_of_main(),
             }
             environ |= {"HOME": str(place), VARIABLE: json.dumps(paths)}

@@ -20,13 +20,7 @@ from ..evaluation.requirements import parse_requirement
 from ..evaluation.statistics import Estimate
 from ..plain_text import counted
 from .options import AsJson
-from .terminal import (
-    print_json,
-    print_lines,
-    printable,
-    result_console,
-    table,
-)
+from .terminal import print_json, print_lines, printable, result_console, table
 
 _UNMET = 1
 
@@ -100,7 +94,13 @@ def compare(
     )
     unmet = [why for each in required for why in each.shortfalls(comparison)]
     if required:
-        unmet += _failures(comparison, no_worse_than == "B")
+        side, name = (0, "A") if no_worse_than == "B" else (1, "B")
+        failed = {task.task: task.failed[side] for task in comparison.tasks}
+        unmet += [
+            f"{task}: {counted(count, 'episode')} of {name} failed"
+            for task, count in failed.items()
+            if count
+        ]
     if as_json:
         sides = {side: list(map(str, getattr(comparison, side))) for side in "ab"}
         print_json({**dataclasses.asdict(comparison), **sides, "unmet": unmet})
@@ -116,14 +116,6 @@ def compare(
         for task in comparison.tasks
     )
     return _UNMET if unmet or unknown else 0
-
-
-def _failures(comparison: Comparison, of_a: bool) -> Iterator[str]:
-    for task in comparison.tasks:
-        failed = task.failed[0 if of_a else 1]
-        if failed:
-            name = "A" if of_a else "B"
-            yield f"{task.task}: {counted(failed, 'episode')} of {name} failed"
 
 
 def _lines_before(comparison: Comparison) -> Iterator[str]:

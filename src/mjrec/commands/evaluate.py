@@ -18,6 +18,7 @@ import tyro
 
 from ..errors import InvalidArgument, UnknownName
 from ..evaluation.episode_results import EpisodeResult
+from ..evaluation.evaluating import DEFAULT_FPS
 from ..evaluation.evaluating import evaluate as evaluate_policy
 from ..evaluation.evaluation import Evaluation
 from ..evaluation.following import EvaluationProgress
@@ -27,11 +28,12 @@ from ..evaluation.summaries import TaskSummary
 from ..evaluation.task_sets import tasks_from
 from ..formats.json_fields import to_json
 from ..monitors.progress import ShowProgress, progress_bar
-from ..plain_text import counted
+from ..plain_text import counted, listed
 from ..recorder.keep_rules import keep_rule
 from .options import NO_ENGINE, AsJson, Engine, camera_of, kwargs_of, size_of
 from .terminal import (
-    and_more,
+    FAILED,
+    INTERRUPTED,
     names_by,
     print_json,
     print_lines,
@@ -42,8 +44,6 @@ from .terminal import (
 
 T = TypeVar("T")
 
-_FAILED = 1
-_INTERRUPTED = 130
 _SHOWN = 10
 _MOST_SEEDS = 1_000_000
 _COLUMNS = ("IQM", "median", "min..max", "success", "failed")
@@ -136,29 +136,11 @@ def evaluate(
             "other place, render the episodes afterwards: mjrec render DIR --episode N "
             f"--camera {shlex.quote(str(camera))}"
         )
-    least = _by_task("--fail-under", fail_under, float, "TASK=VALUE")
-    options: dict[str, Any] = {
-        "policy": policy,
-        "episodes": episodes,
-        "seeds": None if seeds is None else _seeds_of(seeds),
-        "num_seeds": num_seeds,
-        "keep": keep,
-        "protocol": protocol,
-        "max_steps": max_steps,
-        "episode_timeout": episode_timeout,
-        "camera": view_from,
-        "height": height,
-        "width": width,
-        "max_fps": max_fps,
-        "quality": quality,
-        "env_kwargs": None if env_kwargs is None else kwargs_of(env_kwargs),
-        "policy_kwargs": None
-        if policy_kwargs is None
-        else kwargs_of(policy_kwargs, "--policy-kwargs"),
-        "score_ranges": _by_task(
-            "--score-range", score_range, _range_of, "TASK=LOW:HIGH"
-        ),
-    }
+    least = _by_task("--fail-under", fail_under, _value_of, "TASK=VALUE")
+    ranges = _by_task("--score-range", score_range, _range_of, "TASK=LOW:HIGH")
+    listed = None if seeds is None else _seeds_of(seeds)
+    env_options = kwargs_of(env_kwargs or "{}")
+    policy_options = kwargs_of(policy_kwargs or "{}", "--policy-kwargs")
     tasks, out = _tasks_and_directory(tasks, out, resume=resume)
     names = tasks_from(tasks) if tasks else ()
     if names:
@@ -169,25 +151,35 @@ def evaluate(
         with progress_bar(console) as show:
             evaluation = evaluate_policy(
                 names,
+                policy=policy,
                 directory=out,
+                episodes=episodes,
+                seeds=listed,
+                num_seeds=num_seeds,
                 workers=workers if engine is None else None,
-                engine=engine,
+                keep=keep,
+                protocol=protocol,
                 resume=resume,
                 force=force,
+                max_steps=max_steps,
+                episode_timeout=episode_timeout,
+                camera=view_from,
+                height=height,
+                width=width,
+                max_fps=DEFAULT_FPS if max_fps is None else max_fps,
+                quality=quality,
+                env_kwargs=env_options,
+                policy_kwargs=policy_options,
+                score_ranges=ranges,
                 confidence=confidence,
                 on_progress=_shown_progress(show, console),
-                # Other options are as in the evaluation to resume, or by default.
-                **{name: value for name, value in options.items() if value is not None},
+                engine=engine,
             )
     except KeyboardInterrupt:
-        print_lines(
-            console,
-            [
-                f"Interrupted. Finished episodes are in {out}. To continue: mjrec "
-                f"evaluate --resume {out}"
-            ],
-        )
-        return _INTERRUPTED
+        way_on = f"To continue: mjrec evaluate --resume {out}"
+        interrupted = f"Interrupted. Finished episodes are in {out}. {way_on}"
+        print_lines(console, [interrupted])
+        return INTERRUPTED
     least = _matching(least, [task.name for task in evaluation.plan.tasks])
     short = dict(_shortfalls(evaluation, least))
     if as_json:
@@ -196,7 +188,7 @@ def evaluate(
         result_console().print(_table(evaluation))
         print_lines(result_console(), _lines(evaluation, short))
     is_nan = bool(evaluation.not_finite) and not allow_nan
-    return _FAILED if evaluation.failed or short or is_nan else 0
+    return FAILED if evaluation.failed or short or is_nan else 0
 
 
 def _shown_progress(
@@ -267,15 +259,16 @@ def _by_task(
         try:
             if not (task and equals):
                 raise ValueError
-            said[task] = _finite(read(value))
+            said[task] = read(value)
         except ValueError:
             raise InvalidArgument(f"{option} must be {form}, got {text!r}.") from None
     return said
 
 
-def _finite(value: T) -> T:
-    if isinstance(value, float) and not math.isfinite(value):
-        raise ValueError(value)
+def _value_of(text: str) -> float:
+    value = float(text)
+    if not math.isfinite(value):
+        raise ValueError(text)
     return value
 
 
@@ -351,7 +344,7 @@ def _lines(evaluation: Evaluation, short: Mapping[str, str]) -> Iterator[str]:
         yield f"{counted(len(pending), 'video')} could not be rendered:"
         reasons = {path.name: reason for path, reason in pending.items()}
         for reason, names in names_by(reasons).items():
-            yield f"  {and_more(names)}: {printable(reason)}"
+            yield f"  {listed(names, 1)}: {printable(reason)}"
     yield f"The results are in {evaluation.directory.absolute()}"
 
 
@@ -380,13 +373,13 @@ def _failure_lines(evaluation: Evaluation) -> Iterator[str]:
         yield f"{len(failed)} of {total} failed:"
         reasons = names_by({_name(each): str(each.failure) for each in failed})
         for reason, names in [*reasons.items()][:_SHOWN]:
-            yield f"  {printable(and_more(names))}: {printable(reason)}"
+            yield f"  {printable(listed(names, 1))}: {printable(reason)}"
         if len(reasons) > _SHOWN:
             yield f"  and {len(reasons) - _SHOWN} more reasons, in results.csv"
     if not_finite := evaluation.not_finite:
         yield (
             f"NaN or infinite: {counted(len(not_finite), 'return')} (--allow-nan "
-            f"accepts them): {and_more([*map(_name, not_finite)])}"
+            f"accepts them): {listed([*map(_name, not_finite)], 1)}"
         )
 
 
@@ -394,11 +387,8 @@ def _example_lines(evaluation: Evaluation) -> Iterator[str]:
     """Yield a line for the best, median and worst episode of each task."""
     not_finite = set(map(_name, evaluation.not_finite))
     for task in evaluation.plan.tasks[:_SHOWN]:
-        known = [
-            each
-            for each in sorted(evaluation.results, key=lambda each: each.unit)
-            if each.task == task.name and _name(each) not in not_finite
-        ]
+        known = sorted(evaluation.by_task[task.name], key=lambda each: each.unit)
+        known = [each for each in known if _name(each) not in not_finite]
         for each, role in keep_rule("best,median,worst").choose(known):
             value, file = _number(each.total_reward), evaluation.file_of(each)
             yield f"  {role:6}  {value:>10}  {_name(each)}  {file}"

@@ -11,10 +11,8 @@ from typing import Annotated, Any
 
 import tyro
 
-from ..errors import UnreadableFile
-from ..evaluation.chunk_results import recorded_results
 from ..evaluation.episode_results import EpisodeResult
-from ..evaluation.evaluation import is_evaluation, read_results
+from ..evaluation.evaluation import is_evaluation, results_in
 from ..formats.monitor_directory import (
     infix_of,
     iter_monitor_files,
@@ -27,6 +25,10 @@ from .terminal import print_json, print_rows, printable
 
 _Rows = Iterator[Sequence[str]]
 
+_FIELDS = (
+    *("task", "seed", "episode", "length", "reward"),
+    *("terminated", "truncated", "success", "failure"),
+)
 _TEXTS = ("task", "monitor", "ended", "video")
 
 
@@ -48,7 +50,7 @@ def list_episodes(
             Each has a `directory` key if there are several directories.
     """
     if is_evaluation(directory):
-        results = _fields_of_results(directory)
+        results = (_fields_of_result(*each) for each in results_in(directory))
         if as_json:
             _print_all(results)
         else:
@@ -79,31 +81,9 @@ def _print_table(directory: Path, names: Sequence[str], rows: _Rows) -> None:
 # --- An evaluation ----------------------------------------------------------------
 
 
-def _fields_of_results(directory: Path) -> Iterator[dict[str, Any]]:
-    try:
-        results = read_results(directory)
-    except UnreadableFile:
-        for _, result in recorded_results(directory):
-            yield _fields_of_result(result, None)
-        return
-    for columns in results.by_task.values():
-        for index, result in enumerate(columns):
-            video = columns.video_path(index)
-            path = None if video is None else results.directory / video
-            yield _fields_of_result(result, path)
-
-
 def _fields_of_result(result: EpisodeResult, video: Path | None) -> dict[str, Any]:
     return {
-        "task": result.task,
-        "seed": result.seed,
-        "episode": result.episode,
-        "length": result.length,
-        "reward": result.total_reward,
-        "terminated": result.terminated,
-        "truncated": result.truncated,
-        "success": result.success,
-        "failure": result.failure,
+        **{name: getattr(result, name) for name in _FIELDS},
         "video": None if video is None else str(video),
         "pending": video is not None and not video.exists(),
     }

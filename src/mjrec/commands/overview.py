@@ -6,10 +6,6 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    from ..evaluation.episode_results import EpisodeResult
 
 # The commands, grouped by purpose.
 GROUPS = {
@@ -116,13 +112,13 @@ def _places(directory: Path, levels: int) -> Iterator[Path]:
 def _summary(directory: Path) -> tuple[str, bool]:
     """Return a summary of a directory, and whether a video is pending."""
     from ..errors import Error
-    from ..evaluation.evaluation import is_evaluation
+    from ..evaluation.evaluation import is_evaluation, results_in
     from ..plain_text import counted
     from ..results import iter_episodes
 
     try:
         if is_evaluation(directory):
-            results = list(_results(directory))
+            results = [result for result, _ in results_in(directory)]
             tasks = counted(len({result.task for result in results}), "task")
             failed = sum(result.failure is not None for result in results)
             text = f"evaluation of {tasks}, {counted(len(results), 'episode')}"
@@ -139,18 +135,3 @@ def _summary(directory: Path) -> tuple[str, bool]:
     videos = sum(episode.video is not None for episode in episodes)
     parts.append(counted(videos, "video") + f" and {pending} pending" * bool(pending))
     return ", ".join(parts), bool(pending)
-
-
-def _results(directory: Path) -> Iterator[EpisodeResult]:
-    """Yield the results of an evaluation, finished or not."""
-    from ..errors import UnreadableFile
-    from ..evaluation.chunk_results import recorded_results
-    from ..evaluation.evaluation import read_results
-
-    try:
-        columns = read_results(directory).by_task.values()
-    except UnreadableFile:
-        yield from (result for _, result in recorded_results(directory))
-        return
-    for each in columns:
-        yield from each

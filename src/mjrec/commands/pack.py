@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import re
 import shlex
 import zipfile
@@ -13,16 +12,16 @@ from typing import Annotated
 import rich.console
 import tyro
 
+from ..atomic_files import file_sha256
 from ..errors import InvalidArgument
 from ..evidence.pack import pack as pack_directory
 from ..evidence.size_limit import shown_size
 from ..monitors.progress import render_progress
-from .help_text import flowing_help
+from .terminal import print_lines
 
 _NUMBERS = re.compile(r"\d{1,15}(,\d{1,15})*", re.ASCII)
 
 
-@flowing_help
 def pack(
     directory: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="DIR")],
     /,
@@ -66,7 +65,7 @@ def pack(
             max_size=max_size,
             on_progress=on_progress,
         )
-    _show(archive)
+    print_lines(rich.console.Console(), _lines(archive))
     return 0
 
 
@@ -85,19 +84,13 @@ def _numbers(text: str) -> list[int]:
     return [int(number) for number in plain.split(",")]
 
 
-def _show(archive: Path) -> None:
+def _lines(archive: Path) -> list[str]:
     size = archive.stat().st_size
-    with archive.open("rb") as file:
-        digest = hashlib.file_digest(file, "sha256").hexdigest()
     with zipfile.ZipFile(archive) as packed:
         count = len(packed.infolist())
-    # Lines are not wrapped, so that names can be copied.
-    rich.console.Console().print(
-        f"{archive}\n"
-        f"  {count} files, {shown_size(size)} ({size} bytes)\n"
-        f"  sha256 {digest}\n"
+    return [
+        str(archive),
+        f"  {count} files, {shown_size(size)} ({size} bytes)",
+        f"  sha256 {file_sha256(archive)}",
         f"To verify it: mjrec verify {shlex.quote(str(archive))}",
-        highlight=False,
-        markup=False,
-        soft_wrap=True,
-    )
+    ]

@@ -18,17 +18,9 @@ from ..formats.video_metadata import finished_videos
 from ..monitors.progress import progress_bar
 from ..plain_text import counted
 from ..recorder.options import RecorderOptions
-from ..sessions import (
-    Session,
-    SessionEpisode,
-    record_session,
-    with_chosen_videos,
-)
+from ..sessions import Session, SessionEpisode, record_session, with_chosen_videos
 from .options import AsJson, camera_of, kwargs_of, size_of
-from .terminal import print_json, print_lines
-
-_FAILED = 1
-_INTERRUPTED = 130
+from .terminal import FAILED, INTERRUPTED, print_json, print_lines
 
 
 def record(
@@ -155,8 +147,8 @@ def record(
             where = f"(--allow-nan accepts them), first in episode {not_finite[0]}"
             print_lines(console, [f"NaN or infinite: {what} {where}"])
     if interrupted:
-        return _INTERRUPTED
-    return _FAILED if not_finite and not allow_nan else 0
+        return INTERRUPTED
+    return FAILED if not_finite and not allow_nan else 0
 
 
 def _run(
@@ -229,10 +221,8 @@ def _fields(
         "interrupted": interrupted,
         "episodes": [
             {
-                "episode_id": episode.episode_id,
-                "length": episode.length,
-                "reward": episode.reward,
-                "video": episode.video.name if episode.video else None,
+                **vars(episode),
+                "video": episode.video and episode.video.name,
                 "pending": bool(episode.video and not episode.video.exists()),
             }
             for episode in recorded

@@ -9,14 +9,13 @@ from typing import Annotated
 import tyro
 
 from ..evaluation.evaluation import is_evaluation
+from ..formats.json_fields import to_json
 from ..formats.monitor_directory import monitor_directories_in
 from ..rendering.leftovers import RecoveredFile
 from ..rendering.recovery import Recovery
 from ..rendering.recovery import recover as recover_directory
 from .options import AsJson
-from .terminal import print_json, print_lines, result_console
-
-_FAILED = 1
+from .terminal import FAILED, print_json, print_lines, result_console
 
 
 def recover(
@@ -40,10 +39,10 @@ def recover(
     """
     recovery = _recover_all(directory, timeout)
     if as_json:
-        print_json(_fields(recovery))
+        print_json(to_json(recovery))
     else:
         print_lines(result_console(), [str(recovery)])
-    return _FAILED if recovery.failures else 0
+    return FAILED if recovery.failures else 0
 
 
 def _recover_all(directory: Path, timeout: float) -> Recovery:
@@ -63,16 +62,3 @@ def _recover_all(directory: Path, timeout: float) -> Recovery:
             recovery.open_monitors + found.open_monitors,
         )
     return recovery
-
-
-def _fields(recovery: Recovery) -> dict[str, object]:
-    return {
-        "directory": str(recovery.directory),
-        "files": _listed(recovery.files),
-        "failures": _listed(recovery.failures),
-        "open_monitors": list(recovery.open_monitors),
-    }
-
-
-def _listed(files: tuple[RecoveredFile, ...]) -> list[dict[str, str]]:
-    return [{"name": file.name, "what": file.what} for file in files]

@@ -13,21 +13,15 @@ import tyro
 
 from ..annotation import check_annotation
 from ..errors import InvalidArgument
-from ..evaluation.chunk_results import recorded_results
+from ..evaluation.episode_results import recorded_results
 from ..evaluation.evaluation import is_evaluation
-from ..formats.monitor_directory import (
-    recording_directories,
-    trajectory_prefix,
-)
+from ..formats.monitor_directory import recording_directories
 from ..monitors.progress import render_progress
 from ..plain_text import counted
 from ..rendering.jobs import RenderedVideos, Variant, View
 from ..rendering.render_videos import iter_rendered_videos
 from .options import NO_ENGINE, AsJson, Engine, camera_of, size_of
-from .terminal import names_by, print_json, print_lines
-
-_FAILED = 1
-_INTERRUPTED = 130
+from .terminal import FAILED, INTERRUPTED, names_by, print_json, print_lines
 
 
 def render(
@@ -145,8 +139,8 @@ def render(
     else:
         print_lines(console, _summary(report, is_interrupted))
     if is_interrupted:
-        return _INTERRUPTED
-    return _FAILED if report.failures or report.blank else 0
+        return INTERRUPTED
+    return FAILED if report.failures or report.blank else 0
 
 
 def _places(target: Path, episode: int | None) -> tuple[list[Path], int | None]:
@@ -171,9 +165,8 @@ def _places(target: Path, episode: int | None) -> tuple[list[Path], int | None]:
 
 def _trajectories(directory: Path, episode: int) -> Iterator[Path]:
     for folder, result in recorded_results(directory):
-        infix = result.monitor
-        if result.episode == episode and infix and result.episode_id is not None:
-            yield folder / f"{trajectory_prefix(infix, result.episode_id)}.h5"
+        if result.episode == episode and (key := result.key):
+            yield folder / f"{key.name}.h5"
 
 
 def _collect(

@@ -13,6 +13,9 @@ import rich.table
 
 from .. import json_text
 
+# Exit statuses. The second is what shells report for a process that Ctrl-C ended.
+FAILED, INTERRUPTED = 1, 130
+
 _LOG_WIDTH = 160
 # The number of rows from which the column widths of a long table are measured.
 _ROWS_MEASURED = 1000
@@ -35,12 +38,6 @@ def printable(text: str) -> str:
     return "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
 
 
-def and_more(names: Sequence[str]) -> str:
-    """Return the first name, and how many more there are."""
-    more = len(names) - 1
-    return f"{names[0]} and {more} more" if more else names[0]
-
-
 def names_by(reasons: Mapping[str, str]) -> dict[str, list[str]]:
     """Group names by their reason."""
     names: dict[str, list[str]] = {}
@@ -60,13 +57,13 @@ def print_json(value: object) -> None:
     sys.stdout.write(json_text.dumps(value) + "\n")
 
 
-def table(names: Iterable[str], *, left: Iterable[str] = ("task",)) -> rich.table.Table:
-    """Return an empty table of numbers; the columns in `left` hold text."""
+def table(names: Iterable[str]) -> rich.table.Table:
+    """Return an empty table of numbers; only the column `task` holds text."""
     made = rich.table.Table(
         box=rich.box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False
     )
     for name in names:
-        is_text = name in left
+        is_text = name == "task"
         made.add_column(name, justify="left" if is_text else "right", overflow="fold")
     return made
 

@@ -3,12 +3,12 @@
 
 from __future__ import annotations
 
-import importlib
 import weakref
 from collections.abc import Mapping
 from concurrent.futures import Executor
 
-from ..errors import Error, InvalidArgument, MissingDependency, UnknownName
+from ..errors import Error, InvalidArgument, UnknownName
+from .gpu_shares import engine_package
 from .local import LocalEngine
 from .ray import RayEngine
 from .slurm import SlurmEngine, slurm_options
@@ -97,24 +97,15 @@ def engine_from(
         )
     if name == "ray":
         return RayEngine(workers, address=address, gpus=gpus, require_gpu=require_gpu)
-    if name == "slurm":
-        return SlurmEngine(
-            workers, gpus=gpus, require_gpu=require_gpu, **slurm_options(options or {})
-        )
-    return LocalEngine(workers, gpus=gpus, require_gpu=require_gpu)
+    own = slurm_options(options or {}) if name == "slurm" else {}
+    engine = SlurmEngine if name == "slurm" else LocalEngine
+    return engine(workers, gpus=gpus, require_gpu=require_gpu, **own)
 
 
 def _dask(address: str) -> Executor:
-    try:
-        distributed = importlib.import_module("distributed")
-    except ModuleNotFoundError as error:
-        if error.name != "distributed":
-            raise
-        raise MissingDependency(
-            "distributed",
-            purpose=f'engine="{_DASK}{address}"',
-            install='pip install "dask[distributed]"',
-        ) from error
+    distributed = engine_package(
+        "distributed", f"{_DASK}{address}", install="dask[distributed]"
+    )
     try:
         client = distributed.Client(address, set_as_default=False)
     except (OSError, ValueError) as error:

@@ -1,13 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The number of workers, and the GPUs that each worker gets."""
+"""The number of workers, the GPUs that each worker gets, and engines' packages."""
 
 from __future__ import annotations
 
+import importlib
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
-from ..errors import InvalidArgument
+from ..errors import InvalidArgument, MissingDependency
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -97,3 +99,19 @@ def check_worker_count(count: int | None, name: str = "workers") -> int | None:
             f"{name} must be a whole number of at least 1, not {count!r}."
         )
     return count
+
+
+def engine_package(package: str, engine: str, *, install: str) -> Any:
+    """Import the package that an engine needs, which is slow and optional.
+
+    Raises:
+        MissingDependency: the package is not installed.
+    """
+    try:
+        return importlib.import_module(package)
+    except ModuleNotFoundError as error:
+        if error.name != package:
+            raise
+        raise MissingDependency(
+            package, purpose=f'engine="{engine}"', install=f'pip install "{install}"'
+        ) from error

@@ -79,13 +79,11 @@ class JobOutcome:
         key: the job's key.
         value: the handler's return value; None if the job failed.
         failure: the handler's error, or how the child died; None if the job succeeded.
-        tries: number of times the job was started.
     """
 
     key: str
     value: Mapping[str, Any] | None
     failure: str | None = None
-    tries: int = 1
 
 
 @dataclass
@@ -144,11 +142,6 @@ class Run:
         self._parked: list[_Task] = []
         self._done: queue.SimpleQueue[Future[Any]] = queue.SimpleQueue()
         self._told: set[tuple[str, int, str]] = set()
-
-    @property
-    def unfinished(self) -> int:
-        """Number of jobs without an outcome."""
-        return len(self._tasks) + len(self._parked)
 
     def submit(self, key: str, **arguments: Any) -> None:
         """Add a job, which is possible even while results arrive.
@@ -241,12 +234,8 @@ class Run:
             raise unpacked(answer["error"])
         if "died" in answer:
             return self._bury(task, answer["died"], has_begun=answer["begun"])
-        return JobOutcome(
-            key=task.key,
-            value=answer.get("value"),
-            failure=answer.get("failure"),
-            tries=task.deaths + 1,
-        )
+        value, failure = answer.get("value"), answer.get("failure")
+        return JobOutcome(key=task.key, value=value, failure=failure)
 
     def _bury(self, task: _Task, how: str, *, has_begun: bool) -> JobOutcome | None:
         can_any_begin = (self._place / BEGUN).exists()
@@ -268,7 +257,7 @@ class Run:
         if not can_any_begin:
             raise Error(f"No worker can start. The last worker {how}")
         failure = f"Its worker died, on try {task.deaths} of {TRIES}: it {how}"
-        return JobOutcome(key=task.key, value=None, failure=failure, tries=task.deaths)
+        return JobOutcome(key=task.key, value=None, failure=failure)
 
     def _log(self, lines: Any) -> None:
         """Log the children's log records in this process, each text once per run."""

@@ -17,16 +17,17 @@ import signal
 import socket
 import threading
 import weakref
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, Future
 from pathlib import Path
 from typing import Any
 
 import mjrec
 
-from ..errors import ClosedError, Error, GLError, InvalidArgument, MissingDependency
+from ..child_python import changed_environ
+from ..errors import ClosedError, Error, GLError, InvalidArgument
 from ..machine import usable_cpus
-from .gpu_shares import GpuShare, check_worker_count
+from .gpu_shares import GpuShare, check_worker_count, engine_package
 
 logger = logging.getLogger(__name__)
 
@@ -67,7 +68,7 @@ class RayEngine(Executor):
         self.workers = check_worker_count(workers)
         self.address = address
         self.share = GpuShare(each=gpus, required=require_gpu)
-        self._ray = _import_ray()
+        self._ray = engine_package("ray", "ray", install="mjrec[ray]")
         self._task: Any = None
         self._disconnect: weakref.finalize[Any, Any] | None = None
         self._is_shut_down = False
@@ -163,18 +164,6 @@ def _call(
     return fn(*args, **kwargs)
 
 
-def _import_ray() -> Any:
-    try:
-        # This import is slow and optional.
-        return importlib.import_module("ray")
-    except ModuleNotFoundError as error:
-        if error.name != "ray":
-            raise
-        raise MissingDependency(
-            "ray", purpose='engine="ray"', install='pip install "mjrec[ray]"'
-        ) from error
-
-
 def _disconnect(ray: Any) -> None:
     with contextlib.suppress(Exception):
         ray.shutdown()
@@ -244,7 +233,7 @@ def _start(ray: Any, cpus: int) -> None:
     if not is_token_known:
         # Otherwise Ray would write a token into the home directory, and leave it there.
         environ["RAY_AUTH_TOKEN"] = secrets.token_hex(32)
-    with _environment(environ):
+    with changed_environ(environ):
         ray.init(
             address="local",
             num_cpus=cpus,
@@ -252,19 +241,6 @@ def _start(ray: Any, cpus: int) -> None:
             object_store_memory=_SMALLEST_STORE,
             logging_level=logging.ERROR,
         )
-
-
-@contextlib.contextmanager
-def _environment(more: Mapping[str, str]) -> Iterator[None]:
-    """Set environment variables for the block, then restore the environment."""
-    before = dict(os.environ)
-    os.environ.update(more)
-    try:
-        yield
-    finally:
-        for name in set(os.environ) - set(before):
-            del os.environ[name]
-        os.environ.update(before)
 
 
 @contextlib.contextmanager

@@ -26,20 +26,19 @@ import os
 import shutil
 import signal
 import subprocess
-import sys
 import threading
 import time
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from concurrent.futures import Executor, Future
 from dataclasses import dataclass
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 from ..atomic_files import write_text
-from ..errors import ClosedError, Error, InvalidArgument, MissingDependency, UnknownName
+from ..child_python import changed_environ
+from ..errors import ClosedError, Error, InvalidArgument, UnknownName
 from ..machine import usable_cpus
-from .gpu_shares import GpuShare, check_worker_count
+from .gpu_shares import GpuShare, check_worker_count, engine_package
 from .local import LocalEngine
 from .worker import do_job, end_idle_children
 
@@ -152,14 +151,14 @@ class SlurmEngine(Executor):
         names_gpus = any(name.startswith(("gpu", "gres")) for name in others)
         self._per_job = per_job
         self._most_jobs = math.ceil(self.workers / per_job)
+        # Named GPUs are among the other options.
+        needed_gpus = 0 if names_gpus else math.ceil(gpus * per_job - 1e-9)
         self._parameters = {
             "name": "mjrec",
             "timeout_min": time_min,
             "cpus_per_task": cpus,
             "mem_gb": mem_gb and mem_gb * per_job,
-            "gpus_per_node": None
-            if names_gpus
-            else math.ceil(gpus * per_job - 1e-9) or None,
+            "gpus_per_node": needed_gpus or None,
             "slurm_partition": partition,
             "slurm_account": account,
             "slurm_qos": qos,
@@ -174,10 +173,8 @@ class SlurmEngine(Executor):
         }
         self._numbers = itertools.count()
         self._waiting: list[_Task] = []
-        # The tasks, by the id of the Slurm job that does them.
-        self._elements: dict[str, list[_Task]] = {}
-        # The processes for `cluster="local"`.
-        self._processes: dict[str, Any] = {}
+        # The tasks, by the submitit job that does them.
+        self._elements: dict[Any, list[_Task]] = {}
         self._last_added = self._last_asked = -math.inf
         self._last_progress = 0.0
         self._one_at_a_time = threading.Lock()
@@ -222,13 +219,11 @@ class SlurmEngine(Executor):
         """Cancel the Slurm jobs of a run, and wait until they end. Idempotent."""
         with self._one_at_a_time:
             self._waiting = [t for t in self._waiting if t.place.parent != Path(place)]
-            ending = {
-                job
-                for job, tasks in self._elements.items()
-                if tasks[0].place.parent == Path(place)
-            }
+            elements = self._elements.items()
+            of_run = [j for j, of in elements if of[0].place.parent == Path(place)]
+            ending = {*of_run}
             if ending and self._cluster == "slurm":
-                _command("scancel", "--quiet", *sorted(ending))
+                _command("scancel", "--quiet", *sorted(job.job_id for job in ending))
             deadline = time.monotonic() + _SECONDS_TO_END
             # If Slurm does not answer, the deadline ends the wait. Local processes exit
             # on their own.
@@ -236,11 +231,8 @@ class SlurmEngine(Executor):
                 states = self._states(ending)
                 ending -= {job for job in states if states[job][0] not in _NOT_OVER}
                 time.sleep(_SECONDS_BETWEEN_LOOKS)
-            self._elements = {
-                job: tasks
-                for job, tasks in self._elements.items()
-                if tasks[0].place.parent != Path(place)
-            }
+            for job in of_run:
+                del self._elements[job]
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
         """Accept no more jobs. Idempotent."""
@@ -293,9 +285,7 @@ class SlurmEngine(Executor):
             answer = " ".join(str(error).split())
             raise Error(f"No job could be submitted: {answer}") from error
         self._waiting = [task for task in self._waiting if task.place != place]
-        for job, share in zip(jobs, shares, strict=True):
-            self._elements[job.job_id] = share
-            self._processes[job.job_id] = job
+        self._elements.update(zip(jobs, shares, strict=True))
 
     def _take_outcomes(self) -> None:
         for place in {tasks[0].place for tasks in self._elements.values()}:
@@ -321,8 +311,9 @@ class SlurmEngine(Executor):
         for job in over:
             for task in self._elements.pop(job):
                 how = (
-                    f"was in the Slurm job {job}, which ended ({states[job][0]}). The "
-                    f"end of that job's log: {_end_of_log(task.place, job)}"
+                    f"was in the Slurm job {job.job_id}, which ended "
+                    f"({states[job][0]}). The end of that job's log: "
+                    f"{_end_of_log(task.place, job.job_id)}"
                 )
                 _resolve(task, {"died": how, "begun": True})
         if states and now - self._last_progress > _SECONDS_WITHOUT_START:
@@ -335,13 +326,14 @@ class SlurmEngine(Executor):
                     ", ".join(sorted(reasons)) or "none",
                 )
 
-    def _states(self, jobs: Collection[str]) -> dict[str, tuple[str, str]]:
+    def _states(self, jobs: Collection[Any]) -> dict[Any, tuple[str, str]]:
         """Return the jobs' states and reasons, or {} if Slurm does not answer."""
         if self._cluster == "local":
-            return {job: (self._processes[job].state, "") for job in jobs}
+            return {job: (job.state, "") for job in jobs}
         if not jobs:
             return {}
-        of_arrays = sorted({job.partition("_")[0] for job in jobs})
+        by_id = {job.job_id: job for job in jobs}
+        of_arrays = sorted({job_id.partition("_")[0] for job_id in by_id})
         asked = _command(
             *("squeue", "--noheader", "--array", "--states=all"),
             *("--format=%i|%T|%r", f"--jobs={','.join(of_arrays)}"),
@@ -350,9 +342,9 @@ class SlurmEngine(Executor):
             return {}
         states = dict.fromkeys(jobs, ("GONE", ""))
         for line in asked.stdout.splitlines():
-            job, state, reason = line.strip().split("|", 2)
-            if job in states:
-                states[job] = state, reason
+            job_id, state, reason = line.strip().split("|", 2)
+            if job_id in by_id:
+                states[by_id[job_id]] = state, reason
         return states
 
 
@@ -461,7 +453,7 @@ def _end_of_log(place: Path, job: str) -> str:
     return answer.decode(errors="replace").strip() or "(nothing)"
 
 
-def _submitit(cluster: str) -> ModuleType:
+def _submitit(cluster: str) -> Any:
     if cluster not in _CLUSTERS:
         raise InvalidArgument(
             f"cluster must be {' or '.join(map(repr, _CLUSTERS))}, not {cluster!r}."
@@ -469,19 +461,9 @@ def _submitit(cluster: str) -> ModuleType:
     # Without this setting, submitit would reconfigure the process's logging and close
     # its handlers. Slurm jobs do not inherit the setting, so their logs contain
     # submitit's messages.
-    before = os.environ.get("SUBMITIT_LOG_LEVEL")
-    if "submitit" not in sys.modules and before is None:
-        os.environ["SUBMITIT_LOG_LEVEL"] = "NOCONFIG"
-    try:
-        # This import is slow and optional.
-        import submitit
-    except ImportError as error:
-        raise MissingDependency(
-            "submitit", purpose='engine="slurm"', install='pip install "mjrec[slurm]"'
-        ) from error
-    finally:
-        if before is None:
-            os.environ.pop("SUBMITIT_LOG_LEVEL", None)
+    level = {"SUBMITIT_LOG_LEVEL": os.environ.get("SUBMITIT_LOG_LEVEL", "NOCONFIG")}
+    with changed_environ(level):
+        submitit = engine_package("submitit", "slurm", install="mjrec[slurm]")
     missing = [command for command in _COMMANDS if shutil.which(command) is None]
     if cluster == "slurm" and missing:
         raise Error(
@@ -493,25 +475,17 @@ def _submitit(cluster: str) -> ModuleType:
     return submitit
 
 
-@contextlib.contextmanager
-def _as_from_outside() -> Iterator[None]:
+def _as_from_outside() -> contextlib.AbstractContextManager[None]:
     """Hide any surrounding Slurm job from commands in the block.
 
     Otherwise that job's resources (its CPUs and memory) would be mistaken for the
     requested ones.
     """
-    inside = "SLURM_JOB_ID" in os.environ
-    hidden = {
-        name: os.environ.pop(name)
-        for name in [*os.environ]
-        # SLURM_CONF is kept, because it locates the cluster.
-        if inside and name != "SLURM_CONF"
-        if name.startswith(("SLURM_", "SLURMD_", "SRUN_"))
-    }
-    try:
-        yield
-    finally:
-        os.environ.update(hidden)
+    # SLURM_CONF is kept, because it locates the cluster.
+    names = {n for n in os.environ if n.startswith(("SLURM_", "SLURMD_", "SRUN_"))}
+    is_inside = "SLURM_JOB_ID" in names
+    hidden = dict.fromkeys(names - {"SLURM_CONF"}) if is_inside else {}
+    return changed_environ(hidden)
 
 
 def _command(*words: str) -> subprocess.CompletedProcess[str] | None:

@@ -182,7 +182,7 @@ def compare(
         a=of_a.directories,
         b=of_b.directories,
         unit="episodes" if is_single else "evaluations",
-        policies=(_listed(of_a.policies), _listed(of_b.policies)),
+        policies=(of_a.policies(), of_b.policies()),
         cautions=tuple(_cautions(of_a, of_b, tasks)),
         remarks=tuple(
             f"{name}: {in_a} in A, {in_b} in B"
@@ -225,6 +225,7 @@ class _Side:
             directories = [directories]
         self.name = name
         self.directories = tuple(map(Path, directories))
+        self.told = f"{name} ({', '.join(map(str, self.directories))})"
         if not self.directories:
             raise InvalidArgument(
                 f"Side {name} has no evaluation. Give at least one directory."
@@ -232,21 +233,12 @@ class _Side:
         if len({path.resolve() for path in self.directories}) < len(self.directories):
             raise InvalidArgument(f"An evaluation was given twice: {self.told}.")
         self.results = [read_results(path) for path in self.directories]
+        first, *rest = (each.by_task for each in self.results)
+        # The tasks that all evaluations have in common.
+        self.tasks = [task for task in first if all(task in other for other in rest)]
 
-    @property
-    def told(self) -> str:
-        return f"{self.name} ({', '.join(map(str, self.directories))})"
-
-    @property
-    def tasks(self) -> list[str]:
-        """The tasks that all evaluations have in common."""
-        rest = [each.by_task for each in self.results[1:]]
-        first = self.results[0].by_task
-        return [task for task in first if all(task in other for other in rest)]
-
-    @property
-    def policies(self) -> list[str]:
-        return [each.plan.policy for each in self.results]
+    def policies(self) -> str:
+        return _listed(each.plan.policy for each in self.results)
 
     def without(self, tasks: Sequence[str]) -> tuple[str, ...]:
         """Return the tasks of this side except the given ones."""

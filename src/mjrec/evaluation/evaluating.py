@@ -22,43 +22,17 @@ from ..atomic_files import make_directory
 from ..engines.choice import given_engine
 from ..engines.jobs import WORK_FOLDER, Run, Work
 from ..engines.local import LocalEngine
-from ..errors import (
-    DirectoryInUse,
-    GLError,
-    InvalidArgument,
-    PolicyError,
-)
-from ..formats.bundle import FINISHED, finished_trajectories
+from ..errors import DirectoryInUse, GLError, InvalidArgument, PolicyError
 from ..formats.json_fields import to_json
 from ..formats.locks import try_lock
-from ..formats.monitor_directory import (
-    iter_monitor_files,
-    names_in,
-    trajectory_prefix,
-    video_prefix,
-)
+from ..formats.monitor_directory import names_in
 from ..gl.choice import choose
 from ..provenance import versions
 from ..recorder.keep_rules import keep_rule
 from ..rendering.finish import environ_for_drawing
 from ..results import clear_monitor_files
-from .episode_results import EpisodeResult
-from .evaluation import (
-    RESULT_NAMES,
-    Evaluation,
-    read_results,
-    write_results,
-)
-from .following import (
-    Choice,
-    EvaluationProgress,
-    check_tasks,
-    choose_videos,
-    chunks_in,
-    draw_videos,
-    results_of,
-    run_chunks,
-)
+from . import following
+from .evaluation import RESULT_NAMES, Evaluation, read_results, write_results
 from .plan import (
     NO_GL,
     PLAN_NAME,
@@ -69,8 +43,6 @@ from .plan import (
     write_plan,
 )
 from .planning import check_score_ranges, plan_from
-from .policy_objects import SentPolicy, sent_policy
-from .result_tables import EpisodeFiles
 from .statistics import Bootstrap, load_scipy
 from .summaries import default_score_range, summarize_across, summarize_results
 
@@ -86,7 +58,7 @@ _ONE_THREAD_EACH = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"
 
 _GL = "MUJOCO_GL"
 
-_DEFAULT_FPS = 60
+DEFAULT_FPS = 60
 _DEFAULTS: Mapping[str, Any] = {
     "episodes": 10,
     "keep": "best,median,worst",
@@ -94,7 +66,7 @@ _DEFAULTS: Mapping[str, Any] = {
     "quality": "full",
 }
 
-_Tell = Callable[[EvaluationProgress], object]
+_Tell = Callable[[following.EvaluationProgress], object]
 
 
 def evaluate(
@@ -115,7 +87,7 @@ def evaluate(
     camera: str | int | None = None,
     height: int | None = None,
     width: int | None = None,
-    max_fps: float | None = _DEFAULT_FPS,
+    max_fps: float | None = DEFAULT_FPS,
     quality: str | None = None,
     env_kwargs: Mapping[str, Any] | None = None,
     policy_kwargs: Mapping[str, Any] | None = None,
@@ -221,14 +193,18 @@ def evaluate(
         policy_kwargs=policy_kwargs or None,
     )
     if policy is None and begun is not None:
-        policy = _policy_as_begun(begun)
+        if begun.is_object:
+            raise PolicyError(
+                f"The policy of this evaluation is an object ({begun.policy}). To "
+                "continue the evaluation, pass the object again (policy=...)."
+            )
+        policy = begun.policy
     if policy is None:
         raise PolicyError(
             "An evaluation needs a policy: random, zero, module:name, or an object."
         )
-    sent = sent_policy(policy, options["policy_kwargs"] or {})
-    plan = plan_from(
-        tasks, sent, seeds=seeds, num_seeds=num_seeds, begun=begun, **options
+    plan, payload = plan_from(
+        tasks, policy, seeds=seeds, num_seeds=num_seeds, begun=begun, **options
     )
     ranges = check_score_ranges(score_ranges, [task.name for task in plan.tasks])
     if begun is not None:
@@ -242,31 +218,56 @@ def evaluate(
             stack.enter_context(_held(place))
         executor = given or local
         is_here = isinstance(executor, LocalEngine)
-        work = _work(plan, sent, place, chooses_gl=given is not None)
+        work = _work(plan, payload, place, chooses_gl=given is not None)
         # Quick checks run locally, so that they do not wait in a cluster's queue.
         with Run(executor if is_here else local, work) as home:
             load_scipy()
             needed = min(local.workers, len(plan.tasks) * len(plan.chunks))
-            plan, velocities = check_tasks(home, plan, workers=needed if is_here else 1)
+            plan, velocities = following.check_tasks(
+                home, plan, workers=needed if is_here else 1
+            )
             if begun is None:
                 make_directory(place)
                 stack.enter_context(_held(place))
                 _clear(place)
             write_plan(place, plan)
-            chunks = chunks_in(place, plan)
+            chunks = following.chunks_in(place, plan)
             # The slowest tasks come first, so that all workers finish at about the same
             # time.
             chunks.sort(key=lambda each: -velocities.get(each.task.name, 0))
             if is_here:
-                progress = run_chunks(home, chunks, tell)
+                progress = following.run_chunks(home, chunks, tell)
         if not is_here:
             with Run(executor, work) as run:
-                progress = run_chunks(run, chunks, tell)
-        results = results_of(plan, chunks)
-        choice = choose_videos(plan, chunks, results)
+                progress = following.run_chunks(run, chunks, tell)
+        results = following.results_of(plan, chunks)
+        choice = following.choose_videos(plan, chunks, results)
         # Written before the videos are drawn, because drawing takes a long time.
-        _write(place, plan, results, choice, ranges, how)
-        videos, pending = draw_videos(
+        scales = {
+            task.name: ranges.get(task.name)
+            or default_score_range(task.name, task.step_limit)
+            for task in plan.tasks
+        }
+        returns = {
+            name: [each.total_reward for each in own if each.total_reward is not None]
+            for name, own in results.items()
+        }
+        evaluation = Evaluation(
+            directory=place,
+            plan=plan,
+            summaries=[
+                summarize_results(name, own, score_range=scales[name], bootstrap=how)
+                for name, own in results.items()
+            ],
+            across=summarize_across(returns, scales, bootstrap=how),
+            bootstrap=how,
+            selection=choice.selection,
+            # SciPy is included because it computes the statistics.
+            versions=versions("scipy"),
+        )
+        episodes_of = [result for own in results.values() for result in own]
+        write_results(evaluation, episodes_of, following.files_of(evaluation, chunks))
+        videos, pending = following.draw_videos(
             choice,
             place,
             engine=given,
@@ -311,30 +312,17 @@ def _begun(directory: Path, *, resume: bool, force: bool) -> EvaluationPlan | No
 
 def _options(begun: EvaluationPlan | None, **given: Any) -> dict[str, Any]:
     """Replace options that are None by their earlier values or their defaults."""
-    if begun is None:
-        return {
-            name: _DEFAULTS.get(name) if value is None else value
-            for name, value in given.items()
-        }
-    if given["max_fps"] == _DEFAULT_FPS:
+    if begun is not None and given["max_fps"] == DEFAULT_FPS:
         given["max_fps"] = None
+    earlier = _DEFAULTS if begun is None else vars(begun)
     return {
-        name: getattr(begun, name) if value is None else value
+        name: earlier.get(name) if value is None else value
         for name, value in given.items()
     }
 
 
-def _policy_as_begun(begun: EvaluationPlan) -> str:
-    if begun.is_object:
-        raise PolicyError(
-            f"The policy of this evaluation is an object ({begun.policy}). To continue "
-            "the evaluation, pass the object again (policy=...)."
-        )
-    return begun.policy
-
-
 def _work(
-    plan: EvaluationPlan, sent: SentPolicy, directory: Path, *, chooses_gl: bool
+    plan: EvaluationPlan, payload: bytes | None, directory: Path, *, chooses_gl: bool
 ) -> Work:
     return Work(
         entry=_WORKER,
@@ -348,7 +336,7 @@ def _work(
         },
         environ=_environ_of_workers(plan, is_elsewhere=chooses_gl),
         shared_directory=directory.absolute(),
-        payload=sent.payload,
+        payload=payload,
     )
 
 
@@ -400,77 +388,3 @@ def _held(directory: Path) -> Iterator[None]:
         )
     with lock:
         yield
-
-
-def _write(
-    directory: Path,
-    plan: EvaluationPlan,
-    results: Sequence[EpisodeResult],
-    choice: Choice,
-    ranges: Mapping[str, tuple[float, float]],
-    bootstrap: Bootstrap,
-) -> None:
-    scales = {
-        task.name: ranges.get(task.name)
-        or default_score_range(task.name, task.step_limit)
-        for task in plan.tasks
-    }
-    by_task: dict[str, list[EpisodeResult]] = {name: [] for name in scales}
-    for result in results:
-        by_task[result.task].append(result)
-    returns = {
-        name: [each.total_reward for each in own if each.total_reward is not None]
-        for name, own in by_task.items()
-    }
-    write_results(
-        directory,
-        plan=plan,
-        results=results,
-        summaries=[
-            summarize_results(name, own, score_range=scales[name], bootstrap=bootstrap)
-            for name, own in by_task.items()
-        ],
-        across=summarize_across(returns, scales, bootstrap=bootstrap),
-        bootstrap=bootstrap,
-        selection=choice.selection,
-        # SciPy is included because it computes the statistics.
-        versions=versions("scipy"),
-        files=_Files(directory, plan, choice),
-    )
-
-
-class _Files:
-    """A function that looks up the files of an episode."""
-
-    def __init__(self, directory: Path, plan: EvaluationPlan, choice: Choice) -> None:
-        self._directory = directory
-        self._plan = plan
-        self._chosen = {
-            task: {(each.seed, each.episode) for each in chosen}
-            for task, chosen in choice.selection.items()
-        }
-        self._folders = {task.name: task.folder for task in plan.tasks}
-        # The file names in the previous episode's folder are cached.
-        self._folder = ""
-        self._names: set[str] = set()
-
-    def __call__(self, result: EpisodeResult) -> EpisodeFiles:
-        infix, chunk = result.monitor, self._plan.chunk_of(result.unit)
-        if infix is None or chunk is None or result.episode_id is None:
-            return EpisodeFiles()
-        folder = f"{self._folders[result.task]}/{chunk.folder}"
-        if folder != self._folder:
-            place = self._directory / folder
-            files = (*iter_monitor_files(place), *finished_trajectories(place))
-            self._folder, self._names = folder, {path.name for path in files}
-        trajectory = f"{trajectory_prefix(infix, result.episode_id)}{FINISHED}"
-        prefix = video_prefix(infix, result.episode_id)
-        # Text environments have a text recording instead of a video.
-        video = f"{prefix}.json" if f"{prefix}.json" in self._names else None
-        if video is None and result.unit in self._chosen.get(result.task, ()):
-            video = f"{prefix}.mp4"
-        return EpisodeFiles(
-            folder=folder,
-            trajectory=trajectory if trajectory in self._names else None,
-            video=video,
-        )

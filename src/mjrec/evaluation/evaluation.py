@@ -22,30 +22,16 @@ import functools
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Annotated, Any, NamedTuple, TextIO
 
-from ..atomic_files import replacing, write_text, writing
+from ..atomic_files import replacing, writing
 from ..errors import UnreadableFile
-from ..formats.json_fields import (
-    field,
-    from_json,
-    integer,
-    list_of,
-    mapping,
-    optional,
-    read_object,
-    text,
-    to_json,
-    unreadable,
-)
-from ..formats.monitor_directory import video_prefix
+from ..formats.json_fields import from_json, integer, text, to_json, unreadable
 from ..formats.notebook import shown
 from ..formats.spans import find_trajectory
-from ..json_text import dumps
-from .episode_results import EpisodeResult
-from .plan import FORMAT_VERSION, PLAN_NAME, EvaluationPlan
+from .episode_results import EpisodeResult, recorded_results
+from .plan import PLAN_NAME, EvaluationPlan, read_versioned, write_versioned
 from .result_tables import (
     EpisodeFiles,
     TaskResults,
@@ -59,11 +45,14 @@ from .summaries import AcrossTasks, TaskSummary
 RESULTS_NAME = "results.json"
 _TABLE_NAME = "results.csv"
 _TIMING_NAME = "timing.csv"
+_UNFINISHED = (
+    "the evaluation is not finished; to continue it, run the same command with --resume"
+)
+_NO_EVALUATION = "the directory contains no evaluation"
 RESULT_NAMES = (RESULTS_NAME, _TABLE_NAME, _TIMING_NAME, PLAN_NAME)
 
 
-@dataclass(frozen=True)
-class ChosenEpisode:
+class ChosenEpisode(NamedTuple):
     """An episode that was chosen to get a video.
 
     Attributes:
@@ -105,7 +94,7 @@ class Evaluation:
     bootstrap: Bootstrap
     selection: Mapping[str, Sequence[ChosenEpisode]]
     versions: Mapping[str, str]
-    by_task: Mapping[str, TaskResults]
+    by_task: Mapping[str, TaskResults] = dataclasses.field(default_factory=dict)
     videos: Sequence[Path] = ()
     pending: Mapping[Path, str] = dataclasses.field(default_factory=dict)
 
@@ -162,16 +151,16 @@ class Evaluation:
 
         Return None if both files are missing.
         """
-        infix = result.monitor
-        if infix is None or result.episode_id is None:
+        key = result.key
+        if key is None:
             return None
         folders = {of: folder for folder, of in self.by_task[result.task].places}
-        folder = self.directory / folders[infix]
-        video = folder / f"{video_prefix(infix, result.episode_id)}.mp4"
+        folder = self.directory / folders[key.infix]
+        video = folder / key.video_name
         for each in (video, video.with_suffix(".json")):
             if each.exists():
                 return each
-        return find_trajectory(folder, infix, result.episode_id)
+        return find_trajectory(folder, key.infix, key.number)
 
 
 def is_evaluation(directory: Path) -> bool:
@@ -180,15 +169,8 @@ def is_evaluation(directory: Path) -> bool:
 
 
 def write_results(
-    directory: Path,
-    *,
-    plan: EvaluationPlan,
+    evaluation: Evaluation,
     results: Sequence[EpisodeResult],
-    summaries: Sequence[TaskSummary],
-    across: AcrossTasks | None,
-    bootstrap: Bootstrap,
-    selection: Mapping[str, Sequence[ChosenEpisode]],
-    versions: Mapping[str, str],
     files: Callable[[EpisodeResult], EpisodeFiles] = lambda _: EpisodeFiles(),
 ) -> None:
     """Write the results of an evaluation. `results.json` is written last.
@@ -197,42 +179,30 @@ def write_results(
     tables of one plan together with the summaries of another.
 
     Args:
-        directory: the evaluation's directory.
-        plan: the plan of the evaluation.
+        evaluation: everything but the episodes.
         results: the results of all episodes in the plan, in the plan's order.
-        summaries: summaries of the tasks, in the plan's order.
-        across: the summary of all tasks that have a scale, if any.
-        bootstrap: settings for the confidence intervals.
-        selection: see `Evaluation`.
-        versions: see `Evaluation`.
         files: a function that returns the files of an episode.
 
     Raises:
         FileNotWritten: the disk is full, or the directory is missing or read-only.
     """
-    value = {
-        "format_version": FORMAT_VERSION,
+    directory, plan = evaluation.directory, evaluation.plan
+    content = _ResultsFile(
         # Chunks are left out because they depend on when episodes were added, and that
         # must not change the results.
-        "plan": to_json(replace(plan, chunks=())),
-        "selection": {
-            "rule": plan.keep,
-            "by_task": {
-                task: [[each.seed, each.episode, each.role] for each in chosen]
-                for task, chosen in selection.items()
-            },
-        },
-        "bootstrap": to_json(bootstrap),
-        "tasks": [to_json(each) for each in summaries],
-        "across": None if across is None else to_json(across),
-        "versions": dict(versions),
-    }
+        plan=replace(plan, chunks=()),
+        selection=_Selection(rule=plan.keep, by_task=evaluation.selection),
+        bootstrap=evaluation.bootstrap,
+        tasks=evaluation.summaries,
+        across=evaluation.across,
+        versions=evaluation.versions,
+    )
     (directory / RESULTS_NAME).unlink(missing_ok=True)
     _write(directory / _TABLE_NAME, lambda file: write_results_table(file, results))
     _write(
         directory / _TIMING_NAME, lambda file: write_timing_table(file, results, files)
     )
-    write_text(directory / RESULTS_NAME, dumps(value, indent=2) + "\n")
+    write_versioned(directory / RESULTS_NAME, to_json(content))
 
 
 def read_results(directory: Path, *, needs_timing: bool = False) -> Evaluation:
@@ -264,34 +234,42 @@ def read_summaries(directory: Path) -> Evaluation:
     """
     path = directory / RESULTS_NAME
     if not path.exists():
-        raise UnreadableFile(path, _why_missing(directory))
+        is_begun = (directory / PLAN_NAME).exists()
+        raise UnreadableFile(path, _UNFINISHED if is_begun else _NO_EVALUATION)
     with unreadable(path):
-        value = read_object(path)
-        version = field(value, "format_version", integer)
-        if version != FORMAT_VERSION:
-            raise ValueError(
-                f"it has format version {version}, but this mjrec reads version "
-                f"{FORMAT_VERSION}"
-            )
-        plan = field(value, "plan", _plan)
-        tasks = [each.name for each in plan.tasks]
-        summaries = field(value, "tasks", list_of(partial(from_json, TaskSummary)))
-        if [each.task for each in summaries] != tasks:
+        read = from_json(_ResultsFile, read_versioned(path))
+        if [each.task for each in read.tasks] != [
+            each.name for each in read.plan.tasks
+        ]:
             raise ValueError("its summaries do not match the tasks of its plan")
-        across = field(value, "across", optional(partial(from_json, AcrossTasks)))
-        bootstrap = field(value, "bootstrap", partial(from_json, Bootstrap))
-        selection = field(value, "selection", _selection)
-        versions = field(value, "versions", _versions)
     return Evaluation(
         directory=directory,
-        plan=plan,
-        summaries=summaries,
-        across=across,
-        bootstrap=bootstrap,
-        selection=selection,
-        versions=versions,
-        by_task={},
+        plan=read.plan,
+        summaries=read.tasks,
+        across=read.across,
+        bootstrap=read.bootstrap,
+        selection=read.selection.by_task,
+        versions=read.versions,
     )
+
+
+def results_in(directory: Path) -> Iterator[tuple[EpisodeResult, Path | None]]:
+    """Yield the results of an evaluation, finished or not, and the videos' paths.
+
+    The episodes are in the plan's order. Videos are None if it is not finished.
+
+    Raises:
+        UnreadableFile: the plan or a journal cannot be read.
+    """
+    try:
+        results = read_results(directory)
+    except UnreadableFile:
+        yield from ((result, None) for _, result in recorded_results(directory))
+        return
+    for columns in results.by_task.values():
+        for index, result in enumerate(columns):
+            video = columns.video_path(index)
+            yield result, None if video is None else directory / video
 
 
 def _write(path: Path, write: Callable[[TextIO], None]) -> None:
@@ -301,15 +279,6 @@ def _write(path: Path, write: Callable[[TextIO], None]) -> None:
         temporary.open("w", encoding="utf-8", newline="") as file,
     ):
         write(file)
-
-
-def _why_missing(directory: Path) -> str:
-    if (directory / PLAN_NAME).exists():
-        return (
-            "the evaluation is not finished; to continue it, run the same command with "
-            "--resume"
-        )
-    return "the directory contains no evaluation"
 
 
 def _plan(value: Any) -> EvaluationPlan:
@@ -324,21 +293,29 @@ def _plan(value: Any) -> EvaluationPlan:
     return plan
 
 
-def _versions(value: Any) -> Mapping[str, str]:
-    return {text(name): text(version) for name, version in mapping(value).items()}
-
-
-def _selection(value: Any) -> Mapping[str, Sequence[ChosenEpisode]]:
-    by_task = field(mapping(value), "by_task", mapping)
-    read = list_of(_chosen)
-    return {text(task): read(chosen) for task, chosen in by_task.items()}
-
-
 def _chosen(value: Any) -> ChosenEpisode:
     if not isinstance(value, list) or len(value) != 3:
         raise ValueError("a chosen episode must be a list of seed, number and role")
     seed, episode, role = value
     return ChosenEpisode(integer(seed), integer(episode), text(role))
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Selection:
+    rule: str
+    by_task: Mapping[str, Sequence[Annotated[ChosenEpisode, _chosen]]]
+
+
+@dataclass(frozen=True, kw_only=True)
+class _ResultsFile:
+    """The content of `results.json`, in its order."""
+
+    plan: Annotated[EvaluationPlan, _plan]
+    selection: _Selection
+    bootstrap: Bootstrap
+    tasks: Sequence[TaskSummary]
+    across: AcrossTasks | None
+    versions: Mapping[str, str]
 
 
 def _extent(interval: Interval | None) -> str:

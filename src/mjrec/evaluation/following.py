@@ -8,26 +8,28 @@ of workers.
 from __future__ import annotations
 
 import dataclasses
+import functools
 import logging
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from ..engines.jobs import Run
 from ..errors import EnvironmentNotMade, Error
+from ..formats.bundle import FINISHED, finished_trajectories
+from ..formats.monitor_directory import iter_monitor_files
 from ..messages import unpacked
 from ..recorder.keep_rules import keep_rule
 from ..rendering.chosen_videos import write_choice
 from ..rendering.finish import bring_up_to_date, do_jobs
 from ..rendering.jobs import Progress, RecordingKey, VideoJob
 from ..simulation.model_trust import note_models
-from .chunk_results import ChunkResults, read_chunk
-from .episode_results import EpisodeResult
-from .evaluation import ChosenEpisode
-from .plan import Chunk, EvaluatedTask, EvaluationPlan
+from .episode_results import ChunkResults, EpisodeResult, read_chunk
+from .evaluation import ChosenEpisode, Evaluation
+from .plan import Chunk, EvaluatedTask, EvaluationPlan, Unit
+from .result_tables import EpisodeFiles
 
 logger = logging.getLogger(__name__)
 
@@ -75,25 +77,39 @@ class ChunkRun:
         chunk: the chunk.
         folder: the chunk's monitor directory.
         known: the chunk's finished episodes, as last read.
-        rounds: number of times that the chunk was submitted.
         size: value of `ChunkResults.size` when the chunk was last submitted.
         reason: the reason to give for episodes that have no result.
-        is_over: whether the chunk will not produce any more results.
     """
 
     task: EvaluatedTask
     chunk: Chunk
     folder: Path
     known: ChunkResults
-    rounds: int = 0
     size: int = 0
     reason: str = "its result is missing"
-    is_over: bool = False
+
+    @property
+    def place(self) -> str:
+        """Path of the folder, relative to the evaluation's directory."""
+        return f"{self.task.folder}/{self.chunk.folder}"
 
     @property
     def is_complete(self) -> bool:
         """Whether all episodes of the chunk have a result."""
         return all(unit in self.known.results for unit in self.chunk)
+
+    def result(self, unit: Unit) -> EpisodeResult:
+        """Return the result of an episode, which has failed if no result is known."""
+        return self.known.results.get(unit) or EpisodeResult(
+            task=self.task.name,
+            seed=unit[0],
+            episode=unit[1],
+            total_reward=None,
+            length=0,
+            terminated=None,
+            truncated=None,
+            failure=self.reason,
+        )
 
 
 @dataclass(frozen=True)
@@ -177,11 +193,7 @@ def run_chunks(run: Run, chunks: Sequence[ChunkRun], tell: _Tell) -> EvaluationP
     Raises:
         Error: workers cannot be started, or a journal is damaged.
     """
-    by_key: dict[str, ChunkRun] = {}
-    for each in chunks:
-        each.is_over = each.is_complete
-        if not each.is_over:
-            by_key[_submit(run, each)] = each
+    by_key = {_submit(run, each): each for each in chunks if not each.is_complete}
     counts_from = 0.0
     progress = _progress(chunks)
     for outcome in run.results(timeout_s=_SECONDS_BETWEEN_REPORTS):
@@ -195,7 +207,6 @@ def run_chunks(run: Run, chunks: Sequence[ChunkRun], tell: _Tell) -> EvaluationP
                 # repeatedly kills its process eventually counts as failed.
                 by_key[_submit(run, each)] = each
                 continue
-            each.is_over = True
             if not each.is_complete:
                 said = outcome.failure or (
                     f"A worker finished {each.folder}, but the recordings are missing "
@@ -205,8 +216,8 @@ def run_chunks(run: Run, chunks: Sequence[ChunkRun], tell: _Tell) -> EvaluationP
                 each.reason = said.partition(" Its last output")[0]
         now = time.monotonic()
         if now >= counts_from or not by_key:
-            for each in chunks:
-                if not each.is_over and each.folder.exists():
+            for each in by_key.values():
+                if each.folder.exists():
                     each.known = read_chunk(each.folder, each.task.name)
             progress = _progress(chunks)
             counts_from = now + (time.monotonic() - now) / _MOST_OF_TIME
@@ -214,74 +225,100 @@ def run_chunks(run: Run, chunks: Sequence[ChunkRun], tell: _Tell) -> EvaluationP
     return progress
 
 
-def results_of(plan: EvaluationPlan, chunks: Iterable[ChunkRun]) -> list[EpisodeResult]:
-    """Return the results of all episodes, in the plan's order."""
-    by_name = {(each.task.name, each.chunk.folder): each for each in chunks}
-    results = []
-    for task in plan.tasks:
-        for unit in plan:
-            chunk = plan.chunk_of(unit)
-            assert chunk is not None
-            of = by_name[task.name, chunk.folder]
-            lost = EpisodeResult(
-                task=task.name,
-                seed=unit[0],
-                episode=unit[1],
-                total_reward=None,
-                length=0,
-                terminated=None,
-                truncated=None,
-                failure=of.reason,
-            )
-            results.append(of.known.results.get(unit, lost))
-    return results
+def results_of(
+    plan: EvaluationPlan, chunks: Iterable[ChunkRun]
+) -> dict[str, list[EpisodeResult]]:
+    """Return the results of each task's episodes, in the plan's order."""
+    # The chunks of a seed are in the order of their episodes.
+    by_seed: dict[tuple[str, int], list[ChunkRun]] = {}
+    for each in chunks:
+        for seed in each.chunk.seeds:
+            by_seed.setdefault((each.task.name, seed), []).append(each)
+    return {
+        task.name: [
+            each.result((seed, number))
+            for seed in plan.seeds
+            for each in by_seed[task.name, seed]
+            for number in range(each.chunk.first, each.chunk.stop)
+        ]
+        for task in plan.tasks
+    }
 
 
 def choose_videos(
-    plan: EvaluationPlan, chunks: Sequence[ChunkRun], results: Iterable[EpisodeResult]
+    plan: EvaluationPlan,
+    chunks: Sequence[ChunkRun],
+    results: Mapping[str, Sequence[EpisodeResult]],
 ) -> Choice:
     """Choose the episodes that get a video, and write the choice to the folders."""
     selection: dict[str, list[ChosenEpisode]] = {}
     videos: list[tuple[Path, RecordingKey]] = []
     impossible: dict[Path, str] = {}
-    by_task: dict[str, list[EpisodeResult]] = {task.name: [] for task in plan.tasks}
-    for result in results:
-        by_task[result.task].append(result)
-    for task, own in by_task.items():
-        chosen: dict[str, dict[RecordingKey, list[ChosenEpisode]]] = {}
+    chunk_of = _by_monitor(chunks)
+    for task, of_task in results.items():
         # The order in which ties are broken must depend only on the episodes.
-        own.sort(key=lambda each: each.unit)
-        begun = [each if each.episode_id is not None else None for each in own]
-        kept = keep_rule(plan.keep).choose(begun)
+        own = sorted(of_task, key=lambda each: each.unit)
+        kept = keep_rule(plan.keep).choose([each if each.key else None for each in own])
+        roles: dict[Path, dict[RecordingKey, list[str]]] = {}
         for result, role in kept:
-            chunk = plan.chunk_of(result.unit)
-            if chunk and result.monitor and result.episode_id is not None:
-                key = RecordingKey(result.monitor, result.episode_id)
-                episode = ChosenEpisode(*result.unit, role)
-                chosen.setdefault(chunk.folder, {}).setdefault(key, []).append(episode)
-        drawable: set[ChosenEpisode] = set()
+            if result.key is not None:
+                folder = chunk_of[task, result.monitor].folder
+                of_chunk = roles.setdefault(folder, {})
+                of_chunk.setdefault(result.key, []).append(role)
+        drawable: set[RecordingKey] = set()
         for each in chunks:
-            mine = chosen.get(each.chunk.folder, {}) if each.task.name == task else {}
-            if each.task.name != task or not (mine or each.known.is_drawn_live):
+            folder, chosen = each.folder, roles.get(each.folder, {})
+            if each.task.name != task or not (chosen or each.known.is_drawn_live):
                 continue
-            roles = {key: [e.role for e in mine[key]] for key in mine}
             try:
-                keys = write_choice(
-                    each.folder, roles, rule=plan.keep, finished=len(own)
-                )
+                keys = write_choice(folder, chosen, rule=plan.keep, finished=len(own))
             except Error as error:
-                logger.warning("%s: videos could not be chosen: %s", each.folder, error)
-                keys = {*mine}
-                impossible |= {each.folder / k.video_name: str(error) for k in keys}
-            videos += [(each.folder, key) for key in mine if key in keys]
-            drawable |= {e for key in mine if key in keys for e in mine[key]}
+                logger.warning("%s: videos could not be chosen: %s", folder, error)
+                keys = {*chosen}
+                impossible |= {folder / key.video_name: str(error) for key in keys}
+            videos += [(folder, key) for key in chosen if key in keys]
+            drawable |= keys
         # The episodes keep the order in which the rule returned them.
         selection[task] = [
-            episode
+            ChosenEpisode(*result.unit, role)
             for result, role in kept
-            if (episode := ChosenEpisode(*result.unit, role)) in drawable
+            if result.key in drawable
         ]
     return Choice(selection, videos, impossible)
+
+
+def files_of(
+    evaluation: Evaluation, chunks: Iterable[ChunkRun]
+) -> Callable[[EpisodeResult], EpisodeFiles]:
+    """Return a function that looks up the files of an episode."""
+    chunk_of = _by_monitor(chunks)
+    chosen = {
+        (task, each.seed, each.episode)
+        for task, of_task in evaluation.selection.items()
+        for each in of_task
+    }
+
+    @functools.lru_cache(maxsize=1)
+    def names_in(folder: str) -> set[str]:
+        place = evaluation.directory / folder
+        files = (*iter_monitor_files(place), *finished_trajectories(place))
+        return {path.name for path in files}
+
+    def files_of_episode(result: EpisodeResult) -> EpisodeFiles:
+        key = result.key
+        if key is None:
+            return EpisodeFiles()
+        folder = chunk_of[result.task, result.monitor].place
+        names, trajectory = names_in(folder), f"{key.name}{FINISHED}"
+        # Text environments have a text recording instead of a video.
+        as_text, video = f"{key.video_name.removesuffix('.mp4')}.json", None
+        if as_text in names:
+            video = as_text
+        elif (result.task, *result.unit) in chosen:
+            video = key.video_name
+        return EpisodeFiles(folder, trajectory if trajectory in names else None, video)
+
+    return files_of_episode
 
 
 def draw_videos(
@@ -349,13 +386,22 @@ def draw_videos(
     return videos, pending
 
 
+def _by_monitor(
+    chunks: Iterable[ChunkRun],
+) -> dict[tuple[str, str | None], ChunkRun]:
+    """Return the chunks, by task and by the monitors that recorded them."""
+    return {
+        (each.task.name, result.monitor): each
+        for each in chunks
+        for result in each.known.results.values()
+    }
+
+
 def _submit(run: Run, each: ChunkRun) -> str:
-    each.rounds += 1
+    # A chunk is only submitted again when its size has grown, so the key is unique.
     each.size = each.known.size
-    folder = f"{each.task.folder}/{each.chunk.folder}"
-    key = f"{folder}/{each.rounds}"
-    chunk: dict[str, Any] = dataclasses.asdict(each.chunk)
-    run.submit(key, kind="run", task=each.task.name, folder=folder, chunk=chunk)
+    key, chunk = f"{each.place}/{each.size}", dataclasses.asdict(each.chunk)
+    run.submit(key, kind="run", task=each.task.name, folder=each.place, chunk=chunk)
     return key
 
 

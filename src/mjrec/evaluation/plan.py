@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, TypeAlias
 
 from ..atomic_files import write_text
-from ..errors import DifferentEvaluation, UnreadableFile
+from ..errors import DifferentEvaluation
 from ..formats import json_fields
 from ..formats.json_fields import (
     base_name,
@@ -144,20 +144,6 @@ class EvaluationPlan:
     quality: Annotated[str, one_of(*QUALITIES)] = "full"
     env_kwargs: Mapping[str, Any] = field(default_factory=dict)
 
-    def chunk_of(self, unit: Unit) -> Chunk | None:
-        """Return the chunk that contains an episode, or None if no chunk does."""
-        seed, number = unit
-        chunks = self._chunks_by_seed.get(seed, ())
-        return next((each for each in chunks if each.first <= number < each.stop), None)
-
-    @functools.cached_property
-    def _chunks_by_seed(self) -> Mapping[int, list[Chunk]]:
-        chunks: dict[int, list[Chunk]] = {}
-        for chunk in self.chunks:
-            for seed in chunk.seeds:
-                chunks.setdefault(seed, []).append(chunk)
-        return chunks
-
     def __iter__(self) -> Iterator[Unit]:
         """Yield the episodes of a task in the order of the results."""
         for seed in self.seeds:
@@ -171,8 +157,7 @@ def write_plan(directory: Path, plan: EvaluationPlan) -> None:
     Raises:
         FileNotWritten: the disk is full, or the directory is missing or read-only.
     """
-    value = {"format_version": FORMAT_VERSION, "plan": to_json(plan)}
-    write_text(directory / PLAN_NAME, dumps(value, indent=2) + "\n")
+    write_versioned(directory / PLAN_NAME, {"plan": to_json(plan)})
 
 
 def read_plan(directory: Path) -> EvaluationPlan:
@@ -183,17 +168,31 @@ def read_plan(directory: Path) -> EvaluationPlan:
     """
     path = directory / PLAN_NAME
     with unreadable(path):
-        value = json_fields.read_object(path)
-        version = json_fields.field(value, "format_version", json_fields.integer)
-        if version != FORMAT_VERSION:
-            raise UnreadableFile(
-                path,
-                f"it has format version {version}, but this mjrec reads version "
-                f"{FORMAT_VERSION}",
-            )
-        return json_fields.field(
-            value, "plan", lambda plan: from_json(EvaluationPlan, plan)
+        read_as_plan = functools.partial(from_json, EvaluationPlan)
+        return json_fields.field(read_versioned(path), "plan", read_as_plan)
+
+
+def write_versioned(path: Path, value: Mapping[str, Any]) -> None:
+    """Write a JSON object together with the format version."""
+    content = {"format_version": FORMAT_VERSION, **value}
+    write_text(path, dumps(content, indent=2) + "\n")
+
+
+def read_versioned(path: Path) -> Mapping[str, Any]:
+    """Read the JSON object in a file, and check its format version.
+
+    Raises:
+        OSError: the file cannot be read.
+        ValueError: the file contains no JSON object of this version.
+    """
+    value = json_fields.read_object(path)
+    version = json_fields.field(value, "format_version", json_fields.integer)
+    if version != FORMAT_VERSION:
+        raise ValueError(
+            f"it has format version {version}, but this mjrec reads version "
+            f"{FORMAT_VERSION}"
         )
+    return value
 
 
 def check_continues(

@@ -1,29 +1,39 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Creating and checking the plan of an evaluation, without any environment."""
+"""Creating and checking the plan of an evaluation, without any environment.
+
+A digest is stored for each part of a policy: the source file of its module, each file
+named in its arguments, and the pickled content of an object. The digests prevent a
+resumed evaluation from mixing the results of different policies.
+"""
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
+import hashlib
+import importlib.util
+import inspect
 import itertools
 import json
 import math
 import re
+import sys
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from ..atomic_files import file_sha256
 from ..environments.episode_seeds import episode_seeds
 from ..environments.named_environment import EnvironmentOptions
-from ..environments.names import parse_environment_name
-from ..errors import InvalidArgument, UnknownName
+from ..environments.names import parse_environment_name, working_directory_importable
+from ..errors import InvalidArgument, PolicyError, UnknownName
 from ..frames import check_quality
 from ..json_text import loads
 from ..rates import to_rate
 from ..recorder.keep_rules import keep_rule
 from .plan import SEEDED, SUITE, Chunk, EvaluatedTask, EvaluationPlan
-from .policy_objects import SentPolicy
 from .task_sets import tasks_from
 
 DEFAULT_SEEDS = 5
@@ -41,20 +51,22 @@ _MOST_EPISODES_OF_CHUNK = 25
 
 def plan_from(
     tasks: str | Sequence[str],
-    sent: SentPolicy,
+    policy: Any,
     *,
     seeds: Iterable[int] | None,
     num_seeds: int | None,
     begun: EvaluationPlan | None = None,
     **options: Any,
-) -> EvaluationPlan:
-    """Return the checked plan of an evaluation.
+) -> tuple[EvaluationPlan, bytes | None]:
+    """Return the checked plan of an evaluation, and its pickled policy.
+
+    The latter is None if the policy is a string.
 
     `mjrec.evaluate` describes the options.
 
     Args:
         tasks: see `evaluate`. If empty, the tasks of `begun` are used.
-        sent: the policy.
+        policy: see `evaluate`.
         seeds: see `evaluate`. If `seeds` and `num_seeds` are both None, the seeds of
             `begun` are used.
         num_seeds: see `evaluate`.
@@ -65,7 +77,9 @@ def plan_from(
     Raises:
         UnknownName, InvalidArgument: an argument is invalid.
         MissingDependency, EnvironmentNotMade: see `tasks_from`.
+        PolicyError: the policy is invalid or cannot be pickled.
     """
+    policy_name, digests, payload = _sent_policy(policy, options["policy_kwargs"] or {})
     # Quick checks come first, because resolving sets of tasks starts a process.
     if options["protocol"] not in _PROTOCOLS:
         raise UnknownName("protocol", options["protocol"], _PROTOCOLS)
@@ -100,14 +114,14 @@ def plan_from(
         )
     plan = EvaluationPlan(
         tasks=_with_folders(names, known),
-        policy=sent.name,
-        is_object=sent.is_object,
-        policy_digests=sent.digests,
         seeds=checked_seeds,
+        policy=policy_name,
+        is_object=payload is not None,
+        policy_digests=digests,
         **options,
     )
     chunks = chunks_of(plan, begun.chunks if begun else ())
-    return dataclasses.replace(plan, chunks=chunks)
+    return dataclasses.replace(plan, chunks=chunks), payload
 
 
 def chunks_of(plan: EvaluationPlan, known: Sequence[Chunk]) -> tuple[Chunk, ...]:
@@ -153,7 +167,17 @@ def check_score_ranges(
     for task, given in (score_ranges or {}).items():
         if task not in names:
             raise UnknownName("task with a score range in this evaluation", task, names)
-        checked[task] = _score_range(task, given)
+        try:
+            low, high = map(float, given)
+        except (TypeError, ValueError):
+            low = high = np.nan
+        if not (np.isfinite([low, high]).all() and low < high):
+            raise InvalidArgument(
+                f"The score range of {task} must be the return for a score of 0 and a "
+                "higher return for a score of 1, such as (0, 1000), but it is "
+                f"{given!r}."
+            )
+        checked[task] = low, high
     return checked
 
 
@@ -168,19 +192,6 @@ def _range(what: str, first: int, last: int) -> str:
     if first == last:
         return f"{what}-{first:03d}"
     return f"{what}s-{first:03d}-{last:03d}"
-
-
-def _score_range(task: str, given: Any) -> tuple[float, float]:
-    try:
-        low, high = map(float, given)
-    except (TypeError, ValueError):
-        low = high = np.nan
-    if not (np.isfinite([low, high]).all() and low < high):
-        raise InvalidArgument(
-            f"The score range of {task} must be the return for a score of 0 and a "
-            f"higher return for a score of 1, such as (0, 1000), but it is {given!r}."
-        )
-    return low, high
 
 
 def _seeds(seeds: Iterable[int] | None, num_seeds: int | None) -> tuple[int, ...]:
@@ -256,3 +267,97 @@ def _folder(name: str, taken: set[str]) -> str:
 def _encoded(match: re.Match[str]) -> str:
     data = match[0].encode(errors="surrogateescape")
     return "".join(f"%{byte:02X}" for byte in data)
+
+
+def _sent_policy(
+    policy: Any, kwargs: Mapping[str, Any]
+) -> tuple[str, dict[str, str], bytes | None]:
+    """Convert a policy to a form that can be sent to workers.
+
+    Args:
+        policy: a string as in `mjrec record`, a function, an object with `predict`, or
+            a class that is built with each environment.
+        kwargs: keyword arguments for the policy.
+
+    Returns:
+        The name, the digests, and the pickled object; None if the policy is a string.
+
+    Raises:
+        PolicyError: `policy` is not a valid policy or cannot be pickled.
+    """
+    files: dict[str, str | None] = {
+        f"the file of its argument {name}": value
+        for name, value in kwargs.items()
+        if isinstance(value, str)
+    }
+    if isinstance(policy, str):
+        return policy, _digests({**_source_of(policy), **files}), None
+    if not (callable(policy) or callable(getattr(policy, "predict", None))):
+        raise PolicyError(
+            f"The policy {policy!r:.200} is not callable and has no predict() method. "
+            "Give a function, an object with predict(), a class that is built with the "
+            "environment, or a string: random, zero, module:name or module:name()."
+        )
+    named = policy if hasattr(policy, "__qualname__") else type(policy)
+    module = inspect.getmodule(named)
+    name = str(named.__qualname__)
+    name = name if module is None else f"{module.__name__}:{name}"
+    payload = _pickled(policy, name)
+    content = {"its content": _digest_of_pickle(payload)}
+    files = {"its code": getattr(module, "__file__", None), **files}
+    return name, {**content, **_digests(files)}, payload
+
+
+def _source_of(policy: str) -> dict[str, str | None]:
+    """Return the policy file, or the source file of the policy's module."""
+    module, colon, _ = policy.partition(":")
+    if not colon:
+        return {"its file": policy}
+    source = getattr(sys.modules.get(module), "__file__", None)
+    try:
+        if source is None:
+            with working_directory_importable():
+                found = importlib.util.find_spec(module)
+            source = None if found is None else found.origin
+    except Exception:
+        # The workers will import the module and report the error.
+        return {}
+    return {"its code": source}
+
+
+def _digests(files: Mapping[str, str | None]) -> dict[str, str]:
+    """Return the SHA-256 of each file that exists."""
+    digests = {}
+    for what, name in files.items():
+        with contextlib.suppress(OSError):
+            if name is not None and Path(name).is_file():
+                digests[what] = file_sha256(Path(name))
+    return digests
+
+
+def _pickled(policy: Any, name: str) -> bytes:
+    # Imported here because only an evaluation with an object needs cloudpickle, which
+    # is a dependency of gymnasium. The pickle is sent through our own pipe to our own
+    # processes.
+    import cloudpickle  # type: ignore[import-untyped]  # it has no types
+
+    try:
+        payload: bytes = cloudpickle.dumps(policy)
+    except Exception as error:
+        raise PolicyError(
+            f"The policy {name} cannot be sent to the worker processes: "
+            f"{type(error).__name__}: {error}. Pass its name instead "
+            "(policy='module:name'). Each process then imports the policy or, if it is "
+            "a class, builds it with the environment."
+        ) from error
+    return payload
+
+
+def _digest_of_pickle(payload: bytes) -> str:
+    from cloudpickle import cloudpickle
+
+    # A class that is pickled by value gets a different random name in each process.
+    names = getattr(cloudpickle, "_DYNAMIC_CLASS_TRACKER_BY_CLASS", {})
+    for name in names.values():
+        payload = payload.replace(name.encode(), b"0" * len(name))
+    return hashlib.sha256(payload).hexdigest()

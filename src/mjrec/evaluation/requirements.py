@@ -71,14 +71,10 @@ class Requirement:
                 yield f"{self.text}: the {what} of {whose} is {value:.4g}"
 
     def _value(self, figure: Estimate | None) -> float | None:
-        if figure is None:
-            return None
-        if self.end is None:
-            return figure.value
-        interval = figure.interval
-        if interval is None:
-            return None
-        return interval.low if self.end == "low" else interval.high
+        if figure is None or self.end is None:
+            return None if figure is None else figure.value
+        ends = figure.interval
+        return None if ends is None else getattr(ends, self.end)
 
 
 def parse_requirement(text: str) -> Requirement:

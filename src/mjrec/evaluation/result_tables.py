@@ -40,10 +40,8 @@ from .episode_results import EpisodeResult
 from .plan import EvaluationPlan
 
 _UNIT: Final = ("task", "seed", "episode")
-_RESULTS: Final = (
-    *(*_UNIT, "return", "length"),
-    *("terminated", "truncated", "success", "failure"),
-)
+_TRUTHS: Final = ("terminated", "truncated", "success")
+_RESULTS: Final = (*_UNIT, "return", "length", *_TRUTHS, "failure")
 _TIMING: Final = (
     *(*_UNIT, "start", "seconds", "folder", "monitor"),
     *("episode_id", "trajectory", "video"),
@@ -63,7 +61,6 @@ _NUMBER: Final = re.compile(
 _FOLDER: Final = re.compile(r"(?!\.)[^/\0]{1,255}(/(?!\.)[^/\0]{1,255})?")
 _TRUTH: Final = {"true": 1, "false": 0, "": -1}
 _MEANING: Final = {1: True, 0: False, -1: None}
-_TRUTHS: Final = ("terminated", "truncated", "success")
 _TIMES: Final = ("start_time", "seconds")
 
 
@@ -145,25 +142,22 @@ class TaskResults:
 
     def __iter__(self) -> Iterator[EpisodeResult]:
         """Yield the result of each episode, without its warnings."""
-        monitors = self.monitors
-        for index, row in enumerate(self._rows_in_python()):
+        monitors, names = self.monitors, ROW.names or ()
+        for index, values in enumerate(self._rows_in_python()):
+            row = dict(zip(names, values, strict=True))
             failure, monitor = self.failures.get(index), row["monitor"]
-            for name in _TRUTHS:
-                row[name] = _MEANING[row[name]]
-            for name in _TIMES:
-                row[name] = None if math.isnan(row[name]) else row[name]
+            row |= {name: _MEANING[row[name]] for name in _TRUTHS}
+            row |= {name: None for name in _TIMES if math.isnan(row[name])}
+            row["monitor"] = None if monitor < 0 else monitors[monitor]
             if failure:
                 row["total_reward"] = None
-            row["monitor"] = None if monitor < 0 else monitors[monitor]
             if monitor < 0:
                 row["episode_id"] = None
             yield EpisodeResult(task=self.task, failure=failure, **row)
 
-    def _rows_in_python(self) -> Iterator[dict[str, Any]]:
-        names = ROW.names or ()
+    def _rows_in_python(self) -> Iterator[tuple[Any, ...]]:
         for start in range(0, len(self), _ROWS_AT_ONCE):
-            for row in self.rows[start : start + _ROWS_AT_ONCE].tolist():
-                yield dict(zip(names, row, strict=True))
+            yield from self.rows[start : start + _ROWS_AT_ONCE].tolist()
 
 
 def write_results_table(file: TextIO, results: Iterable[EpisodeResult]) -> None:
@@ -176,16 +170,10 @@ def write_results_table(file: TextIO, results: Iterable[EpisodeResult]) -> None:
     writer = csv.writer(file, lineterminator="\n")
     writer.writerow(_RESULTS)
     for each in results:
-        failure = each.failure
-        writer.writerow(
-            [
-                *_unit(each),
-                "" if failure is not None else _shown(each.total_reward),
-                str(each.length),
-                *map(_truth_text, (each.terminated, each.truncated, each.success)),
-                "" if failure is None else _one_line(failure),
-            ]
-        )
+        truths = [_truth_text(getattr(each, name)) for name in _TRUTHS]
+        failure = "" if each.failure is None else _one_line(each.failure)
+        total = "" if failure else _shown(each.total_reward)
+        writer.writerow([*_unit(each), total, each.length, *truths, failure])
 
 
 def write_timing_table(
@@ -204,16 +192,10 @@ def write_timing_table(
     writer.writerow(_TIMING)
     for each in results:
         of = files(each)
-        recorded = (of.folder, each.monitor, each.episode_id) if of.folder else ()
-        writer.writerow(
-            [
-                *_unit(each),
-                *map(_shown, (each.start_time, each.seconds)),
-                *(recorded or ("", "", "")),
-                of.trajectory or "",
-                of.video or "",
-            ]
-        )
+        recorded = (of.folder, each.monitor, each.episode_id) if of.folder else [""] * 3
+        times = map(_shown, (each.start_time, each.seconds))
+        files_of_it = (of.trajectory or "", of.video or "")
+        writer.writerow([*_unit(each), *times, *recorded, *files_of_it])
 
 
 def read_tables(

@@ -16,6 +16,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import fnmatch
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -124,13 +125,7 @@ def _candidates(module: str, wanted: str) -> Iterator[str]:
         yield from suite_tasks("all")
         return
     if not module and _SUITE.startswith(beginning):
-        yield from _suite_if_installed()
-    yield from gymnasium_ids(module)
-
-
-def _suite_if_installed() -> Sequence[str]:
-    try:
-        return suite_tasks("all")
-    except MissingDependency:
         # Not an error, because the pattern may mean other environments.
-        return ()
+        with contextlib.suppress(MissingDependency):
+            yield from suite_tasks("all")
+    yield from gymnasium_ids(module)

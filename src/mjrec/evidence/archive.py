@@ -13,7 +13,7 @@ import shutil
 import stat
 import zipfile
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import IO, Any
 
@@ -101,7 +101,6 @@ def _copy_in(path: Path, into: Path) -> str:
     bag = _bag_in(path)
     if bag is not None:
         files = {each.relative_to(bag).as_posix(): each for each in _files_below(bag)}
-        _check_folders(bag)
         _copy_files(files, into, given=path)
         return "unpacked run"
     recordings: dict[str, Path] = {}
@@ -133,15 +132,24 @@ def _bag_in(path: Path) -> Path | None:
     return None
 
 
-def _files_below(folder: Path) -> Iterator[Path]:
+def _files_below(folder: Path) -> list[Path]:
+    """Return all files below a folder, which has only files and folders with files.
+
+    The manifests of a bag list only files.
+    """
+    found: list[Path] = []
     for entry in folder.iterdir():
         status = entry.lstat()
         if stat.S_ISDIR(status.st_mode):
-            yield from _files_below(entry)
+            files = _files_below(entry)
+            if not files:
+                raise ValueError(f"{entry.name[:200]!r} is an empty folder")
+            found += files
         elif stat.S_ISREG(status.st_mode):
-            yield entry
+            found.append(entry)
         else:
             raise ValueError(f"{entry.name!r} is neither a file nor a folder")
+    return found
 
 
 def _unbundle(recordings: Path) -> None:
@@ -181,15 +189,8 @@ def _unpack(path: Path, into: Path) -> None:
                 continue
             with archive.open(info) as packed:
                 _write(unpacked, name, packed, info.file_size)
-    _check_folders(unpacked)
+    _files_below(unpacked)
     (unpacked / top).rename(into)
-
-
-def _check_folders(folder: Path) -> None:
-    """Check that no folder is empty: the manifests of a bag list only files."""
-    for path in folder.rglob("*"):
-        if path.is_dir() and not any(path.iterdir()):
-            raise ValueError(f"{path.name[:200]!r} is an empty folder")
 
 
 def _check_room(size: int, into: Path, path: Path) -> None:

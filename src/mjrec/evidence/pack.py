@@ -175,7 +175,9 @@ def _bag(
     """Make the bag below `folder`; with a size limit, also make the archive there."""
     _check_count(contents)
     staged, bag = folder / "staged", folder / "whole" / options.name
-    _stage(contents, staged)
+    staged.mkdir()
+    for name, write in contents.files.items():
+        write(staged / name)
     if options.max_size is None:
         return bag, _make_bag(staged, bag, options, identity)
     archive = folder / _ARCHIVE
@@ -257,13 +259,6 @@ def _folder_beside(archive: Path) -> Iterator[Path]:
         yield folder
     finally:
         shutil.rmtree(folder, ignore_errors=True)
-
-
-def _stage(contents: Contents, folder: Path) -> None:
-    """Put the files to pack into a new folder."""
-    folder.mkdir()
-    for name, write in contents.files.items():
-        write(folder / name)
 
 
 def _publish(finished: Path, path: Path) -> None:

@@ -56,7 +56,12 @@ class Trial:
     def take(self, found: Same | Difference | Finding) -> Finding | None:
         """Count what a comparator found; return a contradiction to list separately."""
         if isinstance(found, Same):
-            if not self._proves_nothing(found):
+            is_proof = True
+            for index in self._reaching(found):
+                self._equal[index, found.unit] += found.count
+                # The item was fed in, so it proves nothing.
+                is_proof &= not is_fed(self._excuses[index].name, found.topic)
+            if is_proof:
                 count, unit, outcome = found.count, found.unit, Outcome.RECREATED
                 self._add(
                     Finding(found.topic, found.item, outcome, count=count, unit=unit)
@@ -132,14 +137,6 @@ class Trial:
             for excuse in tried
             if excuse.is_needed or excuse.refuted or excuse.kind in _ELSEWHERE
         )
-
-    def _proves_nothing(self, place: Same) -> bool:
-        """Count an equal item; return True if it was fed in and so proves nothing."""
-        fed = False
-        for index in self._reaching(place):
-            self._equal[index, place.unit] += place.count
-            fed |= is_fed(self._excuses[index].name, place.topic)
-        return fed
 
     def _add(self, finding: Finding) -> None:
         """Merge a finding with those for the same excuse, and keep the worst."""

@@ -55,8 +55,10 @@ def open_plain_zip(path: Path) -> Iterator[zipfile.ZipFile]:
     """
     with open_regular(path) as file:
         # First, because it limits the length of what `zipfile` reads.
-        _check_table(file)
+        table = _place_of_table(file)
         with zipfile.ZipFile(file) as archive:
+            if archive.start_dir != table:
+                raise ValueError("it has two tables of contents")
             for info in archive.infolist():
                 _check_entry(info)
             _check_places(archive)
@@ -91,8 +93,8 @@ def top_folder(archive: zipfile.ZipFile) -> str:
     return tops.pop()
 
 
-def _check_table(file: BinaryIO) -> None:
-    """Check the end of a zip file, which locates its table of contents."""
+def _place_of_table(file: BinaryIO) -> int:
+    """Check the end of a zip file, and return where its table of contents begins."""
     table_size, offset, entries, end = _table_of(file, file.seek(0, 2))
     if entries > MOST_ENTRIES or table_size > _LONGEST_TABLE:
         raise ValueError(
@@ -103,6 +105,7 @@ def _check_table(file: BinaryIO) -> None:
         raise ValueError(
             "it has extra bytes before its first file or after its table of contents"
         )
+    return offset
 
 
 def _table_of(file: BinaryIO, size: int) -> tuple[int, int, int, int]:

@@ -95,10 +95,8 @@ def trajectories_in(bundle: Path) -> list[Path]:
 
 def index_size(count: int) -> int:
     """Return the number of bytes reserved for the index of `count` episodes."""
-    size = _SMALLEST_INDEX
-    while size < _SMALLEST_INDEX // 4 + _LONGEST_RANGE * count:
-        size *= 2
-    return size
+    needed = _SMALLEST_INDEX // 4 + _LONGEST_RANGE * count
+    return max(_SMALLEST_INDEX, 1 << (needed - 1).bit_length())
 
 
 def index_of(episodes: Iterable[int]) -> bytes:

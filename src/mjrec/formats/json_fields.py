@@ -105,11 +105,7 @@ def optional(convert: Callable[[Any], T]) -> Callable[[Any], T | None]:
 
 def list_of(convert: Callable[[Any], T]) -> Callable[[Any], tuple[T, ...]]:
     """Return a conversion that converts each item of a list."""
-
-    def convert_items(value: Any) -> tuple[T, ...]:
-        return tuple(convert(item) for item in _checked(value, list))
-
-    return convert_items
+    return lambda value: tuple(map(convert, _checked(value, list)))
 
 
 def one_of(*known: str) -> Callable[[Any], str]:
@@ -259,14 +255,13 @@ def _readers(kind: Any) -> list[tuple[str, _Read, bool]]:
     """Return name and reader of each field, and whether it has no default."""
     hints = typing.get_type_hints(kind, include_extras=True)
     return [
-        (each.name, _reader(hints[each.name]), _is_needed(each))
+        (
+            each.name,
+            _reader(hints[each.name]),
+            each.default is each.default_factory is dataclasses.MISSING,
+        )
         for each in dataclasses.fields(kind)
     ]
-
-
-def _is_needed(each: dataclasses.Field[Any]) -> bool:
-    missing = dataclasses.MISSING
-    return each.default is missing and each.default_factory is missing
 
 
 def _reader(hint: Any) -> _Read:
@@ -290,7 +285,8 @@ def _reader(hint: Any) -> _Read:
         return list_of(_reader(inner[0]))
     if origin is tuple:
         return _tuple(inner)
-    return _values(_reader(inner[1]))
+    read = _reader(inner[1])
+    return lambda value: {text(k): read(v) for k, v in mapping(value).items()}
 
 
 def _any_of(readers: list[_Read]) -> _Read:
@@ -317,10 +313,3 @@ def _tuple(inner: tuple[Any, ...]) -> Callable[[Any], tuple[Any, ...]]:
         return tuple(read(item) for read, item in zip(readers, items, strict=True))
 
     return read_so_many
-
-
-def _values(read: _Read) -> Callable[[Any], Mapping[str, Any]]:
-    def read_values(value: Any) -> Mapping[str, Any]:
-        return {text(key): read(item) for key, item in mapping(value).items()}
-
-    return read_values

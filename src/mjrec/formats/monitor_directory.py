@@ -63,6 +63,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import InvalidArgument
+from ..plain_text import listed
 
 FILE_PREFIX = "openaigym"
 MANIFEST_PREFIX = f"{FILE_PREFIX}.manifest"
@@ -424,9 +425,7 @@ def where_recordings_are(directory: Path) -> str:
     folders = [str(path.relative_to(directory)) for path in below]
     if not folders:
         return f"To record, run `mjrec record ENV --out {shlex.quote(str(directory))}`."
-    rest = len(folders) - _SHOWN
-    more = f" and {rest} more" if rest > 0 else ""
-    return f"Its folders do ({', '.join(folders[:_SHOWN])}{more}): name one of them."
+    return f"Its folders do ({listed(folders, _SHOWN)}): name one of them."
 
 
 def names_in(directory: Path) -> Iterator[str]:
@@ -515,7 +514,11 @@ def further_parts(cameras: Sequence[Any]) -> list[str]:
     for place, camera in enumerate(cameras[1:], 2):
         has_name = isinstance(camera, str | int)
         part = camera_part(camera) if has_name else f"camera{place}"
-        parts.append(_unlike(part, parts))
+        unlike, number = part, 1
+        while unlike in parts:
+            number += 1
+            unlike = f"{part}-{number}"
+        parts.append(unlike)
     return parts
 
 
@@ -577,11 +580,3 @@ def second_name_of(name: str, second: str, *, first: str) -> str | None:
     if not name.startswith(f"{stem}."):
         return None
     return second.removesuffix(_MP4) + name.removeprefix(stem)
-
-
-def _unlike(part: str, others: Sequence[str]) -> str:
-    unlike, number = part, 1
-    while unlike in others:
-        number += 1
-        unlike = f"{part}-{number}"
-    return unlike

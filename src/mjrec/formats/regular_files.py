@@ -27,7 +27,14 @@ def regular_path(path: Path) -> Path:
             directory.
     """
     if path.is_symlink():
-        path = _followed(path)
+        # Not `Path.resolve`, which does not raise an OSError for a link to itself.
+        target = Path(os.path.realpath(path, strict=True))
+        if not target.is_relative_to(os.path.realpath(path.parent)):
+            raise ValueError(
+                "it is a link that leads out of its directory; put the file itself "
+                "there"
+            )
+        path = target
     if not stat.S_ISREG(path.lstat().st_mode):
         raise ValueError("it is not a regular file")
     return path
@@ -62,13 +69,3 @@ def read_regular(path: Path, *, limit: int) -> bytes:
         if size > limit:
             raise ValueError(f"it has {size} bytes, more than the limit of {limit}")
         return file.read(size)
-
-
-def _followed(link: Path) -> Path:
-    # Not `Path.resolve`, which does not raise an OSError for a link to itself.
-    target = Path(os.path.realpath(link, strict=True))
-    if not target.is_relative_to(os.path.realpath(link.parent)):
-        raise ValueError(
-            "it is a link that leads out of its directory; put the file itself there"
-        )
-    return target

@@ -80,7 +80,11 @@ def _reader_of(
     opened: contextlib.ExitStack,
 ) -> TrajectoryReader:
     log, dtype = recording.log, recording.dtype
-    first, stop = recording.row, _stop_of(recording, count)
+    first, stop = recording.row, recording.stop
+    if stop is None:
+        # A recording without an end extends to the next one, if there is one.
+        stop = count if recording.following is None else recording.following
+    stop = max(first, min(stop, count))
     heads = _sound_heads(rows, dtype, first, stop)
     is_step, is_frame = heads["flags"] & STEP != 0, heads["flags"] & FRAME != 0
     places = {
@@ -121,20 +125,6 @@ def _reader_of(
         read_change=read_change,
         release=opened.pop_all().close,
     )
-
-
-def _stop_of(recording: Recording, count: int) -> int:
-    """Return the row number at which a recording stops.
-
-    Args:
-        recording: the recording.
-        count: number of rows in its log.
-    """
-    stop = recording.stop
-    if stop is None:
-        # A recording without an end extends to the next one, if there is one.
-        stop = count if recording.following is None else recording.following
-    return max(recording.row, min(stop, count))
 
 
 def _sound_heads(

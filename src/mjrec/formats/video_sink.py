@@ -91,7 +91,10 @@ class VideoSink:
         assert not isinstance(frame, str)
         if self._note is not None and not self._writer.frame_count:
             # Write the note before the file that it describes.
-            self._write_note(self._note, *frame.shape[:2])
+            metadata, timing = self._note()
+            facts = {**timing, **file_facts(self._writer.file_of(*frame.shape[:2]))}
+            note = {"metadata": metadata, "facts": facts}
+            write_text(note_path(self.path), dumps(note))
         self._writer.write(frame if caption is None else annotated(frame, caption))
         self._is_annotated |= caption is not None
         # Check the frame without the caption, which would hide that it is blank.
@@ -152,13 +155,6 @@ class VideoSink:
         if self._is_annotated:
             facts["annotated"] = {"pillow": check_annotation()}
         return facts
-
-    def _write_note(self, note: _Note, height: int, width: int) -> None:
-        assert isinstance(self._writer, VideoWriter)
-        file = self._writer.file_of(height, width)
-        metadata, timing = note()
-        content = {"metadata": metadata, "facts": {**timing, **file_facts(file)}}
-        write_text(note_path(self.path), dumps(content))
 
     def _forget_note(self) -> None:
         if self._note is not None:

@@ -41,9 +41,12 @@ from dataclasses import dataclass, field
 from typing import Any, Protocol, TypeVar
 
 from ..errors import InvalidArgument, UnknownName
+from ..plain_text import listed
 from ..schedules import capped_cubic_video_schedule, check_takes_one, schedule_name
 from .tracking import FinishedEpisode
 
+# The most episode numbers that a message lists.
+_SHOWN = 10
 RULES = ("best", "best:N", "worst", "worst:N", "median", "failures", "failures:N")
 RULES_OF_EVALUATIONS = (*RULES, "cubic", "all", "none")
 
@@ -376,8 +379,9 @@ def _ask(
     unknown = sorted(numbers.difference(known))
     if unknown:
         raise InvalidArgument(
-            f"keep={name} returned {_listed(unknown)}, but no finished episode has "
-            f"that number. The finished episodes are {_listed(known)}."
+            f"keep={name} returned {listed(unknown, _SHOWN)}, but no finished episode "
+            "has that number. The finished episodes are "
+            f"{listed(known, _SHOWN) or 'none'}."
         )
     return numbers
 
@@ -387,9 +391,3 @@ def _number(value: Any) -> int:
         # Most likely the function returned flags, which would mean episodes 0 and 1.
         raise TypeError(f"{value} is not an episode number")
     return operator.index(value)
-
-
-def _listed(numbers: Sequence[int], most: int = 10) -> str:
-    shown = ", ".join(map(str, numbers[:most])) or "none"
-    more = len(numbers) - most
-    return f"{shown} and {more} more" if more > 0 else shown

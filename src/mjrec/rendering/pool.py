@@ -24,7 +24,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from ..child_python import Child, wait_for_news
+from ..child_python import Child, changed_environ, wait_for_news
 from ..errors import ClosedError, Error, GLError
 from ..formats.json_fields import to_json
 from ..formats.locks import Lock, try_lock
@@ -263,20 +263,16 @@ class WorkerPool:
     def _main_of_fork(self, environ: Mapping[str, str]) -> Callable[[], object] | None:
         if not self._forks or threading.active_count() > 1:
             return None
-        before = dict(os.environ)
-        # mujoco reads them when it is imported.
-        os.environ.update(environ)
         try:
-            # Not imported at the top: other processes that have a pool never draw.
-            from .worker import main
+            # mujoco reads them when it is imported. If this backend fails, the user's
+            # own choice is looked up again.
+            with changed_environ(environ):
+                # Not imported at the top: other processes that have a pool never draw.
+                from .worker import main
         except Exception:
             # A separate worker process reports the reason, or another backend works.
             self._forks = False
             return None
-        finally:
-            # If this backend fails, the user's own choice is looked up again.
-            os.environ.clear()
-            os.environ.update(before)
         return main
 
     def _choose_backend(self) -> None:

@@ -27,6 +27,7 @@ from typing import Final
 from ..atomic_files import make_directory, temporary_path, write_text
 from ..errors import DirectoryNotWritable, FileNotWritten, InvalidArgument
 from ..formats.regular_files import open_regular
+from ..plain_text import listed
 from .contents import ReportContents
 from .gathering import Directories, gather
 from .media import (
@@ -169,10 +170,9 @@ def _check_target(target: Path, *, is_page: bool) -> None:
     if not _is_own_page(target / PAGE_NAME):
         foreign = sorted(names)
     if foreign:
-        more = f" and {len(foreign) - _SHOWN} more" if len(foreign) > _SHOWN else ""
         raise InvalidArgument(
             f"{target} contains files that do not belong to a report: "
-            f"{', '.join(foreign[:_SHOWN])}{more}. It is not replaced. Choose a "
+            f"{listed(foreign, _SHOWN)}. It is not replaced. Choose a "
             "different folder, or move them away."
         )
 

@@ -21,6 +21,7 @@ from ..formats.monitor_directory import infix_of, is_bundle
 from ..formats.notebook import shown
 from ..formats.spans import recordings_in_flight
 from ..formats.trajectory import TrajectoryReader
+from ..plain_text import listed
 from .foreign_files import open_vetted_trajectory
 
 if TYPE_CHECKING:
@@ -287,8 +288,5 @@ def _what_is_in(path: Path) -> str:
         names = sorted({*finished, *in_flight})
     if not names:
         return f"{path} is a {kind} without trajectories."
-    more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
-    return (
-        f"{path} is a {kind}. Name one of the trajectories in it: "
-        f"{', '.join(names[:_SHOWN])}{more}."
-    )
+    shown = listed(names, _SHOWN)
+    return f"{path} is a {kind}. Name one of the trajectories in it: {shown}."
