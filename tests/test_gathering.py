@@ -53,7 +53,7 @@ def test_a_monitor_directory_is_one_task(recorded):
     assert (task.name, task.source) == ("HalfCheetah-v5", str(recorded))
     assert not task.is_evaluation
     assert task.summary.episodes == 2
-    assert task.episodes[["length", "outcome"]].tolist() == [(6, 2), (6, 2)]
+    assert task.episodes[["length", "truncated"]].tolist() == [(6, 1), (6, 1)]
     assert contents.title == "Recordings: HalfCheetah-v5"
     assert contents.problems == []
     assert [video.index for video in task.videos] == [0, 0, 1, 1]

@@ -183,7 +183,7 @@ def test_all_videos_of_an_episode_are_counted_and_listed(tmp_path, painter):
     """When the first is there, and it is then not pending any more."""
     write_with_cameras(tmp_path)
     manifest, seen = write_pending_manifest(tmp_path, 0), []
-    job = VideoJob.finishing(tmp_path, KEY)
+    job = VideoJob(directory=tmp_path, recording=KEY.shown_name)
     with contextlib.closing(Finisher(painter, on_progress=seen.append)) as finisher:
         assert finisher.add(job)
         assert (finisher.progress.videos, finisher.progress.frames) == (3, 15)

@@ -10,7 +10,7 @@ import logging
 import os
 import re
 import sys
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -35,6 +35,7 @@ TIMEOUT = 60.0
 _END_OF_OUTPUT = 4000
 _SAID = ("renders", "gl_renderer", "gl_vendor", "gl_version", "frames_per_second")
 _SOFTWARE = re.compile(r"llvmpipe|softpipe|swrast|SwiftShader|software", re.IGNORECASE)
+_BY_DEFAULT = "the first that works"
 _EARLIER = (
     "mujoco, dm_control and PyOpenGL read the backend once, when they are imported. "
     "Call mjrec.use_gl(), or set MUJOCO_GL, before anything imports them."
@@ -103,11 +104,7 @@ class Probe:
 
 
 def probe(
-    backend: str,
-    *,
-    environ: Mapping[str, str] | None = None,
-    measure: bool = False,
-    timeout: float = TIMEOUT,
+    backend: str, *, environ: Mapping[str, str] | None = None, measure: bool = False
 ) -> Probe:
     """Test `backend` as `use_gl` would set it, and cache the result in this process.
 
@@ -117,7 +114,6 @@ def probe(
         backend: the backend's name.
         environ: the environment variables; if None, this process's.
         measure: whether to measure the speed too.
-        timeout: maximum time to wait for a frame, in seconds.
 
     Raises:
         UnknownName: no such backend exists.
@@ -129,7 +125,7 @@ def probe(
     known = _answers.get(key)
     if known and not (measure and known.renders and known.frames_per_second is None):
         return known
-    _answers[key] = probe_environment(environ, measure=measure, timeout=timeout)
+    _answers[key] = probe_environment(environ, measure=measure)
     return _answers[key]
 
 
@@ -246,7 +242,7 @@ def backend_for_children() -> str:
     Raises:
         GLError: no backend works.
     """
-    choice = _first_that_renders(BACKENDS, None, "the first that works")
+    choice = _first_that_renders(None, _BY_DEFAULT, is_for_children=True)
     _log(choice)
     return choice.backend
 
@@ -258,21 +254,20 @@ def choose(backend: str | None = None) -> Choice:
         UnknownName: see `use_gl`.
         GLError: see `use_gl`.
     """
-    asked, reason = _asked_for(backend)
-    return _first_that_renders(
-        [asked] if asked else BACKENDS, asked, reason, conflict_with
-    )
+    asked, reason = None, _BY_DEFAULT
+    if backend is not None:
+        asked, reason = backend_name(backend), "requested"
+    elif named := backend_in_environment():
+        asked, reason = named, "set by MUJOCO_GL"
+    return _first_that_renders(asked, reason)
 
 
 def _first_that_renders(
-    candidates: Iterable[str],
-    asked: str | None,
-    reason: str,
-    conflict_with: Callable[[str], Diagnosis | None] = lambda _: None,
+    asked: str | None, reason: str, *, is_for_children: bool = False
 ) -> Choice:
     rejected: list[tuple[str, Diagnosis]] = []
-    for candidate in candidates:
-        conflict = conflict_with(candidate)
+    for candidate in [asked] if asked else BACKENDS:
+        conflict = None if is_for_children else conflict_with(candidate)
         if conflict:
             rejected.append((candidate, conflict))
             continue
@@ -289,15 +284,6 @@ def _log(choice: Choice) -> None:
     if choice.probe.warning():
         _LOG.warning("%s", choice.probe.warning())
     _LOG.info("Using %s (%s).", choice.backend, choice.probe.gl_renderer)
-
-
-def _asked_for(backend: str | None) -> tuple[str | None, str]:
-    if backend is not None:
-        return backend_name(backend), "requested"
-    named = backend_in_environment()
-    if named:
-        return named, "set by MUJOCO_GL"
-    return None, "the first that works"
 
 
 def conflict_with(backend: str) -> Diagnosis | None:

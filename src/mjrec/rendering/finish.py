@@ -178,8 +178,7 @@ def _done_on_engine(
             assert done is not None
             result = _result_of(done, by_name[done.key])
             # The job was counted as one video.
-            count = len(result.videos)
-            videos = count or int(bool(result.failures or result.elsewhere))
+            videos = len(result.videos) or bool(result.failures or result.elsewhere)
             now = Progress(
                 videos=now.videos + videos - 1,
                 videos_done=now.videos_done + videos,

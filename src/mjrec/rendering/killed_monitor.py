@@ -18,15 +18,8 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import Error, UnreadableFile
+from ..formats import journal, spans, trajectory_file
 from ..formats.bundle import FINISHED, is_finished
-from ..formats.journal import (
-    KILLED,
-    JournalEntry,
-    JournalWriter,
-    entry_of,
-    missing_line,
-    read_journal,
-)
 from ..formats.locks import try_lock
 from ..formats.monitor_directory import (
     VideoName,
@@ -35,18 +28,6 @@ from ..formats.monitor_directory import (
     journal_name,
     lock_name,
     manifest_name,
-)
-from ..formats.spans import (
-    files_beside,
-    find_trajectory,
-    recordings_in,
-    recordings_in_flight,
-    remove_log,
-)
-from ..formats.trajectory_file import (
-    bundle_trajectories,
-    finish_trajectories,
-    open_trajectory,
 )
 from ..plain_text import counted
 from ..results.journal_or_stats import MonitorResults, locked_run
@@ -198,13 +179,15 @@ class _KilledMonitor:
         Raises:
             UnreadableFile: the journal does not say what is in the log. The log stays.
         """
-        in_flight = [each.path for each in recordings_in(log) if each.is_in_flight]
+        in_flight = [
+            each.path for each in spans.recordings_in(log) if each.is_in_flight
+        ]
         episodes = [path for path in in_flight if path.suffix == FINISHED]
         for paths in [episodes] if self.bundles else [[path] for path in episodes]:
             self._finish_trajectories(paths)
-        is_idle = not any(each.is_in_flight for each in recordings_in(log))
-        if is_idle and any(map(Path.exists, files_beside(log))):
-            remove_log(log)
+        is_idle = not any(each.is_in_flight for each in spans.recordings_in(log))
+        if is_idle and any(map(Path.exists, spans.files_beside(log))):
+            spans.remove_log(log)
             self.report.note(log.name, "nothing in flight, removed")
 
     def _finish_trajectories(self, paths: Iterable[Path]) -> None:
@@ -212,7 +195,9 @@ class _KilledMonitor:
         with contextlib.ExitStack() as claims:
             ours = [p for p in paths if claims.enter_context(self._claimed(p))]
             ours = [path for path in ours if not is_finished(path)]
-            finish = bundle_trajectories if self.bundles else finish_trajectories
+            finish = trajectory_file.finish_trajectories
+            if self.bundles:
+                finish = trajectory_file.bundle_trajectories
             failures = finish(ours)
             for path in ours:
                 with self.report.attempt(path.name):
@@ -234,12 +219,12 @@ class _KilledMonitor:
     # Known facts about episodes
 
     @functools.cached_property
-    def _entries(self) -> dict[int, JournalEntry | None]:
+    def _entries(self) -> dict[int, journal.JournalEntry | None]:
         """Journal entries of the episodes with files; None for an episode cut off.
 
         Episodes without files are left out: there may be millions.
         """
-        files, entries = self._files(), dict[int, JournalEntry | None]()
+        files, entries = self._files(), dict[int, journal.JournalEntry | None]()
         # An unreadable journal is reported when the statistics are written.
         with contextlib.suppress(UnreadableFile):
             if files.journal is not None:
@@ -249,7 +234,7 @@ class _KilledMonitor:
                     if kind == "cut" and isinstance(facts, Mapping):
                         entries.setdefault(facts.get("episode_id", -1))
 
-                for entry in read_journal(files.journal, on_event=note):
+                for entry in journal.read_journal(files.journal, on_event=note):
                     if entry.episode_id in numbers:
                         entries[entry.episode_id] = entry
         return entries
@@ -258,7 +243,7 @@ class _KilledMonitor:
         """Return the facts in an episode's trajectory; empty if missing or damaged."""
         with contextlib.suppress(UnreadableFile):
             if number is not None and (
-                path := find_trajectory(self.directory, self.infix, number)
+                path := spans.find_trajectory(self.directory, self.infix, number)
             ):
                 return _facts_of(path)
         return {}
@@ -268,7 +253,7 @@ class _KilledMonitor:
         facts = self._facts(number)
         entry = None if number is None else self._entries.get(number)
         known = {key: facts[key] for key in ("length", "reward") if key in facts}
-        if "complete" in facts and facts.get("reason") != KILLED:
+        if "complete" in facts and facts.get("reason") != journal.KILLED:
             keys = ("complete", "terminated", "truncated", "reason", "exception")
             known |= {key: facts[key] for key in keys if key in facts}
         if entry is not None:
@@ -290,7 +275,7 @@ class _KilledMonitor:
                 "chosen": bool(video) and not is_choosing,
                 "recording": video.get("recording"),
             }
-            yield missing_line(facts, choice)
+            yield journal.missing_line(facts, choice)
 
     def _missing_clips(self, now: MonitorFiles) -> Iterator[_Line]:
         """Yield a line for each clip, deferred or live.
@@ -298,7 +283,7 @@ class _KilledMonitor:
         Some may repeat lines of the journal. Unreadable clips are left out; rendering
         the directory reports them.
         """
-        in_flight = recordings_in_flight(self.directory, self.infix)
+        in_flight = spans.recordings_in_flight(self.directory, self.infix)
         for key in {key_of(each.name) for each in in_flight}:
             if key is None or not key.is_clip:
                 continue
@@ -325,11 +310,11 @@ class _KilledMonitor:
         """Add the lines that the monitor did not live to write."""
         lines = [*self._missing_episodes(now), *self._missing_clips(now)]
         path = self.directory / journal_name(self.infix)
-        writer = JournalWriter(path, run=self._run_facts(now))
+        writer = journal.JournalWriter(path, run=self._run_facts(now))
         with contextlib.closing(writer), manifest_lock(self.directory, self.infix):
             for kind, facts in (*lines, ("recovered", {})):
                 if kind == "episode":
-                    writer.append(entry_of(facts))
+                    writer.append(journal.entry_of(facts))
                 else:
                     writer.note(kind, facts)
         added = sum(kind == "episode" for kind, _ in lines)
@@ -364,9 +349,9 @@ class _KilledMonitor:
 
 
 def _how_long(path: Path) -> str:
-    with open_trajectory(path) as reader:
+    with trajectory_file.open_trajectory(path) as reader:
         steps = counted(reader.step_count, "step")
-        is_cut = reader.facts.get("reason") == KILLED
+        is_cut = reader.facts.get("reason") == journal.KILLED
     return f"{steps}, incomplete: killed" if is_cut else steps
 
 

@@ -396,19 +396,9 @@ class WorkerPool:
             f"it drew nothing for {seconds:g} seconds and was ended; the log shows "
             "where it hung"
         )
-        # If nothing was ever drawn, this frame is not the cause.
-        kind = Error if self._has_drawn else GLError
-        self._lose(worker, job, "hung", how, kind=kind)
+        self._lose(worker, job, "hung", how)
 
-    def _lose(
-        self,
-        worker: _Worker,
-        job: _Job,
-        what: str,
-        how: str,
-        *,
-        kind: type[Error] = Error,
-    ) -> None:
+    def _lose(self, worker: _Worker, job: _Job, what: str, how: str) -> None:
         """End a worker's process; the second loss at the same frame is an error."""
         worker.end()
         if not worker.is_tried:
@@ -417,6 +407,8 @@ class WorkerPool:
         position = worker.owes.start
         if worker.lost_at == position:
             source = job.drawing.get("trajectory", "the given states")
+            # If nothing was ever drawn, this frame is not the cause of a hang.
+            kind = Error if self._has_drawn or what == "died" else GLError
             worker.error = kind(
                 f"A worker {what} while drawing frame {job.indices[position]} of "
                 f"{source} for the second time: {how}"

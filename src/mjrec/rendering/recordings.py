@@ -156,11 +156,8 @@ def recordings(directory: Path) -> list[RecordingKey]:
     """Return the episodes with a trajectory, then the clips in flight, in order."""
     finished = finished_trajectories(directory)
     in_flight = (recording.path for recording in recordings_in_flight(directory))
-    keys = {key_of(path.name) for path in (*finished, *in_flight)} - {None}
-    return sorted(
-        (key for key in keys if key is not None),
-        key=lambda key: (key.is_clip, infix_order(key.infix), key.number),
-    )
+    keys = {key for path in (*finished, *in_flight) if (key := key_of(path.name))}
+    return sorted(keys, key=lambda k: (k.is_clip, infix_order(k.infix), k.number))
 
 
 def parts_of(directory: Path, key: RecordingKey) -> list[Path]:

@@ -16,14 +16,9 @@ from numpy.typing import ArrayLike
 from ..errors import InvalidArgument
 from ..formats.json_fields import to_json
 from ..frames import Frame
+from . import recorded_facts
 from .jobs import View, plain_camera
 from .pool import WorkerPool
-from .recorded_facts import (
-    check_has_frames,
-    chosen_frames,
-    open_for_rendering,
-    warn_of_other_frames,
-)
 
 if TYPE_CHECKING:
     from ..simulation.cameras import Camera
@@ -88,11 +83,11 @@ def render(
         width=width,
         quality=quality,
     )
-    with open_for_rendering(path) as reader:
+    with recorded_facts.open_for_rendering(path) as reader:
         facts = reader.facts
-        check_has_frames(reader)
-        warn_of_other_frames(path.name, facts)
-        chosen = chosen_frames(reader.frame_count, facts, max_fps)
+        recorded_facts.check_has_frames(reader)
+        recorded_facts.warn_of_other_frames(path.name, facts)
+        chosen = recorded_facts.chosen_frames(reader.frame_count, facts, max_fps)
     is_trusted = bool(getattr(trajectory, "trust_models", False))
     pool = WorkerPool(workers, trust_models=is_trusted)
     return _started(pool, lambda: pool.frames(path, chosen.indices, view))

@@ -116,8 +116,8 @@ def render_video(
         annotate = bool(video_facts(facts).get("annotate", False))
     if annotate:
         check_annotation()
-    rate = variant.fps
-    rate = recorded.usual_fps(chosen) if rate is None else to_rate(rate)
+    fps = variant.fps
+    rate = recorded.usual_fps(chosen) if fps is None else to_rate(fps)
     stride = facts.get("stride", 1) * chosen.every
     timestep = recorded.timing.get("timestep")
     description = {

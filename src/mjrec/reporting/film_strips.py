@@ -26,14 +26,9 @@ from ..errors import InvalidArgument, UnreadableFile
 from ..formats.json_fields import field, integer, list_of, rate, read_object
 from ..formats.video_metadata import metadata_path
 from ..frames import Frame
+from ..rendering import recorded_facts
 from ..rendering.jobs import View
 from ..rendering.pool import WorkerPool
-from ..rendering.recorded_facts import (
-    captions,
-    check_has_frames,
-    open_for_rendering,
-    warn_of_other_frames,
-)
 from .video_stream import frames_at, read_stream, video_kind
 
 _TRAJECTORY: Final = ".h5"
@@ -102,11 +97,11 @@ def film_strip(
                 "(openaigym.trajectory.*.h5)."
             )
         return _laid_out(*_of_video(path, frames), columns)
-    with open_for_rendering(path) as reader:
-        check_has_frames(reader)
-        warn_of_other_frames(path.name, reader.facts)
+    with recorded_facts.open_for_rendering(path) as reader:
+        recorded_facts.check_has_frames(reader)
+        recorded_facts.warn_of_other_frames(path.name, reader.facts)
         indices = _spread(reader.frame_count, frames, path)
-        times = [caption.time for caption in captions(reader, indices)]
+        times = [caption.time for caption in recorded_facts.captions(reader, indices)]
     view = View(camera=camera, height=height, width=width, quality=quality)
     with contextlib.closing(WorkerPool(1)) as workers:
         drawn = workers.frames(path, indices, view)

@@ -35,6 +35,7 @@ from ..formats.monitor_directory import monitor_directories_in
 from ..results.episodes import Episode, episodes_of
 from ..results.journal_or_stats import MonitorResults
 from ..results.monitor_files import MonitorFiles, monitors_of
+from . import monitor_facts
 from .contents import (
     ReportContents,
     ReportTask,
@@ -45,14 +46,6 @@ from .contents import (
     in_time,
     rows_of_monitor,
     summary_of_rows,
-)
-from .monitor_facts import (
-    joined,
-    machine_of,
-    pairs_of_monitor,
-    pairs_of_results,
-    recorded_videos,
-    recorded_when,
 )
 
 _package_logger = logging.getLogger(__package__.partition(".")[0])
@@ -196,11 +189,13 @@ def _add_monitors(
         name = (monitor.env_info or {}).get("env_id")
         known = name[:_LONGEST_NAME] if isinstance(name, str) else ""
         recorded = by_name.setdefault(known or _UNKNOWN_ENVIRONMENT, _Recorded())
-        recorded.videos += recorded_videos(monitor, place, contents.problems)
+        recorded.videos += monitor_facts.recorded_videos(
+            monitor, place, contents.problems
+        )
         episodes = _readable_episodes(contents, monitor)
         recorded.rows.append(rows_of_monitor(episodes, run=len(recorded.runs)))
         recorded.runs.append(monitor.files.infix)
-        recorded.provenance |= dict.fromkeys(pairs_of_monitor(monitor))
+        recorded.provenance |= dict.fromkeys(monitor_facts.pairs_of_monitor(monitor))
     # Monitors of which nothing could be read are not an environment.
     unknown = by_name.get(_UNKNOWN_ENVIRONMENT)
     if unknown and not unknown.videos and not any(map(len, unknown.rows)):
@@ -263,8 +258,8 @@ def _readable_episodes(
 def _complete(task: ReportTask) -> None:
     """Join a task's provenance, order its videos by episode, and set their roles."""
     renderers = [("OpenGL renderer", video.renderer or "") for video in task.videos]
-    when = ("Recorded", recorded_when(task.episodes))
-    task.provenance = joined([*task.provenance, *renderers, when])
+    when = ("Recorded", monitor_facts.recorded_when(task.episodes))
+    task.provenance = monitor_facts.joined([*task.provenance, *renderers, when])
     roles = episodes_with_roles(task)
     # Sorting is stable, so the order of cameras stays.
     task.videos = sorted(task.videos, key=lambda v: (v.index is None, v.index or 0))
@@ -298,7 +293,7 @@ def _add_evaluation(contents: ReportContents, directory: Path) -> None:
         contents.across[str(directory)] = results.across
     for summary in results.summaries:
         task = summary.task
-        provenance = [*pairs_of_results(results, task)]
+        provenance = [*monitor_facts.pairs_of_results(results, task)]
         videos = _videos_of_task(contents, results, task, provenance)
         contents.tasks.append(
             ReportTask(
@@ -332,8 +327,8 @@ def _videos_of_task(
     columns, folder = results.by_task[task], results.folder(task)
     videos: list[ReportVideo] = []
     for place, monitor in _monitors(contents, _places_of_task(folder)):
-        videos += recorded_videos(monitor, place, contents.problems)
-        provenance.append(machine_of(monitor))
+        videos += monitor_facts.recorded_videos(monitor, place, contents.problems)
+        provenance.append(monitor_facts.machine_of(monitor))
     find_episodes(videos, columns.rows, columns.monitors)
     shown = [video for video in videos if video.index is not None]
     missing = len(columns.videos.keys() - {video.index for video in shown})

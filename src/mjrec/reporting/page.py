@@ -240,25 +240,24 @@ def _cards(contents: ReportContents) -> list[dict[str, Any]]:
     They are ordered by task, then best, median, worst, and all others.
     """
     tasks = [i for i, task in enumerate(contents.tasks) for _ in task.videos]
-    videos = list(enumerate(zip(tasks, contents.videos, strict=True)))
-    if len(videos) > _MOST_PLAYERS:
-        videos = sorted(videos, key=lambda each: not each[1][1].roles)[:_MOST_PLAYERS]
-    videos.sort(key=lambda each: (each[1][0], _place_of(each[1][1].roles), each[0]))
+    videos = contents.videos
+
+    def place(index: int) -> tuple[int, int, int]:
+        role = min(map(ROLES.index, videos[index].roles), default=len(ROLES))
+        return tasks[index], role, index
+
+    shown = sorted(range(len(videos)), key=lambda index: not videos[index].roles)
     return [
-        _card(index, video, task, contents.tasks[task])
-        for index, (task, video) in videos
+        _card(index, videos[index], tasks[index], contents)
+        for index in sorted(shown[:_MOST_PLAYERS], key=place)
     ]
 
 
-def _place_of(roles: Sequence[str]) -> int:
-    return min(map(ROLES.index, roles), default=len(ROLES))
-
-
 def _card(
-    index: int, video: ReportVideo, number_of_task: int, task: ReportTask
+    index: int, video: ReportVideo, number_of_task: int, contents: ReportContents
 ) -> dict[str, Any]:
     """Return a video in the gallery, with the facts about its episode."""
-    which, reward = "", None
+    task, which, reward = contents.tasks[number_of_task], "", None
     facts: list[tuple[str, str]] = []
     if video.index is not None:
         episode = task.episodes[video.index]
@@ -310,21 +309,22 @@ def _episodes(contents: ReportContents, shown: set[int]) -> dict[str, Any]:
         contents: the report's contents.
         shown: the `id()` of each video that has a card.
     """
-    places = [
-        f"#video-{i}" if id(video) in shown else video.file and address(video.file)
+    places = {
+        id(video): f"#video-{i}"
+        if id(video) in shown
+        else video.file and address(video.file)
         for i, video in enumerate(contents.videos)
-    ]
+    }
     total = sum(len(task.episodes) for task in contents.tasks)
     most = None
     if total > _MOST_EPISODES:
         most = max(5, _MOST_EPISODES // (4 * len(contents.tasks)))
-    tasks, first = [], 0
+    tasks = []
     for task in contents.tasks:
         videos: dict[int, list[str]] = {}
-        for video, place in zip(task.videos, places[first:], strict=False):
-            if video.index is not None and place:
+        for video in task.videos:
+            if video.index is not None and (place := places[id(video)]):
                 videos.setdefault(video.index, []).append(place)
-        first += len(task.videos)
         tasks.append(_columns(task, _most_telling(task, videos, most), videos))
     return {"outcomes": _OUTCOMES, "tasks": tasks}
 

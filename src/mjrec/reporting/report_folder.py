@@ -28,24 +28,14 @@ from ..atomic_files import make_directory, temporary_path, write_text
 from ..errors import DirectoryNotWritable, FileNotWritten, InvalidArgument
 from ..formats.regular_files import open_regular
 from ..plain_text import listed
+from . import media
 from .contents import ReportContents
 from .gathering import Directories, gather
-from .media import (
-    POSTERS,
-    REPLAYS,
-    VIDEOS,
-    OnProgress,
-    add_images,
-    copy_videos,
-    is_own_name,
-    with_embedded_videos,
-    write_replays,
-)
 from .page import page_of
 
 PAGE_NAME: Final = "index.html"
 
-_FOLDERS: Final = (VIDEOS, POSTERS, REPLAYS)
+_FOLDERS: Final = (media.VIDEOS, media.POSTERS, media.REPLAYS)
 _PAGE_ENDINGS: Final = (".html", ".htm")
 _GENERATOR: Final = re.compile(rb'<meta name="generator" content="mjrec [^"]*">')
 _BEGIN: Final = 4096
@@ -61,7 +51,7 @@ def write_report(
     max_single_file_bytes: int = 50_000_000,
     replays: bool = False,
     verifications: Iterable[str | os.PathLike[str]] = (),
-    on_progress: OnProgress | None = None,
+    on_progress: media.OnProgress | None = None,
 ) -> Path:
     """Write a web page about recordings, and return its path.
 
@@ -108,7 +98,7 @@ def write_report(
     _check_target(target, is_page=is_page)
     tell = on_progress or (lambda progress: None)
     contents = gather(directories, title=title, verifications=verifications)
-    add_images(contents, tell)
+    media.add_images(contents, tell)
     if single_file:
         page = _single_page(contents, max_single_file_bytes)
         if is_page:
@@ -117,9 +107,9 @@ def write_report(
             return Path(path)
     with _replacing_folder(target) as folder:
         if not single_file:
-            copy_videos(contents, folder, tell)
+            media.copy_videos(contents, folder, tell)
             if replays:
-                write_replays(contents, folder, tell)
+                media.write_replays(contents, folder, tell)
             page = page_of(contents)
         write_text(folder / PAGE_NAME, page)
     return Path(path) / PAGE_NAME
@@ -128,7 +118,7 @@ def write_report(
 def _single_page(contents: ReportContents, most_bytes: int) -> str:
     room = most_bytes
     while True:
-        page = page_of(with_embedded_videos(contents, room=room))
+        page = page_of(media.with_embedded_videos(contents, room=room))
         size = len(page.encode())
         if size <= most_bytes:
             return page
@@ -165,7 +155,7 @@ def _check_target(target: Path, *, is_page: bool) -> None:
         for folder in _FOLDERS
         if (target / folder).is_dir()
         for entry in (target / folder).iterdir()
-        if not is_own_name(entry.name)
+        if not media.is_own_name(entry.name)
     )
     if not _is_own_page(target / PAGE_NAME):
         foreign = sorted(names)

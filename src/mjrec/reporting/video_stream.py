@@ -27,11 +27,9 @@ _BEGIN: Final = 12
 # ffmpeg's names of the formats, by suffix.
 _KINDS: Final = {".mp4": "mp4", ".avi": "avi", ".mkv": "matroska"}
 
-_HEADER: Final = re.compile(rb"#(?P<key>tb|dimensions) 0: (?P<a>\d+)[/x](?P<b>\d+)")
+_HEADER: Final = re.compile(rb"^#(tb|dimensions) 0: (\d+)[/x](\d+)$", re.MULTILINE)
 # Stream, decoding time, presentation time, duration, size, checksum.
-_PACKET: Final = re.compile(
-    rb"0, *(?P<decoded>-?\d+), *(?P<time>-?\d+), *(?P<duration>\d+), .*"
-)
+_PACKET: Final = re.compile(rb"^0, *(-?\d+), *(-?\d+), *(\d+), .*$", re.MULTILINE)
 # ffmpeg's value for a missing presentation time, as in AVI files.
 _NO_TIME: Final = -(2**63)
 # A crafted file may claim any size.
@@ -88,21 +86,14 @@ def read_stream(path: Path) -> VideoStream:
     """
     arguments = [*_reading(path), "-c", "copy", "-f", "framecrc", "pipe:1"]
     output = run_ffmpeg(arguments, what=f"The video {path.name} cannot be read.")
-    headers: dict[bytes, tuple[int, int]] = {}
-    packets: list[tuple[int, int]] = []
-    for line in output.splitlines():
-        packet = _PACKET.fullmatch(line)
-        header = _HEADER.fullmatch(line)
-        if packet is not None:
-            time = int(packet["time"])
-            known = int(packet["decoded"]) if time == _NO_TIME else time
-            packets.append((known, int(packet["duration"])))
-        elif header is not None:
-            headers[header["key"]] = (int(header["a"]), int(header["b"]))
+    headers = {key: (int(a), int(b)) for key, a, b in _HEADER.findall(output)}
+    # Packets come in decoding order; sort them by time.
+    packets = sorted(
+        (int(decoded if int(time) == _NO_TIME else time), int(duration))
+        for decoded, time, duration in _PACKET.findall(output)
+    )
     if not packets or len(headers) < 2 or not headers[b"tb"][1]:
         raise UnreadableFile(path, "it contains no frames")
-    # Packets come in decoding order; sort them by time.
-    packets.sort()
     unit = float(Fraction(*headers[b"tb"]))
     width, height = headers[b"dimensions"]
     times = np.array([time for time, _ in packets], np.float64)

@@ -150,8 +150,11 @@ class Capture:
                 lambda: frames.objection(fields, frames.source.taken())
             )
         self._is_current = _never
-        if self._is_unmoved is not None and refusal is None and not frames.scene:
-            self._watch(stored.looks, self._is_unmoved)
+        is_unmoved, looks = self._is_unmoved, stored.looks
+        if is_unmoved is not None and refusal is None and not frames.scene:
+            seen, present = [*looks.seen], [*looks.present]
+            self._is_current = lambda: seen == present and is_unmoved()
+            self._look_closely = seen.clear
         return EpisodeStart(
             state=stored.state,
             snapshot=frames.kind if refusal is None else None,
@@ -276,12 +279,6 @@ class Capture:
         if self._frames is None or self._frames.key != key:
             self._frames = _Frames(stored, data, view, key)
         return self._frames
-
-    def _watch(self, looks: Looks, is_unmoved: Callable[[], bool]) -> None:
-        """Set `is_current` to check whether only the state has changed."""
-        seen, present = [*looks.seen], [*looks.present]
-        self._is_current = lambda: seen == present and is_unmoved()
-        self._look_closely = seen.clear
 
     def _at_moment(self, do: Callable[[], T]) -> T:
         """Call `do` when the environment would draw, and return its result."""

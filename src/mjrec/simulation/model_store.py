@@ -33,14 +33,8 @@ from ..formats.json_fields import unreadable
 from ..formats.monitor_directory import FILE_PREFIX
 from ..formats.regular_files import open_regular
 from ..worker_thread import WorkerThread
+from . import model_trust
 from .model_sources import AuthoredModel, with_embedded_files, write_authored
-from .model_trust import (
-    TRUST_VARIABLE,
-    directory_digest,
-    is_stored,
-    is_trusted,
-    note_models,
-)
 
 logger = logging.getLogger(__name__)
 
@@ -99,7 +93,9 @@ class ModelStore:
         names = {f"{stem}.mjb.gz", *([] if authored is None else [f"{stem}.zip"])}
         if not names <= self._known:
             self._known |= names
-            note_models([digest, directory_digest(self._directory)])
+            model_trust.note_models(
+                [digest, model_trust.directory_digest(self._directory)]
+            )
             if self._writer is None:
                 # Models may be large, so at most one may wait.
                 self._writer = WorkerThread(self._store, capacity=1, name="model store")
@@ -236,7 +232,7 @@ def _load_compiled(
     digest = facts.get("sha256")
     if path is None or facts.get("mujoco") != mujoco.__version__:
         raise _not_loadable(directory, facts)
-    if not (trust_models or is_stored(digest) or is_trusted()):
+    if not (trust_models or model_trust.is_stored(digest) or model_trust.is_trusted()):
         raise _untrusted(path, "are missing")
     content = _read_gzip(path, _recorded_size(path, facts))
     # MuJoCo trusts the sizes and addresses in the file, so its hash must match.
@@ -283,7 +279,7 @@ def _untrusted(compiled: Path, what_of_sources: str) -> UntrustedModel:
         "any code in the process that loads it; its sources "
         f"{what_of_sources}. If you trust its author, use `mjrec render "
         "--trust-models`, mjrec.load_trajectory(path, trust_models=True), or the "
-        f"environment variable {TRUST_VARIABLE}=1",
+        f"environment variable {model_trust.TRUST_VARIABLE}=1",
     )
 
 

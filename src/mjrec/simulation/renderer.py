@@ -16,22 +16,8 @@ from numpy.typing import ArrayLike
 
 from ..errors import ClosedError, InvalidArgument
 from ..frames import Frame, check_quality, check_size
-from .cameras import (
-    FREE_CAMERA,
-    Camera,
-    has_infinite_plane,
-    is_tracking,
-    resolve_camera,
-)
+from . import cameras, gl_context
 from .fields import holder_of
-from .gl_context import (
-    context_kept,
-    current_gl_facts,
-    gl_error,
-    new_context,
-    raw_opengl,
-    refuse_fork_of_gl,
-)
 
 _EVERYTHING = int(mujoco.mjtCatBit.mjCAT_ALL)
 _DRAFT_SHADOW_MAP = 1024
@@ -153,7 +139,7 @@ class Canvas:
         # At exit, EGL may already have shut down, and then nothing is left to free. A
         # forked child must not free its parent's context.
         if context is not None and os.getpid() == self._process_id:
-            with context_kept(), contextlib.suppress(Exception):
+            with gl_context.context_kept(), contextlib.suppress(Exception):
                 context.make_current()
                 self._free_drawing()
                 context.free()
@@ -169,11 +155,11 @@ class Canvas:
         if self._is_alone and self._context is not None:
             yield
             return
-        refuse_fork_of_gl()
-        with context_kept():
+        gl_context.refuse_fork_of_gl()
+        with gl_context.context_kept():
             if self._context is None:
-                self._context = new_context()
-                self.gl_facts = current_gl_facts()
+                self._context = gl_context.new_context()
+                self.gl_facts = gl_context.current_gl_facts()
             else:
                 self._context.make_current()
             yield
@@ -184,7 +170,7 @@ class Canvas:
         with self._current():
             # The longest side that the driver can draw.
             limits = np.zeros(1, np.int32)
-            raw_opengl().glGetIntegerv(_MAX_RENDERBUFFER_SIZE, limits)
+            gl_context.raw_opengl().glGetIntegerv(_MAX_RENDERBUFFER_SIZE, limits)
             limit = int(limits[0])
             if max(height, width) > limit:
                 raise InvalidArgument(
@@ -201,7 +187,9 @@ class Canvas:
                 )
             except mujoco.FatalError as error:
                 what = f"A {width}x{height} frame cannot be drawn"
-                raise gl_error(what, error, remedy="Try a smaller size.") from error
+                raise gl_context.gl_error(
+                    what, error, remedy="Try a smaller size."
+                ) from error
             offscreen = int(mujoco.mjtFramebuffer.mjFB_OFFSCREEN)
             mujoco.mjr_setBuffer(offscreen, self._drawing)
 
@@ -268,7 +256,7 @@ class SceneRenderer:
         *,
         height: int,
         width: int,
-        camera: Camera | Mapping[str, Any] = FREE_CAMERA,
+        camera: cameras.Camera | Mapping[str, Any] = cameras.FREE_CAMERA,
         scene_option: mujoco.MjvOption | None = None,
         max_geom: int = 10000,
         quality: str = "full",
@@ -279,8 +267,8 @@ class SceneRenderer:
     ) -> None:
         self.size = height, width = check_size(height, width)
         check_quality(quality)
-        placed = resolve_camera(model, camera)
-        self.is_following = not is_moved and is_tracking(placed)
+        placed = cameras.resolve_camera(model, camera)
+        self.is_following = not is_moved and cameras.is_tracking(placed)
         self._model = model
         # Kept by name or number, because the model's cameras may change later.
         self._camera = placed if isinstance(camera, Mapping) else camera
@@ -301,12 +289,12 @@ class SceneRenderer:
     def shows_frame_before(self) -> bool:
         """Whether a frame depends on the cameras' positions in the previous frame."""
         return self.is_following or (
-            not self._fresh and has_infinite_plane(self._model)
+            not self._fresh and cameras.has_infinite_plane(self._model)
         )
 
     def look(self, data: mujoco.MjData) -> None:
         """Update the scene's cameras as drawing a frame of `data` would."""
-        camera = resolve_camera(self._model, self._camera)
+        camera = cameras.resolve_camera(self._model, self._camera)
         mujoco.mjv_updateCamera(self._model, data, camera, self._scene)
 
     def render(self, data: mujoco.MjData) -> Frame:
@@ -324,7 +312,7 @@ class SceneRenderer:
         """
         if self._fresh:
             self._put_cameras(np.zeros((2, 3)))
-        camera = resolve_camera(self._model, self._camera)
+        camera = cameras.resolve_camera(self._model, self._camera)
         mujoco.mjv_updateScene(
             *(self._model, data, self._scene_option, None, camera),
             *(_EVERYTHING, self._scene),

@@ -137,18 +137,16 @@ class LiveView:
                 except (Error, OSError) as error:
                     # A file may disappear while it is read; the page asks again.
                     kind, body = "application/json", json.dumps({"error": str(error)})
-                with contextlib.suppress(ConnectionError):
-                    # The browser may have disconnected in the meantime.
-                    self._send(kind, body.encode())
-
-            def _send(self, kind: str, body: bytes) -> None:
+                content = body.encode()
                 self.send_response(HTTPStatus.OK)
                 self.send_header("Content-Type", f"{kind}; charset=utf-8")
-                self.send_header("Content-Length", str(len(body)))
+                self.send_header("Content-Length", str(len(content)))
                 self.send_header("Cache-Control", "no-store")
                 self.send_header("Referrer-Policy", "no-referrer")
-                self.end_headers()
-                self.wfile.write(body)
+                with contextlib.suppress(ConnectionError):
+                    # The browser may have disconnected in the meantime.
+                    self.end_headers()
+                    self.wfile.write(content)
 
             def log_message(self, format: str, *args: Any) -> None:
                 # Nothing is logged, because request URLs contain the token.
