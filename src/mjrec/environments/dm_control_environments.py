@@ -110,20 +110,15 @@ class DmControlEnvironment(NamedEnvironment):
     """
 
     def __init__(self, env_id: str, options: EnvironmentOptions) -> None:
-        environment = make_dm_control(env_id, options)
-        view: dict[str, Any] = {}
+        self.env_id = env_id
+        environment = self.environment = make_dm_control(env_id, options)
+        self.step_limit = int(environment._step_limit)
         if options.frames:
             camera = options.camera
             if camera is None:
                 camera = default_camera(environment.physics.model)
             resolve_camera(environment.physics.model, camera)
-            view = {"camera": camera, **options.size}
-        super().__init__(
-            environment,
-            env_id=env_id,
-            step_limit=int(environment._step_limit),
-            view=view,
-        )
+            self.view = {"camera": camera, **options.size}
         self._made_with = getattr(environment.task, MADE_WITH)["task_kwargs"]["random"]
         fresh = np.random.RandomState(self._made_with)
         states = (each.get_state() for each in (self._generator(), fresh))

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import contextlib
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from operator import attrgetter
 from typing import Any
 
@@ -22,17 +22,9 @@ from ..simulation.cameras import (
     resolve_camera,
 )
 from ..simulation.capture import Capture
-from ..simulation.gl_context import (
-    collection_paused,
-    context_kept,
-    current_gl_facts,
-)
+from ..simulation.gl_context import collection_paused, context_kept, current_gl_facts
 from ..simulation.model_sources import AuthoredModel
-from ..simulation.view import (
-    SceneView,
-    option_without_rangefinder,
-    place_free_camera,
-)
+from ..simulation.view import SceneView, option_without_rangefinder, place_free_camera
 from .scenes import (
     NoFrameSource,
     Scenes,
@@ -330,7 +322,8 @@ class _PhysicsScene:
         self._view = SceneView(
             camera=resolve_camera(self._model, self._camera),
             option=self._option,
-            max_geom=_max_geom(model) if self._by_physics else _MAX_GEOM,
+            # Only dm_control's scenes show which number it chose.
+            max_geom=wrapper.MjvScene(model).maxgeom if self._by_physics else _MAX_GEOM,
             # Each `physics.render()` creates a new scene.
             fresh=self._by_physics,
             height=height,
@@ -344,11 +337,6 @@ def _drawn_by_physics(physics: Any, camera: Any, height: int, width: int) -> boo
     buffer = physics.model.vis.global_
     named = camera is None or isinstance(camera, str | int)
     return bool(named and height <= buffer.offheight and width <= buffer.offwidth)
-
-
-def _max_geom(model: Any) -> int:
-    # Only dm_control's scenes show which number it chose.
-    return int(wrapper.MjvScene(model).maxgeom)
 
 
 def _authored(env: Any) -> AuthoredModel | None:
@@ -376,11 +364,8 @@ def _authored_of_suite(task: Any) -> AuthoredModel | None:
     except TypeError:
         # Some domains, such as stacks, have a different model for each number.
         return None
-    return AuthoredModel("model.xml", {"model.xml": _bytes(text), **_all_bytes(assets)})
-
-
-def _all_bytes(files: Mapping[str, Any]) -> dict[str, bytes]:
-    return {name: _bytes(content) for name, content in files.items()}
+    files = {"model.xml": text, **assets}
+    return AuthoredModel("model.xml", {k: _bytes(v) for k, v in files.items()})
 
 
 def _bytes(content: str | bytes) -> bytes:

@@ -86,19 +86,12 @@ class GymnasiumEnvironment(NamedEnvironment):
     """
 
     def __init__(
-        self,
-        environment: gymnasium.Env[Any, Any],
-        *,
-        not_drawn: Error | None = None,
+        self, environment: gymnasium.Env[Any, Any], *, not_drawn: Error | None = None
     ) -> None:
         # Environments created from names always have a spec and a limit.
         spec: Any = environment.spec
-        super().__init__(
-            environment,
-            env_id=spec.id,
-            step_limit=spec.max_episode_steps,
-            not_drawn=not_drawn,
-        )
+        self.environment, self.not_drawn = environment, not_drawn
+        self.env_id, self.step_limit = spec.id, spec.max_episode_steps
 
     def begin(self, around: Any, seeds: EpisodeSeeds, seed: int | None) -> Any:
         """Reset, and return the first observation.

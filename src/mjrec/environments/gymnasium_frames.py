@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Iterator
+from contextlib import AbstractContextManager
 from typing import Any
 
 import gymnasium
@@ -21,7 +22,10 @@ class EnvironmentFrames:
 
     def __init__(self, env: gymnasium.Env[Any, Any]) -> None:
         self._env = env
-        self._keeps_frames = _keeps_frames(env)
+        # gymnasium.wrappers.RenderCollection(pop_frames=False) returns all frames every
+        # time, including old ones.
+        has_frames = env.has_wrapper_attr("pop_frames")
+        self._keeps_frames = has_frames and not env.get_wrapper_attr("pop_frames")
         self._seen = 0
 
     @property
@@ -34,7 +38,10 @@ class EnvironmentFrames:
         with _own_context(self._env):
             rendered: Any = self._env.render()
         if self._keeps_frames and isinstance(rendered, list):
-            return self._new_ones(rendered)
+            # If the list did not grow, a reset has emptied it.
+            first = self._seen if len(rendered) > self._seen else 0
+            self._seen = len(rendered)
+            return rendered[first:]
         return rendered
 
     def facts(self) -> dict[str, Any]:
@@ -55,12 +62,6 @@ class EnvironmentFrames:
                 facts.update(current_gl_facts())
         return facts
 
-    def _new_ones(self, frames: list[Any]) -> list[Any]:
-        # If the list did not grow, a reset has emptied it.
-        first = self._seen if len(frames) > self._seen else 0
-        self._seen = len(frames)
-        return frames[first:]
-
 
 def close_environment(env: gymnasium.Env[Any, Any]) -> None:
     """Close an environment, after freeing everything in its OpenGL contexts."""
@@ -80,20 +81,15 @@ def free_viewers(env: gymnasium.Env[Any, Any]) -> None:
             viewer.free()
 
 
-@contextlib.contextmanager
-def _own_context(env: gymnasium.Env[Any, Any]) -> Iterator[None]:
-    """Make the context that Gymnasium draws with current in the block.
+def _own_context(env: gymnasium.Env[Any, Any]) -> AbstractContextManager[None]:
+    """Return a context manager for drawing in the context that Gymnasium draws with.
 
-    Gymnasium itself does this only when it creates the context. If two environments
-    alternated, one would be drawn with the other's meshes and textures, or not at all.
-    The previous context is current again after the block.
+    Gymnasium itself makes it current only when it creates the context. If two
+    environments alternated, one would be drawn with the other's meshes and textures, or
+    not at all. The previous context is current again after the block.
     """
     renderer = _renderer(env)
-    if renderer is None:
-        yield
-        return
-    with _current(renderer.viewer):
-        yield
+    return contextlib.nullcontext() if renderer is None else _current(renderer.viewer)
 
 
 @contextlib.contextmanager
@@ -110,9 +106,3 @@ def _current(viewer: Any) -> Iterator[None]:
 def _renderer(env: gymnasium.Env[Any, Any]) -> Any:
     """Return Gymnasium's renderer of a MuJoCo environment, or None for others."""
     return getattr(simulation_in(env), "mujoco_renderer", None)
-
-
-def _keeps_frames(env: gymnasium.Env[Any, Any]) -> bool:
-    """Return whether `render` returns all frames every time, including old ones."""
-    # gymnasium.wrappers.RenderCollection(pop_frames=False) does this.
-    return env.has_wrapper_attr("pop_frames") and not env.get_wrapper_attr("pop_frames")

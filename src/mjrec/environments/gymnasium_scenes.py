@@ -123,15 +123,11 @@ def gymnasium_scenes(
         obstacle=obstacle,
         environment=environment,
         frames=NoFrameSource(_ANOTHER_VIEW) if own_view else EnvironmentFrames(env),
+        own_view=_own_view(env),
     )
 
 
-def own_view(env: gymnasium.Env[Any, Any]) -> dict[str, Any]:
-    """Return the `own_camera` that an environment itself shows, unless it is free.
-
-    The camera may differ from the environment's arguments, because it can be changed
-    later.
-    """
+def _own_view(env: gymnasium.Env[Any, Any]) -> dict[str, Any]:
     shown = drawn_part(env.unwrapped)
     chosen = getattr(getattr(shown, "mujoco_renderer", shown), "camera_id", None)
     if chosen is None and has_own_scenes(shown):

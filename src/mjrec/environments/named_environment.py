@@ -6,6 +6,7 @@ from __future__ import annotations
 import abc
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -104,35 +105,23 @@ class NamedEnvironment(abc.ABC):
 
     In the methods, `around` is the environment or a wrapper of it, such as a monitor.
 
-    Args:
+    Attributes:
         environment: a `gymnasium.Env` or a `dm_env.Environment`.
         env_id: the environment's name in recordings.
         step_limit: number of steps after which episodes end.
         view: the `camera`, `height` and `width` to pass to the monitor; empty if the
             environment itself shows the requested view.
         not_drawn: why the environment cannot be drawn although frames were requested.
-
-    Attributes:
         draws_when_made: whether the model depends on the seed that created the
             environment.
     """
 
+    environment: Any
+    env_id: str
+    step_limit: int
+    view: Mapping[str, Any] = MappingProxyType({})
+    not_drawn: Error | None = None
     draws_when_made = False
-
-    def __init__(
-        self,
-        environment: Any,
-        *,
-        env_id: str,
-        step_limit: int,
-        view: Mapping[str, Any] | None = None,
-        not_drawn: Error | None = None,
-    ) -> None:
-        self.environment = environment
-        self.env_id = env_id
-        self.step_limit = step_limit
-        self.view = view or {}
-        self.not_drawn = not_drawn
 
     def begin_episode(self, around: Any, seeds: EpisodeSeeds) -> Any:
         """Reset with an episode's seeds, and return the first observation."""

@@ -182,10 +182,7 @@ def load_policy(
 
 
 def policy_from(
-    chosen: Any,
-    name: str,
-    environment: Any,
-    kwargs: Mapping[str, Any] = _NONE,
+    chosen: Any, name: str, environment: Any, kwargs: Mapping[str, Any] = _NONE
 ) -> Policy:
     """Create a policy from an object, as `load_policy` does for `module:name`.
 

@@ -26,12 +26,7 @@ from numpy.typing import NDArray
 
 from ..formats.trajectory import columns_of
 from .gymnasium_scenes import drawn_part, random_state, set_own_camera
-from .scenes import (
-    class_name,
-    generator_state,
-    set_generator_state,
-    simulation_below,
-)
+from .scenes import class_name, generator_state, set_generator_state, simulation_below
 from .wrapping import StandIn, stand_ins
 
 # Packages of the registry's entry points that are trusted by default.

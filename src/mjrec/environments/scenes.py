@@ -8,7 +8,7 @@ import math
 import sys
 import weakref
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -69,6 +69,9 @@ class Scenes:
             random generators as JSON-compatible values, or None if there is no
             generator yet. It does not create a generator.
         frames: the source of live frames.
+        own_view: the `own_camera` that the environment itself shows, for the journal;
+            empty for a free camera. The camera may differ from the environment's
+            arguments, because it can be changed later.
     """
 
     states: Capture | None = None
@@ -76,6 +79,7 @@ class Scenes:
     environment: dict[str, Any] | None = None
     random_state: Callable[[], Any] = lambda: None
     frames: EpisodeFrames = _NO_FRAMES
+    own_view: Mapping[str, Any] = field(default_factory=dict)
 
 
 def simulation_below(env: Any) -> Any:
@@ -203,7 +207,8 @@ def plain_arguments(arguments: Mapping[str, Any]) -> dict[str, Any] | None:
     Tuples become lists, and NumPy scalars become plain numbers.
     """
     try:
-        return {_text(name): _plain(value) for name, value in arguments.items()}
+        plain: dict[str, Any] = _plain(arguments)
+        return plain
     except TypeError:
         return None
 
@@ -266,8 +271,8 @@ def _arrays(state: Any) -> Any:
 def _plain(value: Any) -> Any:
     if isinstance(value, np.generic):
         value = value.item()
-    if isinstance(value, Mapping):
-        return {_text(name): _plain(item) for name, item in value.items()}
+    if isinstance(value, Mapping) and all(isinstance(name, str) for name in value):
+        return {name: _plain(item) for name, item in value.items()}
     if isinstance(value, list | tuple):
         return [_plain(item) for item in value]
     if value is None or isinstance(value, bool | int | str):
@@ -275,9 +280,3 @@ def _plain(value: Any) -> Any:
     if isinstance(value, float) and math.isfinite(value):
         return value
     raise TypeError(value)
-
-
-def _text(name: Any) -> str:
-    if not isinstance(name, str):
-        raise TypeError(name)
-    return name

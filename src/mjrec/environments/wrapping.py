@@ -38,6 +38,10 @@ _TRANSPARENT = frozenset(
         "mjrec.monitors.gymnasium_monitor.GymnasiumMonitor",
     }
 )
+_INNERMOST = (
+    "dm_control.rl.control.Environment",
+    "dm_control.composer.environment.Environment",
+)
 # Attributes in which dm_env's and dm_control's wrappers keep the inner environment.
 _INSIDE = ("_env", "_environment", "environment")
 
@@ -72,7 +76,7 @@ def around_dm_env(env: Any) -> dict[str, Any]:
     because it is not one of dm_control's environments.
     """
     layers: list[Any] = []
-    while not _is_innermost(env):
+    while class_name(type(env)) not in _INNERMOST:
         layers.append(env)
         inside = (_own(env, name) for name in _INSIDE)
         env = next((each for each in inside if each is not None), None)
@@ -82,7 +86,8 @@ def around_dm_env(env: Any) -> dict[str, Any]:
 
 
 def _facts(layers: list[Any], limits: Iterable[Any]) -> dict[str, Any]:
-    known = [int(limit) for limit in limits if _is_limit(limit)]
+    numbers = (limit for limit in limits if isinstance(limit, int | float))
+    known = [int(limit) for limit in numbers if math.isfinite(limit)]
     return {
         "wrappers": [class_name(type(layer)) for layer in _changing(layers)],
         "max_episode_steps": min(known, default=None),
@@ -102,17 +107,6 @@ def _arguments_of(wrapper: Any) -> dict[str, Any] | None:
     if not isinstance(wrapper, RecordConstructorArgs) or saved is None:
         return None
     return plain_arguments(saved)
-
-
-def _is_limit(limit: Any) -> bool:
-    return isinstance(limit, int | float) and math.isfinite(limit)
-
-
-def _is_innermost(env: Any) -> bool:
-    return class_name(type(env)) in (
-        "dm_control.rl.control.Environment",
-        "dm_control.composer.environment.Environment",
-    )
 
 
 def _own(env: Any, name: str) -> Any:

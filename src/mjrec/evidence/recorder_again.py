@@ -16,8 +16,7 @@ from ..errors import Error, InvalidArgument
 from ..monitors.base import EnvironmentMonitor
 from ..monitors.monitor import monitored
 from ..recorder.keep_rules import RULES, keep_rule
-from ..recorder.opening import JOIN, Statements
-from ..recorder.options import RecorderOptions
+from ..recorder.options import JOIN, RecorderOptions, Statements
 from ..schedules import Schedule, schedule_from_text
 from ..trackers.monitor_csv import MonitorCsvTracker
 from .excuses import note

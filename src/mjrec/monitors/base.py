@@ -241,7 +241,6 @@ class EnvironmentMonitor(MonitorBase):
         *,
         scenes: Callable[..., Scenes],
         view: Mapping[str, Any],
-        own_view: Mapping[str, Any] | None = None,
         close_environment: Callable[[Any], None],
         rendering: Callable[[Path], Finisher] | None = None,
         **subject: Any,
@@ -254,7 +253,6 @@ class EnvironmentMonitor(MonitorBase):
             options: the monitor's options.
             scenes: returns the scenes for a camera and a size.
             view: the requested `camera` (or cameras), `height` and `width`.
-            own_view: further facts about the view, for the journal.
             close_environment: closes `env`.
             rendering: creates the finisher that renders videos; if None, the monitor
                 has its own background finisher.
@@ -291,7 +289,7 @@ class EnvironmentMonitor(MonitorBase):
                 clip_states=clip_states,
                 environment=known.environment,
                 random_state=known.random_state,
-                view={**recorded_view(camera, size), **(own_view or {})},
+                view={**recorded_view(camera, size), **known.own_view},
                 **camera_frames(cameras, sources, tiled=options.tiled),
                 **subject,
             ),

@@ -16,7 +16,7 @@ import numpy as np
 from gymnasium.envs.registration import EnvSpec
 
 from ..environments.gymnasium_frames import close_environment
-from ..environments.gymnasium_scenes import gymnasium_scenes, own_view
+from ..environments.gymnasium_scenes import gymnasium_scenes
 from ..recorder.finishers import Finisher
 from ..recorder.options import RecorderOptions
 from .base import EnvironmentMonitor
@@ -62,7 +62,6 @@ class GymnasiumMonitor(EnvironmentMonitor, gymnasium.Wrapper[Any, Any, Any, Any]
             options,
             scenes=functools.partial(gymnasium_scenes, env),
             view=view,
-            own_view=own_view(env),
             close_environment=close_environment,
             rendering=rendering,
             env_id=env_id or env_id_of(env),

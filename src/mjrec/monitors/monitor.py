@@ -192,10 +192,7 @@ def Monitor(  # noqa: N802  named like gym's class
 
 
 def monitored(
-    env: Any,
-    directory: str | os.PathLike[str],
-    options: RecorderOptions,
-    **view: Any,
+    env: Any, directory: str | os.PathLike[str], options: RecorderOptions, **view: Any
 ) -> GymnasiumMonitor | VectorMonitor | DmEnvMonitor:
     """Create a monitor, as `Monitor` does, from an options object.
 

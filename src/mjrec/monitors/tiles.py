@@ -20,6 +20,8 @@ from ..recorder.video_recorder import can_give_frames
 from ..rendering.jobs import plain_camera
 from ..schedules import disable_videos, to_schedule
 
+logger = logging.getLogger(__name__)
+
 _RGB_ARRAY = "rgb_array"
 
 
@@ -81,7 +83,7 @@ def camera_frames(
         # Either all are rendered by workers or none is.
         view["frames"] = without[0]
     elif tiled:
-        view["frames"] = _CameraTiles(sources)
+        view["frames"] = Tiles(sources, are_cameras=True)
     else:
         further = zip(further_parts(plain), sources[1:], strict=True)
         view["further_frames"] = dict(further)
@@ -114,10 +116,13 @@ class Tiles:
 
     Args:
         sources: the sources of the frames.
+        are_cameras: whether they are several cameras of one environment.
     """
 
-    def __init__(self, sources: Sequence[EpisodeFrames]) -> None:
-        self.sources = sources
+    def __init__(
+        self, sources: Sequence[EpisodeFrames], *, are_cameras: bool = False
+    ) -> None:
+        self.sources, self._are_cameras = sources, are_cameras
 
     @property
     def render_mode(self) -> str | None:
@@ -136,19 +141,11 @@ class Tiles:
     def facts(self) -> dict[str, Any]:
         """Return the facts about the frames for a video's metadata."""
         rows, columns = grid_shape(len(self.sources))
-        facts = self.sources[0].facts()
-        return {**facts, "tiled": True, "rows": rows, "columns": columns}
-
-
-class _CameraTiles(Tiles):
-    """The frames of several cameras side by side."""
-
-    def facts(self) -> dict[str, Any]:
-        cameras = [source.facts().get("camera") for source in self.sources]
-        return {**super().facts(), "camera": cameras}
-
-
-logger = logging.getLogger(__name__)
+        size = {"tiled": True, "rows": rows, "columns": columns}
+        facts = {**self.sources[0].facts(), **size}
+        if self._are_cameras:
+            facts["camera"] = [source.facts().get("camera") for source in self.sources]
+        return facts
 
 
 def has_videos(options: RecorderOptions) -> bool:
@@ -212,18 +209,17 @@ class TiledVideo:
         self._episode_id = -1
         self._ending: dict[str, Any] | None = None
 
-    @property
-    def is_recording(self) -> bool:
-        """Whether a video is being recorded."""
-        return self._live is not None
-
     def take_last(self) -> None:
         """Take the frame of the last step, if it was left out."""
         if self._live is not None and self._ending is None:
             self._live.take_last()
 
-    def after_reset(self) -> None:
-        """Start or end videos after a reset of the first sub-environment."""
+    def after_reset(self) -> bool:
+        """Start or end videos after a reset of the first sub-environment.
+
+        Returns:
+            Whether a video is being recorded.
+        """
         episode_id = self._first.episode_id - 1
         if self._live is not None and episode_id == self._episode_id:
             # After a reset before any step, the number is the same but the frame is
@@ -232,13 +228,17 @@ class TiledVideo:
             self._live = None
         self._end_early(RESET)
         self._begin(episode_id)
+        return self._live is not None
 
-    def after_step(self, *, terminated: bool, truncated: bool) -> None:
+    def after_step(self, *, terminated: bool, truncated: bool) -> bool:
         """Record a step of all sub-environments.
 
         Args:
             terminated: whether the task ended the first sub-environment's episode.
             truncated: whether a limit outside the task ended it.
+
+        Returns:
+            Whether a video is being recorded.
         """
         episode_id = self._first.episode_id - 1
         is_over = terminated or truncated
@@ -257,6 +257,7 @@ class TiledVideo:
             self._end(complete=True, terminated=terminated, truncated=truncated)
         if episode_id != self._episode_id:
             self._begin(episode_id)
+        return self._live is not None
 
     def note_error(self, error: BaseException) -> None:
         """Note an exception, which marks the video if nothing is recorded after it."""

@@ -185,9 +185,9 @@ class VectorMonitor(MonitorBase, gymnasium.vector.VectorWrapper):
             reset = self._reset_inside if self._is_inside else self._reset_slots
             result = reset(which, seed, options)
         self._had_error = False
-        if tiled is not None:
-            tiled.after_reset()
-            self._run_first_at_exit(tiled)
+        if tiled is not None and tiled.after_reset():
+            # Rendering has loaded OpenGL by now, which shuts itself down at exit.
+            self._guard.run_first_at_exit()
         return result
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
@@ -205,10 +205,10 @@ class VectorMonitor(MonitorBase, gymnasium.vector.VectorWrapper):
             result: tuple[Any, Any, Any, Any, dict[str, Any]] = step(actions)
         if self._tiled is not None:
             _, _, terminations, truncations, _ = result
-            self._tiled.after_step(
+            if self._tiled.after_step(
                 terminated=bool(terminations[0]), truncated=bool(truncations[0])
-            )
-            self._run_first_at_exit(self._tiled)
+            ):
+                self._guard.run_first_at_exit()
         return result
 
     def close(self, *, wait: bool = True, **options: Any) -> None:
@@ -357,11 +357,6 @@ class VectorMonitor(MonitorBase, gymnasium.vector.VectorWrapper):
         super()._note_error(error)
         if self._tiled is not None:
             self._tiled.note_error(error)
-
-    def _run_first_at_exit(self, tiled: TiledVideo) -> None:
-        if tiled.is_recording:
-            # Rendering has loaded OpenGL by now, which shuts itself down at exit.
-            self._guard.run_first_at_exit()
 
 
 def _reset_indices(options: Mapping[str, Any] | None, count: int) -> list[int]:

@@ -130,9 +130,6 @@ class _Clip:
         self._first_step = run.stats.total_steps
         self._episode_id = self._last_episode_id = run.episode.episode_id
         path = run.directory / clip_video_prefix(run.infix, self._episode_id, taken)
-        second_name = run.second_name("episode", self._episode_id)
-        if taken is not None:
-            second_name = run.second_name("step", taken)
         self._part: StateRecorder | None = None
         self._parts = 0
         start = None
@@ -141,13 +138,11 @@ class _Clip:
             start = run.of_clips.capture.begin_episode()
             start = start if run.can_be_deferred(start) else None
         if start is not None:
-            self._pending_video = run.pending_video(
-                path.name, DEFERRED, second_name=second_name
-            )
+            self._pending_video = run.pending_video(path.name, DEFERRED)
             self._video = path.with_name(f"{path.name}.mp4")
             self._begin_part(start)
         else:
-            self.live = live_videos(run, path, second_name=second_name)
+            self.live = live_videos(run, path)
             self._video = self.live.path
             self.live.say(first_step=self._first_step, last_episode_id=self._episode_id)
 
@@ -222,11 +217,7 @@ class _Clip:
         }
         facts = {"kept": False, "video": self._pending_video, "clip": clip}
         self._part = StateRecorder(
-            run,
-            self._name(self._parts),
-            facts=facts,
-            start=start,
-            is_clip=True,
+            run, self._name(self._parts), facts=facts, start=start, is_clip=True
         )
         self._parts += 1
 

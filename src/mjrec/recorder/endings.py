@@ -68,6 +68,30 @@ def _message(error: BaseException) -> str:
 _OWN_THREADS = "mjrec-"
 
 
+class Failures:
+    """Collects errors inside `with` blocks; `raise_first` raises the first one."""
+
+    def __init__(self) -> None:
+        self._first: Exception | None = None
+
+    def __enter__(self) -> None: ...
+
+    def __exit__(self, kind: object, error: BaseException | None, _: object) -> bool:
+        if isinstance(error, Exception):
+            self.note(error)
+            return True
+        return False
+
+    def note(self, error: Exception) -> None:
+        """Collect an error."""
+        self._first = self._first or error
+
+    def raise_first(self) -> None:
+        """Raise the first error, if there was any."""
+        if self._first is not None:
+            raise self._first
+
+
 class ExitGuard:
     """Calls a function once: on request, when `owner` is collected, or at exit.
 

@@ -37,7 +37,7 @@ import math
 import operator
 import re
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Protocol, TypeVar
 
 from ..errors import InvalidArgument, UnknownName
@@ -224,13 +224,14 @@ class Standing(enum.Enum):
     DROPPED = "dropped"
 
 
+@dataclass(eq=False)
 class Selection:
     """Chooses among the finished episodes of a run.
 
     A selection is also a schedule, which includes every episode that might be chosen
     when it ends.
 
-    Args:
+    Attributes:
         name: the rule's name in the manifest.
         choose: function that takes episodes and returns the numbers of the chosen ones;
             None if only failures are chosen.
@@ -239,36 +240,27 @@ class Selection:
             rejected when more episodes are added.
         most_failures: maximum number of failures to choose in addition, as soon as they
             end; None for no limit.
-
-    Attributes:
-        name: the rule's name in the manifest.
-        holds_all: whether the choice is made only at the end.
         finished: number of episodes that have been added.
     """
 
-    def __init__(
-        self,
-        name: str,
-        choose: Callable[[Sequence[FinishedEpisode]], Iterable[int]] | None,
-        *,
-        holds_all: bool,
-        most_failures: int | None = 0,
-    ) -> None:
-        self.name, self.holds_all = name, holds_all
+    name: str
+    choose: Callable[[Sequence[FinishedEpisode]], Iterable[int]] | None
+    holds_all: bool
+    most_failures: int | None = 0
+    finished: int = 0
+    _failures: int = 0
+    _last_id: int = -1
+    _is_closed: bool = False
+    _candidates: dict[int, FinishedEpisode] = field(default_factory=dict)
+    _chosen: set[int] = field(default_factory=set)
+
+    def __post_init__(self) -> None:
         # The manifest lists schedules by this name.
-        self.__qualname__ = f"keep:{name}"
-        self.finished = 0
-        self._choose = choose
-        self._most_failures = most_failures
-        self._failures = 0
-        self._last_id = -1
-        self._is_closed = False
-        self._candidates: dict[int, FinishedEpisode] = {}
-        self._chosen: set[int] = set()
+        self.__qualname__ = f"keep:{self.name}"
 
     def __call__(self, episode_id: int) -> bool:
         """Return whether to record an episode as if it got a video."""
-        return self._choose is not None or self._has_room
+        return self.choose is not None or self._has_room
 
     def add(self, episode: FinishedEpisode) -> None:
         """Add a finished episode.
@@ -290,11 +282,11 @@ class Selection:
         if self._has_room and has_failed(episode):
             self._chosen.add(number)
             self._failures += 1
-        if self._choose is None:
+        if self.choose is None:
             return
         self._candidates[number] = episode
         if not self.holds_all:
-            best = set(self._choose([*self._candidates.values()]))
+            best = set(self.choose([*self._candidates.values()]))
             self._candidates = {n: e for n, e in self._candidates.items() if n in best}
 
     def standing(self, episode_id: int) -> Standing:
@@ -321,14 +313,14 @@ class Selection:
             InvalidArgument: the user's function raised an exception or did not return
                 numbers of finished episodes. In that case no decision is made.
         """
-        if self._choose is not None and not self._is_closed:
-            self._chosen.update(self._choose([*self._candidates.values()]))
+        if self.choose is not None and not self._is_closed:
+            self._chosen.update(self.choose([*self._candidates.values()]))
         self._is_closed = True
         self._candidates.clear()
 
     @property
     def _has_room(self) -> bool:
-        most = self._most_failures
+        most = self.most_failures
         return most is None or self._failures < most
 
 

@@ -14,6 +14,7 @@ from ..formats.frame_hashes import frame_hash_path
 from ..formats.monitor_directory import second_name_of
 from ..formats.second_names import give_second_names
 from ..formats.video_metadata import amend_metadata
+from .endings import Failures
 from .monitored_run import MonitoredRun
 from .recorded_environment import EpisodeFrames
 from .video_recorder import VideoRecorder
@@ -106,7 +107,7 @@ class LiveVideos:
         """
         self.say(**facts)
         first, *others = self.recorders
-        failure: Error | None = None
+        failures = Failures()
         for recorder in (*others, first):
             if recorder is first:
                 names = [Path(str(each.path)).name for each in others if each.finished]
@@ -115,7 +116,7 @@ class LiveVideos:
                 recorder.close()
             except Error as error:
                 if not self._tolerates(error):
-                    failure = failure or error
+                    failures.note(error)
         if not all(recorder.closed for recorder in self.recorders):
 
             def end_again() -> None:
@@ -124,8 +125,7 @@ class LiveVideos:
 
             # The disk had no room for some metadata.
             self._run.retry_at_close(end_again)
-        if failure is not None:
-            raise failure
+        failures.raise_first()
 
     def name_again(self) -> None:
         """Give the finished videos their second names, if they have any."""
@@ -173,18 +173,12 @@ class LiveVideos:
                 recorder.give_up(str(error))
 
 
-def live_videos(
-    run: MonitoredRun,
-    path: Path,
-    *,
-    second_name: Mapping[str, str],
-) -> LiveVideos:
+def live_videos(run: MonitoredRun, path: Path) -> LiveVideos:
     """Create the live videos of the running episode, one for each camera.
 
     Args:
         run: the monitored run.
         path: the path of the first camera's video, without the extension.
-        second_name: the video's second name; see `MonitoredRun.second_name`.
     """
     sources = {"": run.env.frames, **run.env.further_frames}
     recorders = [
@@ -198,6 +192,7 @@ def live_videos(
     ]
     first, *others = recorders
     if first.path is not None:
+        second_name = run.second_name(path.name)
         first.metadata.update(second_name)
         first_name = Path(first.path).name
         for other in others:

@@ -18,17 +18,23 @@ from ..atomic_files import file_sha256
 from ..errors import FileNotWritten
 from ..formats.journal import JournalEntry, JournalWriter
 from ..formats.manifest import GYM_VERSION
-from ..formats.monitor_directory import journal_name, stats_prefix
+from ..formats.monitor_directory import (
+    VideoName,
+    further_parts,
+    journal_name,
+    stats_prefix,
+)
 from ..formats.span_writer import SpanLogs
 from ..formats.video_metadata import recording_facts
 from ..machine import machine_fingerprint
 from ..provenance import look_around, versions
 from ..results.run import Run
 from . import tracking
+from .episode_choice import EpisodeChoice
 from .finishers import Finisher, LaterFinisher
 from .opening import open_directory
-from .options import LIVE, WARN, RecorderOptions, type_of_mode
-from .recorded_environment import RecordedEnvironment, check_refusal
+from .options import LIVE, OFF, WARN, RecorderOptions, type_of_mode
+from .recorded_environment import RecordedEnvironment, check_frames, check_refusal
 from .stats_recorder import StatsRecorder
 from .step_arrays import StepArray
 from .tracking import Trackers
@@ -97,23 +103,21 @@ class MonitoredRun:
         options: the user's options.
         finisher: creates the finisher that processes ended recordings; None if nothing
             will be rendered now.
-        schedule: the name of the schedule.
-        rule: the rule that chooses videos after their episodes have ended; None if
-            videos are chosen before.
 
     Raises:
-        See `open_directory`.
+        NoPictures: see `check_frames`.
+        Error: see `open_directory`.
 
     Attributes:
         env: the recorded environment.
         options: the user's options.
+        choice: decides what to record of an episode when it begins.
         stats: the recorder that counts steps and rewards.
         finisher: the finisher that processes ended recordings.
         selection: facts for videos that are chosen after their episodes have ended;
             empty if videos are chosen before.
         directory: the monitor directory, absolute.
         infix: the middle part of the monitor's file names.
-        first_episode_id: the number of the first episode.
         clock: function that returns the time in seconds since the Unix epoch.
         events: the journal's content so far, including events that could not be written
             because the disk was full.
@@ -130,29 +134,28 @@ class MonitoredRun:
         env: RecordedEnvironment,
         options: RecorderOptions,
         finisher: Callable[[Path], Finisher] | None,
-        schedule: str,
-        rule: str | None,
     ) -> None:
         self.env, self.options, self.clock = env, options, options.clock
+        mode = env.rendering.mode
+        choice = self.choice = EpisodeChoice(options, draws=mode != OFF)
+        if mode == LIVE and (choice.has_videos or options.has_clips):
+            check_frames(env)
+        rule = None if choice.selection is None else choice.selection.name
         # Absolute, so that a later chdir does not scatter the files.
         self.directory = Path(directory).absolute()
         self.infix, self._lock, facts = open_directory(
             self.directory,
-            force=options.force,
-            resume=options.resume,
-            uid=options.uid,
-            env_info={"gym_version": GYM_VERSION, "env_id": env.env_id},
-            facts={
-                "schedule": schedule,
+            options,
+            {
+                "env_info": {"gym_version": GYM_VERSION, "env_id": env.env_id},
+                "schedule": choice.schedule_name,
                 "keep": None if rule is None else {"rule": rule},
                 "versions": dict(versions()),
-                "views": [*env.further_views],
+                "views": further_parts(env.cameras) or list(env.further_frames),
                 "environment": env.environment,
                 "options": {**options.recorded(), **env.view},
             },
-            statements=options.statements,
         )
-        self.first_episode_id: int = facts["first_episode_id"]
         self.stats = StatsRecorder(
             self.directory,
             stats_prefix(self.infix),
@@ -407,14 +410,14 @@ class MonitoredRun:
         return False
 
     def pending_video(
-        self, name: str, recording: str, *, second_name: Mapping[str, str]
+        self, name: str, recording: str, *, is_only_possible: bool = False
     ) -> dict[str, Any]:
         """Return the facts about a video that its trajectory or clip stores.
 
         Args:
             name: the video's file name without the extension.
             recording: the time when the video is drawn, `DEFERRED` or `LIVE`.
-            second_name: the result of `MonitoredRun.second_name`.
+            is_only_possible: whether the video is not planned.
         """
         options, env = self.options, self.env
         pending: dict[str, Any] = {
@@ -432,20 +435,23 @@ class MonitoredRun:
             pending["annotate"] = True
         if self.selection:
             pending["selection"] = self.selection
-        return {**pending, **second_name}
+        return pending if is_only_possible else {**pending, **self.second_name(name)}
 
-    def second_name(self, what: str, number: int) -> dict[str, str]:
+    def second_name(self, name: str) -> dict[str, str]:
         """Return the second name of a video for its metadata.
 
         The result is empty if `name_prefix` is not set.
 
         Args:
-            what: the kind of event that begins the video, "episode" or "step".
-            number: the number of the episode or step.
+            name: the video's file name without the extension.
         """
         prefix = self.options.name_prefix
-        if prefix is None:
+        video = None if prefix is None else VideoName.parse(f"{name}.mp4")
+        if video is None:
             return {}
+        what, number = "episode", video.episode_id
+        if video.first_step is not None:
+            what, number = "step", video.first_step
         return {"also_named": f"{prefix}-{what}-{number}.mp4"}
 
     def recording_facts(self, start: EpisodeStart | None) -> dict[str, Any]:

@@ -12,17 +12,12 @@ import contextlib
 import itertools
 import os
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 from .. import json_text
-from ..errors import (
-    DifferentEnvironment,
-    DirectoryNotWritable,
-    ExistingRecordings,
-)
+from ..errors import DifferentEnvironment, DirectoryNotWritable, ExistingRecordings
 from ..formats.locks import Lock, is_locked
 from ..formats.monitor_directory import (
     check_uid,
@@ -35,65 +30,29 @@ from ..formats.monitor_directory import (
 from ..results import clear_monitor_files
 from ..results.journal_or_stats import MonitorResults
 from ..results.monitor_files import monitors_of
-
-# The value of `resume` for recording next to monitors of the same environment without
-# reading their files.
-JOIN = "join"
-
+from .options import JOIN, RecorderOptions
 
 # Counts the monitors in this process.
 _monitor_ids = itertools.count()
 
 
-@dataclass(frozen=True, kw_only=True)
-class Statements:
-    """Facts of an original run that a recreation cannot reproduce and must copy.
-
-    Attributes:
-        infix: the middle part of the run's file names, which is not claimed yet.
-        first_episode_id: the number of the run's first episode.
-        provenance: the run's provenance; None if unknown.
-        provenance_after: number of journal lines before the provenance, not counting
-            the first line.
-        clock: function that returns the time in seconds since the Unix epoch.
-        faults: the facts of each fault, paired with the number of journal lines before
-            it.
-    """
-
-    infix: str
-    first_episode_id: int
-    provenance: Mapping[str, Any] | None
-    provenance_after: int
-    clock: Callable[[], float]
-    faults: Sequence[tuple[int, Mapping[str, Any]]] = ()
-
-
 def open_directory(
-    path: Path,
-    *,
-    force: bool,
-    resume: bool | str,
-    uid: str | None,
-    env_info: Mapping[str, str],
-    facts: Mapping[str, Any],
-    statements: Statements | None,
+    path: Path, options: RecorderOptions, facts: Mapping[str, Any]
 ) -> tuple[str, Lock, Mapping[str, Any]]:
     """Claim an infix in a directory, which is created if it is missing.
 
+    With `resume`, episode numbers continue after the highest number of all closed or
+    dead monitors, or only of those with the same `uid` if it is given. Monitors that
+    are still open do not count. `JOIN` reads no files of other monitors, no matter how
+    many there are. In this case the caller knows that all monitors record the same
+    environment, and episodes are numbered from 0. `force` overrides `resume`.
+
     Args:
         path: absolute path of the monitor directory.
-        force: whether to delete existing monitor files. Overrides `resume`.
-        resume: whether to add to existing recordings. Episode numbers continue after
-            the highest number of all closed or dead monitors, or only of those with the
-            same `uid` if it is given. Monitors that are still open do not count. `JOIN`
-            reads no files of other monitors, no matter how many there are. In this case
-            the caller knows that all monitors record the same environment, and episodes
-            are numbered from 0.
-        uid: string to use in file names instead of the process id.
-        env_info: facts about the environment, including its `env_id`.
-        facts: further facts about the run. They are written to the lock file, so they
-            survive even if the process is killed before the journal has a line.
-        statements: the original's facts if a run is being recreated.
+        options: the user's options.
+        facts: the facts about the run, including its `env_info`. They are written to
+            the lock file, so they survive even if the process is killed before the
+            journal has a line.
 
     Returns:
         The claimed infix, its lock, which is held until the monitor closes, and the
@@ -109,22 +68,18 @@ def open_directory(
         DirectoryNotWritable: the directory cannot be created or written to.
         InvalidArgument: `uid` cannot be part of a file name.
     """
-    wanted_uid = None if uid is None else check_uid(uid)
+    uid = None if options.uid is None else check_uid(options.uid)
+    joins = options.resume == JOIN and not options.force
     with made_directory(path):
-        _check_existing(path, force=force, resume=resume, env_id=env_info["env_id"])
-        joins = resume == JOIN and not force
-        numbers_on = not (force or joins)
-        if statements is not None:
-            first = statements.first_episode_id
-        else:
-            first = _next_episode_id(path, uid=wanted_uid) if numbers_on else 0
-        run = {"env_info": dict(env_info), **facts, "first_episode_id": first}
-        if statements is not None:
-            infix = statements.infix
-            lock = Lock(path / lock_name(infix), json_text.dumps({"run": run}))
-        else:
-            infix, lock = _claim(path, uid=wanted_uid, run=run, looks=not joins)
-    return infix, lock, run
+        _check_existing(path, options, env_id=facts["env_info"]["env_id"])
+        if (original := options.statements) is not None:
+            run = {**facts, "first_episode_id": original.first_episode_id}
+            content = json_text.dumps({"run": run})
+            return original.infix, Lock(path / lock_name(original.infix), content), run
+        numbers_on = not (options.force or joins)
+        first = _next_episode_id(path, uid=uid) if numbers_on else 0
+        run = {**facts, "first_episode_id": first}
+        return *_claim(path, uid=uid, run=run, looks=not joins), run
 
 
 @contextlib.contextmanager
@@ -153,16 +108,14 @@ def made_directory(path: Path) -> Iterator[None]:
         raise
 
 
-def _check_existing(
-    path: Path, *, force: bool, resume: bool | str, env_id: str
-) -> None:
-    if force:
+def _check_existing(path: Path, options: RecorderOptions, *, env_id: str) -> None:
+    if options.force:
         clear_monitor_files(path)
         return
-    if resume == JOIN:
+    if options.resume == JOIN:
         return
     existing = [file.name for file in iter_monitor_files(path, hidden=True)]
-    if existing and not resume:
+    if existing and not options.resume:
         raise ExistingRecordings(path, existing)
     for files in monitors_of(path):
         recorded = (MonitorResults(files).env_info or {}).get("env_id")

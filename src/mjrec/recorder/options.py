@@ -6,7 +6,7 @@ from __future__ import annotations
 import os
 import re
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
@@ -21,16 +21,41 @@ from ..frames import check_quality
 from ..rates import to_rate
 from ..schedules import check_takes_one, schedule_name
 from .keep_rules import selection_from
-from .opening import JOIN, Statements
 from .tracking import FinishedEpisode, Tracker
 
 DEFERRED, LIVE, OFF = "deferred", "live", "off"
 RAISE, WARN = "raise", "warn"
+# The value of `resume` for recording next to monitors of the same environment without
+# reading their files.
+JOIN = "join"
 # Gym's own prefix is excluded, because such files would look like monitor files.
 _NAME_PREFIX = re.compile(r"(?!openaigym)[A-Za-z0-9_][A-Za-z0-9_.-]{0,99}", re.ASCII)
 # Switches that affect the content of files.
 _SWITCHES = ("observations", "annotate", "tiled")
 _MODES = {None: "t", "training": "t", "evaluation": "e"}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Statements:
+    """Facts of an original run that a recreation cannot reproduce and must copy.
+
+    Attributes:
+        infix: the middle part of the run's file names, which is not claimed yet.
+        first_episode_id: the number of the run's first episode.
+        provenance: the run's provenance; None if unknown.
+        provenance_after: number of journal lines before the provenance, not counting
+            the first line.
+        clock: function that returns the time in seconds since the Unix epoch.
+        faults: the facts of each fault, paired with the number of journal lines before
+            it.
+    """
+
+    infix: str
+    first_episode_id: int
+    provenance: Mapping[str, Any] | None
+    provenance_after: int
+    clock: Callable[[], float]
+    faults: Sequence[tuple[int, Mapping[str, Any]]] = ()
 
 
 @dataclass(frozen=True, kw_only=True)

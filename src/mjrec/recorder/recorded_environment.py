@@ -9,7 +9,6 @@ from fractions import Fraction
 from typing import TYPE_CHECKING, Any, Protocol
 
 from ..errors import NoPictures, PicturesDiffer
-from ..formats.monitor_directory import further_parts
 from .options import RenderingChoice
 from .video_recorder import FrameSource, can_give_frames
 
@@ -66,11 +65,6 @@ class RecordedEnvironment:
     environment: Mapping[str, Any] | None = None
     view: Mapping[str, Any] = field(default_factory=dict)
     random_state: Callable[[], Any] = lambda: None
-
-    @property
-    def further_views(self) -> list[str]:
-        """The endings of additional cameras' video names, without the extensions."""
-        return further_parts(self.cameras) or list(self.further_frames)
 
 
 def check_frames(env: RecordedEnvironment) -> None:

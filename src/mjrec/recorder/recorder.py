@@ -17,14 +17,13 @@ from ..formats.journal import JournalEntry
 from ..formats.spans import recordings_in_flight
 from ..results.manifest_writing import write_manifest_and_stats
 from .clips import Clips
-from .endings import CLOSE, RESET, ending
-from .episode_choice import EpisodeChoice
+from .endings import CLOSE, RESET, Failures, ending
 from .fast_path import FastPath
 from .finishers import Finisher, LaterFinisher
 from .keep_rules import Standing
 from .monitored_run import MonitoredRun, RunningEpisode
-from .options import DEFERRED, LIVE, OFF, RecorderOptions
-from .recorded_environment import RecordedEnvironment, check_frames
+from .options import DEFERRED, LIVE, RecorderOptions
+from .recorded_environment import RecordedEnvironment
 from .recording import EpisodeRecording, KeptVideos
 from .states import DeferredVideo
 from .stats_recorder import reward_to_float
@@ -73,10 +72,6 @@ class Recorder:
         options: RecorderOptions,
         finisher: Callable[[Path], Finisher] | None = None,
     ) -> None:
-        mode = env.rendering.mode
-        self._choice = EpisodeChoice(options, draws=mode != OFF)
-        if mode == LIVE and (self._choice.has_videos or options.has_clips):
-            check_frames(env)
         self._pid = os.getpid()
         self._is_forked = False
         _recorders.add(self)
@@ -86,17 +81,10 @@ class Recorder:
         self.closed = False
         self.fast: FastPath | None = None
         self.evaluation_facts: Callable[[], Mapping[str, Any] | None] = lambda: None
-        selection = self._choice.selection
-        self.run = MonitoredRun(
-            directory,
-            env=env,
-            options=options,
-            finisher=finisher,
-            schedule=self._choice.schedule_name,
-            rule=None if selection is None else selection.name,
-        )
+        self.run = MonitoredRun(directory, env=env, options=options, finisher=finisher)
+        self._choice, selection = self.run.choice, self.run.choice.selection
         self.directory, self.infix = self.run.directory, self.run.infix
-        self.episode_id = self.run.first_episode_id
+        self.episode_id: int = self.run.events.facts["first_episode_id"]
         self.stats_recorder = self.run.stats
         self._states = [
             each for each in (env.states, env.clip_states) if each is not None
@@ -105,7 +93,7 @@ class Recorder:
             states.open(self.directory)
         self._kept = None if selection is None else KeptVideos(selection)
         self._clips = Clips(self.run) if options.has_clips else None
-        draws_later = mode == DEFERRED and self._clips is None
+        draws_later = env.rendering.mode == DEFERRED and self._clips is None
         if draws_later and self._choice.will_choose(self.episode_id):
             self.run.finisher.expect()
 
@@ -282,7 +270,7 @@ class Recorder:
         self._ending = None
         recording, clips = self._recording, self._clips
         states = None if recording is None else recording.states
-        failures = _Failures()
+        failures = Failures()
         is_counted = False
         try:
             # The row comes first, so that a counted step has a row if it can have one.
@@ -354,15 +342,24 @@ class Recorder:
         """
         if self.closed:
             return
-        failures = _Failures()
+        failures = Failures()
         with self._leaving_if_interrupted():
             self.run.finisher.stop()
             with failures:
                 self._end_recordings()
             self.run.trackers.end()
-            pending = self._write_last_results()
+            self.run.note_provenance(wait=True)
+            if self._kept is not None:
+                self.run.note("keep", self._kept.details())
+            self.run.note("closed", {"next_episode_id": self.episode_id})
+            pending = self._write_results()
             self._leave()
-        self._say_what_is_left(pending)
+        if pending:
+            what = f"{pending} {'video' if pending == 1 else 'videos'}"
+            logger.warning("%s pending: mjrec render %s", what, self.directory)
+        elif in_logs := len(recordings_in_flight(self.directory, self.infix)):
+            what = f"{in_logs} {'trajectory' if in_logs == 1 else 'trajectories'}"
+            logger.warning("%s in a log: mjrec recover %s", what, self.directory)
         failures.raise_first()
         logger.info("Finished writing results. They are in %s.", self.directory)
 
@@ -381,22 +378,14 @@ class Recorder:
         return stats.done is False and stats.steps == 0 and self._ending is None
 
     def _begin_episode(self, recording: EpisodeRecording, observation: Any) -> None:
-        choice, (number, kind, *_) = self._choice, recording.episode
-        wanted = recording.is_chosen = self.run.ask("video", choice.decide, number)
+        number = recording.episode.episode_id
+        wanted = self.run.ask("video", self.run.choice.decide, number)
+        recording.is_chosen = wanted
         if self._clips is not None:
             self._clips.reset(is_chosen=wanted)
         self.run.events.begin(number, chosen=wanted and self._kept is None)
         # With clips the episode has no video of its own.
-        wanted = wanted and self._clips is None
-        keeps = self.run.ask(
-            "trajectory", choice.keeps_trajectory, number, kind, wanted
-        )
-        recording.begin(
-            observation,
-            wants_video=wanted,
-            keeps=keeps,
-            stays=choice.keeps_without_video(kind),
-        )
+        recording.begin(observation, wants_video=wanted and self._clips is None)
 
     def _take_last_frame(self) -> None:
         """Take the running episode's last frame if it was left out."""
@@ -406,11 +395,7 @@ class Recorder:
             recording.take_last()
 
     def _take_frames(
-        self,
-        failures: _Failures,
-        reward: float,
-        flags: Mapping[str, bool],
-        frame: bool,
+        self, failures: Failures, reward: float, flags: Mapping[str, bool], frame: bool
     ) -> None:
         """Take a step's live frames, and the clip's frame."""
         live = None if self._recording is None else self._recording.live
@@ -441,7 +426,7 @@ class Recorder:
             recording.is_over = True
             self._leave_recording(recording)
             return
-        failures = _Failures()
+        failures = Failures()
         facts = {"complete": False, **(self._ending or {"reason": reason})}
         self._end_episode(facts, failures)
         failures.raise_first()
@@ -456,7 +441,7 @@ class Recorder:
     def _end_episode(
         self,
         facts: Mapping[str, Any],
-        failures: _Failures,
+        failures: Failures,
         *,
         success: bool | None = None,
         take: Callable[[], None] = lambda: None,
@@ -556,7 +541,7 @@ class Recorder:
     def _end_recordings(self) -> None:
         """End all running recordings, even if some of them fail. Idempotent."""
         self.fast = None
-        failures = _Failures()
+        failures = Failures()
         with failures:
             if self._clips is not None:
                 self._clips.close(self._ending or {"reason": CLOSE})
@@ -583,7 +568,7 @@ class Recorder:
             FileNotWritten: a model could not be stored, and `on_error` does not
                 tolerate that.
         """
-        failures = _Failures()
+        failures = Failures()
         for states in self._states:
             with failures, self.run.tolerating("model", Error, of_episode=False):
                 states.finish()
@@ -617,24 +602,8 @@ class Recorder:
                 each.leave()
         self.run.leave()
 
-    def _say_what_is_left(self, pending: int) -> None:
-        """Log the command that renders or finishes the rest."""
-        if pending:
-            what = f"{pending} {'video' if pending == 1 else 'videos'}"
-            logger.warning("%s pending: mjrec render %s", what, self.directory)
-        elif in_logs := len(recordings_in_flight(self.directory, self.infix)):
-            what = f"{in_logs} {'trajectory' if in_logs == 1 else 'trajectories'}"
-            logger.warning("%s in a log: mjrec recover %s", what, self.directory)
-
-    def _write_last_results(self) -> int:
-        """Write the run's final results; return the number of pending videos."""
-        self.run.note_provenance(wait=True)
-        if self._kept is not None:
-            self.run.note("keep", self._kept.details())
-        self.run.note("closed", {"next_episode_id": self.episode_id})
-        return self._write_results()
-
     def _write_results(self) -> int:
+        """Write statistics and manifest; return the number of pending videos."""
         listing = write_manifest_and_stats(
             self.directory,
             self.run.infix,
@@ -644,28 +613,6 @@ class Recorder:
         )
         assert listing is not None, "no other process has this monitor's lock"
         return len(listing.pending)
-
-
-class _Failures:
-    """Collects errors inside `with` blocks; `raise_first` raises the first one."""
-
-    def __init__(self) -> None:
-        self._first: Exception | None = None
-
-    def __enter__(self) -> None: ...
-
-    def __exit__(self, kind: object, error: BaseException | None, _: object) -> bool:
-        if isinstance(error, Exception):
-            self.note(error)
-            return True
-        return False
-
-    def note(self, error: Exception) -> None:
-        self._first = self._first or error
-
-    def raise_first(self) -> None:
-        if self._first is not None:
-            raise self._first
 
 
 # Calling os.getpid() at every step would take as long as counting the step.

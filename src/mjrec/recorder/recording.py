@@ -15,8 +15,9 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..errors import Error, FileNotWritten, InvalidArgument
+from ..errors import FileNotWritten, InvalidArgument
 from ..formats.monitor_directory import trajectory_prefix, video_prefix
+from .endings import Failures
 from .fast_path import FastPath, counting
 from .keep_rules import Selection, Standing
 from .live_videos import LiveVideos, live_videos
@@ -64,18 +65,17 @@ class EpisodeRecording:
             return LIVE
         return DEFERRED if isinstance(self.video, DeferredVideo) else None
 
-    def begin(
-        self, observation: Any, *, wants_video: bool, keeps: bool, stays: bool
-    ) -> None:
+    def begin(self, observation: Any, *, wants_video: bool) -> None:
         """Record the reset.
 
         Args:
             observation: the reset's observation.
             wants_video: whether the episode gets a video.
-            keeps: whether its trajectory is kept.
-            stays: whether the trajectory is kept even if the video is dropped.
         """
         run, capture = self._run, self._run.of_episodes.capture
+        number, kind, *_ = self.episode
+        choose = run.choice.keeps_trajectory
+        keeps = run.ask("trajectory", choose, number, kind, wants_video)
         if keeps or wants_video:
             self._path = run.of_episodes.logs.path_of(self._name)
         deferred = wants_video and run.env.rendering.mode == DEFERRED
@@ -86,21 +86,18 @@ class EpisodeRecording:
         if capture is not None and (keeps or deferred):
             start = capture.begin_episode()
             deferred = deferred and run.can_be_deferred(start)
-        name = video_prefix(run.infix, self.episode.episode_id)
-        second_name = run.second_name("episode", self.episode.episode_id)
+        name = video_prefix(run.infix, number)
         if keeps or deferred:
             if wants_video:
                 mode = DEFERRED if deferred else LIVE
-                self._pending_video = run.pending_video(
-                    name, mode, second_name=second_name
-                )
-            self.stays = keeps and stays
+                self._pending_video = run.pending_video(name, mode)
+            self.stays = keeps and run.choice.keeps_without_video(kind)
             self.states = self._new_states(start, observation, name, is_kept=keeps)
         if deferred:
             assert self.states is not None
             self.video = DeferredVideo(run.directory, name, self.states)
         elif wants_video:
-            live = live_videos(run, run.directory / name, second_name=second_name)
+            live = live_videos(run, run.directory / name)
             self.video = live.recorders[0]
             if self.video.enabled:
                 self.live = live
@@ -221,7 +218,9 @@ class EpisodeRecording:
         }
         if self._pending_video is None and run.env.rendering.mode == DEFERRED:
             # Needed if episodes of several monitors are chosen later.
-            facts["possible_video"] = run.pending_video(name, DEFERRED, second_name={})
+            facts["possible_video"] = run.pending_video(
+                name, DEFERRED, is_only_possible=True
+            )
         is_candidate = bool(run.selection) and self._pending_video is not None
         if run.selection:
             facts["candidate"] = is_candidate
@@ -308,18 +307,15 @@ class KeptVideos:
         }
 
     def _hand_on(self, episode_ids: Iterable[int]) -> None:
-        failure: Error | None = None
+        failures = Failures()
         for episode_id in episode_ids:
             standing = self.selection.standing(episode_id)
             if standing is Standing.CANDIDATE:
                 continue
             recording = self._held.pop(episode_id)
-            try:
+            with failures:
                 if standing is Standing.CHOSEN:
                     recording.choose(self.chosen_facts())
                 else:
                     recording.drop()
-            except Error as error:
-                failure = failure or error
-        if failure is not None:
-            raise failure
+        failures.raise_first()

@@ -46,6 +46,7 @@ class StatsRecorder:
         steps: number of steps in the running episode; None before the first reset.
         rewards: sum of the rewards in the running episode; None before the first reset.
         done: whether the running episode is over; None before the first reset.
+        episode_type: the type of the running episode.
         total_steps: total number of steps, including steps of incomplete episodes.
         closed: whether the recorder is closed.
         path: path of the statistics file.
@@ -78,8 +79,8 @@ class StatsRecorder:
         self.closed = False
         self.clock: Callable[[], float] = time.time
         self.path = str(Path(self.directory) / f"{file_prefix}.stats.json")
-        self._type = _TYPES[0]
-        self._episode_type = _TYPES[0]
+        self._type = self.episode_type = _TYPES[0]
+        self._environment = env_id or "the environment"
 
     @property
     def type(self) -> str:
@@ -98,11 +99,6 @@ class StatsRecorder:
                 f"it is {value!r}."
             )
         self._type = value
-
-    @property
-    def episode_type(self) -> str:
-        """The type of the running episode."""
-        return self._episode_type
 
     def before_step(self, action: object = None) -> None:
         """Check that a step is allowed.
@@ -186,7 +182,7 @@ class StatsRecorder:
         self.steps = 0
         self.rewards = 0.0
         self.done = False
-        self._episode_type = self._type
+        self.episode_type = self._type
 
     def save_complete(self) -> None:
         """Add the running episode to the statistics as a complete episode."""
@@ -194,7 +190,7 @@ class StatsRecorder:
         assert self.rewards is not None
         self.episode_lengths.append(self.steps)
         self.episode_rewards.append(self.rewards)
-        self.episode_types.append(self._episode_type)
+        self.episode_types.append(self.episode_type)
         self.timestamps.append(self.clock())
 
     def close(self) -> None:
@@ -216,10 +212,6 @@ class StatsRecorder:
             episode_rewards=tuple(self.episode_rewards),
             episode_types=tuple(self.episode_types),
         )
-
-    @property
-    def _environment(self) -> str:
-        return self.env_id or "the environment"
 
     def _check_open(self) -> None:
         if self.closed:

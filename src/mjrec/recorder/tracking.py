@@ -15,12 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from ..formats.monitor_directory import episode_of, view_of
-from ..formats.video_metadata import (
-    finished_videos,
-    is_broken,
-    is_done,
-    metadata_path,
-)
+from ..formats.video_metadata import finished_videos, is_broken, is_done, metadata_path
 
 logger = logging.getLogger(__name__)
 

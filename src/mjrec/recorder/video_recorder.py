@@ -351,10 +351,7 @@ class VideoRecorder:
         assert self.path is not None
         self._rate = fps
         self._sink = VideoSink(
-            Path(self.path),
-            fps=fps,
-            frame_hashes=self._frame_hashes,
-            note=self._note,
+            Path(self.path), fps=fps, frame_hashes=self._frame_hashes, note=self._note
         )
         for frame, caption in self._waiting:
             self._sink.write(frame, caption)
