@@ -122,6 +122,25 @@ def test_sixty_four_sub_environments(tmp_path):
         assert len(frames_of(tmp_path / name.format("video", "video", "mp4"))) == 3
 
 
+def test_each_monitor_reports_its_own_failures(tmp_path):
+    """Although the sub-environments share the processes that render."""
+    make = functools.partial(
+        gymnasium.make, "InvertedPendulum-v5", max_episode_steps=2, height=16, width=16
+    )
+    env = mjrec.Monitor(SyncVectorEnv([make] * 2), tmp_path, workers=1, quality="draft")
+    good, bad = env.monitors
+    path_of(bad, 0, "mp4").mkdir()
+    env.reset(seed=0)
+    for _ in range(3):
+        env.step(np.zeros((2, 1), np.float32))
+    with pytest.raises(mjrec.RenderError) as caught:
+        bad.close()
+    assert [*caught.value.failures] == [path_of(bad, 0, "mp4").name]
+    good.close()
+    with pytest.raises(mjrec.RenderError):
+        env.close()
+
+
 def test_closing_puts_the_environments_back(corridors, tmp_path):
     """Each is closed once; until then calls reach them through their monitors."""
     vector = corridors()

@@ -12,6 +12,7 @@ from typing import Any, ClassVar, Literal, NoReturn, Self, SupportsIndex, TypeVa
 
 from ..environments.scenes import Scenes
 from ..errors import NotPicklable, PicturesDiffer, RenderError
+from ..formats.monitor_directory import infix_of
 from ..recorder.endings import ExitGuard, last_error
 from ..recorder.finishers import Finisher
 from ..recorder.options import (
@@ -104,9 +105,13 @@ class MonitorBase:
                     self._finish(on_progress)
         finally:
             self._guard.close()
-        failures: dict[str, str] = {}
-        for recorder in self._recorders:
-            failures.update(recorder.run.finisher.failures)
+        # Monitors of sub-environments share a finisher.
+        failures = {
+            name: reason
+            for recorder in self._recorders
+            for name, reason in recorder.run.finisher.failures.items()
+            if infix_of(name) == recorder.infix
+        }
         if not wait or not failures or self._reported_failures:
             return
         self._reported_failures = True
