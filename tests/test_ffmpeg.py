@@ -155,7 +155,9 @@ def cache(tmp_path, monkeypatch):
 def ask(program, asked, answer="yes"):
     """Ask as a new process does, and note where the program had to be asked."""
     ffmpeg._answers.clear()
-    return remembered(str(program), "does it work?", lambda: asked.append("") or answer)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(ffmpeg, "ffmpeg_executable", lambda: str(program))
+        return remembered("does it work?", lambda: asked.append("") or answer)
 
 
 def test_a_program_is_asked_once(program, cache):

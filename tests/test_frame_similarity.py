@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mjrec.evidence.decoded_video import decoded_video
 from mjrec.evidence.frame_similarity import (
     OTHER_CPU,
     OTHER_ENCODER,
@@ -18,6 +17,7 @@ from mjrec.evidence.frame_similarity import (
     planes_of,
     similarity,
 )
+from mjrec.evidence.mp4_videos import decoded_video
 from mjrec.formats.video_writer import VideoWriter
 
 

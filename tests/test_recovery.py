@@ -36,7 +36,6 @@ from mjrec.formats.locks import Lock, is_locked, try_lock
 from mjrec.formats.monitor_directory import (
     lock_name,
     log_name,
-    video_lock_name,
     video_prefix,
 )
 
@@ -497,7 +496,7 @@ def test_unfinished_files_of_a_dead_renderer_are_removed(tmp_path: Path) -> None
     side = tmp_path / f".{video_prefix(INFIX, 0)}.side.mp4.0123abcd.part"
     for part in [*dead, *living]:
         part.touch()
-    renderer = try_lock(tmp_path / video_lock_name(INFIX, 1))
+    renderer = try_lock(tmp_path / f".{video_prefix(INFIX, 1)}.lock")
     assert renderer is not None
     drawn = Lock(side, "")
     # This may be an open monitor's.

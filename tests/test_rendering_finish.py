@@ -21,7 +21,7 @@ from mjrec.formats.locks import Lock
 from mjrec.formats.monitor_directory import (
     lock_name,
     trajectory_prefix,
-    video_lock_name,
+    video_prefix,
 )
 from mjrec.formats.spans import is_in_flight
 from mjrec.formats.trajectory_file import open_trajectory
@@ -111,7 +111,7 @@ def test_what_another_process_has_is_left_to_it(tmp_path, painter):
     assert result.elsewhere == (f"{VIDEO}.mp4",)
     assert painter.asked == []
     lock.release()
-    (tmp_path / video_lock_name(INFIX, 0)).write_text("4711")
+    (tmp_path / f".{video_prefix(INFIX, 0)}.lock").write_text("4711")
     write_pending_manifest(tmp_path, 0)
     [result] = finish(tmp_path, workers=None)
     assert result.videos

@@ -23,7 +23,6 @@ import numpy as np
 from ..formats.json_fields import unreadable
 from ..formats.regular_files import open_regular, read_regular
 from .compare_json import Rules, lines_of
-from .decoded_video import decoded_video, has_messages, has_usual_colours
 from .differences import Aspect, Difference, Same, differs, short
 from .findings import Topic
 from .frame_similarity import (
@@ -35,7 +34,7 @@ from .frame_similarity import (
     planes_of,
     similarity,
 )
-from .mp4_boxes import Box, read_boxes, shown_times
+from .mp4_videos import Box, decoded_video, odd_contents, read_boxes, shown_times
 
 # Boxes that a different encoder, or different frames, may change.
 _ENCODED: Final = frozenset(
@@ -81,7 +80,8 @@ def compare_videos(
         aspect=Aspect.ENCODED,
         how="it was encoded differently",
     )
-    frames = [*_compare_frames(given, made, rules), *_streams(given)]
+    frames = [*_compare_frames(given, made, rules)]
+    frames += [_differs(*each) for each in odd_contents(given)]
     yield from frames
     if not found and not any(each.topic is Topic.VIDEOS for each in frames):
         yield Same(Topic.VIDEOS, unit="video")
@@ -118,14 +118,6 @@ def _compare_frames(
             worst.add(number, a, b)
     rules.decoded[given] = digest.hexdigest()
     yield from worst.differences()
-
-
-def _streams(given: Path) -> Iterator[Difference]:
-    """Yield differences outside the frames: colour tags and captions."""
-    if not has_usual_colours(given):
-        yield _differs("colour tags", "other tags", "BT.709")
-    if has_messages(given):
-        yield _differs("the stream", "frames and messages", "frames")
 
 
 def compare_sampled(

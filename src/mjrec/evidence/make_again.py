@@ -27,7 +27,7 @@ from ..environments.recreate import NotRecreated, Recreated, checked_options, re
 from ..environments.scenes import mujoco_warnings, new_warnings
 from ..environments.wrapping import RecordedSteps
 from ..errors import Error, UnreadableFile
-from ..formats.journal import KILLED
+from ..formats.killed_episodes import KILLED
 from ..plain_text import counted
 from ..recorder.endings import EXCEPTION, INTERRUPT, RESET
 from ..simulation.model_sources import read_authored

@@ -48,13 +48,15 @@ _LONGEST_RANGE = 44
 
 def is_finished(path: Path) -> bool:
     """Return whether a finished trajectory exists, given the path of its own file."""
-    return path.is_file() or _is_bundled(path)
+    return file_of(path).is_file()
 
 
 def file_of(path: Path) -> Path:
     """Return the file that holds a trajectory, or `path` if no file does."""
-    if not path.is_file() and _is_bundled(path):
-        return bundle_of(path)
+    if not path.is_file() and path.suffix == FINISHED:
+        bundle = bundle_of(path)
+        if episode_of(path.name) in _episodes_in(bundle):
+            return bundle
     return path
 
 
@@ -109,15 +111,6 @@ def index_of(episodes: Iterable[int]) -> bytes:
             ranges.append([number, number])
     index = {"format": _FORMAT, "version": _VERSION, "episodes": ranges}
     return dumps(index).encode() + b"\n"
-
-
-def _is_bundled(path: Path) -> bool:
-    number = episode_of(path.name)
-    return (
-        path.suffix == FINISHED
-        and number is not None
-        and number in _episodes_in(bundle_of(path))
-    )
 
 
 def _episodes_in(bundle: Path) -> frozenset[int]:

@@ -162,7 +162,7 @@ def check_encoding(settings: EncoderSettings, fps: Fraction) -> None:
         EncoderError: ffmpeg cannot encode with these settings.
     """
     question = " ".join(_trial_arguments(settings, fps))
-    remembered(ffmpeg_executable(), question, lambda: try_encoding(settings, fps))
+    remembered(question, lambda: try_encoding(settings, fps))
 
 
 def try_encoding(settings: EncoderSettings, fps: Fraction) -> str:
@@ -234,10 +234,8 @@ def _pixel_format(codec: str, help_text: str) -> str:
 
 def _encoder_help(codec: str) -> str:
     """Return ffmpeg's help text for an encoder."""
-    executable = ffmpeg_executable()
     arguments = ["-hide_banner", "-h", f"encoder={codec}"]
     text = remembered(
-        executable,
         " ".join(arguments),
         lambda: run_ffmpeg(arguments).decode("utf-8", errors="replace"),
     )
@@ -247,6 +245,7 @@ def _encoder_help(codec: str) -> str:
             "video encoder",
             codec,
             video_encoders(),
-            hint=f"These are the encoders of {executable}, {ffmpeg_version()}.",
+            hint=f"These are the encoders of {ffmpeg_executable()}, "
+            f"{ffmpeg_version()}.",
         )
     return text

@@ -78,14 +78,13 @@ def ffmpeg_version() -> str:
 
 def ffmpeg_sha256() -> str:
     """Return the SHA-256 of the ffmpeg binary, in hexadecimal."""
-    executable = ffmpeg_executable()
     return remembered(
-        executable, "sha256", lambda: file_sha256(Path(executable).resolve())
+        "sha256", lambda: file_sha256(Path(ffmpeg_executable()).resolve())
     )
 
 
-def remembered(program: str, question: str, answer: Callable[[], str]) -> str:
-    """Return the answer to a question about a program, which is asked only once.
+def remembered(question: str, answer: Callable[[], str]) -> str:
+    """Return the answer to a question about ffmpeg, which is asked only once.
 
     Asking ffmpeg three questions and hashing its 80 megabytes takes as long as
     rendering a hundred small frames. So the answers are cached in
@@ -94,11 +93,11 @@ def remembered(program: str, question: str, answer: Callable[[], str]) -> str:
     same path, device, inode, size, mtime and ctime (which only the kernel can set).
 
     Args:
-        program: the program's path.
         question: a key that identifies the question.
-        answer: a function that asks the program. If it raises an error, nothing is
+        answer: a function that asks ffmpeg. If it raises an error, nothing is
             cached.
     """
+    program = ffmpeg_executable()
     status = Path(program).stat()
     times = (status.st_mtime_ns, status.st_ctime_ns)
     numbers = (status.st_dev, status.st_ino, status.st_size, *times)
@@ -407,9 +406,7 @@ os.register_at_fork(after_in_child=_close_pipes_after_fork)
 
 def _version() -> str:
     return remembered(
-        ffmpeg_executable(),
-        "version",
-        lambda: run_ffmpeg(["-version"]).decode(errors="replace"),
+        "version", lambda: run_ffmpeg(["-version"]).decode(errors="replace")
     )
 
 

@@ -63,9 +63,6 @@ EVENTS = (
 SPAN_EVENTS = ("rows", "begin", "note", "end", "drop", "full")
 _OF_SPANS = tuple(f'{{"{kind}": '.encode() for kind in SPAN_EVENTS)
 
-# The reason why an episode ended if its process was killed.
-KILLED = "killed"
-
 # Seeds and options are for people to read, so longer ones are truncated.
 _LONGEST_REPR = 1000
 
@@ -310,26 +307,6 @@ def entry_of(values: Mapping[str, Any]) -> JournalEntry:
         ValueError: a member is missing or has the wrong type.
     """
     return from_json(JournalEntry, {"seed": None, "options": None, **values})
-
-
-def missing_line(
-    facts: Mapping[str, Any], choice: Mapping[str, Any]
-) -> tuple[str, Mapping[str, Any]]:
-    """Return the kind and the facts of the journal line that a kill prevented.
-
-    Args:
-        facts: the facts in the episode's trajectory; empty if there is no trajectory.
-        choice: the line's `episode_id`, `chosen` and `recording`.
-    """
-    known = {**facts, **choice}
-    try:
-        entry_of(known)
-        is_complete = facts.get("complete") is True
-    except ValueError:
-        is_complete = False
-    if is_complete:
-        return "episode", known
-    return "cut", {**choice, "reason": facts.get("reason", KILLED)}
 
 
 def count(value: Any) -> int:

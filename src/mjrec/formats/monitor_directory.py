@@ -266,11 +266,6 @@ def is_bundle(name: str) -> bool:
     return _VISIBLE["trajectories"].fullmatch(name) is not None
 
 
-def video_lock_name(infix: str, episode_id: int) -> str:
-    """Return the name of the lock file held while an episode is rendered."""
-    return f".{video_prefix(infix, episode_id)}.lock"
-
-
 def clip_prefix(infix: str, first_step: int) -> str:
     """Return the start of the names of a clip's parts.
 
@@ -289,11 +284,6 @@ def clip_part_name(infix: str, first_step: int, number: int) -> str:
 def log_name(infix: str, number: int) -> str:
     """Return the name of a row log; its companion files have other suffixes."""
     return f"{FILE_PREFIX}.states.{infix}.{number:06d}.log"
-
-
-def clip_lock_name(infix: str, first_step: int) -> str:
-    """Return the name of the lock file held while a clip is rendered."""
-    return f".{clip_prefix(infix, first_step)}.lock"
 
 
 def clip_video_prefix(infix: str, episode_id: int, step: int | None) -> str:

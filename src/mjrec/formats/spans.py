@@ -128,8 +128,7 @@ class Recording:
     @property
     def is_in_flight(self) -> bool:
         """Whether the recording exists only in its log."""
-        path = self.path
-        return not (path.suffix == FINISHED and is_finished(path)) and not self.is_gone
+        return not is_finished(self.path) and not self.is_gone
 
     @property
     def last_write(self) -> float:
@@ -313,10 +312,7 @@ def find_recording(path: Path) -> Recording | None:
         UnreadableFile: the journal of its monitor cannot be read.
     """
     name = path.name.removesuffix(FINISHED)
-    infix = infix_of_recording(name)
-    if infix is None:
-        return None
-    recording = _read(path.with_name(journal_name(infix))).recordings.get(name)
+    recording = _read(_journal_of(path)).recordings.get(name)
     if recording is None or recording.is_gone or not recording.log.exists():
         return None
     return recording
@@ -343,9 +339,7 @@ def is_in_flight(path: Path) -> bool:
     Raises:
         UnreadableFile: the journal of its monitor cannot be read.
     """
-    if path.suffix == FINISHED and is_finished(path):
-        return False
-    return find_recording(path) is not None
+    return not is_finished(path) and find_recording(path) is not None
 
 
 def recordings_in_flight(directory: Path, infix: str | None = None) -> list[Recording]:

@@ -10,11 +10,11 @@ from typing import Any
 
 from ..errors import Error, UnreadableFile
 from .bundle import bundle_of, file_of, is_finished
-from .journal import KILLED
 from .json_fields import unreadable
+from .killed_episodes import how_it_ended
 from .regular_files import open_regular
 from .spans import Recording, find_recording, is_in_flight, remove_if_done
-from .trajectory import TrajectoryReader, added_up
+from .trajectory import TrajectoryReader
 from .trajectory_hdf5 import SIGNATURE, open_hdf5, write_bundle, write_hdf5
 from .trajectory_log import open_recording
 
@@ -152,55 +152,5 @@ def amend_trajectories(changes: Mapping[Path, Callable[[Any], Any]]) -> None:
 def _ended(path: Path, recording: Recording | None) -> TrajectoryReader:
     """Open a recording, and add facts about how it ended."""
     reader = open_recording(path)
-    reader.facts = {**reader.facts, **_how_it_ended(reader, recording)}
+    reader.facts = {**reader.facts, **how_it_ended(reader, recording)}
     return reader
-
-
-def _how_it_ended(
-    reader: TrajectoryReader, recording: Recording | None
-) -> dict[str, Any]:
-    """Derive facts about an episode's end from its rows, if its facts lack them.
-
-    The last row shows whether a killed process had completed the episode. If so, it
-    counts like any other. Otherwise, it has `complete: false` and `reason: "killed"`,
-    keeps all rows up to the kill, and is not in the statistics.
-
-    Args:
-        reader: the reader of the episode's rows.
-        recording: the episode's recording in the row log; None if the log is gone.
-    """
-    facts = reader.facts
-    if "complete" in facts:
-        return {}
-    known: dict[str, Any] = {
-        "complete": False,
-        "length": reader.step_count,
-        "reward": added_up(reader.rewards),
-    }
-    if reader.step_count and (reader.terminated[-1] or reader.truncated[-1]):
-        # Only the end event is missing, because of a kill or a full disk.
-        known |= {
-            "complete": True,
-            "terminated": bool(reader.terminated[-1]),
-            "truncated": bool(reader.truncated[-1]),
-            "end_time": _end_time(facts, recording),
-        }
-    else:
-        known["reason"] = KILLED
-    video = facts.get("video")
-    is_deferred = isinstance(video, dict) and video.get("recording") == "deferred"
-    if is_deferred and not reader.frame_count:
-        # Prevent any process from waiting for a video without frames.
-        known["broken_reason"] = "the process was killed before its first frame"
-    return known
-
-
-def _end_time(facts: Mapping[str, Any], recording: Recording | None) -> float:
-    """Return the approximate time when an episode ended, never before its start.
-
-    The modification time of a mapped file may be updated late or never.
-    """
-    start, last = facts.get("start_time"), 0.0
-    if recording is not None:
-        last = recording.last_write
-    return max(start, last) if isinstance(start, float) else last

@@ -29,6 +29,11 @@ _CUT = " [...] "
 _PART = re.compile(r"[A-Za-z0-9_%-]{1,200}", re.ASCII)
 
 
+# Keys about a finished file that metadata takes from a `VideoFile`.
+_OF_FILE = (
+    *("height", "width", "padded_height", "padded_width", "codec", "pixel_format"),
+    *("file_sha256", "decoded_sha256"),
+)
 # Keys about the episode that metadata takes from a recording's facts.
 _OF_EPISODE = ("episode_id", "type", "env_id", "seed", "options", "versions")
 
@@ -120,14 +125,7 @@ def file_facts(file: VideoFile) -> dict[str, Any]:
             "cmdline": [file.encoder["ffmpeg"], *file.encoder["arguments"]],
         },
         "ffmpeg_sha256": file.encoder["sha256"],
-        "height": file.height,
-        "width": file.width,
-        "padded_height": file.padded_height,
-        "padded_width": file.padded_width,
-        "codec": file.codec,
-        "pixel_format": file.pixel_format,
-        "file_sha256": file.file_sha256,
-        "decoded_sha256": file.decoded_sha256,
+        **{name: getattr(file, name) for name in _OF_FILE},
     }
 
 

@@ -20,13 +20,12 @@ import numpy as np
 from ..errors import InvalidArgument, UnknownName
 from ..formats.monitor_directory import (
     VideoName,
-    clip_lock_name,
     clip_part_name,
+    clip_prefix,
     clip_step,
     episode_of,
     infix_of,
     trajectory_prefix,
-    video_lock_name,
     video_prefix,
 )
 from ..formats.notebook import shown
@@ -206,8 +205,8 @@ class RecordingKey:
     @property
     def lock_name(self) -> str:
         """The name of the file that the process working on it locks."""
-        name_of = clip_lock_name if self.is_clip else video_lock_name
-        return name_of(self.infix, self.number)
+        prefix_of = clip_prefix if self.is_clip else video_prefix
+        return f".{prefix_of(self.infix, self.number)}.lock"
 
 
 def key_of(name: str) -> RecordingKey | None:

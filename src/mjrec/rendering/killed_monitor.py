@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import Error, UnreadableFile
-from ..formats import journal, spans, trajectory_file
+from ..formats import journal, killed_episodes, spans, trajectory_file
 from ..formats.bundle import FINISHED, is_finished
 from ..formats.locks import try_lock
 from ..formats.monitor_directory import (
@@ -253,7 +253,7 @@ class _KilledMonitor:
         facts = self._facts(number)
         entry = None if number is None else self._entries.get(number)
         known = {key: facts[key] for key in ("length", "reward") if key in facts}
-        if "complete" in facts and facts.get("reason") != journal.KILLED:
+        if "complete" in facts and facts.get("reason") != killed_episodes.KILLED:
             keys = ("complete", "terminated", "truncated", "reason", "exception")
             known |= {key: facts[key] for key in keys if key in facts}
         if entry is not None:
@@ -275,7 +275,7 @@ class _KilledMonitor:
                 "chosen": bool(video) and not is_choosing,
                 "recording": video.get("recording"),
             }
-            yield journal.missing_line(facts, choice)
+            yield killed_episodes.missing_line(facts, choice)
 
     def _missing_clips(self, now: MonitorFiles) -> Iterator[_Line]:
         """Yield a line for each clip, deferred or live.
@@ -351,7 +351,7 @@ class _KilledMonitor:
 def _how_long(path: Path) -> str:
     with trajectory_file.open_trajectory(path) as reader:
         steps = counted(reader.step_count, "step")
-        is_cut = reader.facts.get("reason") == journal.KILLED
+        is_cut = reader.facts.get("reason") == killed_episodes.KILLED
     return f"{steps}, incomplete: killed" if is_cut else steps
 
 

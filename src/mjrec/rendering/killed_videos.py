@@ -18,7 +18,6 @@ from ..errors import DirectoryNotWritable, EncoderError, Error, UnreadableFile
 from ..formats.asciicast import unfinished_recording
 from ..formats.ffmpeg import ffmpeg_sha256, ffmpeg_version
 from ..formats.frame_hashes import cut_frame_hashes, frame_hash_path
-from ..formats.journal import KILLED
 from ..formats.json_fields import (
     field,
     mapping,
@@ -29,6 +28,7 @@ from ..formats.json_fields import (
     text,
     unreadable,
 )
+from ..formats.killed_episodes import KILLED
 from ..formats.locks import is_locked
 from ..formats.monitor_directory import episode_of, unfinished_files
 from ..formats.video_file import content_facts

@@ -19,7 +19,7 @@ from typing import Any
 
 from ..annotation import Caption, check_annotation
 from ..errors import BlankVideo, EncoderError, NoPictures
-from ..formats.journal import KILLED
+from ..formats.killed_episodes import KILLED
 from ..formats.monitor_directory import second_name_of
 from ..formats.second_names import give_second_names, take_second_names
 from ..formats.video_metadata import (

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Functions that write statistics files and manifests from a monitor's other files.
 
-Only this module writes them, and only if their content changes, at these moments:
+In a monitor directory, only this module writes them, and only if their content changes,
+at these moments:
 
 - A monitor closes or, with `write_upon_reset`, begins an episode (`recorder.recorder`).
 - A process has rendered pending videos (`rendering.finish`).
@@ -20,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import UnreadableFile
-from ..formats.bundle import FINISHED, is_finished
+from ..formats.bundle import FINISHED
 from ..formats.locks import Lock, is_locked, wait_for_lock
 from ..formats.manifest import (
     GYM_VERSION,
@@ -46,7 +47,7 @@ from ..formats.monitor_directory import (
     video_prefix,
     with_part,
 )
-from ..formats.spans import is_in_flight
+from ..formats.spans import is_recorded
 from ..formats.video_metadata import (
     finished_videos,
     forget_failure,
@@ -282,7 +283,7 @@ def _pending(directory: Path, infix: str, run: Run) -> list[Mapping[str, Any]]:
 def _is_recorded(directory: Path, entry: Mapping[str, Any]) -> bool:
     path = directory / entry.get("clip", f"{entry.get('trajectory')}{FINISHED}")
     try:
-        return is_finished(path) or is_in_flight(path)
+        return is_recorded(path)
     except UnreadableFile:
         # The unreadable journal may list this recording.
         return True
