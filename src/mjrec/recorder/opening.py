@@ -140,13 +140,11 @@ def _next_episode_id(path: Path, *, uid: str | None) -> int:
 
 def _last_counted(results: MonitorResults) -> int:
     """Return the last episode number that the manifest states or implies, or -1."""
-    if results.manifest is None:
-        return -1
-    if results.manifest.mjrec is not None:
-        return int(results.manifest.mjrec.get("next_episode_id") or 0) - 1
-    # This manifest was written by gym. Resets number the episodes from 0, and each
-    # reset has a type.
-    stats = results.saved
+    if results.details:
+        return int(results.details.get("next_episode_id") or 0) - 1
+    # A manifest without these facts was written by gym. Resets number the episodes from
+    # 0, and each reset has a type.
+    stats = None if results.manifest is None else results.saved
     if stats is None:
         return -1
     return max(len(stats.timestamps), len(stats.episode_types or ())) - 1

@@ -82,7 +82,7 @@ class Recorder:
         self.fast: FastPath | None = None
         self.evaluation_facts: Callable[[], Mapping[str, Any] | None] = lambda: None
         self.run = MonitoredRun(directory, env=env, options=options, finisher=finisher)
-        self._choice, selection = self.run.choice, self.run.choice.selection
+        selection = self.run.choice.selection
         self.directory, self.infix = self.run.directory, self.run.infix
         self.episode_id: int = self.run.events.facts["first_episode_id"]
         self.stats_recorder = self.run.stats
@@ -94,7 +94,7 @@ class Recorder:
         self._kept = None if selection is None else KeptVideos(selection)
         self._clips = Clips(self.run) if options.has_clips else None
         draws_later = env.rendering.mode == DEFERRED and self._clips is None
-        if draws_later and self._choice.will_choose(self.episode_id):
+        if draws_later and self.run.choice.will_choose(self.episode_id):
             self.run.finisher.expect()
 
     @property
@@ -153,8 +153,8 @@ class Recorder:
             self._take_last_frame()
         self._reset_time = now
         self._random_state = None
-        kind = self.stats_recorder.type
-        if self._choice.has_videos or self._choice.keeps_without_video(kind):
+        choice = self.run.choice
+        if choice.has_videos or choice.keeps_without_video(self.stats_recorder.type):
             self._random_state = self.run.env.random_state()
 
     def reset(
@@ -503,7 +503,7 @@ class Recorder:
                     if kept is None:
                         recording.hand_on()
                     else:
-                        kept.hold(recording)
+                        kept.held[episode_id] = recording
             if kept is not None:
                 with failures, self._tolerating_lost():
                     kept.settle()

@@ -241,11 +241,14 @@ class KeptVideos:
 
     Args:
         selection: the object that chooses the episodes that get a video.
+
+    Attributes:
+        held: the recordings of ended episodes that are neither chosen nor dropped yet.
     """
 
     def __init__(self, selection: Selection) -> None:
         self.selection = selection
-        self._held: dict[int, EpisodeRecording] = {}
+        self.held: dict[int, EpisodeRecording] = {}
         self._is_decided = False
         # The reason why no decision could be made, and the episodes kept because of it.
         self._failure: str | None = None
@@ -257,10 +260,6 @@ class KeptVideos:
         facts = {"rule": selection.name, "decided": True}
         return {**facts, "finished": selection.finished}
 
-    def hold(self, recording: EpisodeRecording) -> None:
-        """Hold the recording of an ended episode until it is chosen or dropped."""
-        self._held[recording.episode.episode_id] = recording
-
     def settle(self) -> None:
         """Submit the recordings that are already chosen, and delete dropped ones.
 
@@ -268,8 +267,8 @@ class KeptVideos:
             DirectoryNotWritable, FileNotWritten: see `EpisodeRecording.choose` and
                 `drop`. A failure does not affect the other recordings.
         """
-        if len(self._held) > self.selection.undecided:
-            self._hand_on(list(self._held))
+        if len(self.held) > self.selection.undecided:
+            self._hand_on(list(self.held))
 
     def decide(self) -> None:
         """Decide about all held recordings at the end of the run.
@@ -285,14 +284,14 @@ class KeptVideos:
             self.selection.close()
         except InvalidArgument as error:
             self._failure = str(error)
-            self._left = list(self._held)
-            for recording in self._held.values():
+            self._left = list(self.held)
+            for recording in self.held.values():
                 recording.expect()
             raise
         self._is_decided = True
         # Chosen recordings come first, so that they survive if the process is killed.
         chosen = set(self.selection.chosen)
-        self._hand_on(sorted(self._held, key=lambda number: number not in chosen))
+        self._hand_on(sorted(self.held, key=lambda number: number not in chosen))
 
     def details(self) -> dict[str, Any]:
         """Return the facts about the final choice for the journal."""
@@ -312,7 +311,7 @@ class KeptVideos:
             standing = self.selection.standing(episode_id)
             if standing is Standing.CANDIDATE:
                 continue
-            recording = self._held.pop(episode_id)
+            recording = self.held.pop(episode_id)
             with failures:
                 if standing is Standing.CHOSEN:
                     recording.choose(self.chosen_facts())
