@@ -18,6 +18,8 @@ from .trajectory import TrajectoryReader, added_up
 
 # The reason why an episode ended if its process was killed.
 KILLED = "killed"
+# The facts about the end of such an episode, and of its live video.
+CUT_BY_KILL = {"complete": False, "reason": KILLED}
 
 
 def how_it_ended(
@@ -33,7 +35,6 @@ def how_it_ended(
     if "complete" in facts:
         return {}
     known: dict[str, Any] = {
-        "complete": False,
         "length": reader.step_count,
         "reward": added_up(reader.rewards),
     }
@@ -46,7 +47,7 @@ def how_it_ended(
             "end_time": _end_time(facts, recording),
         }
     else:
-        known["reason"] = KILLED
+        known |= CUT_BY_KILL
     video = facts.get("video")
     is_deferred = isinstance(video, dict) and video.get("recording") == "deferred"
     if is_deferred and not reader.frame_count:

@@ -28,7 +28,7 @@ from ..formats.json_fields import (
     text,
     unreadable,
 )
-from ..formats.killed_episodes import KILLED
+from ..formats.killed_episodes import CUT_BY_KILL
 from ..formats.locks import is_locked
 from ..formats.monitor_directory import episode_of, unfinished_files
 from ..formats.video_file import content_facts
@@ -45,7 +45,6 @@ from ..plain_text import counted
 
 # Only the metadata of clips has this key.
 _FIRST_STEP = "first_step"
-_CUT = {"complete": False, "reason": KILLED}
 _BROKEN = (
     "the recording process was killed, and its encoder before it had finished the file"
 )
@@ -90,7 +89,7 @@ def finish_video(path: Path, known: Mapping[str, Any]) -> Iterator[tuple[str, st
             metadata = _metadata(path, about, {**facts, **found}, known)
             done = path.name, _counted(metadata["frame_count"], metadata)
         except EncoderError as error:
-            ending = known if "complete" in known else {**known, **_CUT}
+            ending = known if "complete" in known else {**known, **CUT_BY_KILL}
             metadata = {**about, **ending, "empty": True, "recovered": True}
             done = metadata_path(path).name, "there was no frame yet"
             # Frames are hashed before they are encoded, so the encoder may never have
@@ -186,7 +185,7 @@ def _metadata(
     if not is_whole or "complete" not in known:
         # The last frames had not reached the encoder.
         steps = [*range(0, frame_count * stride, stride)]
-        known = {**_sums(known), **_CUT}
+        known = {**_sums(known), **CUT_BY_KILL}
     # The step of each frame is known only if there is one frame per step.
     is_known = frames_per_step == 1
     further = further_live_videos(video)
@@ -230,7 +229,7 @@ def finish_text(
             yield part.name, "unfinished, removed"
             return
         if "complete" not in known or known.get("length") != len(frames) - 1:
-            known = {**_sums(known), **_CUT}
+            known = {**_sums(known), **CUT_BY_KILL}
         sink = VideoSink(path, fps=rate)
         for frame in frames:
             sink.write(frame)
