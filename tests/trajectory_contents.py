@@ -37,6 +37,6 @@ def content_of(reader: TrajectoryReader) -> TrajectoryContent:
         observations=reader.observations(0, reader.row_count),
         frame_steps=reader.frame_steps,
         snapshots=reader.snapshots(0, reader.frame_count),
-        model_changes=reader.model_changes,
+        model_changes=tuple(reader.iter_model_changes()),
         dropped=reader.dropped,
     )

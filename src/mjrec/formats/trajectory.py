@@ -271,11 +271,6 @@ class TrajectoryReader:
             self._check_open()
             yield self.read_change(index)
 
-    @functools.cached_property
-    def model_changes(self) -> tuple[ModelChange, ...]:
-        """The changes of the model in the order of their steps, read only once."""
-        return tuple(self.iter_model_changes())
-
     def close(self) -> None:
         """Close the file. Idempotent. Data that was already read stays available."""
         self.is_closed = True
