@@ -95,13 +95,17 @@ while True:
     env.step(env.action_space.sample())
     time.sleep(0.05)
 """
-_VERTICES = """(name) => {
+_VERTICES = """(name, kind = "position") => {
   let found = null;
   window.__viserMutable.nodeRefFromName[name].traverse((part) => {
-    if (part.isMesh) found ??= [...part.geometry.attributes.position.array];
+    if (part.isMesh) found ??= [...part.geometry.attributes[kind].array];
   });
   return found;
 }"""
+_NORMALS = f"(name) => ({_VERTICES})(name, 'normal')"
+_SIZES = """(names) => names.map((name) => {
+  return window.__viserMutable.nodeRefFromName[name].scale.toArray();
+})"""
 
 
 def record(env: gymnasium.Env[Any, Any], directory: Path, steps: int = _STEPS) -> Path:
@@ -336,12 +340,19 @@ def test_tendons_and_cloth_move(pages: Any, tmp_path: Path) -> None:
     assert made.notes == ()
     page = pages(f"{file.as_uri()}#step=8")
     # The page draws the cloth with vertices at zero until its motion is loaded.
-    page.wait_for_function(f"({_VERTICES})('/flex/0')?.some(Boolean)")
+    page.wait_for_function(f"({_VERTICES})('/flex/0')?.some(Boolean)", polling=50)
     data = data_at(trajectory, 8)
     shown = np.reshape(page.evaluate(_VERTICES, "/flex/0"), (-1, 3))
     assert shown == pytest.approx(data.flexvert_xpos, abs=1e-5)
+    normals = np.reshape(page.evaluate(_NORMALS, "/flex/0"), (-1, 3))
+    assert normals == pytest.approx(np.tile([0, 0, 1], (16, 1)), abs=1e-5)
     segments = [n for n in page.evaluate(_POSES) if n.startswith("/tendon/")]
-    assert len(segments) >= 2
+    sizes = np.array(page.evaluate(_SIZES, segments))
+    is_there = sizes[:, 2] > 1e-6
+    # The tendon has fewer segments here than in another state.
+    assert 2 <= is_there.sum() < len(segments)
+    assert sizes[is_there, 0] == pytest.approx(0.01)
+    assert sizes.max() < 1
 
 
 # --- The file -----------------------------------------------------------------------

@@ -138,7 +138,10 @@ def soft_mesh(model: mujoco.MjModel, shape: Shape) -> trimesh.Trimesh:
     """
     index = shape.object_id
     if shape.geom_type == _FLEX:
-        return _finished(_flex_mesh(model, index), shape)
+        mesh = _finished(_flex_mesh(model, index), shape)
+        # Cloth is visible from both sides.
+        mesh.visual.material.doubleSided = bool(model.flex_dim[index] == 2)
+        return mesh
     vertices = _part(model.skin_vert, model.skin_vertadr, model.skin_vertnum, index)
     faces = _part(model.skin_face, model.skin_faceadr, model.skin_facenum, index)
     mesh = trimesh.Trimesh(vertices, faces, process=False)
@@ -250,15 +253,11 @@ def _flex_mesh(model: mujoco.MjModel, flex: int) -> trimesh.Trimesh:
     mujoco.mj_flex(model, data)
     places = data.flexvert_xpos
     vertices = _part(places, model.flex_vertadr, model.flex_vertnum, flex)
-    is_cloth = model.flex_dim[flex] == 2
-    if is_cloth:
+    if model.flex_dim[flex] == 2:
         lists = (model.flex_elem, model.flex_elemdataadr, 3 * model.flex_elemnum)
     else:
         lists = (model.flex_shell, model.flex_shelldataadr, 3 * model.flex_shellnum)
     faces = _part(*lists, flex).reshape(-1, 3)
-    if is_cloth:
-        # It is visible from both sides.
-        faces = np.vstack([faces, faces[:, ::-1]])
     return trimesh.Trimesh(vertices, faces, process=False)
 
 

@@ -61,10 +61,8 @@
     frame.scaled.forEach((name, index) => {
       const node = viewer.nodeRefFromName[name];
       const size = frame.scales.subarray(3 * index, 3 * index + 3);
-      if (node) {
-        node.visible = size[0] > 0;
-        node.scale.set(...size.map((each) => each || 1));
-      }
+      // What is not there in this state gets no size: viser decides what is visible.
+      if (node) node.scale.set(...size.map((each) => each || (size[0] > 0 ? 1 : 1e-9)));
     });
     for (const name of Object.keys(about.skins)) bend(name, frame);
     for (const [name, places] of Object.entries(frame.vertices)) {
