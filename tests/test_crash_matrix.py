@@ -137,8 +137,10 @@ def check_episodes(directory, crashed):
     last = f"{len(crashed.rewards):06d}"
     facts = [mjrec.load_trajectory(p).facts for p in directory.glob(f"*{last}.h5")]
     facts += [json.loads(p.read_text()) for p in directory.glob(f"*{last}.meta.json")]
-    # An ending that a signal interrupts leaves what a kill leaves.
-    reasons = {crashed.reason, *(["killed"] * (crashed.reason == "interrupt"))}
+    # Both come from a signal's handler. If it runs while an episode ends, it leaves
+    # what a kill leaves.
+    by_handler = crashed.reason in ("interrupt", "exception")
+    reasons = {crashed.reason, *(["killed"] * by_handler)}
     for each in facts:
         assert each["complete"] or each["reason"] in reasons
 

@@ -117,6 +117,22 @@ def test_a_model_whose_colours_change_at_every_step(tmp_path):
     assert hashes(tmp_path) == seen
 
 
+@pytest.mark.parametrize("workers", [1, 2])
+def test_a_model_whose_extent_changes_at_every_step(tmp_path, workers):
+    """Contexts scale shadows by it, and are created anew for another field."""
+
+    def grow(number, env):
+        env.model.stat.extent *= 1.2
+        env.model.vis.rgba.fog[:3] = number // 4 / 4
+
+    cheetah = gymnasium.make("HalfCheetah-v5", render_mode="rgb_array", **SIZE)
+    env = Around(cheetah, before=grow)
+    seen = []
+    with mjrec.Monitor(env, tmp_path, lambda _: True, workers=workers) as monitor:
+        play(monitor, 10, seen=seen)
+    assert hashes(tmp_path) == seen
+
+
 @pytest.mark.dm_control
 @pytest.mark.parametrize(
     "options", [{}, {"step_trigger": lambda step: step == 2, "video_length": 9}]

@@ -103,6 +103,7 @@ class Canvas:
             self._bottom_up = np.empty((height, width, 3), np.uint8)
             self._quality = quality
         self._kind = kind
+        self._extent = float(model.stat.extent)
         self.update(model)
 
     def update(self, model: mujoco.MjModel) -> None:
@@ -181,6 +182,10 @@ class Canvas:
             self._free_drawing()
             # Only the context needs these settings, and it keeps no reference to them.
             for_context = _with_settings(model, height, width, self._quality)
+            # Shadows and fog are scaled by the extent that the context was created
+            # with. The environment's context does not follow a change, and workers
+            # would notice it at different frames.
+            for_context.stat.extent = self._extent
             try:
                 self._drawing = mujoco.MjrContext(
                     for_context, int(mujoco.mjtFontScale.mjFONTSCALE_150)
