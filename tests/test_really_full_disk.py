@@ -77,3 +77,39 @@ def test_episodes_of_a_full_disk_are_complete(room, ending, disk):
         assert "reason" not in facts
     assert len(manifest_of(run)["mjrec"]["pending"]) == len(paths)
     assert not list(run.glob(".*"))
+
+
+CUT = """
+import os, sys
+import gymnasium, mjrec, numpy
+
+disk = sys.argv[1]
+env = gymnasium.make("HalfCheetah-v5", max_episode_steps=200)
+monitor = mjrec.Monitor(env, disk + "/run", lambda _: True, workers=0, on_error="warn")
+with open(disk + "/filler", "wb") as file:
+    free = os.statvfs(disk)
+    room = 400_000
+    os.posix_fallocate(file.fileno(), 0, free.f_bavail * free.f_bsize - room)
+monitor.reset(seed=0)
+for _ in range(200):
+    monitor.step(numpy.ones(6, numpy.float32))
+os.unlink(disk + "/filler")
+monitor.close(wait=False)
+"""
+
+
+def test_a_trajectory_without_room_for_its_last_rows_ends_with_them(disk):
+    """Length and reward are those of its rows; the episode is counted as it was."""
+    run_python(CUT, disk)
+    run = disk / "run"
+    mjrec.recover(run)
+    [path] = run.glob("*.h5")
+    trajectory = mjrec.load_trajectory(path)
+    facts, length = trajectory.facts, len(trajectory.rewards)
+    assert 0 < length < 200
+    assert (facts["complete"], facts["length"]) == (False, length)
+    assert facts["reward"] == pytest.approx(sum(trajectory.rewards))
+    assert facts["exception"]["type"] == "mjrec.errors.FileNotWritten"
+    assert ".log" in facts["broken_reason"]
+    assert "truncated" not in facts
+    assert stats_of(run)["episode_lengths"] == [200]

@@ -33,7 +33,8 @@ def how_it_ended(
     """
     facts = reader.facts
     if "complete" in facts:
-        return {}
+        # Rows that found no room on the disk are not in the reward either.
+        return {} if "reward" in facts else {"reward": added_up(reader.rewards)}
     known: dict[str, Any] = {
         "length": reader.step_count,
         "reward": added_up(reader.rewards),

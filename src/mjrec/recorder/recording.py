@@ -146,7 +146,13 @@ class EpisodeRecording:
         try:
             if self.states is not None:
                 own = {"length": self.states.steps, "end_time": end_time}
-                self.states.end({**known, **own})
+                early = self.states.early_end
+                if early is not None and self.states.steps < (stats.steps or 0):
+                    # Its trajectory ends before the episode. The finisher adds up the
+                    # rewards of the rows that are there.
+                    self.states.end({"complete": False, **early, **own})
+                else:
+                    self.states.end({**known, **own})
         finally:
             if self.live is not None:
                 self.live.end(known)

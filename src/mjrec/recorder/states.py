@@ -18,6 +18,7 @@ from ..errors import FileNotWritten, PicturesDiffer
 from ..formats.span_writer import SpanWriter
 from ..formats.trajectory import ModelChange, row_dtype
 from ..rates import rate_from_timestep, stride_for
+from .endings import ending
 from .fast_path import FastPath, gathering
 from .monitored_run import MonitoredRun, What
 from .step_arrays import StepArray, action_array, step_array
@@ -53,6 +54,7 @@ class StateRecorder:
 
     Attributes:
         is_stopped: whether recording has stopped after an error.
+        early_end: the facts about that error; None before.
         broken_reason: why no more frames are taken; None while they are.
     """
 
@@ -68,6 +70,7 @@ class StateRecorder:
         is_alone: bool = False,
     ) -> None:
         self.is_stopped = False
+        self.early_end: Mapping[str, Any] | None = None
         self.broken_reason: str | None = None
         self._run = run
         self._name = name
@@ -292,13 +295,16 @@ class StateRecorder:
             self.end_frames(str(error))
         except FileNotWritten as error:
             self.is_stopped = True
+            self.early_end = ending(error)
             self._break(str(error))
             if not self._run.tolerates(self._what, error):
                 raise
 
     def _break(self, reason: str) -> None:
-        self.broken_reason = reason
-        self.note(broken_reason=reason)
+        # The first error ended the frames.
+        if self.broken_reason is None:
+            self.broken_reason = reason
+            self.note(broken_reason=reason)
 
     def _new_fast_path(self, span: SpanWriter) -> FastPath | None:
         start, action = self._start, self._action
