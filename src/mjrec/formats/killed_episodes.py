@@ -33,8 +33,9 @@ def how_it_ended(
     """
     facts = reader.facts
     if "complete" in facts:
-        # Rows that found no room on the disk are not in the reward either.
-        return {} if "reward" in facts else {"reward": added_up(reader.rewards)}
+        # If the last rows found no room on the disk, the reward is left to be added up.
+        is_cut = facts.get("reward", 0) is None
+        return {"reward": added_up(reader.rewards)} if is_cut else {}
     known: dict[str, Any] = {
         "length": reader.step_count,
         "reward": added_up(reader.rewards),

@@ -148,9 +148,10 @@ class EpisodeRecording:
                 own = {"length": self.states.steps, "end_time": end_time}
                 early = self.states.early_end
                 if early is not None and self.states.steps < (stats.steps or 0):
-                    # Its trajectory ends before the episode. The finisher adds up the
-                    # rewards of the rows that are there.
-                    self.states.end({"complete": False, **early, **own})
+                    # Its trajectory ends before the episode. Readers add up the rewards
+                    # of the rows that are there.
+                    cut = {"complete": False, **early, "reward": None}
+                    self.states.end({**cut, **own})
                 else:
                     self.states.end({**known, **own})
         finally:
