@@ -204,7 +204,7 @@ def test_a_reader_beside_a_writer_sees_whole_recordings(tmp_path: Path) -> None:
                 assert reader.dropped == 0
                 assert reader.rewards.tolist() == list(range(1, count))
                 assert (reader.states(0, count) == np.arange(count)[:, None]).all()
-                changes = [each.step for each in reader.model_changes]
+                changes = [each.step for each in reader.iter_model_changes()]
                 assert changes == list(range(0, count, 100))
                 assert not is_over or count == reader.facts["rows"]
             seen.add(count)
