@@ -197,7 +197,7 @@ def odd_contents(path: Path) -> Iterator[tuple[str, str, str]]:
 def _is_by_x264(units: bytes) -> bool:
     """Return whether units of a stream are exactly one message of the encoder.
 
-    The message's size is encoded as a sum of bytes, the last of which is not 255.
+    The message's size is the sum of bytes of 255 and of the first other byte.
     """
     sizes = units.removeprefix(_MESSAGE)
     full = len(sizes) - len(sizes.lstrip(b"\xff"))

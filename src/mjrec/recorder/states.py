@@ -53,8 +53,8 @@ class StateRecorder:
         is_alone: whether it may be deleted separately; it then gets its own log.
 
     Attributes:
-        is_stopped: whether recording has stopped after an error.
-        early_end: the facts about that error; None before.
+        early_end: the facts about the error that stopped the recording; None while it
+            goes on.
         broken_reason: why no more frames are taken; None while they are.
     """
 
@@ -69,7 +69,6 @@ class StateRecorder:
         is_clip: bool = False,
         is_alone: bool = False,
     ) -> None:
-        self.is_stopped = False
         self.early_end: Mapping[str, Any] | None = None
         self.broken_reason: str | None = None
         self._run = run
@@ -131,7 +130,7 @@ class StateRecorder:
 
     def before_step(self, action: Any) -> None:
         """Copy the next step's action, because the environment may overwrite it."""
-        if self.is_stopped or not self._has_actions:
+        if self.early_end is not None or not self._has_actions:
             return
         if self._action is not None and self._action.set(action):
             return
@@ -219,7 +218,11 @@ class StateRecorder:
 
     def fast_path(self) -> FastPath | None:
         """Return the fast path, or None if it cannot be used."""
-        if self.is_stopped or not self._takes_frames or self._observation is not None:
+        if (
+            self.early_end is not None
+            or not self._takes_frames
+            or self._observation is not None
+        ):
             return None
         if self._fast is None and self._span is not None:
             self._fast = self._new_fast_path(self._span)
@@ -258,7 +261,7 @@ class StateRecorder:
         # The fast path keeps the log's memory alive.
         self._fast = None
         try:
-            if self._span is None and not self.is_stopped:
+            if self._span is None and self.early_end is None:
                 # No step was taken, so only the reset is recorded.
                 self._begin(_pace(self._run.env.declared(), None, self._max_fps))
             if self._span is not None:
@@ -287,14 +290,13 @@ class StateRecorder:
             self._span = None
 
     def _try(self, take: Callable[[], None]) -> None:
-        if self.is_stopped:
+        if self.early_end is not None:
             return
         try:
             take()
         except PicturesDiffer as error:
             self.end_frames(str(error))
         except FileNotWritten as error:
-            self.is_stopped = True
             self.early_end = ending(error)
             self._break(str(error))
             if not self._run.tolerates(self._what, error):

@@ -224,7 +224,7 @@ def find_episodes(
 def summary_of_rows(
     name: str, rows: NDArray[np.void], *, bootstrap: Bootstrap
 ) -> TaskSummary:
-    """Return the summary of the episodes of monitors, none of which failed.
+    """Return the summary of episodes that monitors recorded, without failed ones.
 
     Args:
         name: the environment's name.
