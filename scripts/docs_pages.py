@@ -102,6 +102,9 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
         "reference/commands.md": commands_page(),
         "reference/api.md": api_page(),
         "reference/opengl-errors.md": gl_page(),
+        "reference/figures.md": (ROOT / "benchmarks" / "RESULTS.md").read_text(
+            encoding="utf-8"
+        ),
         "changelog.md": (ROOT / "CHANGELOG.md").read_text(encoding="utf-8"),
     }
     for name, text in pages.items():
