@@ -176,6 +176,14 @@ def test_ways_of_ending_a_program(code, status, reason, tmp_path):
         assert trajectory.facts["exception"]["message"] == "too far"
 
 
+def test_a_full_disk_at_exit_is_one_line(tmp_path):
+    """No traceback of the interpreter's exit hooks, in which the reason would drown."""
+    code = "import resource\nresource.setrlimit(resource.RLIMIT_FSIZE, (0, 0))\n"
+    done = run(code, tmp_path, 0)
+    assert "File too large" in done.stderr
+    assert "Traceback" not in done.stderr
+
+
 def test_a_hangup_that_is_ignored_stays_ignored(tmp_path):
     """`nohup` asks for it; a SIGTERM closes the files all the same."""
     done = run(

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import atexit
+import logging
 import os
 import sys
 import threading
@@ -11,7 +12,10 @@ import weakref
 from collections.abc import Callable
 from typing import Any
 
+from ..errors import Error
 from ..signals import received
+
+logger = logging.getLogger(__name__)
 
 CLOSE, EXCEPTION, INTERRUPT, RESET = "close", "exception", "interrupt", "reset"
 
@@ -123,7 +127,11 @@ class ExitGuard:
         def exit_hook() -> None:
             if finalize.alive:
                 at_exit()
-                finalize()
+                try:
+                    finalize()
+                except Error as error:
+                    # Python would print a traceback of its own machinery.
+                    logger.error("%s", error)
 
         self._at_exit = exit_hook
         atexit.register(exit_hook)
