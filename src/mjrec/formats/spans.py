@@ -367,7 +367,8 @@ def remove_if_done(log: Path) -> None:
         is_over = not is_open or log in _read(_journal_of(log)).full
     except UnreadableFile:
         return
-    if is_over and not any(each.is_in_flight for each in recordings):
+    # Finished from the first to the last, so the last is the most likely to be in flight.
+    if is_over and not any(each.is_in_flight for each in reversed(recordings)):
         remove_log(log)
 
 
