@@ -5,6 +5,9 @@ from __future__ import annotations
 
 import base64
 import json
+import signal
+import subprocess
+import sys
 import threading
 import urllib.error
 import urllib.parse
@@ -120,3 +123,17 @@ def test_nothing_is_served_without_the_token(view: LiveView) -> None:
         ask(view, "/motion", episode="../secret.h5")
     with pytest.raises(urllib.error.HTTPError, match="501"):
         urllib.request.urlopen(view.url, data=b"{}")
+
+
+@pytest.mark.usefixtures("run", "default_signals")
+def test_ctrl_c_ends_the_command(tmp_path: Path) -> None:
+    """It prints its address, answers, and leaves with status 0 and without an error."""
+    command = [sys.executable, "-m", "mjrec", "view", str(tmp_path)]
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    with subprocess.Popen(command, **pipes) as process:
+        assert process.stdout is not None
+        url = process.stdout.readline().strip()
+        assert urllib.request.urlopen(url.replace("/?", "/episodes?")).status == 200
+        process.send_signal(signal.SIGINT)
+        _, errors = process.communicate(timeout=60)
+    assert (process.returncode, errors) == (0, "")

@@ -65,6 +65,16 @@ _SOFT = """
 </mujoco>
 """
 
+_ROPE = """
+<mujoco>
+  <worldbody>
+    <geom type="sphere" size=".1"/>
+    <flexcomp name="rope" type="grid" dim="1" count="4 1 1" spacing=".1 .1 .1"
+      pos="0 0 1" radius=".01" mass=".1"/>
+  </worldbody>
+</mujoco>
+"""
+
 _BOX = """
 <mujoco>
   <asset>
@@ -443,6 +453,19 @@ def test_states_that_are_no_numbers_are_left_out(cheetah: Path, tmp_path: Path) 
     trajectory.states[-1] = np.nan
     made = mjrec.write_replay(trajectory, tmp_path / "page.html")
     assert made.states == _STEPS
+
+
+def test_the_page_says_what_it_does_not_show(tmp_path: Path, caplog: Any) -> None:
+    """A rope has no surface; the result, the log and the page say so."""
+    model, out = tmp_path / "rope.xml", tmp_path / "run"
+    model.write_text(_ROPE)
+    arguments = ["--out", str(out), "--max-steps", "2", "--workers", "0"]
+    assert main(["record", str(model), "--policy", "zero", *arguments]) == 0
+    [path] = out.glob("*.h5")
+    made = mjrec.write_replay(mjrec.load_trajectory(path), tmp_path / "page.html")
+    assert made.notes == ("One-dimensional flexible bodies are not shown.",)
+    assert made.notes[0] in caplog.text
+    assert f"<p>{made.notes[0]}</p>" in made.path.read_text()
 
 
 @pytest.mark.thorough
