@@ -3,6 +3,7 @@
 
 import json
 import os
+import shutil
 from pathlib import Path
 
 import pytest
@@ -65,6 +66,17 @@ def test_all_of_an_episode_has_a_second_name(video, monkeypatch, has_hard_links)
     give_second_names(video)
     clear_monitor_files(video.parent)
     assert list(video.parent.iterdir()) == []
+
+
+def test_a_copy_without_hard_links_is_not_another_file(video, tmp_path, caplog):
+    """A copied directory needs no warning, and new videos replace the copies."""
+    give_second_names(video)
+    copied = tmp_path / "copy"
+    shutil.copytree(tmp_path, copied)
+    give_all_second_names(copied)
+    assert not caplog.records
+    take_second_names(copied / video.name)
+    assert seconds(copied) == []
 
 
 def test_somebody_elses_file_stays(video, caplog):

@@ -13,6 +13,7 @@ replaced nor removed.
 from __future__ import annotations
 
 import contextlib
+import filecmp
 import itertools
 import logging
 import os
@@ -115,7 +116,11 @@ def _link(file: Path, link: Path) -> None:
 
 
 def _is_same(file: Path, link: Path) -> bool:
+    """Return whether a name is a link to a file, or a copy of it.
+
+    Where a directory is copied without its hard links, they become copies.
+    """
     try:
-        return link.samefile(file)
+        return link.samefile(file) or filecmp.cmp(file, link, shallow=False)
     except OSError:
         return False

@@ -367,7 +367,7 @@ def remove_if_done(log: Path) -> None:
         is_over = not is_open or log in _read(_journal_of(log)).full
     except UnreadableFile:
         return
-    # Finished from the first to the last, so the last is the most likely to be in flight.
+    # From the last, because the first recordings are finished first.
     if is_over and not any(each.is_in_flight for each in reversed(recordings)):
         remove_log(log)
 
