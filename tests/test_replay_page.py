@@ -113,6 +113,15 @@ _VERTICES = """(name, kind = "position") => {
   return found;
 }"""
 _NORMALS = f"(name) => ({_VERTICES})(name, 'normal')"
+# What the page writes on its curve from now on.
+_NOTE_TEXT = """() => {
+  window.drawnText = [];
+  const context = CanvasRenderingContext2D.prototype, write = context.fillText;
+  context.fillText = function (text, ...rest) {
+    window.drawnText.push(text);
+    write.call(this, text, ...rest);
+  };
+}"""
 _SIZES = """(names) => names.map((name) => {
   return window.__viserMutable.nodeRefFromName[name].scale.toArray();
 })"""
@@ -255,6 +264,25 @@ def test_keys_go_through_the_states(page: Page, cheetah: Path) -> None:
     assert page.inner_text("#replay-ending") == "Episode truncated"
     assert page.evaluate("location.hash") == "#step=12&camera=track&speed=2"
     check_geoms(page, data_at(trajectory, _STEPS))
+
+
+@pytest.mark.browser
+def test_the_curve_tells_the_step_under_the_cursor(page: Page, cheetah: Path) -> None:
+    """Pointing shows a step's reward and return, a click goes to it."""
+    rewards = mjrec.load_trajectory(cheetah).rewards
+    page.evaluate(_NOTE_TEXT)
+    curve = page.locator("#replay-curve")
+    width = curve.bounding_box()["width"]
+    place = {"x": width * 3 / _STEPS, "y": 5}
+    curve.hover(position=place)
+    told = page.evaluate("window.drawnText")[-1]
+    assert "step 3 of 12" in told
+    assert float(told.split("reward ")[1].split(",")[0]) == pytest.approx(
+        rewards[2], rel=1e-3
+    )
+    assert float(told.split("return ")[1]) == pytest.approx(rewards[:3].sum(), rel=1e-3)
+    curve.click(position=place)
+    assert page.inner_text("#replay-where") == told
 
 
 @pytest.mark.browser
