@@ -285,7 +285,8 @@ def _reader_of(
     facts = bytes(_attribute(attributes, "facts", "S"))
     if zlib.crc32(facts) != _attribute(attributes, "crc32", "iu"):
         raise ValueError("its facts are damaged")
-    there = [part for part in PARTS if part == "state" or f"{part}s" in {*file}]
+    names = {*file}
+    there = [part for part in PARTS if part == "state" or f"{part}s" in names]
     datasets = {part: _dataset(file, f"{part}s") for part in there}
     columns = {name: _column(file, name, kind) for name, kind in _COLUMNS.items()}
     rows, steps = len(datasets["state"]), len(columns["rewards"])
