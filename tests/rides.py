@@ -5,8 +5,6 @@ A camera rides over an infinite plane, which is drawn around the camera of the f
 before; on the way the terrain, a texture and a colour change.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any, NamedTuple
 

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Monitors that record states and leave the frames to other processes."""
 
-from __future__ import annotations
-
 import contextlib
 import copy
 import gc

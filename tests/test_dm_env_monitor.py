@@ -12,11 +12,7 @@ from dm_env import test_utils as dm_env_test_utils  # noqa: E402  after importor
 from recordings import frames_in, journal_of, metadata_of  # noqa: E402  after importorskip
 
 import mjrec  # noqa: E402  after importorskip
-from mjrec import (  # noqa: E402  after importorskip
-    InvalidArgument,
-    NoPictures,
-    ResetNotAllowed,
-)
+from mjrec import InvalidArgument, NoPictures, ResetNotAllowed  # noqa: E402  after importorskip
 
 pytestmark = pytest.mark.dm_control
 

@@ -12,11 +12,7 @@ from full_disk import file_size_limit
 
 from mjrec.errors import ClosedError, FileNotWritten, UnreadableFile
 from mjrec.formats import journal
-from mjrec.formats.journal import (
-    JournalEntry,
-    JournalWriter,
-    read_journal,
-)
+from mjrec.formats.journal import JournalEntry, JournalWriter, read_journal
 
 ENTRY = JournalEntry(
     episode_id=3,

@@ -1,15 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Recordings in a monitor's row logs are there whatever becomes of the process."""
 
-from __future__ import annotations
-
 import itertools
 import os
 import signal
 import struct
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -18,18 +15,13 @@ from processes import forked, kill_self
 from random_rows import ACTION, DTYPE, FACTS, INFIX, NAME, STATE, check, write
 from recordings import add_facts, drop
 from trajectories_by_hand import add_row, new_logs
-from trajectory_contents import TrajectoryContent, content_of
+from trajectory_contents import content_of
 
 from mjrec.errors import FileNotWritten, InvalidArgument, UnreadableFile
 from mjrec.formats import row_log, span_writer, spans
 from mjrec.formats.locks import Lock
-from mjrec.formats.monitor_directory import (
-    journal_name,
-    lock_name,
-    trajectory_prefix,
-)
-from mjrec.formats.row_log import TAIL_HEAD, RowLog, tail_path
-from mjrec.formats.span_writer import SpanLogs
+from mjrec.formats.monitor_directory import journal_name, lock_name, trajectory_prefix
+from mjrec.formats.row_log import TAIL_HEAD, tail_path
 from mjrec.formats.spans import (
     is_in_flight,
     log_paths,
@@ -44,39 +36,39 @@ ROW, CAPACITY = DTYPE.itemsize, 8
 
 
 @pytest.fixture
-def path(tmp_path: Path) -> Path:
+def path(tmp_path):
     """The file that the recording will be."""
     return tmp_path / f"{NAME}.h5"
 
 
 @pytest.fixture
-def logs(tmp_path: Path) -> SpanLogs:
+def logs(tmp_path):
     """Logs whose tails hold eight rows."""
     return new_logs(tmp_path, INFIX, tail_bytes=CAPACITY * ROW)
 
 
-def read(path: Path) -> TrajectoryContent:
+def read(path):
     with open_recording(path) as reader:
         return content_of(reader)
 
 
-def episode(directory: Path, number: int) -> Path:
+def episode(directory, number):
     return directory / f"{trajectory_prefix(INFIX, number)}.h5"
 
 
-def files_of(directory: Path) -> tuple[Path, Path, Path, Path]:
+def files_of(directory):
     """Return the journal, and the only log there is, its tail and its changes."""
     [log] = log_paths(directory)
     journal = directory / journal_name(INFIX)
     return journal, log, tail_path(log), log.with_suffix(".looks")
 
 
-def change(step: int, **fields: Any) -> ModelChange:
+def change(step, **fields):
     return ModelChange(step=step, fields=fields or {"a": np.ones(2)})
 
 
 @pytest.fixture(params=["a mapped tail", "no tail"])
-def mapped(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> bool:
+def mapped(request, monkeypatch):
     """Whether the file system has mappings that outlive a process."""
     is_mapped = bool(request.param == "a mapped tail")
     monkeypatch.setattr(row_log, "_may_be_mapped", lambda _: is_mapped)
@@ -87,8 +79,8 @@ def mapped(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> b
 
 
 def test_rows_are_there_when_they_are_counted_and_when_all_is_closed(
-    logs: SpanLogs, path: Path, mapped: bool
-) -> None:
+    logs, path, mapped
+):
     """Wherever the tail wraps, also for an open reader; then there is the log alone."""
     span = write(logs, 2)
     found, log, tail, _ = files_of(path.parent)
@@ -106,9 +98,7 @@ def test_rows_are_there_when_they_are_counted_and_when_all_is_closed(
     assert sorted(path.parent.iterdir()) == sorted([found, log])
 
 
-def test_recordings_of_one_log_come_back_bit_for_bit(
-    logs: SpanLogs, tmp_path: Path
-) -> None:
+def test_recordings_of_one_log_come_back_bit_for_bit(logs, tmp_path):
     """Each has its own rows and facts, ended or not; the last is written still."""
     lengths = [3, 0, 17, 40, 2]
     said = [{**FACTS, "number": 0}, {"number": 1}, {}, {**FACTS, "seed": 8}, FACTS]
@@ -128,7 +118,7 @@ def test_recordings_of_one_log_come_back_bit_for_bit(
         logs.close()
 
 
-def test_model_changes_come_back(logs: SpanLogs, path: Path) -> None:
+def test_model_changes_come_back(logs, path):
     """Names, kinds and values; of a row that was never counted there is none."""
     fields = {
         "geom_rgba": np.arange(8, dtype=np.float32).reshape(2, 4),
@@ -158,9 +148,7 @@ def test_model_changes_come_back(logs: SpanLogs, path: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "values"), [("a", np.array(["text"])), ("a/b", np.zeros(1))]
 )
-def test_what_no_file_can_hold_is_refused(
-    logs: SpanLogs, path: Path, name: str, values: Any
-) -> None:
+def test_what_no_file_can_hold_is_refused(logs, path, name, values):
     """As a change of the model, after which the log goes on, and as a row."""
     span = write(logs, 3)
     with pytest.raises(InvalidArgument, match="cannot be recorded"):
@@ -171,11 +159,11 @@ def test_what_no_file_can_hold_is_refused(
         row_dtype(snapshot=packed([(name, (values.dtype, (1,)))]))
 
 
-def test_a_reader_beside_a_writer_sees_whole_recordings(tmp_path: Path) -> None:
+def test_a_reader_beside_a_writer_sees_whole_recordings(tmp_path):
     """With all changes of the model, though the tail wraps with every fourth row."""
     path, enough = episode(tmp_path, 0), tmp_path / "enough"
 
-    def record() -> None:
+    def record():
         logs = new_logs(tmp_path, INFIX, tail_bytes=1)
         span = logs.begin(path.stem, {}, row_dtype(state=STATE))
         step = 0
@@ -218,22 +206,22 @@ def test_a_reader_beside_a_writer_sees_whole_recordings(tmp_path: Path) -> None:
 # --- a process that is killed, a machine that crashes --------------------------------
 
 
-def killed_in_the_middle_of_a_write(rows: RowLog) -> None:
+def killed_in_the_middle_of_a_write(rows):
     """With some rows of a full tail in the log, and half of one."""
     if rows.count == 3 * CAPACITY:
         kill_after_writing(lambda data: data[: len(data) // 2 - 3])
 
 
-def killed_after_a_write(rows: RowLog) -> None:
+def killed_after_a_write(rows):
     """With a full tail in the log, which nobody has taken note of."""
     if rows.count == 3 * CAPACITY:
         kill_after_writing(lambda data: data)
 
 
-def kill_after_writing(part: Callable[[memoryview], memoryview]) -> None:
+def kill_after_writing(part):
     real = os.pwrite
 
-    def pwrite(descriptor: int, data: memoryview, offset: int) -> int:
+    def pwrite(descriptor, data, offset):
         real(descriptor, part(data), offset)
         kill_self()
         return 0
@@ -241,7 +229,7 @@ def kill_after_writing(part: Callable[[memoryview], memoryview]) -> None:
     os.pwrite = pwrite
 
 
-def killed_in_the_next_slot(rows: RowLog) -> None:
+def killed_in_the_next_slot(rows):
     """When the first slot of a tail that was written is filled again."""
     if rows.count == 3 * CAPACITY:
         rows.make_room()
@@ -249,7 +237,7 @@ def killed_in_the_next_slot(rows: RowLog) -> None:
         kill_self()
 
 
-def killed_in_a_close(rows: RowLog) -> None:
+def killed_in_a_close(rows):
     """With all rows in the log, before the tail is removed."""
     if rows.count == 3 * CAPACITY + 2:
         Path.unlink = kill_self  # type: ignore[method-assign]
@@ -263,12 +251,10 @@ MOMENTS = [
 
 
 @pytest.mark.parametrize("moment", MOMENTS)
-def test_a_killed_process_loses_no_counted_row(
-    logs: SpanLogs, path: Path, mapped: bool, moment: Callable[[RowLog], None]
-) -> None:
+def test_a_killed_process_loses_no_counted_row(logs, path, mapped, moment):
     """At any moment; nothing was flushed, and no signal's handler was called."""
 
-    def record(tell: Callable[[], object]) -> None:
+    def record(tell):
         span = write(logs, 0)
         for step in itertools.count(1):
             moment(span.log)
@@ -287,15 +273,13 @@ class Interrupt(BaseException):
 
 
 @pytest.mark.parametrize("written", [0, 5, 8 * ROW])
-def test_an_interrupted_write_is_taken_up_again(
-    logs: SpanLogs, path: Path, monkeypatch: pytest.MonkeyPatch, written: int
-) -> None:
+def test_an_interrupted_write_is_taken_up_again(logs, path, monkeypatch, written):
     """After Ctrl-C at any byte of it; each row is there once."""
     last = 2 * CAPACITY - 1
     span = write(logs, last)
     real = os.pwrite
 
-    def pwrite(descriptor: int, data: memoryview, offset: int) -> int:
+    def pwrite(descriptor, data, offset):
         monkeypatch.undo()
         real(descriptor, data[:written], offset)
         raise Interrupt
@@ -318,9 +302,7 @@ HEADS = {
 
 
 @pytest.mark.parametrize("head", HEADS)
-def test_a_tail_of_something_else_is_passed_over(
-    logs: SpanLogs, path: Path, head: str
-) -> None:
+def test_a_tail_of_something_else_is_passed_over(logs, path, head):
     """What it says would lead beyond it, or to rows of another size."""
     write(logs, 4)
     _, _, tail, _ = files_of(path.parent)
@@ -333,11 +315,11 @@ def test_a_tail_of_something_else_is_passed_over(
     assert content.dropped == 0
 
 
-def kill_in_line(number: int, part: Callable[[bytes], bytes]) -> None:
+def kill_in_line(number, part):
     """Have this process die in the writing of a line of the journal."""
     real, lines = os.write, itertools.count(1)
 
-    def write_part(descriptor: int, data: bytes) -> int:
+    def write_part(descriptor, data):
         if next(lines) < number:
             return real(descriptor, data)
         real(descriptor, part(data))
@@ -358,12 +340,12 @@ PARTS: dict[str, Callable[[bytes], bytes]] = {
 @pytest.mark.parametrize("part", PARTS)
 @pytest.mark.parametrize("line", range(1, 6))
 def test_a_process_killed_in_a_line_of_the_journal_loses_nothing_else(
-    logs: SpanLogs, tmp_path: Path, line: int, part: str
-) -> None:
+    logs, tmp_path, line, part
+):
     """What was recorded before is there; what was being said is said or is not."""
     lines = ["rows", "begin 0", "end 0", "begin 1", "end 1"]
 
-    def record(tell: Callable[[], object]) -> None:
+    def record(tell):
         kill_in_line(line, PARTS[part])
         for number in range(2):
             span = write(logs, 5, episode=number)
@@ -394,9 +376,7 @@ def test_a_process_killed_in_a_line_of_the_journal_loses_nothing_else(
     assert [path.suffix for path in tmp_path.iterdir()] == [".jsonl"]
 
 
-def test_lost_rows_of_an_ended_recording_are_counted(
-    logs: SpanLogs, path: Path
-) -> None:
+def test_lost_rows_of_an_ended_recording_are_counted(logs, path):
     """Cut at every word; the journal says how many rows there were."""
     write(logs, 5).end({"complete": True})
     write(logs, 5, episode=28).end({"complete": True})
@@ -411,7 +391,7 @@ def test_lost_rows_of_an_ended_recording_are_counted(
 
 
 @pytest.mark.parametrize("stale", ["zeros", "an older tail", "zeros behind the head"])
-def test_a_stale_tail_ends_a_recording(logs: SpanLogs, path: Path, stale: str) -> None:
+def test_a_stale_tail_ends_a_recording(logs, path, stale):
     """Its pages are older than the log, or never were written: no row is invented."""
     span = write(logs, 12)
     _, _, tail, _ = files_of(path.parent)
@@ -428,9 +408,7 @@ def test_a_stale_tail_ends_a_recording(logs: SpanLogs, path: Path, stale: str) -
     assert content.dropped == (3 if stale == "zeros behind the head" else 0)
 
 
-def test_a_log_that_changes_while_it_is_read_is_an_error(
-    logs: SpanLogs, path: Path
-) -> None:
+def test_a_log_that_changes_while_it_is_read_is_an_error(logs, path):
     """Never rows of something else."""
     write(logs, 30)
     logs.close()
@@ -447,9 +425,7 @@ def test_a_log_that_changes_while_it_is_read_is_an_error(
 # --- a full disk ---------------------------------------------------------------------
 
 
-def test_a_full_disk_when_a_log_is_made_leaves_nothing(
-    logs: SpanLogs, path: Path
-) -> None:
+def test_a_full_disk_when_a_log_is_made_leaves_nothing(logs, path):
     """Its tail finds no room, or the journal; with room again it is begun."""
     for room in (0, 100, 4096):
         with file_size_limit(room), pytest.raises(FileNotWritten, match=r"openaigym\."):
@@ -460,9 +436,7 @@ def test_a_full_disk_when_a_log_is_made_leaves_nothing(
 
 
 @pytest.mark.parametrize("room", [0, 30])
-def test_what_a_full_disk_did_not_let_be_said_is_said_later(
-    logs: SpanLogs, path: Path, room: int
-) -> None:
+def test_what_a_full_disk_did_not_let_be_said_is_said_later(logs, path, room):
     """The journal stays as it was; an end may stand behind the next beginning."""
     span = write(logs, 3)
     found, *_ = files_of(path.parent)
@@ -486,9 +460,7 @@ def test_what_a_full_disk_did_not_let_be_said_is_said_later(
     check(read(episode(path.parent, 28)), 5)
 
 
-def test_a_full_disk_costs_no_step_that_was_recorded(
-    logs: SpanLogs, path: Path, mapped: bool
-) -> None:
+def test_a_full_disk_costs_no_step_that_was_recorded(logs, path, mapped):
     """The step that finds no room is refused, or kept in memory where none is mapped.
 
     With room again all goes on.
@@ -509,7 +481,7 @@ def test_a_full_disk_costs_no_step_that_was_recorded(
     check(read(path), recorded + 8)
 
 
-def test_a_change_on_a_full_disk_can_be_added_again(logs: SpanLogs, path: Path) -> None:
+def test_a_change_on_a_full_disk_can_be_added_again(logs, path):
     """The error names the file; what was added before stays, and nothing of this."""
     span = write(logs, 1)
     span.log.add_change(change(2))
@@ -531,9 +503,7 @@ def test_a_change_on_a_full_disk_can_be_added_again(logs: SpanLogs, path: Path) 
 # --- logs and what is in them --------------------------------------------------------
 
 
-def test_a_log_ends_where_the_next_rows_do_not_belong(
-    logs: SpanLogs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_log_ends_where_the_next_rows_do_not_belong(logs, tmp_path, monkeypatch):
     """Of another kind, to be deleted alone, or behind many; changes count as rows."""
     other = row_dtype(state=STATE, action=np.dtype(("<i4", ACTION.shape)))
     monkeypatch.setattr(span_writer, "_LONG", 10 * ROW)
@@ -555,9 +525,7 @@ def test_a_log_ends_where_the_next_rows_do_not_belong(
     check(read(episode(tmp_path, 4)), 0, dtype=other)
 
 
-def test_a_log_of_which_nothing_is_needed_is_removed(
-    logs: SpanLogs, tmp_path: Path
-) -> None:
+def test_a_log_of_which_nothing_is_needed_is_removed(logs, tmp_path):
     """With its files, when the last of its recordings is dropped, a file, a video."""
     write(logs, 3, episode=0).log.add_change(change(4))
     video = {"kept": False, "video": {"name": "v.mp4"}}
@@ -580,9 +548,7 @@ def test_a_log_of_which_nothing_is_needed_is_removed(
     assert list(tmp_path.glob("openaigym.states.*")) == []
 
 
-def test_a_log_that_an_open_monitor_writes_is_not_removed(
-    logs: SpanLogs, path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_log_that_an_open_monitor_writes_is_not_removed(logs, path, monkeypatch):
     """Its next recording goes there; also one that begins while it is looked at."""
     lock = Lock(path.parent / lock_name(INFIX), "")
     write(logs, 3)
@@ -590,7 +556,7 @@ def test_a_log_that_an_open_monitor_writes_is_not_removed(
     _, log, *_ = files_of(path.parent)
     real = spans._is_open
 
-    def record_late(name: Path) -> bool:
+    def record_late(name):
         write(logs, 5, episode=28).end({"complete": True})
         logs.release()
         lock.release()
@@ -606,9 +572,7 @@ def test_a_log_that_an_open_monitor_writes_is_not_removed(
 
 
 @pytest.mark.parametrize("more", [-1, 1])
-def test_a_journal_by_the_name_of_one_that_was_removed_is_another(
-    tmp_path: Path, more: int
-) -> None:
+def test_a_journal_by_the_name_of_one_that_was_removed_is_another(tmp_path, more):
     """As where `force` empties a directory; shorter or longer."""
     for number in range(4):
         logs, count = new_logs(tmp_path, INFIX), 4 + more * number
@@ -624,8 +588,8 @@ def test_a_journal_by_the_name_of_one_that_was_removed_is_another(
 
 
 def test_files_that_are_removed_while_they_are_written_cost_one_recording(
-    logs: SpanLogs, tmp_path: Path
-) -> None:
+    logs, tmp_path
+):
     """The next one begins another log and another journal, which says all again."""
     write(logs, 3, episode=0)
     for file in files_of(tmp_path):
@@ -639,7 +603,7 @@ def test_files_that_are_removed_while_they_are_written_cost_one_recording(
     check(read(episode(tmp_path, 2)), 3)
 
 
-def test_facts_that_no_line_holds_are_cut_off(logs: SpanLogs, path: Path) -> None:
+def test_facts_that_no_line_holds_are_cut_off(logs, path):
     """Of the options; what comes behind is read as ever."""
     write(logs, 3, facts={"options": "x" * (1 << 24), "seed": 7})
     write(logs, 3, episode=28, facts={"seed": 8})
@@ -647,7 +611,7 @@ def test_facts_that_no_line_holds_are_cut_off(logs: SpanLogs, path: Path) -> Non
     assert read(episode(path.parent, 28)).facts == {"seed": 8}
 
 
-def test_rows_of_a_newer_version_are_no_rows(logs: SpanLogs, path: Path) -> None:
+def test_rows_of_a_newer_version_are_no_rows(logs, path):
     """They stay, and are told of where they are asked for."""
     write(logs, 3)
     journal, log, *_ = files_of(path.parent)
@@ -661,9 +625,7 @@ def test_rows_of_a_newer_version_are_no_rows(logs: SpanLogs, path: Path) -> None
 
 
 @pytest.mark.parametrize("is_gone", [True, False])
-def test_rows_that_no_journal_has_stay(
-    logs: SpanLogs, path: Path, is_gone: bool
-) -> None:
+def test_rows_that_no_journal_has_stay(logs, path, is_gone):
     """In the tail as in the log; the journal is gone, or its lines are damaged."""
     write(logs, 3)
     journal, log, *_ = files_of(path.parent)

@@ -1,10 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Actions and observations become arrays of one kind, with every value kept."""
 
-from __future__ import annotations
-
-from typing import Any
-
 import numpy as np
 import pytest
 
@@ -25,7 +21,7 @@ from mjrec.recorder.step_arrays import action_array, step_array
         ({"b": [1, 2], "a": np.float32(3)}, np.dtype(("<f8", (3,)))),
     ],
 )
-def test_a_kind_keeps_every_value(example: Any, kind: Any) -> None:
+def test_a_kind_keeps_every_value(example, kind):
     """Floats are float64 and integers int64; frames stay as they are."""
     array = step_array(example)
     assert array is not None
@@ -37,12 +33,12 @@ def test_a_kind_keeps_every_value(example: Any, kind: Any) -> None:
 
 
 @pytest.mark.parametrize("example", [None, "left", [[1], [1, 2]], {}, {"a": "b"}, 1j])
-def test_what_no_array_holds_is_not_recorded(example: Any) -> None:
+def test_what_no_array_holds_is_not_recorded(example):
     """Nothing is made of it."""
     assert step_array(example) is None
 
 
-def test_actions_may_begin_with_whole_numbers() -> None:
+def test_actions_may_begin_with_whole_numbers():
     """A single one is a choice and stays an integer; several are float64."""
     kinds = [action_array(example) for example in (3, [0, 0], np.zeros(2, np.int64))]
     assert [kind and kind.kind.base for kind in kinds] == ["<i8", "<f8", "<f8"]
@@ -61,7 +57,7 @@ def test_actions_may_begin_with_whole_numbers() -> None:
         ({"a": [1.0], "b": 2.0}, {"b": 2.0, "a": [1.0]}, [1.0, 2.0]),
     ],
 )
-def test_an_odd_one_is_held_as_zeros(example: Any, like: Any, odd: Any) -> None:
+def test_an_odd_one_is_held_as_zeros(example, like, odd):
     """In the same memory, from which rows are gathered; and then goes on."""
     array = step_array(example)
     assert array is not None

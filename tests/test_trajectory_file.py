@@ -1,32 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
 """A finished trajectory holds what its log held, for mjrec and for plain h5py."""
 
-from __future__ import annotations
-
 import math
 import re
 import signal
 import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import h5py
 import numpy as np
 import pytest
 from full_disk import file_size_limit
-from random_rows import (
-    DTYPE,
-    FACTS,
-    INFIX,
-    NAME,
-    SNAPSHOT,
-    STATE,
-    check,
-    write,
-)
+from random_rows import DTYPE, FACTS, INFIX, NAME, SNAPSHOT, STATE, check, write
 from trajectories_by_hand import new_logs
-from trajectory_contents import TrajectoryContent, content_of
+from trajectory_contents import content_of
 
 import mjrec.formats.trajectory_file as trajectory_file
 from mjrec.errors import FileNotWritten, UnreadableFile
@@ -54,17 +42,17 @@ CHANGES = (
 
 
 @pytest.fixture
-def path(tmp_path: Path) -> Path:
+def path(tmp_path):
     """The file of the episode, which is not there yet."""
     return tmp_path / f"{NAME}.h5"
 
 
-def files_in(directory: Path) -> list[str]:
+def files_in(directory):
     """Return the names of the files there but the journal."""
     return [path.name for path in directory.iterdir() if path.suffix != ".jsonl"]
 
 
-def record(path: Path, steps: int = 40, *, ended: bool = True, **more: Any) -> None:
+def record(path, steps=40, *, ended=True, **more):
     """Record an episode whose model changes in its first step."""
     logs = new_logs(path.parent, INFIX)
     span = write(logs, -1, **more)
@@ -77,12 +65,12 @@ def record(path: Path, steps: int = 40, *, ended: bool = True, **more: Any) -> N
     logs.close()
 
 
-def read(path: Path) -> TrajectoryContent:
+def read(path):
     with open_trajectory(path) as reader:
         return content_of(reader)
 
 
-def check_changes(content: TrajectoryContent) -> None:
+def check_changes(content):
     assert [each.step for each in content.model_changes] == [0, 1]
     for change, expected in zip(content.model_changes, CHANGES, strict=True):
         assert sorted(change.fields) == sorted(expected.fields)
@@ -102,9 +90,7 @@ def check_changes(content: TrajectoryContent) -> None:
         (3, 2, row_dtype(snapshot=SNAPSHOT)),
     ],
 )
-def test_the_finished_file_holds_what_the_log_held(
-    path: Path, steps: int, every: int, dtype: np.dtype[Any]
-) -> None:
+def test_the_finished_file_holds_what_the_log_held(path, steps, every, dtype):
     """Bit for bit, NaNs with their payloads; what is not recorded is not there."""
     facts = {**FACTS, "long": "x" * 10**5}
     record(path, steps, every=every, dtype=dtype, facts=facts)
@@ -117,7 +103,7 @@ def test_the_finished_file_holds_what_the_log_held(
         check_changes(content)
 
 
-def test_an_episode_that_was_killed_says_so(path: Path) -> None:
+def test_an_episode_that_was_killed_says_so(path):
     """Also before its first row."""
     for steps in (-1, 12):
         record(path, steps, ended=False)
@@ -129,7 +115,7 @@ def test_an_episode_that_was_killed_says_so(path: Path) -> None:
         path.unlink()
 
 
-def test_plain_h5py_finds_every_array_by_its_name(path: Path) -> None:
+def test_plain_h5py_finds_every_array_by_its_name(path):
     """With the format of HDF5 1.10, and no filter that is not built in."""
     record(path)
     content = read(path)
@@ -157,9 +143,7 @@ def test_plain_h5py_finds_every_array_by_its_name(path: Path) -> None:
     assert path.read_bytes()[8] == 3
 
 
-def test_the_example_of_the_specification_runs(
-    path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_example_of_the_specification_runs(path, monkeypatch, capsys):
     """What docs/reference/trajectories.md shows a stranger works on a real file."""
     record(path)
     finish_trajectory(path).rename(path.with_name("episode.h5"))
@@ -176,13 +160,11 @@ def test_the_example_of_the_specification_runs(
     assert capsys.readouterr().out == "episode000027 7 (41, 2)\n"
 
 
-def test_what_is_finished_meanwhile_is_read(
-    path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_is_finished_meanwhile_is_read(path, monkeypatch):
     """Who finds it in flight gets what it has become; an open reader keeps its log."""
     real = trajectory_file.open_recording
 
-    def open_late(name: Path) -> Any:
+    def open_late(name):
         monkeypatch.undo()
         finish_trajectory(name)
         return real(name)
@@ -200,7 +182,7 @@ def test_what_is_finished_meanwhile_is_read(
         path.unlink()
 
 
-def test_nothing_to_finish_is_one_clear_error(path: Path) -> None:
+def test_nothing_to_finish_is_one_clear_error(path):
     """Neither log nor file; or a log that cannot be read, which stays."""
     with pytest.raises(UnreadableFile, match=r"\.h5: neither the file nor its log"):
         finish_trajectory(path)
@@ -214,7 +196,7 @@ def test_nothing_to_finish_is_one_clear_error(path: Path) -> None:
 
 
 @pytest.mark.parametrize("room", [0, 700, 5000])
-def test_a_full_disk_leaves_the_log_and_nothing_else(path: Path, room: int) -> None:
+def test_a_full_disk_leaves_the_log_and_nothing_else(path, room):
     """One error that names the file; with room again it succeeds."""
     record(path)
     with (
@@ -230,7 +212,7 @@ def test_a_full_disk_leaves_the_log_and_nothing_else(path: Path, room: int) -> N
 LONG = row_dtype(snapshot=packed([("geom_xpos", ("<f8", (5000,)))]))
 
 
-def test_memory_does_not_grow_with_the_episode(path: Path) -> None:
+def test_memory_does_not_grow_with_the_episode(path):
     """What was written is in the file, and not in memory as well."""
     record(path, 600, dtype=LONG)
     tracemalloc.start()
@@ -242,14 +224,12 @@ def test_memory_does_not_grow_with_the_episode(path: Path) -> None:
 
 
 @pytest.mark.usefixtures("default_signals")
-def test_ctrl_c_leaves_the_log_and_nothing_else(
-    path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_ctrl_c_leaves_the_log_and_nothing_else(path, monkeypatch):
     """Also between HDF5 and its file, where an exception would crash it."""
     record(path, 600, dtype=LONG)
     unfailing = trajectory_hdf5._Unfailing
 
-    def interrupted(self: Any, data: Any) -> int:
+    def interrupted(self, data):
         signal.raise_signal(signal.SIGINT)
         return usual(self, data)
 
@@ -262,20 +242,20 @@ def test_ctrl_c_leaves_the_log_and_nothing_else(
     finish_trajectory(path)
 
 
-def attribute(name: str, value: Any) -> Callable[[h5py.File], None]:
+def attribute(name, value):
     return lambda file: file.attrs.__setitem__(name, value)
 
 
-def dataset(name: str, *data: Any, **options: Any) -> Callable[[h5py.File], None]:
-    def replace(file: h5py.File) -> None:
+def dataset(name, *data, **options):
+    def replace(file):
         del file[name]
         file.create_dataset(name, *data, **options)
 
     return replace
 
 
-def link(name: str, target: Any) -> Callable[[h5py.File], None]:
-    def replace(file: h5py.File) -> None:
+def link(name, target):
+    def replace(file):
         del file[name]
         file[name] = target
 
@@ -307,7 +287,7 @@ HARM: dict[str, Callable[[h5py.File], None]] = {
 
 
 @pytest.mark.parametrize("reason", HARM)
-def test_a_file_of_another_making_is_refused(path: Path, reason: str) -> None:
+def test_a_file_of_another_making_is_refused(path, reason):
     """One clear error for each thing that is not as mjrec writes it."""
     record(path)
     finish_trajectory(path)
@@ -318,7 +298,7 @@ def test_a_file_of_another_making_is_refused(path: Path, reason: str) -> None:
     assert error.value.path == path
 
 
-def test_rewards_are_added_up_one_after_the_other() -> None:
+def test_rewards_are_added_up_one_after_the_other():
     """As a monitor does at each step, on every version of Python."""
     assert added_up([1e16, 1.0, -1e16]) == 0.0
     assert math.copysign(1, added_up([-0.0])) == 1

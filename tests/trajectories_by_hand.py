@@ -5,10 +5,8 @@ Frame k of one is a grey frame of brightness `grey(k)`, which `Painter` draws fr
 its snapshots, with a white pixel in a corner.
 """
 
-from __future__ import annotations
-
 import itertools
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +22,7 @@ from mjrec.formats.monitor_directory import (
     video_prefix,
 )
 from mjrec.formats.row_log import TAIL_BYTES
-from mjrec.formats.span_writer import SpanLogs, SpanWriter
+from mjrec.formats.span_writer import SpanLogs
 from mjrec.formats.spans import log_paths
 from mjrec.formats.trajectory import packed, row_dtype
 from mjrec.formats.trajectory_file import finish_trajectory, open_trajectory
@@ -38,7 +36,7 @@ GREY_ROWS = row_dtype(
 )
 
 
-def grey(frame: int) -> int:
+def grey(frame):
     """Return the brightness of a frame."""
     return 10 + 20 * frame
 
@@ -60,23 +58,14 @@ class Painter:
 
     gl_facts = {"gl_renderer": "a painter"}  # noqa: RUF012  as it is asked for
 
-    def __init__(
-        self, size: tuple[int, int] = (16, 24), *, plain: bool = False
-    ) -> None:
+    def __init__(self, size=(16, 24), *, plain=False):
         self.size = size
         self.plain = plain
         self.asked: list[tuple[Path, list[int], View]] = []
         self.tiles: list[Any] = []
         self.breaks_at: Callable[[Path, View, int], object] = lambda *_: None
 
-    def frames(
-        self,
-        trajectory: Path,
-        indices: Sequence[int],
-        view: View | None = None,
-        *,
-        cameras: Any = None,
-    ) -> Iterator[Any]:
+    def frames(self, trajectory, indices, view=None, *, cameras=None):
         view = view or View()
         self.asked.append((trajectory, list(indices), view))
         self.tiles.append(cameras)
@@ -92,16 +81,14 @@ class Painter:
                 frame[-1, -1] = 255
             yield frame
 
-    def start(self) -> None: ...
+    def start(self): ...
 
-    def rest(self) -> None: ...
+    def rest(self): ...
 
-    def close(self) -> None: ...
+    def close(self): ...
 
 
-def new_logs(
-    directory: Path, infix: str = INFIX, *, tail_bytes: int = TAIL_BYTES
-) -> SpanLogs:
+def new_logs(directory, infix=INFIX, *, tail_bytes=TAIL_BYTES):
     """Return what writes recordings beside those that others have written."""
     used = [log_number(path.name) or 0 for path in log_paths(directory, infix)]
     return SpanLogs(
@@ -113,7 +100,7 @@ def new_logs(
     )
 
 
-def add_row(span: SpanWriter, step: int, **values: Any) -> None:
+def add_row(span, step, **values):
     """Add a row whose columns are `values`; with a snapshot it is a frame's, too."""
     slot = span.make_room()
     commit = {
@@ -128,19 +115,19 @@ def add_row(span: SpanWriter, step: int, **values: Any) -> None:
 
 
 def write_log(
-    directory: Path,
-    episode_id: int = 0,
+    directory,
+    episode_id=0,
     *,
-    infix: str = INFIX,
-    steps: int = 4,
-    stride: int = 1,
-    frames: bool = True,
-    video: str | None = "deferred",
-    ended: bool = True,
-    over: bool | None = None,
-    fps: str | None = None,
-    **facts: Any,
-) -> Path:
+    infix=INFIX,
+    steps=4,
+    stride=1,
+    frames=True,
+    video="deferred",
+    ended=True,
+    over=None,
+    fps=None,
+    **facts,
+):
     """Record an episode at 20 steps a second; return the file that it would become.
 
     Where it has `ended`, its last words are there; where it is `over`, its last row
@@ -189,7 +176,7 @@ def write_log(
     return logs.path_of(name)
 
 
-def write_finished(directory: Path, episode_id: int = 0, **rest: Any) -> Path:
+def write_finished(directory, episode_id=0, **rest):
     """Write the finished trajectory of an episode, and nothing else."""
     note_models([directory_digest(directory)])
     path = finish_trajectory(write_log(directory, episode_id, **rest))
@@ -202,9 +189,7 @@ def write_finished(directory: Path, episode_id: int = 0, **rest: Any) -> Path:
     return path
 
 
-def write_pending_manifest(
-    directory: Path, *episode_ids: int, infix: str = INFIX, **rest: Any
-) -> Path:
+def write_pending_manifest(directory, *episode_ids, infix=INFIX, **rest):
     """Write the manifest of a closed monitor whose videos are all pending."""
     path = directory / manifest_name(infix)
     pending = [
