@@ -165,6 +165,7 @@ def no_process_is_left():
     """See that a test leaves no process that was not there before, zombies included."""
     before = children()
     yield
+    gc.collect()
     assert children() <= before
 
 

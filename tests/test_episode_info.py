@@ -27,36 +27,27 @@ def monitor(directory, env=None, **options):
 
 
 def test_last_step_has_what_gymnasium_gives(tmp_path):
-    """Keys, types and values are those of RecordEpisodeStatistics."""
+    """Keys, types and values are those of RecordEpisodeStatistics; its own stay."""
     theirs = RecordEpisodeStatistics(gymnasium.make("CartPole-v1"))
     expected = last_info(theirs)[-1]["episode"]
     with monitor(tmp_path, episode_info=True) as env:
         *before, last = last_info(env)
     assert not any("episode" in info for info in before)
-    assert list(last["episode"]) == list(expected) == ["r", "l", "t"]
-    assert (last["episode"]["r"], last["episode"]["l"]) == (
-        expected["r"],
-        expected["l"],
-    )
-    assert 0 < last["episode"]["t"] < 60
-
-
-def test_key_that_is_there_stays(tmp_path):
-    """The environment below, or a wrapper of it, has said it already."""
-    inner = RecordEpisodeStatistics(gymnasium.make("CartPole-v1"))
-    with monitor(tmp_path, inner, episode_info=True) as env:
+    episode = last["episode"]
+    assert list(episode) == list(expected) == ["r", "l", "t"]
+    assert (episode["r"], episode["l"]) == (expected["r"], expected["l"])
+    assert 0 < episode["t"] < 60
+    with monitor(tmp_path / "around", theirs, episode_info=True) as env:
         episode = last_info(env)[-1]["episode"]
-    assert episode["t"] == inner.time_queue[-1]
+    assert episode["t"] == theirs.time_queue[-1]
 
 
 def test_gymnasiums_own_goes_around_a_monitor(tmp_path):
     """It asserts that the key is absent, which is why it is off by default."""
     with monitor(tmp_path) as env:
         assert last_info(RecordEpisodeStatistics(env))[-1]["episode"]["l"] > 0
-    with (
-        monitor(tmp_path / "on", episode_info=True) as env,
-        pytest.raises(AssertionError),
-    ):
+    options = {"episode_info": True}
+    with monitor(tmp_path / "on", **options) as env, pytest.raises(AssertionError):
         last_info(RecordEpisodeStatistics(env))
 
 
@@ -75,9 +66,7 @@ def test_time_steps_have_no_info_to_add_to(tmp_path):
         ({}, None),
         ({"is_success": True}, True),
         ({"is_success": 0.0}, False),
-        ({"is_success": np.float32(1)}, True),
         ({"success": np.array([False])}, False),
-        ({"is_success": False, "success": True}, False),
         ({"is_success": None, "success": True}, True),
         ({"success": "no"}, None),
         ({"success": np.zeros(2)}, None),
