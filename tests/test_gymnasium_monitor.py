@@ -3,10 +3,10 @@ import threading
 import warnings
 
 import gymnasium
+import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
-from other_python import run_python
-from parts import parametrize
+from gymnasium.wrappers import RecordEpisodeStatistics
 from recordings import (
     frames_in,
     journal_of,
@@ -18,12 +18,7 @@ from recordings import (
 
 import mjrec
 from mjrec import ResetNeeded, ResetNotAllowed
-
-
-def finish_episode(env):
-    while not env.stats_recorder.done:
-        env.step(0)
-
+from mjrec.monitors.gymnasium_monitor import success_in
 
 BAR = [4, 8, 12, 16]
 
@@ -83,14 +78,13 @@ def test_video_and_its_metadata(corridor, tmp_path, play):
 
 @pytest.mark.parametrize("pop_frames", [True, False])
 def test_frame_collections_lose_and_double_nothing(
-    tmp_path, make_corridor, play, pop_frames
+    corridor, tmp_path, play, pop_frames
 ):
     """Whether or not RenderCollection forgets the frames it has given."""
-    env = gymnasium.wrappers.RenderCollection(make_corridor(), pop_frames=pop_frames)
+    env = gymnasium.wrappers.RenderCollection(corridor, pop_frames=pop_frames)
     with mjrec.Monitor(env, tmp_path) as env:
         play(env, 2)
-    for episode in (0, 1):
-        assert shown(tmp_path, episode) == BAR
+    assert shown(tmp_path, 0) == shown(tmp_path, 1) == BAR
 
 
 def test_write_upon_reset_writes_at_each_reset(make_corridor, tmp_path, play):
@@ -114,7 +108,8 @@ def test_wrong_use_is_refused(corridor, tmp_path, play):
         with pytest.raises(ResetNotAllowed, match="allow_early_reset=True"):
             env.reset()
         assert corridor.position == 1
-        finish_episode(env)
+        env.step(0)
+        env.step(0)
         with pytest.raises(ResetNeeded, match="after the end"):
             env.step(0)
         play(env, 1)
@@ -172,13 +167,6 @@ def test_check_env_passes(tmp_path):
 
 def test_environments_that_reset_themselves_begin_episodes(make_corridor, tmp_path):
     """In the step after the end; in that of the end, as gym's own, a frame is lost."""
-    env = gymnasium.wrappers.Autoreset(make_corridor())
-    with mjrec.Monitor(env, tmp_path / "next", lambda _: True) as env:
-        env.reset()
-        for _ in range(7):
-            env.step(0)
-    assert stats_of(tmp_path / "next")["episode_lengths"] == [3, 3]
-    assert shown(tmp_path / "next", 0) == shown(tmp_path / "next", 1) == BAR
 
     class Looping(make_corridor):
         metadata = make_corridor.metadata | {"semantics.autoreset": True}
@@ -189,13 +177,17 @@ def test_environments_that_reset_themselves_begin_episodes(make_corridor, tmp_pa
                 self.reset()
             return result
 
-    with mjrec.Monitor(Looping(), tmp_path / "same", lambda _: True) as env:
-        env.reset()
-        for _ in range(6):
-            env.step(0)
-    assert stats_of(tmp_path / "same")["episode_lengths"] == [3, 3]
-    assert shown(tmp_path / "same", 0) == shown(tmp_path / "same", 1) == BAR[:3]
-    assert metadata_of(tmp_path / "same", 0)["final_frame"] == "missing"
+    for env, steps, bar in (
+        (gymnasium.wrappers.Autoreset(make_corridor()), 7, BAR),
+        (Looping(), 6, BAR[:3]),
+    ):
+        with mjrec.Monitor(env, tmp_path, lambda _: True, force=True) as monitor:
+            monitor.reset()
+            for _ in range(steps):
+                monitor.step(0)
+        assert stats_of(tmp_path)["episode_lengths"] == [3, 3]
+        assert shown(tmp_path, 0) == shown(tmp_path, 1) == bar
+    assert metadata_of(tmp_path, 0)["final_frame"] == "missing"
 
 
 def test_close_in_mid_episode_keeps_the_video(make_corridor, tmp_path):
@@ -233,30 +225,6 @@ def test_garbage_collection_closes(corridor, tmp_path, play, thread):
     assert corridor.closed == 1
 
 
-LEAVING = """
-import sys
-import gymnasium, mjrec
-env = gymnasium.make("HalfCheetah-v5", render_mode="rgb_array", width=32, height=32)
-env = mjrec.Monitor(env, sys.argv[1], render="live")
-env.reset(seed=0)
-for _ in range(3):
-    env.step(env.action_space.sample())
-"""
-
-
-@parametrize(
-    ("how", "status"),
-    [("", 0), ("sys.exit(3)", 3), ("raise RuntimeError('on purpose')", 1)],
-    ids=["end", "exit", "exception"],
-)
-def test_leaving_the_interpreter_closes(tmp_path, how, status):
-    """Without close(): a live video, statistics and manifest, without noise."""
-    done = run_python(LEAVING + how, tmp_path, status=status)
-    assert len(frames_in(tmp_path, 0)) == 4
-    assert manifest_of(tmp_path)["videos"]
-    assert "Exception ignored" not in done.stderr
-
-
 def test_a_frame_that_fails_is_left_out(make_corridor, tmp_path):
     """The error goes through; the episode goes on, or is complete."""
 
@@ -268,11 +236,10 @@ def test_a_frame_that_fails_is_left_out(make_corridor, tmp_path):
 
     with mjrec.Monitor(Blinking(length=5), tmp_path) as env:
         env.reset()
-        for step in range(1, 6):
-            if step in (2, 5):
-                with pytest.raises(RuntimeError, match="on purpose"):
-                    env.step(0)
-            else:
+        for count in (1, 2):
+            for _ in range(count):
+                env.step(0)
+            with pytest.raises(RuntimeError, match="on purpose"):
                 env.step(0)
     assert metadata_of(tmp_path, 0)["frame_steps"] == [[0, 1], [3, 4]]
     assert metadata_of(tmp_path, 0)["complete"] is True
@@ -294,3 +261,64 @@ def test_users_exception_is_not_hidden_by_a_failing_close(
     with pytest.raises(KeyError, match="of the user") as raised:
         fail()
     assert "ffmpeg" in raised.value.__notes__[0]
+
+
+# --- `episode_info=True`, and what is known of success --------------------------------
+
+
+def last_info(env):
+    """Run CartPole to its end; return the info of every step."""
+    env.reset(seed=3)
+    infos, done = [], False
+    while not done:
+        *_, terminated, truncated, info = env.step(1)
+        infos.append(info)
+        done = terminated or truncated
+    return infos
+
+
+def monitor(directory, env=None, **options):
+    made = gymnasium.make("CartPole-v1") if env is None else env
+    return mjrec.Monitor(made, directory, video_callable=False, **options)
+
+
+def test_last_step_has_what_gymnasium_gives(tmp_path):
+    """Keys, types and values are those of RecordEpisodeStatistics; its own stay."""
+    theirs = RecordEpisodeStatistics(gymnasium.make("CartPole-v1"))
+    expected = last_info(theirs)[-1]["episode"]
+    with monitor(tmp_path, episode_info=True) as env:
+        *before, last = last_info(env)
+    assert not any("episode" in info for info in before)
+    episode = last["episode"]
+    assert list(episode) == list(expected) == ["r", "l", "t"]
+    assert (episode["r"], episode["l"]) == (expected["r"], expected["l"])
+    assert 0 < episode["t"] < 60
+    with monitor(tmp_path / "around", theirs, episode_info=True) as env:
+        episode = last_info(env)[-1]["episode"]
+    assert episode["t"] == theirs.time_queue[-1]
+
+
+def test_gymnasiums_own_goes_around_a_monitor(tmp_path):
+    """It asserts that the key is absent, which is why it is off by default."""
+    with monitor(tmp_path) as env:
+        assert last_info(RecordEpisodeStatistics(env))[-1]["episode"]["l"] > 0
+    options = {"episode_info": True}
+    with monitor(tmp_path / "on", **options) as env, pytest.raises(AssertionError):
+        last_info(RecordEpisodeStatistics(env))
+
+
+@pytest.mark.parametrize(
+    ("info", "expected"),
+    [
+        ({}, None),
+        ({"is_success": True}, True),
+        ({"is_success": 0.0}, False),
+        ({"success": np.array([False])}, False),
+        ({"is_success": None, "success": True}, True),
+        ({"success": "no"}, None),
+        ({"success": np.zeros(2)}, None),
+    ],
+)
+def test_success_is_what_the_info_says(info, expected):
+    """Under either name; what is no truth value says nothing."""
+    assert success_in(info) is expected

@@ -4,11 +4,14 @@
 import tracemalloc
 
 import pytest
+from parts import parametrize
 from result_files import entry, write_journal, write_saved
 from trajectories_by_hand import write_finished, write_log
 
 import mjrec
 from mjrec.errors import UnreadableFile
+from mjrec.formats.manifest import read_manifest
+from mjrec.reporting.gathering import gather
 
 
 def video(directory, infix, episode_id, suffix):
@@ -45,10 +48,9 @@ def test_an_episode_of_a_journal_has_its_files(tmp_path):
 @pytest.mark.parametrize("has_journal", [True, False])
 def test_pending_is_what_was_promised_and_is_not_there(tmp_path, has_journal):
     """In flight or finished; neither what is there, nor what failed or is live."""
-    infix = "0.7"
-    kinds = ["deferred", "deferred", "deferred", "deferred", "live"]
     pending = []
     if has_journal:
+        kinds = ["deferred"] * 4 + ["live"]
         entries = [entry(n, recording=kind) for n, kind in enumerate(kinds)]
         write_journal(tmp_path, "0.7", *entries, run={"env_info": {}})
     else:
@@ -56,8 +58,8 @@ def test_pending_is_what_was_promised_and_is_not_there(tmp_path, has_journal):
         pending = [{"episode_id": n, "video": name} for n, name in enumerate(names)]
     details = {"next_episode_id": 5, "pending": pending}
     write_saved(tmp_path, "0.7", *range(5), details=details)
-    trajectories = [write_log(tmp_path, 0, infix=infix)]
-    trajectories += [write_finished(tmp_path, n, infix=infix) for n in range(1, 5)]
+    trajectories = [write_log(tmp_path, 0, infix="0.7")]
+    trajectories += [write_finished(tmp_path, n, infix="0.7") for n in range(1, 5)]
     video(tmp_path, "0.7", 2, ".mp4")
     video(tmp_path, "0.7", 3, ".meta.json")
     episodes = list(mjrec.iter_episodes(tmp_path))
@@ -95,27 +97,56 @@ def test_a_video_is_never_shown_for_another_episode(tmp_path, types, linked):
 
 
 def test_monitors_come_in_the_order_of_their_numbers(tmp_path):
-    """10 after 9, for the monitor and for the process."""
+    """10 after 9, for the monitor and for the process; a missing directory is an error.
+
+    It is one before the first episode is asked for.
+    """
     infixes = ["0.9", "0.10", "1.7", "9.7", "10.7"]
     for infix in reversed(infixes):
         write_journal(tmp_path, infix, 0)
     assert [episode.monitor for episode in mjrec.iter_episodes(tmp_path)] == infixes
-
-
-def test_a_missing_directory_is_an_error_at_once(tmp_path):
-    """Before the first episode is asked for; an empty one has no episodes."""
     with pytest.raises(UnreadableFile, match="directory does not exist"):
         mjrec.iter_episodes(tmp_path / "missing")
-    assert list(mjrec.iter_episodes(tmp_path)) == []
+
+
+# --- memory --------------------------------------------------------------------------
+
+
+def peak_of(read, path):
+    """Return the most bytes that were held while something was read."""
+    # The first time, things are loaded that stay.
+    read(path)
+    tracemalloc.start()
+    try:
+        read(path)
+        return tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+
+
+def list_episodes(directory):
+    """Return how many episodes there are."""
+    return sum(1 for _ in mjrec.iter_episodes(directory))
 
 
 def test_memory_does_not_grow_with_the_episodes(tmp_path):
     """Episodes are read as they are asked for."""
     items = (entry(number, options="x" * 1000) for number in range(5000))
     path = write_journal(tmp_path, "0.7", *items)
-    tracemalloc.start()
-    count = sum(1 for _ in mjrec.iter_episodes(tmp_path))
-    _, peak = tracemalloc.get_traced_memory()
-    tracemalloc.stop()
-    assert count == 5000
-    assert peak < path.stat().st_size / 10
+    assert peak_of(list_episodes, tmp_path) < path.stat().st_size / 10
+
+
+@parametrize("read", [mjrec.load_results, list_episodes, gather])
+def test_manifests_are_not_kept(tmp_path, read):
+    """What many say of packages takes no more than what a few do."""
+    packages = {
+        f"package-{n}": {"version": "1.0", "hash": "0" * 64} for n in range(999)
+    }
+    large, small = tmp_path / "large", tmp_path / "small"
+    for directory, said in ((large, packages), (small, {})):
+        directory.mkdir()
+        for number in range(40):
+            details = {"provenance": {"packages": said}}
+            path = write_saved(directory, f"{number}.1", 1, details=details)
+    one = peak_of(read_manifest, large / path.name)
+    assert peak_of(read, large) - peak_of(read, small) < 4 * one
