@@ -12,8 +12,8 @@ from trajectories_by_hand import new_logs
 from trajectory_contents import content_of
 
 import mjrec
-import mjrec.formats.trajectory_file as trajectory_file
 from mjrec.errors import FileNotWritten, InvalidArgument, UnreadableFile
+from mjrec.formats import trajectory_file
 from mjrec.formats.bundle import (
     bundle_of,
     file_of,
@@ -41,8 +41,7 @@ def record(directory, *episodes):
         if episode != episodes[-1]:
             span.end({"complete": True, "length": episode})
     logs.close()
-    names = [f"{trajectory_prefix(INFIX, episode)}.h5" for episode in episodes]
-    return [directory / name for name in names]
+    return [logs.path_of(trajectory_prefix(INFIX, episode)) for episode in episodes]
 
 
 def content(path):
@@ -72,6 +71,27 @@ def test_a_bundle_holds_what_files_would_hold(tmp_path):
         assert json.loads(raw.readline())["episodes"] == [[3, 5], [9, 9], [12, 12]]
 
 
+def test_more_come_into_a_bundle_and_facts_change(tmp_path):
+    """What was there is as before, bit for bit; on a full disk the log stays."""
+    paths = record(tmp_path, 20, 300, 301)
+    assert bundle_trajectories(paths[:1]) == {}
+    bundle = bundle_of(paths[0])
+    assert [each.path for each in recordings_in_flight(tmp_path)] == paths[1:]
+    first, before = datasets_in(paths[0]), bundle.read_bytes()
+    with file_size_limit(len(before)):
+        failures = bundle_trajectories(paths)
+    assert [type(error) for error in failures.values()] == [FileNotWritten] * 2
+    assert bundle.read_bytes() == before
+    check(content(paths[1]), 300)
+    assert bundle_trajectories(paths) == {}
+    assert recordings_in_flight(tmp_path) == []
+    amend_trajectories({path: lambda facts: {**facts, "new": 1} for path in paths[1:]})
+    assert datasets_in(paths[0]) == first
+    assert ["new" in content(path).facts for path in paths] == [False, True, True]
+    for number, path in zip((20, 300, 301), paths, strict=True):
+        check(content(path), number)
+
+
 def test_a_directory_lists_what_lies_in_bundles(tmp_path):
     """Beside files of their own; a bundle itself is none, and says what it holds."""
     own, *others = record(tmp_path, 1, 2, 3)
@@ -90,59 +110,30 @@ def test_a_directory_lists_what_lies_in_bundles(tmp_path):
         mjrec.load_trajectory(own.with_name(f"{trajectory_prefix(INFIX, 4)}.h5"))
 
 
-def test_more_come_into_a_bundle_and_facts_change(tmp_path):
-    """What was there is as before, bit for bit."""
-    paths = record(tmp_path, 6, 7, 8)
-    assert bundle_trajectories(paths[:1]) == {}
-    assert [each.path for each in recordings_in_flight(tmp_path)] == paths[1:]
-    first = datasets_in(paths[0])
-    assert bundle_trajectories(paths) == {}
-    amend_trajectories({path: lambda facts: {**facts, "new": 1} for path in paths[1:]})
-    assert datasets_in(paths[0]) == first
-    assert ["new" in content(path).facts for path in paths] == [False, True, True]
-    for number, path in zip((6, 7, 8), paths, strict=True):
-        check(content(path), number)
-
-
-def test_what_cannot_be_written_stays_in_the_log(tmp_path):
-    """On a full disk the bundle is as it was, and the next try has all."""
-    paths = record(tmp_path, 20, 300)
-    bundle_trajectories(paths[:1])
-    before = bundle_of(paths[0]).read_bytes()
-    with file_size_limit(len(before)):
-        failures = bundle_trajectories(paths)
-    assert [type(error) for error in failures.values()] == [FileNotWritten]
-    assert bundle_of(paths[0]).read_bytes() == before
-    check(content(paths[1]), 300)
-    assert bundle_trajectories(paths) == {}
-    assert recordings_in_flight(tmp_path) == []
-    check(content(paths[1]), 300)
-
-
 @pytest.mark.parametrize(
-    "index",
+    ("said", "episodes"),
     [
-        b'{"format": "mjrec trajectories", "version": 1, "episodes": [[0, 9999999]]}',
-        b'{"format": "mjrec trajectories", "version": 1, "episodes": [[5, 4]]}',
-        b'{"format": "mjrec trajectories", "version": 1, "episodes": [[1, 1], [1, 1]]}',
-        b'{"format": "mjrec trajectories", "version": 1, "episodes": [[1]]}',
-        b'{"format": "another", "version": 1, "episodes": [[1, 1]]}',
-        b"\x89HDF\r\n\x1a",
-        b"",
+        ("mjrec trajectories", "[[0, 9999999]]"),
+        ("mjrec trajectories", "[[5, 4]]"),
+        ("mjrec trajectories", "[[1, 1], [1, 1]]"),
+        ("mjrec trajectories", "[[1]]"),
+        ("another", "[[1, 1]]"),
+        (None, "\x89HDF\r\n\x1a"),
+        (None, ""),
     ],
 )
-def test_an_index_that_lies_names_no_episode(tmp_path, index):
-    """One that cannot be read is as one without episodes, and takes no memory."""
+def test_an_index_that_lies_names_no_episode(tmp_path, said, episodes):
+    """One that cannot be read is as one without episodes, and takes no memory.
+
+    What only the index has cannot be opened, nor a group that leads elsewhere.
+    """
     [path] = record(tmp_path, 1)
-    bundle_of(path).write_bytes(index + b"\n")
+    index = f'{{"format": "{said}", "version": 1, "episodes": {episodes}}}'
+    bundle_of(path).write_bytes((index if said else episodes).encode("latin-1") + b"\n")
     assert not is_finished(path)
     assert trajectories_in(bundle_of(path)) == []
     check(content(path), 1)
-
-
-def test_an_episode_that_only_the_index_has_cannot_be_opened(tmp_path):
-    """Nor one whose group leads into another file."""
-    [path] = record(tmp_path, 1)
+    bundle_of(path).unlink()
     bundle_trajectories([path])
     with h5py.File(bundle_of(path), "r+") as file:
         del file["episode000001"]

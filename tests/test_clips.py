@@ -161,7 +161,7 @@ def test_clips_wait_to_be_rendered(options, part, frames, fps, tmp_path):
     steps = {**CLIP, "video_length": 6, "name_prefix": "rl-video"}
     record(tmp_path, hopper(3), 8, **{**steps, **options})
     [entry] = manifest_of(tmp_path)["mjrec"]["pending"]
-    parts = [path.name[-9:-3] for path in in_flight(tmp_path)]
+    parts = [path.name[-6:] for path in in_flight(tmp_path)]
     assert parts == [f"{number:06d}" for number in range(len(parts))]
     assert recordings(tmp_path) == [key_of(entry["clip"])]
     assert main(["render", str(tmp_path)]) == 0
@@ -230,15 +230,15 @@ def test_a_full_disk_ends_a_clip_and_not_the_simulation(tmp_path):
     """With `on_error="warn"`: what had room is rendered, and the manifest tells."""
     options = {**CLIP, "video_length": 9, "on_error": "warn"}
     with mjrec.Monitor(hopper(), tmp_path, **options) as monitor:
-        hop(monitor, 4)
+        hop(monitor, 5)
         with file_size_limit(1000):
             hop(monitor, 5)
         hop(monitor, 3)
-    assert monitor.get_total_steps() == 12
+    assert monitor.get_total_steps() == 13
     details = manifest_of(tmp_path)["mjrec"]
     assert "video" in {fault["what"] for fault in details["faults"]}
     [outcome] = finish(tmp_path, workers=1)
-    assert outcome.videos == {details["pending"][0]["video"]: 4}
+    assert outcome.videos == {details["pending"][0]["video"]: 5}
     [about] = metadata_in(tmp_path)
     assert "Cannot write" in about["broken_reason"]
 

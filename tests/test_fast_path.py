@@ -128,24 +128,6 @@ def test_usual_steps_are_recorded_as_others_are(new, camera, max_fps, frames, tm
         np.testing.assert_array_equal(usual.snapshots[name], values)
 
 
-@pytest.mark.parametrize(
-    ("max_fps", "schedule", "slow"), [(None, None, 1), (8, None, 1), (None, False, 0)]
-)
-def test_all_steps_but_the_first_of_the_run_are_usual(
-    max_fps, schedule, slow, tmp_path
-):
-    """Recorded or counted; the first tells what actions are, and how long it is."""
-    seen = []
-    with monitored(make(), tmp_path, schedule, max_fps=max_fps) as monitor:
-        for _ in range(2):
-            begin(monitor)
-            for _ in range(8):
-                seen.append(is_fast(monitor))
-                go(monitor, 1)
-            assert not is_fast(monitor)
-    assert seen == [*slow * [False], *(16 - slow) * [True]]
-
-
 def test_the_first_step_of_another_episode_may_be_unlike(tmp_path):
     """Another action and another pace: the reset is written anew, or they are noted."""
 

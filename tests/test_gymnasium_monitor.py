@@ -298,15 +298,6 @@ def test_last_step_has_what_gymnasium_gives(tmp_path):
     assert episode["t"] == theirs.time_queue[-1]
 
 
-def test_gymnasiums_own_goes_around_a_monitor(tmp_path):
-    """It asserts that the key is absent, which is why it is off by default."""
-    with monitor(tmp_path) as env:
-        assert last_info(RecordEpisodeStatistics(env))[-1]["episode"]["l"] > 0
-    options = {"episode_info": True}
-    with monitor(tmp_path / "on", **options) as env, pytest.raises(AssertionError):
-        last_info(RecordEpisodeStatistics(env))
-
-
 @pytest.mark.parametrize(
     ("info", "expected"),
     [

@@ -229,27 +229,27 @@ def test_a_run_that_another_machine_renders(tmp_path, monkeypatch):
     assert hashes(tmp_path / "there") == seen
 
 
+MILLION = """
+import resource, sys, gymnasium, mjrec, numpy
+env = gymnasium.make("InvertedPendulum-v5", max_episode_steps=10**7)
+env = mjrec.Monitor(env, sys.argv[1], False, trajectory_callable=True)
+start = env.unwrapped.init_qpos, env.unwrapped.init_qvel
+env.reset(seed=0)
+for step in range(int(sys.argv[2])):
+    if step % 10 == 0:
+        env.unwrapped.set_state(*start)
+    env.step(numpy.zeros(1))
+env.close()
+print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
+"""
+
+
 # Takes more than five seconds: a million steps.
 @pytest.mark.thorough
 def test_an_episode_of_a_million_steps_needs_no_more_memory(tmp_path):
     """Neither while it is recorded nor while its file is written."""
-    program = (
-        "import resource, sys, gymnasium, mjrec, numpy\n"
-        "env = gymnasium.make('InvertedPendulum-v5', max_episode_steps=10**7)\n"
-        "steps = int(sys.argv[2])\n"
-        "env = mjrec.Monitor(env, sys.argv[1], False, trajectory_callable=True)\n"
-        "action = numpy.zeros(1)\n"
-        "start = env.unwrapped.init_qpos, env.unwrapped.init_qvel\n"
-        "env.reset(seed=0)\n"
-        "for step in range(steps):\n"
-        "    if step % 10 == 0:\n"
-        "        env.unwrapped.set_state(*start)\n"
-        "    env.step(action)\n"
-        "env.close()\n"
-        "print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)\n"
+    few, many = (
+        int(run_python(MILLION, tmp_path / str(steps), steps).stdout) << 10
+        for steps in (10_000, 1_000_000)
     )
-    used = {}
-    for steps in (10_000, 1_000_000):
-        done = run_python(program, tmp_path / str(steps), steps)
-        used[steps] = int(done.stdout) << 10
-    assert used[1_000_000] - used[10_000] < 32 << 20, used
+    assert many - few < 32 << 20

@@ -5,7 +5,6 @@ import math
 import re
 import signal
 import tracemalloc
-from collections.abc import Callable
 from pathlib import Path
 
 import h5py
@@ -47,9 +46,10 @@ def path(tmp_path):
     return tmp_path / f"{NAME}.h5"
 
 
-def files_in(directory):
-    """Return the names of the files there but the journal."""
-    return [path.name for path in directory.iterdir() if path.suffix != ".jsonl"]
+def names(directory):
+    """Return the names of the files there but the journal and what is in flight."""
+    files = [path.name for path in directory.iterdir() if path.suffix != ".jsonl"]
+    return [name for name in files if ".states." not in name]
 
 
 def record(path, steps=40, *, ended=True, **more):
@@ -95,7 +95,8 @@ def test_the_finished_file_holds_what_the_log_held(path, steps, every, dtype):
     facts = {**FACTS, "long": "x" * 10**5}
     record(path, steps, every=every, dtype=dtype, facts=facts)
     assert finish_trajectory(path) == path
-    assert sorted(files_in(path.parent)) == [path.name]
+    assert not list(path.parent.glob("*.states.*"))
+    assert names(path.parent) == [path.name]
     content = read(path)
     check(content, steps, every=every, dtype=dtype)
     assert content.facts == {**facts, "complete": True, "length": steps}
@@ -104,15 +105,18 @@ def test_the_finished_file_holds_what_the_log_held(path, steps, every, dtype):
 
 
 def test_an_episode_that_was_killed_says_so(path):
-    """Also before its first row."""
+    """Also before its first row; its rewards are added up one after the other."""
     for steps in (-1, 12):
         record(path, steps, ended=False)
         content = read(finish_trajectory(path))
-        facts = {"complete": False, "reason": "killed", "length": max(steps, 0)}
-        total = sum(step / 3 for step in range(1, steps + 1))
-        assert content.facts == {**FACTS, **facts, "reward": pytest.approx(total)}
+        total = added_up([step / 3 for step in range(1, steps + 1)])
+        facts = {"reason": "killed", "length": max(steps, 0), "reward": total}
+        assert content.facts == {**FACTS, "complete": False, **facts}
         assert len(content.states) == steps + 1
         path.unlink()
+    # As a monitor does at each step, on every version of Python.
+    assert added_up([1e16, 1.0, -1e16]) == 0.0
+    assert math.copysign(1, added_up([-0.0])) == 1
 
 
 def test_plain_h5py_finds_every_array_by_its_name(path):
@@ -174,38 +178,34 @@ def test_what_is_finished_meanwhile_is_read(path, monkeypatch):
         with open_trajectory(path) as before:
             monkeypatch.setattr(trajectory_file, "open_recording", open_late)
             with use(path) as reader:
-                assert sorted(files_in(path.parent)) == [path.name]
+                assert not list(path.parent.glob("*.states.*"))
                 for each in (before, reader):
-                    content = content_of(each)
-                    check(content, 40)
-                    check_changes(content)
+                    check(content_of(each), 40)
+                    check_changes(content_of(each))
         path.unlink()
 
 
-def test_nothing_to_finish_is_one_clear_error(path):
-    """Neither log nor file; or a log that cannot be read, which stays."""
+def test_a_full_disk_leaves_the_log_and_nothing_else(path):
+    """One error that names the file; with room again it succeeds."""
+    record(path)
+    for room in (0, 700, 5000):
+        said = pytest.raises(FileNotWritten, match=r"\.h5: File too large")
+        with file_size_limit(room), said:
+            finish_trajectory(path)
+        assert names(path.parent) == []
+    finish_trajectory(path)
+
+
+def test_without_a_log_that_can_be_read_there_is_one_clear_error(path):
+    """Neither log nor file; or a damaged journal, without which the log stays."""
     with pytest.raises(UnreadableFile, match=r"\.h5: neither the file nor its log"):
         finish_trajectory(path)
     record(path)
     [log], [journal] = log_paths(path.parent), path.parent.glob("*.jsonl")
     journal.write_bytes(b"something else\n")
-    for _ in range(2):
-        with pytest.raises(UnreadableFile, match="nor its log"):
-            finish_trajectory(path)
-    assert log.exists()
-
-
-@pytest.mark.parametrize("room", [0, 700, 5000])
-def test_a_full_disk_leaves_the_log_and_nothing_else(path, room):
-    """One error that names the file; with room again it succeeds."""
-    record(path)
-    with (
-        file_size_limit(room),
-        pytest.raises(FileNotWritten, match=r"\.h5: File too large"),
-    ):
+    with pytest.raises(UnreadableFile, match="nor its log"):
         finish_trajectory(path)
-    assert not [name for name in files_in(path.parent) if ".states." not in name]
-    finish_trajectory(path)
+    assert log.exists()
 
 
 # 24 MB of frames that cannot be compressed.
@@ -227,26 +227,23 @@ def test_memory_does_not_grow_with_the_episode(path):
 def test_ctrl_c_leaves_the_log_and_nothing_else(path, monkeypatch):
     """Also between HDF5 and its file, where an exception would crash it."""
     record(path, 600, dtype=LONG)
-    unfailing = trajectory_hdf5._Unfailing
+    usual = trajectory_hdf5._Unfailing.write
 
     def interrupted(self, data):
         signal.raise_signal(signal.SIGINT)
         return usual(self, data)
 
-    usual = unfailing.write
-    monkeypatch.setattr(unfailing, "write", interrupted)
-    with pytest.raises(KeyboardInterrupt):
-        finish_trajectory(path)
-    monkeypatch.undo()
-    assert not [name for name in files_in(path.parent) if ".states." not in name]
+    with monkeypatch.context() as patch:
+        patch.setattr(trajectory_hdf5._Unfailing, "write", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            finish_trajectory(path)
+    assert names(path.parent) == []
     finish_trajectory(path)
 
 
-def attribute(name, value):
-    return lambda file: file.attrs.__setitem__(name, value)
+def replaced(name, *data, **options):
+    """Return what puts another dataset in the place of one."""
 
-
-def dataset(name, *data, **options):
     def replace(file):
         del file[name]
         file.create_dataset(name, *data, **options)
@@ -254,33 +251,30 @@ def dataset(name, *data, **options):
     return replace
 
 
-def link(name, target):
-    def replace(file):
-        del file[name]
-        file[name] = target
-
-    return replace
+def linked(file):
+    del file["rewards"]
+    file["rewards"] = h5py.ExternalLink("other.h5", "/x")
 
 
-HARM: dict[str, Callable[[h5py.File], None]] = {
-    "not a trajectory": attribute("format", np.bytes_(b"robomimic")),
-    "has the wrong type": attribute("format", "mjrec trajectory"),
-    "update mjrec": attribute("format_version", np.int64(2)),
-    "its facts are damaged": attribute("facts", np.bytes_(b"{}")),
-    "the same number of steps": dataset("actions", data=np.zeros((3, 3), "f4")),
-    "not all float64": dataset("states", data=np.zeros(41, "f4,f4")),
-    "not a valid dtype": dataset("rewards", data=["a"] * 40),
-    "rewards have": dataset("rewards", data=np.zeros((40, 2))),
-    "the snapshot of a row": dataset("snapshots", data=np.zeros(41)),
-    "frame steps are out of order": dataset("frame_steps", data=np.arange(41)[::-1]),
-    "a way that mjrec does not write": dataset(
+HARM = {
+    "not a trajectory": lambda file: file.attrs.update(format=np.bytes_(b"robomimic")),
+    "has the wrong type": lambda file: file.attrs.update(format="mjrec trajectory"),
+    "update mjrec": lambda file: file.attrs.update(format_version=np.int64(2)),
+    "its facts are damaged": lambda file: file.attrs.update(facts=np.bytes_(b"{}")),
+    "the same number of steps": replaced("actions", data=np.zeros((3, 3), "f4")),
+    "not all float64": replaced("states", data=np.zeros(41, "f4,f4")),
+    "not a valid dtype": replaced("rewards", data=["a"] * 40),
+    "rewards have": replaced("rewards", data=np.zeros((40, 2))),
+    "the snapshot of a row": replaced("snapshots", data=np.zeros(41)),
+    "frame steps are out of order": replaced("frame_steps", data=np.arange(41)[::-1]),
+    "a way that mjrec does not write": replaced(
         "rewards", (40,), "<f8", external=[("/etc/passwd", 0, 320)]
     ),
-    "rewards is stored in a way": dataset(
+    "rewards is stored in a way": replaced(
         "rewards", data=np.ones(40), chunks=(40,), compression="lzf"
     ),
-    "no 'rewards' of its": link("rewards", h5py.ExternalLink("other.h5", "/x")),
-    "is not a group": link("model_changes", np.zeros(3)),
+    "no 'rewards' of its": linked,
+    "is not a group": replaced("model_changes", data=np.zeros(3)),
     "no 'truncated' of its own": lambda file: file.__delitem__("truncated"),
     "no '0' of its": lambda file: file.move("model_changes/0", "model_changes/9"),
 }
@@ -296,10 +290,3 @@ def test_a_file_of_another_making_is_refused(path, reason):
     with pytest.raises(UnreadableFile, match=reason) as error:
         read(path)
     assert error.value.path == path
-
-
-def test_rewards_are_added_up_one_after_the_other():
-    """As a monitor does at each step, on every version of Python."""
-    assert added_up([1e16, 1.0, -1e16]) == 0.0
-    assert math.copysign(1, added_up([-0.0])) == 1
-    assert added_up([]) == 0.0

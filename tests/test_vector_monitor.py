@@ -294,17 +294,6 @@ def test_a_masked_reset_leaves_the_others_alone(tmp_path):
     assert shown(path_of(env.monitors[1], 0, "mp4"), step=16) == [0, 1, 2, 3]
 
 
-def test_frames_must_be_one_for_each(tmp_path):
-    """Said at the first reset."""
-    vector = VectorCorridor()
-    vector.render = lambda: (np.zeros((8, 8, 3), np.uint8),)
-    with (
-        mjrec.Monitor(vector, tmp_path) as env,
-        pytest.raises(InvalidArgument, match="each of its 2 sub-environments"),
-    ):
-        env.reset()
-
-
 @pytest.mark.parametrize(
     ("made", "options", "error", "message"),
     [
@@ -471,7 +460,10 @@ def test_pixels_are_those_of_each_environment(tmp_path):
 
 
 def test_a_bad_frame_can_be_tolerated(tmp_path, caplog):
-    """Sizes that differ are an error, or with `on_error="warn"` no tiled video."""
+    """Sizes that differ are an error, or with `on_error="warn"` no tiled video.
+
+    Too few frames are always one.
+    """
     vector = VectorCorridor(heights=(32, 48))
     with (
         mjrec.Monitor(vector, tmp_path / "raise", tiled=True) as env,
@@ -482,4 +474,10 @@ def test_a_bad_frame_can_be_tolerated(tmp_path, caplog):
         play(env, 3)
     assert "64x32, 64x48" in caplog.text
     assert not list(tmp_path.glob("*.tiled.mp4"))
+    vector.render = lambda: (np.zeros((8, 8, 3), np.uint8),)
+    with (
+        mjrec.Monitor(vector, tmp_path / "few") as few,
+        pytest.raises(InvalidArgument, match="each of its 2 sub-environments"),
+    ):
+        few.reset()
     assert path_of(env.monitors[1], 0, "mp4").exists()
