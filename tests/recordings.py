@@ -4,7 +4,6 @@
 import contextlib
 import json
 import re
-from typing import Any
 
 import av
 
@@ -80,8 +79,7 @@ def videos_in(directory):
 
 def _json(pattern, directory):
     [path] = directory.glob(pattern)
-    content: dict[str, Any] = json.loads(path.read_text())
-    return content
+    return json.loads(path.read_text())
 
 
 def add_facts(path, facts):

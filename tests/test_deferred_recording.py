@@ -11,7 +11,6 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
-from typing import ClassVar
 
 import gymnasium
 import numpy as np
@@ -195,63 +194,6 @@ def test_ctrl_c_while_waiting_leaves_the_rest_pending(tmp_path, stuck_encoder):
     assert pending_in(tmp_path) == [0]
 
 
-class Overlay(gymnasium.Wrapper):
-    """Draws something on top."""
-
-    def render(self):
-        frame = np.array(self.env.render())
-        frame[:4] = 255
-        return frame
-
-
-def test_an_overlay_is_recorded_live_and_says_why(tmp_path, caplog):
-    """Its frames do not follow from the state; to render it again says so, too."""
-    caplog.set_level(logging.INFO)
-    with mjrec.Monitor(Overlay(make(render_mode="rgb_array")), tmp_path) as env:
-        steps(env, 1)
-    metadata = metadata_of(tmp_path, 0)
-    assert metadata["recording"] == "live"
-    assert "Overlay" in metadata["recording_reason"]
-    assert "Overlay" in caplog.text
-    assert frames_in(tmp_path, 0)[0][0].min() > 240
-    caplog.clear()
-    [path] = tmp_path.glob("*.h5")
-    assert next(mjrec.render(path))[0].max() < 240
-    assert "recorded live, because the wrapper" in caplog.text
-
-
-@pytest.mark.parametrize(
-    ("how", "mode", "error"),
-    [
-        (None, "rgb_array", None),
-        ("deferred", "rgb_array", mjrec.PicturesDiffer),
-        (None, None, mjrec.NoPictures),
-    ],
-)
-def test_a_plugin_that_draws_is_recorded_live_or_refused(
-    how, mode, error, tmp_path, caplog
-):
-    """Its frames do not follow from what can be put back, and one message says so."""
-    path = tmp_path / "grid.xml"
-    path.write_text(TOUCH_GRID)
-    env = MjcfEnvironment(path, render_mode=mode, **SIZE)
-    out = tmp_path / "out"
-    with mjrec.Monitor(env, out, render=how, env_id="Touching-v0") as monitor:
-        if error:
-            with pytest.raises(error, match="its plugins may draw"):
-                monitor.reset()
-        else:
-            monitor.reset()
-            monitor.step(np.zeros(0))
-    assert videos_in(out) == ([] if error else [0])
-    if not error:
-        said = [r.message for r in caplog.records if "drawn live" in r.message]
-        assert ["its plugins may draw" in each for each in said] == [True]
-        metadata = metadata_of(out, 0)
-        assert (metadata["recording"], metadata["pictures"]) == ("live", "env.render")
-        assert len(frames_in(out, 0)) == 2
-
-
 # Takes more than five seconds: the same video by several numbers of workers.
 def test_a_video_is_the_same_bytes_whoever_draws_it(tmp_path):
     """One worker or three."""
@@ -320,40 +262,29 @@ def test_works_in_a_script_without_a_main_guard(tmp_path):
     assert len(list((tmp_path / "out").glob("*.mp4"))) == 1
 
 
-class Dictionaries(gymnasium.Env):
-    """Its state is hidden; observations and actions are dictionaries."""
-
-    metadata: ClassVar = {"render_fps": 20}
-    action_space = gymnasium.spaces.Dict(
-        {"arm": gymnasium.spaces.Box(-1, 1, (2,)), "grip": gymnasium.spaces.Box(-1, 1)}
-    )
-    observation_space = action_space
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        return self.action_space.sample(), {}
-
-    def step(self, action):
-        return action, 1.5, False, False, {}
-
-
-def test_without_a_simulation_there_are_actions_and_rewards(tmp_path):
+def test_without_a_simulation_there_are_actions_and_rewards(tmp_path, make_corridor):
     """Dictionaries are one vector, and it is said what that was made from."""
-    options = {"trajectory_callable": True, "observations": True, "env_id": "Dict-v0"}
-    with mjrec.Monitor(Dictionaries(), tmp_path, False, **options) as env:
-        env.reset(seed=0)
-        env.step({"arm": np.array([1.0, 2.0]), "grip": np.array([3.0])})
-        env.step({"arm": np.array([1.0, 2.0, 3.0])})
+    kinds = {
+        "arm": gymnasium.spaces.Box(-1, 1, (2,)),
+        "grip": gymnasium.spaces.Box(-1, 1),
+    }
+    first = {"arm": np.array([1.0, 2.0]), "grip": np.array([3.0])}
+    env = make_corridor()
+    env.action_space = env.observation_space = gymnasium.spaces.Dict(kinds)
+    env._observation = lambda: first
+    options = {"trajectory_callable": True, "observations": True}
+    with mjrec.Monitor(env, tmp_path, False, **options) as monitor:
+        monitor.reset()
+        monitor.step(first)
+        monitor.step({"arm": np.array([1.0, 2.0, 3.0])})
     recorded = trajectory_in(tmp_path)
     assert recorded.actions.tolist() == [[1, 2, 3], [0, 0, 0]]
-    assert recorded.rewards.tolist() == [1.5, 1.5]
-    expected = {
-        "action_parts": [["arm", [2]], ["grip", [1]]],
-        "observation_parts": [["arm", [2]], ["grip", [1]]],
-        "irregular_actions_from": 1,
-        "rate": "20",
-    }
+    assert recorded.observations.tolist() == [[1, 2, 3]] * 3
+    assert recorded.rewards.tolist() == [0.5, 0.5]
+    parts = [["arm", [2]], ["grip", [1]]]
+    expected = {"action_parts": parts, "observation_parts": parts, "rate": "10"}
     assert recorded.facts.items() >= expected.items()
+    assert recorded.facts["irregular_actions_from"] == 1
 
 
 def test_data_may_be_replaced_and_deleted_and_actions_change_their_dtype(tmp_path):
@@ -378,3 +309,59 @@ def test_data_may_be_replaced_and_deleted_and_actions_change_their_dtype(tmp_pat
     # After the time.
     np.testing.assert_array_equal(trajectory.states[1:, 1:10], shown)
     assert trajectory.facts["action_dtypes"] == [[0, "float32"], [2, "float64"]]
+
+
+class Overlay(gymnasium.Wrapper):
+    """Draws something on top."""
+
+    def render(self):
+        frame = np.array(self.env.render())
+        frame[:4] = 255
+        return frame
+
+
+def test_an_overlay_is_recorded_live_and_says_why(tmp_path, caplog):
+    """Its frames do not follow from the state; to render it again says so, too."""
+    caplog.set_level(logging.INFO)
+    with mjrec.Monitor(Overlay(make(render_mode="rgb_array")), tmp_path) as env:
+        steps(env, 1)
+    metadata = metadata_of(tmp_path, 0)
+    assert metadata["recording"] == "live"
+    assert "Overlay" in metadata["recording_reason"]
+    assert "Overlay" in caplog.text
+    assert frames_in(tmp_path, 0)[0][0].min() > 240
+    caplog.clear()
+    [path] = tmp_path.glob("*.h5")
+    assert next(mjrec.render(path))[0].max() < 240
+    assert "recorded live, because the wrapper" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("how", "mode", "error"),
+    [
+        (None, "rgb_array", None),
+        ("deferred", "rgb_array", mjrec.PicturesDiffer),
+        (None, None, mjrec.NoPictures),
+    ],
+)
+def test_a_plugin_that_draws_is_recorded_live_or_refused(
+    how, mode, error, tmp_path, caplog
+):
+    """Its frames do not follow from what can be put back, and one message says so."""
+    path = tmp_path / "grid.xml"
+    path.write_text(TOUCH_GRID)
+    env = MjcfEnvironment(path, render_mode=mode, **SIZE)
+    said = "its plugins may draw"
+    with (
+        mjrec.Monitor(env, tmp_path, render=how, env_id="Touching-v0") as monitor,
+        pytest.raises(error, match=said) if error else contextlib.nullcontext(),
+    ):
+        monitor.reset()
+        monitor.step(np.zeros(0))
+    assert videos_in(tmp_path) == ([] if error else [0])
+    if not error:
+        messages = [each for each in caplog.messages if "drawn live" in each]
+        assert [said in each for each in messages] == [True]
+        metadata = metadata_of(tmp_path, 0)
+        assert (metadata["recording"], metadata["pictures"]) == ("live", "env.render")
+        assert len(frames_in(tmp_path, 0)) == 2

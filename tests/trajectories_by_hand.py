@@ -6,9 +6,6 @@ its snapshots, with a white pixel in a corner.
 """
 
 import itertools
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -44,16 +41,9 @@ def grey(frame):
 class Painter:
     """Draws frames of trajectories of this module, as `WorkerPool` would.
 
-    Those of a camera that was asked for are a little brighter.
-
-    Args:
-        size: of the frames.
-        plain: whether to leave the white pixel out.
-
-    Attributes:
-        asked: what was to be drawn: trajectory, indices and view.
-        tiles: the cameras that were to be in one frame, for each of these.
-        breaks_at: called before each frame, with trajectory, view and index.
+    Those of a camera that was asked for are a little brighter; with `plain` the white
+    pixel is left out. `asked` and `tiles` tell of what was drawn, and `breaks_at` is
+    called before each frame, with trajectory, view and index.
     """
 
     gl_facts = {"gl_renderer": "a painter"}  # noqa: RUF012  as it is asked for
@@ -61,18 +51,16 @@ class Painter:
     def __init__(self, size=(16, 24), *, plain=False):
         self.size = size
         self.plain = plain
-        self.asked: list[tuple[Path, list[int], View]] = []
-        self.tiles: list[Any] = []
-        self.breaks_at: Callable[[Path, View, int], object] = lambda *_: None
+        self.asked = []
+        self.tiles = []
+        self.breaks_at = lambda *_: None
 
     def frames(self, trajectory, indices, view=None, *, cameras=None):
         view = view or View()
         self.asked.append((trajectory, list(indices), view))
         self.tiles.append(cameras)
         with open_trajectory(trajectory) as reader:
-            shown = [
-                int(reader.snapshots(i, i + 1)["geom_rgba"][0, 0]) for i in indices
-            ]
+            shown = [reader.snapshots(i, i + 1)["geom_rgba"].item() for i in indices]
         for index, brightness in enumerate(shown):
             self.breaks_at(trajectory, view, index)
             brighter = 0 if view.camera is None else 5
@@ -83,9 +71,7 @@ class Painter:
 
     def start(self): ...
 
-    def rest(self): ...
-
-    def close(self): ...
+    rest = close = start
 
 
 def new_logs(directory, infix=INFIX, *, tail_bytes=TAIL_BYTES):
@@ -103,11 +89,8 @@ def new_logs(directory, infix=INFIX, *, tail_bytes=TAIL_BYTES):
 def add_row(span, step, **values):
     """Add a row whose columns are `values`; with a snapshot it is a frame's, too."""
     slot = span.make_room()
-    commit = {
-        key: values.pop(key)
-        for key in ("reward", "terminated", "truncated", "is_step")
-        if key in values
-    }
+    known = ("reward", "terminated", "truncated", "is_step")
+    commit = {key: values.pop(key) for key in known if key in values}
     for name, column in span.log.columns.items():
         if name not in ("row", "step", "reward", "flags"):
             column[slot] = values.get(name, 0)
@@ -135,35 +118,28 @@ def write_log(
     """
     logs = new_logs(directory, infix)
     name = trajectory_prefix(infix, episode_id)
-    span = logs.begin(
-        name,
-        {
-            "episode_id": episode_id,
-            "infix": str(infix),
-            "env_id": "Grey-v0",
-            "type": "t",
-            "seed": 5,
-            "options": None,
-            "versions": {"mjrec": "0"},
-            "scene": {"label": "side"},
-            "video": video
-            and {
-                "name": f"{video_prefix(infix, episode_id)}.mp4",
-                "quality": "full",
-                "fps": fps,
-                "max_fps": None,
-                "recording": video,
-            },
-            "rate": "20",
-            "timestep": "1/20",
-            "stride": stride,
-            **facts,
-        },
-        GREY_ROWS,
-    )
+    if video:
+        file = f"{video_prefix(infix, episode_id)}.mp4"
+        rates = {"fps": fps, "max_fps": None}
+        video = {"name": file, "quality": "full", "recording": video, **rates}
+    usual = {
+        "episode_id": episode_id,
+        "infix": str(infix),
+        "env_id": "Grey-v0",
+        "type": "t",
+        "seed": 5,
+        "options": None,
+        "versions": {"mjrec": "0"},
+        "scene": {"label": "side"},
+        "video": video,
+        "rate": "20",
+        "timestep": "1/20",
+        "stride": stride,
+    }
+    span = logs.begin(name, {**usual, **facts}, GREY_ROWS)
     taken = 0
     for step in range(steps + 1):
-        values: dict[str, Any] = {}
+        values = {}
         if frames and (step % stride == 0 or step == steps):
             values["snapshot"] = grey(taken)
             taken += 1
@@ -200,13 +176,8 @@ def write_pending_manifest(directory, *episode_ids, infix=INFIX, **rest):
         }
         for episode_id in episode_ids
     ]
-    write_manifest(
-        path,
-        Manifest(
-            stats="openaigym.episode_batch.0.7.stats.json",
-            videos=(),
-            env_info={"gym_version": "mjrec-1", "env_id": "Grey-v0"},
-            mjrec={"format_version": 1, "pending": pending, "broken": [], **rest},
-        ),
-    )
+    stats = "openaigym.episode_batch.0.7.stats.json"
+    env_info = {"gym_version": "mjrec-1", "env_id": "Grey-v0"}
+    details = {"format_version": 1, "pending": pending, "broken": [], **rest}
+    write_manifest(path, Manifest(stats, (), env_info, details))
     return path
