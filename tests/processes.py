@@ -10,10 +10,7 @@ from pathlib import Path
 
 
 def children(of="self"):
-    """Return those that are still there, also as zombies.
-
-    Without those of multiprocessing itself, which it keeps to the very end.
-    """
+    """Return those that are still there, zombies too, but not multiprocessing's own."""
     own = re.compile(b"resource_tracker|forkserver")
     while True:
         try:

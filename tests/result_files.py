@@ -46,10 +46,7 @@ def stats_of(*episodes, start=98.0, types=""):
 
 
 def write_saved(directory, infix, *episodes, stats=None, **options):
-    """Write statistics, and the manifest that names them; return the latter.
-
-    Options are the manifest's `env_info`, `videos` and `details`, or of `stats_of`.
-    """
+    """Write statistics, and the manifest that names them, with options of both."""
     env_info, details = options.pop("env_info", ENV_INFO), options.pop("details", None)
     videos = tuple(options.pop("videos", ()))
     name = f"openaigym.episode_batch.{infix}.stats.json"

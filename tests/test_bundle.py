@@ -123,10 +123,7 @@ def test_a_directory_lists_what_lies_in_bundles(tmp_path):
     ],
 )
 def test_an_index_that_lies_names_no_episode(tmp_path, said, episodes):
-    """One that cannot be read is as one without episodes, and takes no memory.
-
-    What only the index has cannot be opened, nor a group that leads elsewhere.
-    """
+    """One without episodes takes no memory, and no group leads elsewhere."""
     [path] = record(tmp_path, 1)
     index = f'{{"format": "{said}", "version": 1, "episodes": {episodes}}}'
     bundle_of(path).write_bytes((index if said else episodes).encode("latin-1") + b"\n")

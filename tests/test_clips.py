@@ -120,10 +120,7 @@ EVERY = {"video_callable": lambda _: True}
     default=2,
 )
 def test_frames_are_those_that_were_drawn_live(make, steps, options, tmp_path):
-    """Byte for byte, across resets and from the midst of an episode.
-
-    A target lies elsewhere in each episode, or the model is compiled anew.
-    """
+    """Byte for byte, across resets that change or compile the model."""
     said = []
     for render in ("live", "deferred"):
         env = make(render_mode="rgb_array") if make is hopper else make()

@@ -239,10 +239,7 @@ def state():
 
 
 def test_no_opengl_and_no_random_numbers_in_the_simulation(tmp_path):
-    """A process in which MuJoCo has none records all the same, and loads none.
-
-    Python's and NumPy's global random states are left alone.
-    """
+    """Where MuJoCo has none, all is recorded; global random states are left alone."""
     bare, recorded = SCRIPT.split("env = mjrec")
     code = (
         f"{bare}{OPENGL}before = state()\nenv = mjrec{recorded}env.close()\n"
@@ -288,10 +285,7 @@ def test_without_a_simulation_there_are_actions_and_rewards(tmp_path, make_corri
 
 
 def test_data_may_be_replaced_and_deleted_and_actions_change_their_dtype(tmp_path):
-    """Rows follow the data that there is; none are read from freed memory.
-
-    An environment that gets actions of another dtype gives other rewards.
-    """
+    """Rows follow the data that there is; rewards depend on the dtypes that are noted."""
     env = make("HalfCheetah-v5")
     shown = []
     with monitored(env, tmp_path, workers=0) as monitor:

@@ -84,10 +84,7 @@ def test_steps_that_are_resets(tmp_path):
 
 @pytest.mark.parametrize(("discount", "terminated"), [(0.0, True), (1.0, False)])
 def test_reset_is_allowed_at_any_time(tmp_path, discount, terminated):
-    """The unfinished episode has a number and no statistics; it can be forbidden.
-
-    A last step with discount 0 ends the task; another is a limit.
-    """
+    """If not forbidden; a last step's discount tells the task's end from a limit."""
     inner = Countdown(discount=discount)
     with mjrec.Monitor(inner, tmp_path, video_callable=False) as env:
         env.reset()

@@ -76,10 +76,7 @@ def test_a_step_that_raises_ends_its_episode_unless_another_one_follows(
 
 
 def test_reset_that_raises(monitored, tmp_path):
-    """The episode before it, which was not over, is marked with that.
-
-    Before the first there is none to be marked.
-    """
+    """The episode before it, if one was not over, is marked with that."""
     env, monitor = monitored
     for _ in range(2):
         env.error = RuntimeError("no such level")

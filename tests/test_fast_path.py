@@ -20,10 +20,7 @@ CHEETAH, HOPPER = "HalfCheetah-v5", "Hopper-v5"
 
 
 def make(env_id=CHEETAH, steps=8, *, give=None):
-    """Return an environment nearly all of whose steps are usual.
-
-    Its rewards become what `give` makes of them.
-    """
+    """Return an environment whose steps are usual; `give` changes its rewards."""
     env = gymnasium.make(env_id, width=48, height=32, max_episode_steps=steps)
     if give is not None:
         env = gymnasium.wrappers.TransformReward(env, lambda r: give(float(r)))
@@ -184,10 +181,7 @@ def test_rewards_of_any_type_are_numbers(kind, tmp_path):
 
 
 def test_a_step_whose_reward_is_no_number_is_not_recorded(tmp_path):
-    """The next one is; a monitor that is closed within a step returns it as ever.
-
-    As by a signal's handler that only closes it.
-    """
+    """The next one is; a monitor that is closed within a step returns it as ever."""
     rewards = iter([1.0, 1.0, "much", 1.0])
 
     def give(reward):
@@ -212,10 +206,7 @@ def test_a_step_whose_reward_is_no_number_is_not_recorded(tmp_path):
 
 
 def test_actions_are_recorded_as_they_are_given(tmp_path, caplog):
-    """Whatever their type in mid-episode, with no word about it.
-
-    Also where the environment overwrites them.
-    """
+    """Of any type in mid-episode, also where the environment overwrites them."""
 
     class Overwriting(gymnasium.Wrapper):
         def step(self, action):

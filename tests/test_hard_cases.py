@@ -106,10 +106,7 @@ def test_a_model_that_changes_at_every_step(tmp_path, env_id, before, workers):
 @pytest.mark.dm_control
 @pytest.mark.parametrize("is_older", [False, True])
 def test_another_renderer_is_closed_between_live_frames(is_older, tmp_path):
-    """It frees objects in the current context, and leaves none current or dm_control's.
-
-    dm_control notices neither. Its own drawing afterwards works as well.
-    """
+    """None is current then, or dm_control's, which does not notice; all is drawn."""
     model = mujoco.MjModel.from_xml_string("<mujoco/>")
     options = {"video_callable": lambda _: True, "render": "live", **SIZE}
     drawn = []
@@ -127,10 +124,7 @@ def test_another_renderer_is_closed_between_live_frames(is_older, tmp_path):
 
 
 def test_an_environment_that_moves_things_while_it_draws(tmp_path):
-    """Fetch puts its target at the goal in `_render_callback`; not every step is drawn.
-
-    The simulation goes on as if nothing had been drawn.
-    """
+    """Fetch moves its target in `_render_callback`; the simulation is left alone."""
     pytest.importorskip("gymnasium_robotics")
     made = {"max_episode_steps": 5, "render_mode": "rgb_array", **SIZE}
     options = {"max_fps": 10, "workers": 1}

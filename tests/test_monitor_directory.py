@@ -40,10 +40,7 @@ FOREIGN = [
 
 
 def test_names_say_monitor_and_episode_and_are_listed(tmp_path):
-    """Hidden ones if asked for; no other files, no directories.
-
-    A link counts where it leads to a file.
-    """
+    """Hidden ones if asked for; no directories, and links that lead to files."""
     for names, said in (
         (OF_EPISODES, ("0.1", 27)),
         (OF_MONITORS, ("0.1", None)),

@@ -61,10 +61,7 @@ def test_force_deletes_monitor_files_only(tmp_path, names):
 
 
 def test_resume_goes_on_after_the_highest_number(tmp_path):
-    """By what a closed run counted, and by a dead one's videos.
-
-    With a uid each run has numbers of its own; to join looks at no other files.
-    """
+    """Of closed and dead runs, or of those with its uid; to join looks at no files."""
     record(tmp_path)
     assert first_number(tmp_path) == 2
     write_video(tmp_path, "0.alice", 7)
@@ -128,10 +125,7 @@ def test_resume_over_another_environment_is_an_error(tmp_path):
     ],
 )
 def test_an_impossible_directory_is_an_error(path, said, tmp_path):
-    """It names the path: a file, and where not even root may write.
-
-    On a full disk, directories made on the way go again.
-    """
+    """It names the path; of a directory without room nothing is left."""
     (tmp_path / "file").touch()
     with pytest.raises(DirectoryNotWritable, match=said):
         monitor(Path(path.format(tmp_path)))

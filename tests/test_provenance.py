@@ -29,10 +29,7 @@ def git(directory, *arguments):
 
 
 def test_a_program_in_a_repository(tmp_path, tmp_path_factory):
-    """Its command line, packages, variables, commit and policy are in the manifest.
-
-    Files that git knows may have changed; elsewhere there is nothing to say of code.
-    """
+    """Its command, packages, variables, commit and policy are in the manifest."""
     (tmp_path / "train.py").write_text(PROGRAM)
     git(tmp_path, "init", "-q")
     git(tmp_path, "remote", "add", "origin", "https://example.org/robot.git")
@@ -114,10 +111,7 @@ OF_THE_INSTALLER = [
 
 
 def test_hashes_are_of_what_a_wheel_consists_of(tmp_path, monkeypatch):
-    """Whatever the order of its lines, and whatever its installer adds to them.
-
-    Of several versions the first on the path counts, which is the one imported.
-    """
+    """In any order, without an installer's lines; of the first version on the path."""
     for version in ("1.5", "3.0"):
         info = tmp_path / version / f"gripper-{version}.dist-info"
         info.mkdir(parents=True)

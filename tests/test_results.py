@@ -45,10 +45,7 @@ def test_detecting_takes_exact_names_in_order(tmp_path):
 
 
 def test_clearing_removes_monitor_files_and_nothing_else(tmp_path, monkeypatch):
-    """Locks and unfinished files too; a link and not its target; none while in use.
-
-    First what lists the rest: if it is interrupted, no results lack their files.
-    """
+    """First what lists the rest; a link and not its target; none while in use."""
     touch(tmp_path, *MONITOR_FILES[:-1], HIDDEN_FILES[1], *OTHER_FILES)
     (tmp_path / MONITOR_FILES[-1]).symlink_to("policy.pt")
     folder = tmp_path / "openaigym.video.9.9.video000000.mp4"
@@ -99,10 +96,7 @@ def test_merging_sorts_by_time_and_keeps_rows_together(tmp_path):
 
 
 def test_every_monitor_keeps_its_place_in_every_list(tmp_path, caplog):
-    """With a manifest or without, with episodes or without; in gym's order.
-
-    Where there is none, or no directory, the result is None, as in gym.
-    """
+    """With or without manifest and episodes; where there is none the result is None."""
     assert mjrec.load_results(tmp_path / "missing") is None
     assert mjrec.load_results(str(tmp_path)) is None
     assert f"directory {tmp_path / 'missing'} does not exist" in caplog.text

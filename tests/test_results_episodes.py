@@ -97,10 +97,7 @@ def test_a_video_is_never_shown_for_another_episode(tmp_path, types, linked):
 
 
 def test_monitors_come_in_the_order_of_their_numbers(tmp_path):
-    """10 after 9, for the monitor and for the process; a missing directory is an error.
-
-    It is one before the first episode is asked for.
-    """
+    """10 after 9; a missing directory is an error before the first episode."""
     infixes = ["0.9", "0.10", "1.7", "9.7", "10.7"]
     for infix in reversed(infixes):
         write_journal(tmp_path, infix, 0)

@@ -82,10 +82,7 @@ def files_of(result):
 
 
 def test_what_is_written_is_read_back(tmp_path):
-    """Plan, summaries, choice, versions, files, and each number bit for bit.
-
-    Results may be published without the times.
-    """
+    """Each number bit for bit, and all the rest; results may lack the times."""
     read = read_results(written(tmp_path))
     assert read.plan == PLAN
     assert (read.summaries, read.across) == ((SUMMARY,), ACROSS)
@@ -121,10 +118,7 @@ def test_the_files_are_what_the_documentation_says(tmp_path):
 
 
 def test_results_are_gone_while_they_are_rewritten(tmp_path):
-    """Tables of one plan never stand beside the summaries of another.
-
-    An unfinished evaluation is told from none: the way on is to resume it.
-    """
+    """No tables stand beside another plan's summaries; the way on is to resume."""
     with pytest.raises(UnreadableFile, match="the directory contains no evaluation"):
         read_results(tmp_path)
     assert not is_evaluation(tmp_path)

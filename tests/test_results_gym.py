@@ -181,10 +181,7 @@ def test_gym_answers_as_recorded(ask_gym, tmp_path, monkeypatch):
 def test_gym_agrees_on_what_a_monitor_writes(
     ask_gym, tmp_path, corridor, make_corridor, play
 ):
-    """Two runs, the second resumed, with videos, a mode, and an unfinished episode.
-
-    A NaN is null; the other episodes' rewards are unharmed.
-    """
+    """Two runs with all that a monitor writes; a NaN is null, and harms no other."""
     stats = StatsFile(1.0, (2.0, 3.0), (1, 1), (math.nan, 2.5), ("t", "t"))
     write_saved(tmp_path, "0.7", stats=stats, env_info=ENV_INFO)
     [gyms] = ask_gym(tmp_path).values()

@@ -305,10 +305,7 @@ def test_a_process_killed_in_a_line_of_the_journal_loses_nothing_else(
 
 
 def test_lost_rows_of_an_ended_recording_are_counted(logs, path):
-    """Cut at every word; the journal says how many rows there were.
-
-    A log that changes while it is read is an error, never rows of something else.
-    """
+    """Cut at every word, also while it is read; rows of something else are an error."""
     write(logs, 5).end({"complete": True})
     write(logs, 5, episode=28).end({"complete": True})
     logs.close()
@@ -386,10 +383,7 @@ def test_what_a_full_disk_did_not_let_be_said_is_said_later(logs, path, room):
 
 
 def test_a_full_disk_costs_no_step_that_was_recorded(logs, path, mapped):
-    """The step that finds no room is refused, or kept in memory where none is mapped.
-
-    With room again all goes on.
-    """
+    """The step without room is refused, or kept in memory; with room all goes on."""
     span = write(logs, 3)
     with file_size_limit(6000):
         with pytest.raises(FileNotWritten, match=r"\.log: File too large"):

@@ -43,10 +43,7 @@ def in_both_forms(path):
 
 
 def test_everything_is_there_as_arrays(tmp_path):
-    """With the documented shapes, and states by MuJoCo's names of their components.
-
-    Another name is an error that lists them.
-    """
+    """With the documented shapes; an unknown component is an error that lists them."""
     path, seen = record(tmp_path, max_fps=10)
     qpos = seen.pop("qpos")
     for trajectory in in_both_forms(path):
@@ -75,10 +72,7 @@ def test_everything_is_there_as_arrays(tmp_path):
 
 
 def test_the_model_is_that_of_the_step(tmp_path):
-    """Step 0 is what the reset set; later changes hold from their steps on.
-
-    A step that is not there is an error that says how many there are.
-    """
+    """Changes hold from their steps on; an unknown step is an error."""
 
     def change(step, model):
         if step == 0:

@@ -68,10 +68,7 @@ def pendulums(count):
 def test_every_sub_environment_has_whole_videos(
     corridors, tmp_path, caplog, inside, mode
 ):
-    """Each shows its reset and all its steps.
-
-    Where a reset hides the terminal one, metadata and one warning say so.
-    """
+    """Where a reset hides the terminal frame, metadata and one warning say so."""
     is_hidden = (inside, mode) == (False, SAME_STEP)
     with mjrec.Monitor(corridors(mode, inside=inside), tmp_path) as env:
         play(env, 8)
@@ -391,10 +388,7 @@ def tiles_at(path, *, step):
 @pytest.mark.parametrize("inside", [True, False])
 @pytest.mark.parametrize("mode", MODES)
 def test_one_video_shows_all(corridors, tmp_path, mode, inside):
-    """It follows the first's episodes, and is listed in its manifest.
-
-    In SAME_STEP a reset hides the last frame, which is said to be missing.
-    """
+    """It follows the first's episodes and manifest; a frame that is hidden is noted."""
     vector = corridors(mode, inside=inside, lengths=(2, 3, 2), size=(32, 64))
     with mjrec.Monitor(vector, tmp_path, tiled=True) as env:
         play(env, 8)
@@ -460,10 +454,7 @@ def test_pixels_are_those_of_each_environment(tmp_path):
 
 
 def test_a_bad_frame_can_be_tolerated(tmp_path, caplog):
-    """Sizes that differ are an error, or with `on_error="warn"` no tiled video.
-
-    Too few frames are always one.
-    """
+    """With `on_error="warn"` there is no tiled video; too few frames are an error."""
     vector = VectorCorridor(heights=(32, 48))
     with (
         mjrec.Monitor(vector, tmp_path / "raise", tiled=True) as env,

@@ -111,11 +111,7 @@ def write_log(
     fps=None,
     **facts,
 ):
-    """Record an episode at 20 steps a second; return the file that it would become.
-
-    Where it has `ended`, its last words are there; where it is `over`, its last row
-    says so.
-    """
+    """Record an episode; `ended` adds its last event, `over` marks its last row."""
     logs = new_logs(directory, infix)
     name = trajectory_prefix(infix, episode_id)
     if video:
