@@ -174,7 +174,7 @@ import sys, gymnasium, mjrec
 env = gymnasium.make("InvertedPendulum-v5", height=48, width=64)
 env = mjrec.Monitor(env, sys.argv[1], workers=1)
 env.reset(seed=0)
-env.step(env.action_space.sample())
+env.step([0.0])
 """
 
 
@@ -195,68 +195,61 @@ def test_ctrl_c_while_waiting_leaves_the_rest_pending(tmp_path, stuck_encoder):
 
 
 # Takes more than five seconds: the same video by several numbers of workers.
-def test_a_video_is_the_same_bytes_whoever_draws_it(tmp_path):
-    """One worker or three."""
+def test_changes_of_the_model_show_and_one_worker_draws_the_bytes_of_three(tmp_path):
+    """Colours by themselves, textures after `model_changed`: from the next frame on."""
     videos = set()
     for workers in (1, 3):
         directory = tmp_path / str(workers)
-        with mjrec.Monitor(make("Hopper-v5"), directory, workers=workers) as env:
-            steps(env, 8)
+        env = make("Ant-v5")
+        model = env.unwrapped.model
+        with mjrec.Monitor(env, directory, workers=workers) as monitor:
+            monitor.reset(seed=0)
+            monitor.step(np.zeros(8))
+            model.tex_data[:] = 255 - model.tex_data
+            monitor.model_changed()
+            monitor.step(np.zeros(8))
+            model.geom_rgba[:] = (0, 1, 0, 1)
+            monitor.step(np.zeros(8))
         [video] = directory.glob("*.mp4")
         videos.add(video.read_bytes())
     assert len(videos) == 1
-
-
-def test_what_changes_in_the_model_shows(tmp_path):
-    """Colours by themselves, textures after `model_changed`: from the next frame on."""
-    env = make("Ant-v5")
-    with mjrec.Monitor(env, tmp_path, workers=1) as monitor:
-        monitor.reset(seed=0)
-        monitor.step(np.zeros(8))
-        env.unwrapped.model.tex_data[:] = 255 - env.unwrapped.model.tex_data
-        monitor.model_changed()
-        monitor.step(np.zeros(8))
-        env.unwrapped.model.geom_rgba[:] = (0, 1, 0, 1)
-        monitor.step(np.zeros(8))
-    _, *shown = (frame.astype(int) for frame in frames_in(tmp_path, 0))
+    _, *shown = (frame.astype(int) for frame in frames_in(directory, 0))
     textured, coloured = (np.abs(a - b) for a, b in itertools.pairwise(shown))
     assert textured.mean() > 20
     assert coloured.max() > 60
 
 
 # What Gymnasium itself has loaded (glfw) is there before.
-OPENGL = """
+BESIDE = """
 import pathlib, random
 import numpy as np
-def opengl():
+def state():
     maps = pathlib.Path("/proc/self/maps").read_text()
     libraries = "libEGL", "libOSMesa", "libGL.", "libGLX", "libOpenGL", "libglfw"
     loaded = {name.partition(".")[0] for name in sys.modules} & {"OpenGL", "glfw"}
-    return loaded | {name for name in libraries if name in maps}
-def state():
-    return opengl(), random.getstate(), np.random.get_state()[1].tolist()
+    loaded |= {name for name in libraries if name in maps}
+    return loaded, random.getstate(), np.random.get_state()[1].tolist()
+before = state()
 """
 
 
-def test_no_opengl_and_no_random_numbers_in_the_simulation(tmp_path):
-    """Where MuJoCo has none, all is recorded; global random states are left alone."""
+def test_a_script_without_opengl_and_a_main_guard(tmp_path):
+    """It loads no OpenGL, no module is imported twice, and random states are kept."""
     bare, recorded = SCRIPT.split("env = mjrec")
-    code = (
-        f"{bare}{OPENGL}before = state()\nenv = mjrec{recorded}env.close()\n"
-        "assert state() == before, opengl()"
-    ).replace("env.action_space.sample()", "[0.0]")
-    run_python(code, tmp_path, env={**os.environ, "MUJOCO_GL": "disable"})
-    assert len(frames_in(tmp_path, 0)) == 2
-
-
-def test_works_in_a_script_without_a_main_guard(tmp_path):
-    """Workers never import the user's main module, nor what lies beside it."""
     script = tmp_path / "script.py"
     (tmp_path / "h5py.py").write_text("raise RuntimeError('not this one')")
-    script.write_text(SCRIPT + "print('once')\nenv.close()\n")
-    command = [sys.executable, str(script), str(tmp_path / "out")]
-    assert subprocess.check_output(command, text=True) == "once\n"
-    assert len(list((tmp_path / "out").glob("*.mp4"))) == 1
+    script.write_text(
+        f"{bare}{BESIDE}env = mjrec{recorded}env.close()\n"
+        "assert state() == before, state()\nprint('once')\n"
+    )
+    done = subprocess.run(
+        [sys.executable, str(script), str(tmp_path / "out")],
+        env={**os.environ, "MUJOCO_GL": "disable"},
+        capture_output=True,
+        text=True,
+    )
+    assert (done.stdout, done.returncode) == ("once\n", 0), done.stderr
+    assert len(frames_in(tmp_path / "out", 0)) == 2
 
 
 def test_without_a_simulation_there_are_actions_and_rewards(tmp_path, make_corridor):
@@ -285,7 +278,7 @@ def test_without_a_simulation_there_are_actions_and_rewards(tmp_path, make_corri
 
 
 def test_data_may_be_replaced_and_deleted_and_actions_change_their_dtype(tmp_path):
-    """Rows follow the data that there is; rewards depend on the dtypes that are noted."""
+    """Rows follow the data that there is, in the dtypes of the actions given."""
     env = make("HalfCheetah-v5")
     shown = []
     with monitored(env, tmp_path, workers=0) as monitor:

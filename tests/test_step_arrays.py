@@ -30,16 +30,12 @@ def test_a_kind_keeps_every_value(example, kind):
     assert np.array_equal(array.values.ravel(), expected)
 
 
-def test_what_no_array_holds_is_not_recorded():
-    """Nothing is made of it."""
+def test_actions_may_begin_with_whole_numbers():
+    """One is a choice; several are float64; of what fits nowhere nothing is made."""
+    kinds = [action_array(example) for example in (3, [0, 0], np.zeros(2, np.int64))]
+    assert [each.kind.base for each in kinds] == ["<i8", "<f8", "<f8"]
     for example in (None, "left", [[1], [1, 2]], {}, {"a": "b"}, 1j):
         assert step_array(example) is None
-
-
-def test_actions_may_begin_with_whole_numbers():
-    """A single one is a choice and stays an integer; several are float64."""
-    kinds = [action_array(example) for example in (3, [0, 0], np.zeros(2, np.int64))]
-    assert [kind and kind.kind.base for kind in kinds] == ["<i8", "<f8", "<f8"]
 
 
 @pytest.mark.parametrize(

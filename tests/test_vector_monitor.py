@@ -3,7 +3,6 @@ import contextlib
 import functools
 import gc
 import hashlib
-import json
 import pickle
 from pathlib import Path
 
@@ -44,11 +43,12 @@ pytestmark = pytest.mark.usefixtures("no_process_is_left")
 def corridors(make_corridor):
     """Make corridors, 2 and 3 steps long if not said, in a list or in one object."""
 
-    def make(mode=NEXT_STEP, *, inside=True, lengths=LENGTHS, size=(32, 48)):
-        if not inside:
+    def make(mode=NEXT_STEP, *, where="here", lengths=LENGTHS, size=(32, 48)):
+        if where == "one object":
             return VectorCorridor(lengths, mode)
         each = [functools.partial(make_corridor, n, size=size) for n in lengths]
-        return SyncVectorEnv(each, autoreset_mode=mode)
+        kind = {"here": SyncVectorEnv, "other processes": AsyncVectorEnv}[where]
+        return kind(each, autoreset_mode=mode)
 
     return make
 
@@ -61,26 +61,26 @@ def pendulums(count):
     return SyncVectorEnv([make] * count)
 
 
-@pytest.mark.parametrize(
-    ("inside", "mode"),
-    [(True, mode) for mode in MODES] + [(False, mode) for mode in MODES],
-)
+@pytest.mark.parametrize("where", ["here", "one object", "other processes"])
+@pytest.mark.parametrize("mode", MODES)
 def test_every_sub_environment_has_whole_videos(
-    corridors, tmp_path, caplog, inside, mode
+    corridors, tmp_path, caplog, where, mode
 ):
     """Where a reset hides the terminal frame, metadata and one warning say so."""
-    is_hidden = (inside, mode) == (False, SAME_STEP)
-    with mjrec.Monitor(corridors(mode, inside=inside), tmp_path) as env:
-        play(env, 8)
-    for monitor, length in zip(env.monitors, LENGTHS, strict=True):
+    is_hidden = where != "here" and mode == SAME_STEP
+    with mjrec.Monitor(corridors(mode, where=where), tmp_path) as env:
+        play(env, 8, seed=8)
+    for index, (monitor, length) in enumerate(zip(env.monitors, LENGTHS, strict=True)):
         for episode in (0, 1):
             path = path_of(monitor, episode, "mp4")
             frames = list(range(length + (not is_hidden)))
-            assert shown(path, step=4 if inside else 16) == frames
-            said = metadata_at(path.with_suffix(".meta.json")).get("final_frame")
-            assert said == ("missing" if is_hidden else None)
-    said = [r.message for r in caplog.records if "last frame" in r.message]
-    of_all = ["Monitor inside each of the functions" in each for each in said]
+            assert shown(path, step=16 if where == "one object" else 4) == frames
+            said = metadata_at(path.with_suffix(".meta.json"))
+            assert said.get("final_frame") == ("missing" if is_hidden else None)
+            if episode == 0:
+                assert said["seed"] == (8 if where == "one object" else 8 + index)
+    messages = [r.message for r in caplog.records if "last frame" in r.message]
+    of_all = ["Monitor inside each of the functions" in each for each in messages]
     assert of_all == [True] * is_hidden
 
 
@@ -160,10 +160,10 @@ def test_a_failing_constructor_leaves_no_trace(make_corridor, tmp_path, names, r
     assert names(target if resume else tmp_path) == before
 
 
-@pytest.mark.parametrize("inside", [True, False])
-def test_errors_are_noted_in_all_running_episodes(corridors, tmp_path, inside):
+@pytest.mark.parametrize("where", ["here", "one object"])
+def test_errors_are_noted_in_all_running_episodes(corridors, tmp_path, where):
     """Their videos say what has ended them; nothing can be pickled or misused."""
-    vector = corridors(inside=inside)
+    vector = corridors(where=where)
 
     def explode(action):
         raise RuntimeError("the motor burns")
@@ -174,7 +174,7 @@ def test_errors_are_noted_in_all_running_episodes(corridors, tmp_path, inside):
     with pytest.raises(ResetNeeded):
         env.step(np.array([0, 0]))
     env.reset()
-    (vector.envs[1].unwrapped if inside else vector).step = explode
+    (vector.envs[1].unwrapped if where == "here" else vector).step = explode
     with pytest.raises(RuntimeError):
         env.step(np.array([0, 0]))
     env.close()
@@ -256,38 +256,25 @@ def test_statistics_and_episode_info_are_those_of_gymnasium(tmp_path, mode):
             assert len(lengths) == {NEXT_STEP: 4 + 3, SAME_STEP: 6 + 4}[mode]
 
 
-def test_a_list_of_seeds_is_told_one_by_one(tmp_path):
-    """A single seed, for one generator of all, is what each is told."""
-    with mjrec.Monitor(VectorCorridor((2, 2), DISABLED), tmp_path, False) as env:
-        for seed in ([5, 9], 3):
-            env.reset(seed=seed, options={"reset_mask": np.array([True, True]), "a": 1})
-            for _ in range(2):
-                env.step(np.array([0, 0]))
-    said = []
-    for monitor in env.monitors:
-        lines = (tmp_path / f"openaigym.episodes.{monitor.infix}.jsonl").read_text()
-        entries = [json.loads(line) for line in lines.splitlines()]
-        said.append([e["seed"] for e in entries if "seed" in e])
-        assert [e["options"] for e in entries if "seed" in e] == [{"a": 1}] * 2
-    assert said == [[5, 3], [9, 3]]
-
-
 def test_a_masked_reset_leaves_the_others_alone(tmp_path):
-    """Their episodes go on. Others are refused before anything is reset, if asked."""
+    """Their episodes go on; others are refused before anything is reset, if asked."""
     with mjrec.Monitor(
         VectorCorridor(LENGTHS, DISABLED), tmp_path, allow_early_reset=False
     ) as env:
-        env.reset()
+        both, first = np.array([True, True]), np.array([True, False])
+        env.reset(seed=[5, 9], options={"reset_mask": both, "a": 1})
         for _ in range(2):
             env.step(np.array([0, 0]))
         with pytest.raises(ResetNeeded):
             env.step(np.array([0, 0]))
         with pytest.raises(ResetNotAllowed, match=r"\[1\]"):
             env.reset()
-        env.reset(options={"reset_mask": np.array([True, False])})
+        env.reset(options={"reset_mask": first})
         assert [m.episode_id for m in env.monitors] == [2, 1]
         env.step(np.array([0, 0]))
-    assert env.get_episode_lengths() == [[2], [3]]
+    episodes = list(mjrec.iter_episodes(tmp_path))
+    said = [(each.seed, each.options, each.length) for each in episodes]
+    assert said == [(5, {"a": 1}, 2), (9, {"a": 1}, 3)]
     assert shown(path_of(env.monitors[1], 0, "mp4"), step=16) == [0, 1, 2, 3]
 
 
@@ -306,21 +293,6 @@ def test_what_cannot_be_had_from_outside(tmp_path, made, options, error, message
     with pytest.raises(error, match=message):
         mjrec.Monitor(VectorCorridor(**made), tmp_path / "run", **options)
     assert not list(tmp_path.iterdir())
-
-
-@pytest.mark.parametrize("mode", MODES)
-def test_environments_of_other_processes(make_corridor, tmp_path, mode):
-    """Videos of all their frames, but the last where nobody sees it."""
-    each = [lambda length=n: make_corridor(length) for n in LENGTHS]
-    vector = AsyncVectorEnv(each, autoreset_mode=mode)
-    with mjrec.Monitor(vector, tmp_path) as env:
-        play(env, 3, seed=8)
-    for index, (monitor, length) in enumerate(zip(env.monitors, LENGTHS, strict=True)):
-        frames = length if mode == SAME_STEP else length + 1
-        path = path_of(monitor, 0, "mp4")
-        assert shown(path) == list(range(frames))
-        assert metadata_at(path.with_suffix(".meta.json"))["seed"] == 8 + index
-    assert vector.closed
 
 
 def test_what_other_processes_know(tmp_path):
@@ -385,17 +357,17 @@ def tiles_at(path, *, step):
     return shown
 
 
-@pytest.mark.parametrize("inside", [True, False])
+@pytest.mark.parametrize("where", ["here", "one object"])
 @pytest.mark.parametrize("mode", MODES)
-def test_one_video_shows_all(corridors, tmp_path, mode, inside):
+def test_one_video_shows_all(corridors, tmp_path, mode, where):
     """It follows the first's episodes and manifest; a frame that is hidden is noted."""
-    vector = corridors(mode, inside=inside, lengths=(2, 3, 2), size=(32, 64))
+    vector = corridors(mode, where=where, lengths=(2, 3, 2), size=(32, 64))
     with mjrec.Monitor(vector, tmp_path, tiled=True) as env:
         play(env, 8)
     first, second = (path_of(env.monitors[0], k, "tiled.mp4") for k in (0, 1))
     last = [0, 2, 0, -1] if mode == SAME_STEP else [2, 2, 2, -1]
     # The last of the four is the padding.
-    step = 4 if inside else 16
+    step = 4 if where == "here" else 16
     assert tiles_at(first, step=step) == [[0, 0, 0, -1], [1, 1, 1, -1], last]
     assert [tiles[0] for tiles in tiles_at(second, step=step)] == [0, 1, last[0]]
     said = metadata_at(first.with_suffix(".meta.json"))
@@ -411,7 +383,7 @@ def test_one_video_shows_all(corridors, tmp_path, mode, inside):
 @pytest.mark.parametrize("how", ["reset", "close", "error"])
 def test_a_video_that_is_cut_off_says_so(corridors, tmp_path, how):
     """Its metadata has the reason."""
-    vector = corridors(NEXT_STEP, inside=False, lengths=(2, 3, 2))
+    vector = corridors(where="one object", lengths=(2, 3, 2))
     with (
         contextlib.suppress(RuntimeError),
         mjrec.Monitor(vector, tmp_path, tiled=True) as env,
