@@ -293,6 +293,9 @@ def test_last_step_has_what_gymnasium_gives(tmp_path):
     assert list(episode) == list(expected) == ["r", "l", "t"]
     assert (episode["r"], episode["l"]) == (expected["r"], expected["l"])
     assert 0 < episode["t"] < 60
+    # Gymnasium's own asserts that the key is absent: it is off by default.
+    with monitor(tmp_path / "off") as env:
+        assert last_info(RecordEpisodeStatistics(env))[-1]["episode"]["l"] > 0
     with monitor(tmp_path / "around", theirs, episode_info=True) as env:
         episode = last_info(env)[-1]["episode"]
     assert episode["t"] == theirs.time_queue[-1]

@@ -326,10 +326,10 @@ def test_lost_rows_of_an_ended_recording_are_counted(logs, path):
 
 BAD_TAILS = {
     # What it says would lead beyond it, or to rows of another size.
-    "short": lambda *_: struct.pack("=2Q", 9, ROW // 8),
-    "of other rows": lambda *_: tail_head(9, ROW // 8 + 1, CAPACITY),
-    "beyond its end": lambda *_: tail_head(9, ROW // 8, CAPACITY + 1),
-    "without rows": lambda *_: tail_head(9, ROW // 8, 0),
+    "short": lambda *_: struct.pack("=2Q", 19, ROW // 8),
+    "of other rows": lambda *_: tail_head(19, ROW // 8 + 1, CAPACITY),
+    "beyond its end": lambda *_: tail_head(19, ROW // 8, CAPACITY + 1),
+    "without rows": lambda *_: tail_head(19, ROW // 8, 0),
     # Its pages are older than the log, or never were written.
     "zeros": lambda _, newer: bytes(len(newer)),
     "older": lambda older, _: older,
