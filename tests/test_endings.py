@@ -193,21 +193,3 @@ def test_the_end_of_an_episode_that_is_interrupted(moment, tmp_path, monkeypatch
         assert ending == [True, True, 3]
     assert stats_of(tmp_path)["episode_lengths"] == [3, 3]
     assert len(paths) == 2
-
-
-def test_a_handlers_exception_between_a_step_and_its_row(tmp_path, monkeypatch):
-    """The step is not counted and has no row: it is that exception that ended it."""
-
-    def handler(*_, **__):
-        raise ArithmeticError("the handler's")
-
-    monitor = Monitor(pendulum(1), tmp_path, lambda _: True, workers=0)
-    monitor.reset(seed=0)
-    monkeypatch.setattr("mjrec.recorder.states.StateRecorder.step", handler)
-    with pytest.raises(ArithmeticError), monitor:
-        steps(monitor, 1)
-    [path] = in_flight(tmp_path)
-    facts = mjrec.load_trajectory(path).facts
-    assert (facts["complete"], facts["reason"]) == (False, "exception")
-    assert facts["exception"]["message"] == "the handler's"
-    assert stats_of(tmp_path)["episode_lengths"] == []

@@ -215,7 +215,7 @@ def test_actions_are_recorded_as_they_are_given(tmp_path, caplog):
                 action[:] = 7
             return result
 
-    usual = [np.full(6, 0.125 * k, np.float32) for k in range(8)]
+    usual = [np.full(6, 0.125 * k, np.float32) for k in range(6)]
     other = [
         np.linspace(-1, 1, 6),
         np.array([1, 0, -1, 1, 0, 1]),
@@ -224,7 +224,8 @@ def test_actions_are_recorded_as_they_are_given(tmp_path, caplog):
         np.linspace(-1, 1, 6).astype(">f4"),
         np.linspace(-1, 1, 12, dtype=np.float32)[::2],
     ]
-    actions = [*itertools.chain(*zip(usual[:6], other, strict=True)), *usual[6:]]
+    # Also where the first are whole numbers.
+    actions = [other[3], *itertools.chain(*zip(usual, other, strict=True))]
     expected = np.array(actions, np.float64)
     with monitored(Overwriting(make(steps=len(actions))), tmp_path) as monitor:
         begin(monitor)

@@ -68,20 +68,9 @@ def run(env, episodes):
         finish_episode(env)
 
 
-def h5_of(directory):
-    """Return the numbers of the episodes with a finished trajectory."""
-    return sorted(int(path.stem[-6:]) for path in directory.glob("*.h5"))
-
-
-def logs_of(directory):
-    """Return the numbers of the episodes in flight."""
-    return [int(path.stem[-6:]) for path in in_flight(directory)]
-
-
-def facts_of(directory, episode):
-    """Return the facts of a trajectory."""
-    [path] = directory.glob(f"*.episode{episode:06d}.h5")
-    return mjrec.load_trajectory(path).facts
+def numbers(paths):
+    """Return the numbers of the episodes that paths are of."""
+    return sorted(int(path.stem[-6:]) for path in paths)
 
 
 def decided(directory):
@@ -110,11 +99,11 @@ def test_the_worst_n_are_kept(tmp_path, way):
             assert len(list(tmp_path.glob("*.log"))) <= 3
             finish_episode(monitor)
             so_far = sorted(range(number + 1), key=lambda k: (RETURNS[k], k))[:2]
-            assert logs_of(tmp_path) == sorted(so_far)
+            assert numbers(in_flight(tmp_path)) == sorted(so_far)
             assert videos_in(tmp_path) == (sorted(so_far) if way == "live" else [])
         assert not list(tmp_path.glob("w-*"))
         assert notified == {}
-    assert videos_in(tmp_path) == h5_of(tmp_path) == [1, 3]
+    assert videos_in(tmp_path) == numbers(tmp_path.glob("*.h5")) == [1, 3]
     assert not [*tmp_path.glob(".*"), *tmp_path.glob("*00000[024567]*")]
     named = sorted(path.name for path in tmp_path.glob("w-*.mp4"))
     assert named == ["w-episode-1.mp4", "w-episode-3.mp4"]
@@ -128,7 +117,8 @@ def test_the_worst_n_are_kept(tmp_path, way):
     assert details["keep"] == {**chosen, "chosen": [1, 3]}
     for number in (1, 3):
         assert metadata_of(tmp_path, number)["selection"] == chosen
-        assert facts_of(tmp_path, number)["video"]["selection"] == chosen
+        [path] = tmp_path.glob(f"*.episode{number:06d}.h5")
+        assert mjrec.load_trajectory(path).facts["video"]["selection"] == chosen
         assert len(frames_in(tmp_path, number)) == RETURNS[number] + 1
     assert len(journal_of(tmp_path)) == 8
 
@@ -163,7 +153,9 @@ def test_what_is_decided_at_the_end_holds_all(keep, way, kept, tmp_path, caplog)
     caplog.set_level(logging.INFO, "mjrec")
     with mjrec.Monitor(pendulum(), tmp_path, keep=keep, render=way, workers=1) as env:
         run(env, 8)
-        assert (logs_of if way == "deferred" else videos_in)(tmp_path) == [*range(8)]
+        assert [*range(8)] == (
+            numbers(in_flight(tmp_path)) if way == "deferred" else videos_in(tmp_path)
+        )
     assert caplog.text.count("kept on disk") == 1
     assert videos_in(tmp_path) == kept
     name = getattr(keep, "__name__", keep)
@@ -182,13 +174,14 @@ def test_trajectories_are_kept_as_asked(tmp_path, options, kept):
     """Whatever becomes of the videos; those that fell out promise none."""
     with mjrec.Monitor(pendulum([3, 2, 4, 1]), tmp_path, keep="best:1", **options) as e:
         run(e, 4)
-    assert h5_of(tmp_path) == kept
+    assert numbers(tmp_path.glob("*.h5")) == kept
     if not options["workers"]:
-        promised = [bool(facts_of(tmp_path, k)["video"]) for k in kept]
-        assert promised == [False, False, True, False]
+        paths = sorted(tmp_path.glob("*.h5"))
+        promised = [mjrec.load_trajectory(path).facts["video"] for path in paths]
+        assert [bool(each) for each in promised] == [False, False, True, False]
         mjrec.render_videos(tmp_path, workers=1)
     assert videos_in(tmp_path) == [2]
-    assert logs_of(tmp_path) == []
+    assert numbers(in_flight(tmp_path)) == []
     assert metadata_of(tmp_path, 2)["selection"]["rule"] == "best:1"
 
 
@@ -299,7 +292,7 @@ def test_a_killed_run_leaves_its_candidates(tmp_path, kind, recovers):
     """And the running episode, and nothing of what had fallen out; undecided."""
     here = Path(__file__).parent
     run_python(PROGRAM, tmp_path, kind, here, status=-signal.SIGKILL)
-    assert logs_of(tmp_path) == [1, 3, 5]
+    assert numbers(in_flight(tmp_path)) == [1, 3, 5]
     if recovers:
         mjrec.recover(tmp_path)
         details = manifest_of(tmp_path)["mjrec"]

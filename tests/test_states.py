@@ -22,18 +22,13 @@ FULL = """
   {equality}
 </mujoco>
 """
-EQUALITY = '<equality><weld body1="moved" body2="free"/></equality>'
-
-
-def simulated(xml):
-    model = mujoco.MjModel.from_xml_string(xml)
-    return model, mujoco.MjData(model)
 
 
 @pytest.mark.parametrize("xml", [FULL.format(equality=""), "<mujoco/>"])
 def test_the_words_of_a_state_are_what_mujoco_gives(xml):
     """Mocap bodies, user data, activations and forces from outside as well."""
-    model, data = simulated(xml)
+    model = mujoco.MjModel.from_xml_string(xml)
+    data = mujoco.MjData(model)
     data.mocap_pos[:] = 7
     data.userdata[:] = np.arange(len(data.userdata))
     words = state_words(model, data)
@@ -47,7 +42,9 @@ def test_the_words_of_a_state_are_what_mujoco_gives(xml):
 
 def test_components_are_where_mujoco_puts_them():
     """The arrays of `MjData` are found in its vector by name; empty ones are none."""
-    model, data = simulated(FULL.format(equality=EQUALITY))
+    equality = '<equality><weld body1="moved" body2="free"/></equality>'
+    model = mujoco.MjModel.from_xml_string(FULL.format(equality=equality))
+    data = mujoco.MjData(model)
     data.ctrl[:], data.xfrc_applied[:], data.userdata[:] = 0.3, 0.1, [7, 8, 9]
     mujoco.mj_step(model, data, nstep=20)
     row = read_state(model, data)
@@ -60,5 +57,3 @@ def test_components_are_where_mujoco_puts_them():
     assert sum(map(len, parts.values())) == len(row)
     # Whether an equality is active is a byte here and a number there.
     assert state_words(model, data) is None
-    # The forces on the world are part of every state.
-    assert state_dtype(simulated("<mujoco/>")[0]).names == ("time", "xfrc_applied")
