@@ -23,12 +23,6 @@ from mjrec.formats.bundle import (
 )
 from mjrec.formats.monitor_directory import trajectory_prefix
 from mjrec.formats.spans import recordings_in_flight
-from mjrec.formats.trajectory_file import (
-    amend_trajectories,
-    bundle_trajectories,
-    finish_trajectory,
-    open_trajectory,
-)
 from mjrec.results.monitor_files import monitors_of
 
 
@@ -45,7 +39,7 @@ def record(directory, *episodes):
 
 
 def content(path):
-    with open_trajectory(path) as reader:
+    with trajectory_file.open_trajectory(path) as reader:
         return content_of(reader)
 
 
@@ -53,11 +47,11 @@ def test_a_bundle_holds_what_files_would_hold(tmp_path):
     """Dataset by dataset; strangers read it with h5py."""
     numbers = (3, 4, 5, 9, 12)
     apart, together = (record(tmp_path / name, *numbers) for name in "ab")
-    assert bundle_trajectories(together) == {}
+    assert trajectory_file.bundle_trajectories(together) == {}
     bundle = bundle_of(together[0])
     assert not list(bundle.parent.glob("openaigym.states.*"))
     for number, single, bundled in zip(numbers, apart, together, strict=True):
-        finish_trajectory(single)
+        trajectory_file.finish_trajectory(single)
         assert is_finished(bundled)
         assert file_of(bundled) == bundle
         assert datasets_in(bundled) == datasets_in(single)
@@ -74,18 +68,20 @@ def test_a_bundle_holds_what_files_would_hold(tmp_path):
 def test_more_come_into_a_bundle_and_facts_change(tmp_path):
     """What was there is as before, bit for bit; on a full disk the log stays."""
     paths = record(tmp_path, 20, 300, 301)
-    assert bundle_trajectories(paths[:1]) == {}
+    assert trajectory_file.bundle_trajectories(paths[:1]) == {}
     bundle = bundle_of(paths[0])
     assert [each.path for each in recordings_in_flight(tmp_path)] == paths[1:]
     first, before = datasets_in(paths[0]), bundle.read_bytes()
     with file_size_limit(len(before)):
-        failures = bundle_trajectories(paths)
+        failures = trajectory_file.bundle_trajectories(paths)
     assert [type(error) for error in failures.values()] == [FileNotWritten] * 2
     assert bundle.read_bytes() == before
     check(content(paths[1]), 300)
-    assert bundle_trajectories(paths) == {}
+    assert trajectory_file.bundle_trajectories(paths) == {}
     assert recordings_in_flight(tmp_path) == []
-    amend_trajectories({path: lambda facts: {**facts, "new": 1} for path in paths[1:]})
+    trajectory_file.amend_trajectories(
+        {path: lambda facts: {**facts, "new": 1} for path in paths[1:]}
+    )
     assert datasets_in(paths[0]) == first
     assert ["new" in content(path).facts for path in paths] == [False, True, True]
     for number, path in zip((20, 300, 301), paths, strict=True):
@@ -95,8 +91,8 @@ def test_more_come_into_a_bundle_and_facts_change(tmp_path):
 def test_a_directory_lists_what_lies_in_bundles(tmp_path):
     """Beside files of their own; a bundle itself is none, and says what it holds."""
     own, *others = record(tmp_path, 1, 2, 3)
-    finish_trajectory(own)
-    bundle_trajectories([own, *others])
+    trajectory_file.finish_trajectory(own)
+    trajectory_file.bundle_trajectories([own, *others])
     bundle = bundle_of(own)
     assert trajectories_in(bundle) == others
     assert list(finished_trajectories(tmp_path)) == [own, *others]
@@ -131,12 +127,12 @@ def test_an_index_that_lies_names_no_episode(tmp_path, said, episodes):
     assert trajectories_in(bundle_of(path)) == []
     check(content(path), 1)
     bundle_of(path).unlink()
-    bundle_trajectories([path])
+    trajectory_file.bundle_trajectories([path])
     with h5py.File(bundle_of(path), "r+") as file:
         del file["episode000001"]
         file["episode000001"] = h5py.ExternalLink("elsewhere.h5", "/")
     with pytest.raises(UnreadableFile, match=r"episode000001.* of its own"):
-        open_trajectory(path)
+        trajectory_file.open_trajectory(path)
 
 
 @pytest.mark.parametrize("is_written", [False, True])
@@ -148,7 +144,7 @@ def test_what_a_killed_monitor_left_comes_into_its_bundle(
     if is_written:
         with monkeypatch.context() as patched:
             patched.setattr(trajectory_file, "remove_if_done", lambda _: None)
-            assert bundle_trajectories(paths) == {}
+            assert trajectory_file.bundle_trajectories(paths) == {}
         assert recordings_in_flight(tmp_path) == []
     assert any("states" in path.name for path in tmp_path.iterdir())
     recovery = mjrec.recover(tmp_path, bundle=True)

@@ -133,13 +133,8 @@ def test_records_dm_control(tmp_path):
     assert len(frames) == 5
     assert frames[0].shape == (48, 64, 3)
     assert frames[0].std() > 10
-    expected = {
-        "fps": "100",
-        "playback_speed": 1.0,
-        "truncated": True,
-        "camera": -1,
-        "env_id": "dm_control/cheetah",
-    }
     metadata = metadata_of(tmp_path, 0)
-    assert metadata.items() >= expected.items()
+    known = "fps playback_speed truncated camera env_id"
+    values = ["100", 1.0, True, -1, "dm_control/cheetah"]
+    assert [metadata[key] for key in known.split()] == values
     assert metadata["gl_renderer"]

@@ -4,28 +4,23 @@ import doctest
 import numpy as np
 import pytest
 
-from mjrec import (
-    InvalidArgument,
-    capped_cubic_video_schedule,
-    disable_videos,
-    schedules,
-)
+from mjrec import InvalidArgument, schedules
 from mjrec.schedules import schedule_from_text, schedule_name, to_schedule
 
 
 def test_cubes_below_1000_and_then_every_1000th():
     """The docstring's example runs; the answer is a bool for any whole number."""
-    chosen = [n for n in range(5000) if capped_cubic_video_schedule(n)]
+    chosen = [n for n in range(5000) if schedules.capped_cubic_video_schedule(n)]
     assert chosen == [n**3 for n in range(10)] + [1000, 2000, 3000, 4000]
     assert doctest.testmod(schedules).failed == 0
-    assert capped_cubic_video_schedule(np.int64(27)) is True
-    assert capped_cubic_video_schedule(-8) is False
+    assert schedules.capped_cubic_video_schedule(np.int64(27)) is True
+    assert schedules.capped_cubic_video_schedule(-8) is False
     # As in gym; a function is itself.
-    assert to_schedule(None) is capped_cubic_video_schedule
+    assert to_schedule(None) is schedules.capped_cubic_video_schedule
     assert to_schedule(max) is max
     for never in (False, 0, np.False_):
-        assert to_schedule(never) is disable_videos
-    assert not any(disable_videos(n) for n in (0, 1, 8, 1000))
+        assert to_schedule(never) is schedules.disable_videos
+    assert not any(schedules.disable_videos(n) for n in (0, 1, 8, 1000))
 
 
 @pytest.mark.parametrize(

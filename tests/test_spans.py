@@ -21,13 +21,6 @@ from mjrec.formats import row_log, span_writer, spans
 from mjrec.formats.locks import Lock
 from mjrec.formats.monitor_directory import journal_name, lock_name, trajectory_prefix
 from mjrec.formats.row_log import TAIL_HEAD, tail_path
-from mjrec.formats.spans import (
-    is_in_flight,
-    log_paths,
-    recordings_in,
-    recordings_in_flight,
-    remove_if_done,
-)
 from mjrec.formats.trajectory import ModelChange, row_dtype
 from mjrec.formats.trajectory_log import open_recording
 
@@ -57,7 +50,7 @@ def episode(directory, number):
 
 def files_of(directory):
     """Return the journal, and the only log there is, its tail and its changes."""
-    [log] = log_paths(directory)
+    [log] = spans.log_paths(directory)
     journal = directory / journal_name(INFIX)
     return journal, log, tail_path(log), log.with_suffix(".looks")
 
@@ -100,14 +93,14 @@ def test_recordings_of_one_log_come_back_bit_for_bit(logs, tmp_path):
         if number % 2:
             span.end({"complete": True})
     for _ in range(2):
-        found = recordings_in_flight(tmp_path)
+        found = spans.recordings_in_flight(tmp_path)
         assert [each.path for each in found] == [episode(tmp_path, k) for k in range(5)]
         for number, steps in enumerate(lengths):
             content = read(found[number].path)
             check(content, steps, every=2)
             ending = {"complete": True} if number % 2 else {}
             assert (content.facts, content.dropped) == ({**said[number], **ending}, 0)
-        assert len(list(log_paths(tmp_path))) == 1
+        assert len(list(spans.log_paths(tmp_path))) == 1
         logs.close()
 
 
@@ -163,7 +156,7 @@ def test_a_reader_beside_a_writer_sees_whole_recordings(tmp_path):
     try:
         seen, is_over = set(), False
         while not is_over:
-            if not is_in_flight(path):
+            if not spans.is_in_flight(path):
                 continue
             with open_recording(path) as reader:
                 is_over, count = "complete" in reader.facts, reader.row_count
@@ -282,7 +275,7 @@ def test_a_process_killed_in_a_line_of_the_journal_loses_nothing_else(
     recorded, status = forked(record)
     assert os.WTERMSIG(status) == signal.SIGKILL
     assert recorded == (line - 1) // 2
-    found = {each.name: each.path for each in recordings_in_flight(tmp_path)}
+    found = {each.name: each.path for each in spans.recordings_in_flight(tmp_path)}
     lines = ["rows", "begin 0", "end 0", "begin 1", "end 1"]
     said = lines[: line - (part is not bytes)]
     for number in range(2):
@@ -299,8 +292,8 @@ def test_a_process_killed_in_a_line_of_the_journal_loses_nothing_else(
     for number in range(2):
         # Also one whose line lacked its end only, which it has by now.
         drop(episode(tmp_path, number))
-    for left in log_paths(tmp_path):
-        remove_if_done(left)
+    for left in spans.log_paths(tmp_path):
+        spans.remove_if_done(left)
     assert [path.suffix for path in tmp_path.iterdir()] == [".jsonl"]
 
 
@@ -429,9 +422,12 @@ def test_a_log_ends_where_the_next_rows_do_not_belong(logs, tmp_path, monkeypatc
     for number in (5, 6, 7):
         name = trajectory_prefix(INFIX, number)
         add_row(logs.begin(name, FACTS, other, alone=number < 7), 0)
-    found = [[r.name[-1:] for r in recordings_in(log)] for log in log_paths(tmp_path)]
+    found = [
+        [r.name[-1:] for r in spans.recordings_in(log)]
+        for log in spans.log_paths(tmp_path)
+    ]
     assert ["".join(numbers) for numbers in found] == ["01", *"234567"]
-    tails = [tail_path(log).exists() for log in log_paths(tmp_path)]
+    tails = [tail_path(log).exists() for log in spans.log_paths(tmp_path)]
     assert tails == [False] * 6 + [True]
     check(read(episode(tmp_path, 1)), 5)
     check(read(episode(tmp_path, 4)), 0, dtype=other)
@@ -449,14 +445,14 @@ def test_a_log_of_which_nothing_is_needed_is_removed(logs, tmp_path):
     paths[0].write_bytes(b"a file")
     drop(paths[1])
     (tmp_path / "v.mp4").touch()
-    assert is_in_flight(paths[3])
+    assert spans.is_in_flight(paths[3])
     (tmp_path / "v.meta.json").touch()
-    remove_if_done(log)
-    assert [each.path for each in recordings_in_flight(tmp_path)] == paths[2:3]
-    assert [is_in_flight(each) for each in paths] == [False, False, True, False]
+    spans.remove_if_done(log)
+    assert [each.path for each in spans.recordings_in_flight(tmp_path)] == paths[2:3]
+    assert [spans.is_in_flight(each) for each in paths] == [False, False, True, False]
     check(read(paths[2]), 3)
     drop(paths[2])
-    remove_if_done(log)
+    spans.remove_if_done(log)
     assert list(tmp_path.glob("openaigym.states.*")) == []
 
 
@@ -475,11 +471,11 @@ def test_a_log_that_an_open_monitor_writes_is_not_removed(logs, path, monkeypatc
         return real(name)
 
     monkeypatch.setattr(spans, "_is_open", record_late)
-    remove_if_done(log)
+    spans.remove_if_done(log)
     check(read(episode(path.parent, 28)), 5)
     monkeypatch.undo()
     drop(episode(path.parent, 28))
-    remove_if_done(log)
+    spans.remove_if_done(log)
     assert not log.exists()
 
 
@@ -490,7 +486,7 @@ def test_a_journal_by_the_name_of_one_that_was_removed_is_another(tmp_path, more
         logs, count = new_logs(tmp_path, INFIX), 4 + more * number
         for each in range(count):
             write(logs, 0, episode=number + 10 * each, facts={"start_time": number})
-        in_flight = recordings_in_flight(tmp_path)
+        in_flight = spans.recordings_in_flight(tmp_path)
         names = [int(each.name[-2:]) for each in in_flight]
         assert names == [number + 10 * each for each in range(count)]
         assert in_flight[0].facts == {"start_time": number}
@@ -518,7 +514,7 @@ def test_rows_that_no_journal_describes_stay(logs, path, said, reason):
     text = journal.read_bytes()
     journal.unlink() if said is None else journal.write_bytes(said(text))
     with pytest.raises(UnreadableFile, match=reason):
-        recordings_in(log)
+        spans.recordings_in(log)
     logs.release()
-    remove_if_done(log)
+    spans.remove_if_done(log)
     assert log.exists()
