@@ -2,19 +2,22 @@
 """Steps of which nothing but the state is new are recorded as all others are."""
 
 import itertools
+import os
 import signal
 import sys
+import types
 
 import gymnasium
 import mujoco
 import numpy as np
 import pytest
-from other_python import run_python
+from processes import forked, kill_self
 from recordings import stats_of
 
 import mjrec
 from mjrec import Monitor
 from mjrec.formats.trajectory import added_up
+from mjrec.recorder import fast_path
 
 CHEETAH, HOPPER = "HalfCheetah-v5", "Hopper-v5"
 
@@ -297,43 +300,31 @@ def test_an_interrupted_step_is_recorded_or_is_not(max_fps, schedule, tmp_path):
     assert number > 4
 
 
-KILLED = """
-import os, signal, sys
-import gymnasium, mjrec
-from mjrec.recorder import fast_path
-
-rows = 0
-
-class Words:
-    def take(self, *arguments):
-        global rows
-        rows += 1
-        words.take(*arguments)
-        kill_at("being filled")
-
-def add(*rewards):
-    kill_at("filled")
-    return total(*rewards)
-
-def kill_at(moment):
-    if rows == 7 and sys.argv[2] == moment:
-        os.kill(os.getpid(), signal.SIGKILL)
-
-words, fast_path.WORDS = fast_path.WORDS, Words()
-total, fast_path._sum = fast_path._sum, add
-env = gymnasium.make("InvertedPendulum-v5", max_episode_steps=3)
-env = mjrec.Monitor(env, sys.argv[1], lambda _: True, workers=0)
-while True:
-    env.reset(seed=0)
-    for _ in range(3):
-        env.step(env.action_space.sample() * 0)
-"""
-
-
+@pytest.mark.filterwarnings("ignore:This process:DeprecationWarning")
 @pytest.mark.parametrize("moment", ["being filled", "filled"])
 def test_a_kill_at_a_row_loses_that_row(moment, tmp_path):
     """Between filling it and counting it, too: all rows before it are there."""
-    run_python(KILLED, tmp_path, moment, status=-signal.SIGKILL)
+
+    def record(_):
+        rows = itertools.count(1)
+        words = fast_path.WORDS
+
+        def take(*arguments):
+            words.take(*arguments)
+            if next(rows) == 7:
+                if moment == "being filled":
+                    kill_self()
+                fast_path._sum = kill_self
+
+        fast_path.WORDS = types.SimpleNamespace(take=take)
+        monitor = monitored(make("InvertedPendulum-v5", 3), tmp_path)
+        while True:
+            begin(monitor)
+            for _ in range(3):
+                monitor.step(np.zeros(1))
+
+    _, status = forked(record)
+    assert os.WTERMSIG(status) == signal.SIGKILL
     mjrec.recover(tmp_path)
     # The first step of all did not go the fast way.
     assert [len(each) for each in trajectories(tmp_path)] == [3, 3, 1]

@@ -350,6 +350,16 @@ def test_a_tail_of_something_else_or_older_ends_a_recording(logs, path, tail):
     assert content.dropped == (3 if tail == "zeros behind the head" else 0)
 
 
+def test_a_full_disk_when_a_log_is_made_leaves_nothing(logs, path):
+    """Its tail finds no room, or the journal; with room again it is begun."""
+    for room in (0, 100, 4096):
+        with file_size_limit(room), pytest.raises(FileNotWritten, match=r"openaigym\."):
+            logs.begin(path.stem, FACTS, DTYPE)
+        assert list(spans.log_paths(path.parent)) == []
+    write(logs, 3)
+    check(read(path), 3)
+
+
 @pytest.mark.parametrize("room", [0, 30])
 def test_what_a_full_disk_did_not_let_be_said_is_said_later(logs, path, room):
     """The journal stays as it was; an end may stand behind the next beginning."""
@@ -518,3 +528,17 @@ def test_rows_that_no_journal_describes_stay(logs, path, said, reason):
     logs.release()
     spans.remove_if_done(log)
     assert log.exists()
+
+
+def test_files_that_are_removed_while_they_are_written_cost_one_recording(
+    logs, tmp_path
+):
+    """The next one begins another log and another journal, which says all again."""
+    write(logs, 3, episode=0)
+    for file in files_of(tmp_path):
+        file.unlink(missing_ok=True)
+    with pytest.raises(FileNotWritten, match="it was removed"):
+        write(logs, 3, episode=1)
+    write(logs, 3, episode=2)
+    [found] = spans.recordings_in_flight(tmp_path)
+    check(read(found.path), 3)

@@ -61,17 +61,6 @@ def test_rewards_add_up_in_float64(recorder, rewards, total):
     assert read == pytest.approx((total,), nan_ok=True, abs=0, rel=0)
 
 
-def test_an_early_reset_drops_the_episode(tmp_path):
-    """Its steps count only in the total; without a step nothing is lost."""
-    recorder = StatsRecorder(str(tmp_path), "x", allow_early_reset=True)
-    run_episode(recorder, [5.0], end=False)
-    run_episode(recorder, [])
-    run_episode(recorder, [1.0])
-    assert recorder.episode_rewards == [1.0]
-    assert recorder.episode_types == ["t"]
-    assert recorder.total_steps == 2
-
-
 def test_a_type_takes_effect_at_the_next_reset(recorder):
     """Types stay aligned with the completed episodes; there are two."""
     run_episode(recorder, [0.0], end=False)
