@@ -37,16 +37,6 @@ def write_video(directory, infix, episode):
     (directory / f"openaigym.video.{infix}.video{episode:06d}.mp4").touch()
 
 
-def test_existing_recordings_need_force_or_resume(tmp_path):
-    """The error lists files and the ways out; a crashed run's videos count too."""
-    write_video(tmp_path, "0.1", 0)
-    with pytest.raises(ExistingRecordings):
-        monitor(tmp_path)
-    record(tmp_path, force=True)
-    with pytest.raises(ExistingRecordings, match=r"(?s)manifest.*resume=True.*force"):
-        monitor(tmp_path)
-
-
 def test_force_deletes_monitor_files_only(tmp_path, names):
     """Others' files are no recordings, and stay, whatever their names begin with."""
     others = ["notes.txt", "openaigym.manifest.1.1.manifest.json", "openaigym.txt"]
@@ -62,8 +52,12 @@ def test_force_deletes_monitor_files_only(tmp_path, names):
 
 def test_resume_goes_on_after_the_highest_number(tmp_path):
     """Of closed and dead runs, or of those with its uid; to join looks at no files."""
-    record(tmp_path)
-    assert first_number(tmp_path) == 2
+    write_video(tmp_path, "0.1", 0)
+    # A crashed run's videos count as recordings.
+    with pytest.raises(ExistingRecordings, match=r"(?s)mp4.*resume=True.*force"):
+        monitor(tmp_path)
+    record(tmp_path, resume=True)
+    assert first_number(tmp_path) == 3
     write_video(tmp_path, "0.alice", 7)
     write_video(tmp_path, "0.bob", 3)
     # A number that makes names which no file can have does not count.
