@@ -1,16 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Results are found, merged and cleared as in gym, without its mistakes."""
+"""Results are found, merged, listed and cleared as in gym, without its mistakes."""
 
 import json
+import tracemalloc
 from pathlib import Path
 
 import pytest
-from result_files import write_journal, write_saved
+from parts import parametrize
+from result_files import entry, write_journal, write_saved
+from trajectories_by_hand import write_finished, write_log
 
 import mjrec
 from mjrec.errors import DirectoryInUse, UnreadableFile
 from mjrec.formats.locks import Lock
-from mjrec.formats.manifest import StatsFile
+from mjrec.formats.manifest import StatsFile, read_manifest
+from mjrec.reporting.gathering import gather
 
 VIDEO = "openaigym.video.0.1.video000000"
 MONITOR_FILES = [
@@ -122,9 +126,9 @@ def test_unequal_env_infos_are_merged_with_one_warning(tmp_path, caplog):
     results = mjrec.load_results(tmp_path)
     assert results["env_info"] == newest
     assert results["timestamps"] == [101.0, 109.0]
-    (record,) = caplog.records
-    assert "0.7.manifest.json has {'gym_version': 'mjrec-1'" in record.getMessage()
-    assert "1.7.manifest.json has {'gym_version': '0.21.0'}" in record.getMessage()
+    [said] = caplog.messages
+    assert "0.7.manifest.json has {'gym_version': 'mjrec-1'" in said
+    assert "1.7.manifest.json has {'gym_version': '0.21.0'}" in said
 
 
 def test_videos_are_pairs_of_paths_in_order(tmp_path, caplog):
@@ -138,9 +142,9 @@ def test_videos_are_pairs_of_paths_in_order(tmp_path, caplog):
     assert mjrec.load_results(new)["videos"] == [
         tuple(str(new / name) for name in pairs[number]) for number in (2, 0)
     ]
-    (record,) = caplog.records
-    assert "2 of the 4 videos" in record.getMessage()
-    assert "v1.mp4, v3.mp4" in record.getMessage()
+    [said] = caplog.messages
+    assert "2 of the 4 videos" in said
+    assert "v1.mp4, v3.mp4" in said
 
 
 def test_missing_and_damaged_files_are_named(tmp_path):
@@ -156,3 +160,125 @@ def test_missing_and_damaged_files_are_named(tmp_path):
     manifest.write_text(json.dumps({"stats": "../secret"}))
     with pytest.raises(UnreadableFile, match=manifest.name):
         mjrec.load_results(tmp_path)
+
+
+# --- episodes ------------------------------------------------------------------------
+
+
+def video(directory, infix, episode_id, suffix):
+    path = directory / f"openaigym.video.{infix}.video{episode_id:06d}{suffix}"
+    path.touch()
+    return path
+
+
+def test_an_episode_of_a_journal_has_its_files(tmp_path):
+    """Numbers, seeds and flags as the monitor knew them; no other monitor's video."""
+    facts = {"type": "e", "options": {"x": 1}, "terminated": False, "truncated": True}
+    write_journal(tmp_path, "0.7", entry(27, **facts), 28)
+    # The same monitor's statistics hold less of each.
+    write_saved(tmp_path, "0.7", 27, 28)
+    mp4, meta = (video(tmp_path, "0.7", 27, end) for end in (".mp4", ".meta.json"))
+    for infix, end in (("0.7", ".side.mp4"), ("0.7", ".framehash"), ("1.7", ".mp4")):
+        video(tmp_path, infix, 28, end)
+    first, second = mjrec.iter_episodes(str(tmp_path))
+    known = {"episode_id": 27, "length": 37, "reward": 27.0, "seed": 27}
+    known |= {"start_time": 126.5, "end_time": 127.0, "monitor": "0.7"}
+    assert first == mjrec.Episode(video=mp4, metadata=meta, **known, **facts)
+    assert (second.episode_id, second.video, second.metadata) == (28, None, None)
+
+
+@pytest.mark.parametrize("has_journal", [True, False])
+def test_pending_is_what_was_promised_and_is_not_there(tmp_path, has_journal):
+    """In flight or finished; neither what is there, nor what failed or is live."""
+    pending = []
+    if has_journal:
+        kinds = ["deferred"] * 4 + ["live"]
+        entries = [entry(n, recording=kind) for n, kind in enumerate(kinds)]
+        write_journal(tmp_path, "0.7", *entries, run={"env_info": {}})
+    else:
+        names = [f"openaigym.video.0.7.video00000{n}.mp4" for n in range(4)]
+        pending = [{"episode_id": n, "video": name} for n, name in enumerate(names)]
+    details = {"next_episode_id": 5, "pending": pending}
+    write_saved(tmp_path, "0.7", *range(5), details=details)
+    trajectories = [write_log(tmp_path, 0, infix="0.7")]
+    trajectories += [write_finished(tmp_path, n, infix="0.7") for n in range(1, 5)]
+    video(tmp_path, "0.7", 2, ".mp4")
+    video(tmp_path, "0.7", 3, ".meta.json")
+    episodes = list(mjrec.iter_episodes(tmp_path))
+    assert [each.pending for each in episodes] == [True, True, False, False, False]
+    assert [each.trajectory for each in episodes] == trajectories
+
+
+def test_gyms_episodes_have_what_gym_wrote(tmp_path):
+    """Numbered by their index; the rest is None. A gym may die before its manifest."""
+    write_saved(tmp_path, "0.7", 1, 2, types="te").unlink()
+    text, meta = (video(tmp_path, "0.7", 1, end) for end in (".json", ".meta.json"))
+    _, episode = mjrec.iter_episodes(tmp_path)
+    known = {"episode_id": 1, "length": 12, "reward": 2.0, "type": "e"}
+    known |= {"end_time": 102.0, "monitor": "0.7", "video": text, "metadata": meta}
+    assert episode == mjrec.Episode(**known)
+
+
+@pytest.mark.parametrize(
+    ("types", "linked"), [(None, True), ("ttt", True), ("tttt", False)]
+)
+def test_a_video_is_never_shown_for_another_episode(tmp_path, types, linked):
+    """Gym numbers videos by resets; more of them than ends and a next are in doubt."""
+    write_saved(tmp_path, "0.7", 1, 2, types=types)
+    video(tmp_path, "0.7", 0, ".mp4")
+    first, second = mjrec.iter_episodes(tmp_path)
+    assert (first.video is not None) == linked
+    assert (first.type, second.type) == ("t", "t")
+
+
+def test_monitors_come_in_the_order_of_their_numbers(tmp_path):
+    """10 after 9; a missing directory is an error before the first episode."""
+    infixes = ["0.9", "0.10", "1.7", "9.7", "10.7"]
+    for infix in reversed(infixes):
+        write_journal(tmp_path, infix, 0)
+    assert [episode.monitor for episode in mjrec.iter_episodes(tmp_path)] == infixes
+    with pytest.raises(UnreadableFile, match="directory does not exist"):
+        mjrec.iter_episodes(tmp_path / "missing")
+
+
+# --- memory --------------------------------------------------------------------------
+
+
+def peak_of(read, path):
+    """Return the most bytes that were held while something was read."""
+    # The first time, things are loaded that stay.
+    read(path)
+    tracemalloc.start()
+    try:
+        read(path)
+        return tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+
+
+def list_episodes(directory):
+    """Return how many episodes there are."""
+    return sum(1 for _ in mjrec.iter_episodes(directory))
+
+
+def test_memory_does_not_grow_with_the_episodes(tmp_path):
+    """Episodes are read as they are asked for."""
+    items = (entry(number, options="x" * 1000) for number in range(5000))
+    path = write_journal(tmp_path, "0.7", *items)
+    assert peak_of(list_episodes, tmp_path) < path.stat().st_size / 10
+
+
+@parametrize("read", [mjrec.load_results, list_episodes, gather])
+def test_manifests_are_not_kept(tmp_path, read):
+    """What many say of packages takes no more than what a few do."""
+    packages = {
+        f"package-{n}": {"version": "1.0", "hash": "0" * 64} for n in range(999)
+    }
+    large, small = tmp_path / "large", tmp_path / "small"
+    for directory, said in ((large, packages), (small, {})):
+        directory.mkdir()
+        for number in range(40):
+            details = {"provenance": {"packages": said}}
+            path = write_saved(directory, f"{number}.1", 1, details=details)
+    one = peak_of(read_manifest, large / path.name)
+    assert peak_of(read, large) - peak_of(read, small) < 4 * one
