@@ -153,6 +153,7 @@ def test_the_first_step_of_another_episode_may_be_unlike(tmp_path):
     assert paces == ["1/20", "1/40", "1/60", "1/80"]
 
 
+@pytest.mark.parametrize("schedule", [None, False], ids=["recorded", "counted"])
 @pytest.mark.parametrize(
     "kind",
     [
@@ -165,9 +166,9 @@ def test_the_first_step_of_another_episode_may_be_unlike(tmp_path):
     ],
     ids=["int", "float32", "0-d", "1-d", "mixed"],
 )
-def test_rewards_of_any_type_are_numbers(kind, tmp_path):
+def test_rewards_of_any_type_are_numbers(kind, schedule, tmp_path):
     """In the trajectory and, added up in their order, in the statistics."""
-    with monitored(make(give=kind), tmp_path) as monitor:
+    with monitored(make(give=kind), tmp_path, schedule) as monitor:
         begin(monitor)
         stats, rewards = monitor.stats_recorder, []
         for number in range(1, 9):
@@ -178,8 +179,8 @@ def test_rewards_of_any_type_are_numbers(kind, tmp_path):
             assert (stats.rewards, type(stats.rewards)) == (added_up(rewards), float)
         [total] = monitor.get_episode_rewards()
     assert (total, type(total)) == (added_up(rewards), float)
-    [trajectory] = trajectories(tmp_path)
-    assert trajectory.rewards.tolist() == rewards
+    recorded = [each.rewards.tolist() for each in trajectories(tmp_path)]
+    assert recorded == ([rewards] if schedule is None else [])
     assert stats_of(tmp_path)["episode_rewards"] == [total]
 
 

@@ -227,12 +227,12 @@ MILLION = """
 import resource, sys, gymnasium, mjrec, numpy
 env = gymnasium.make("InvertedPendulum-v5", max_episode_steps=10**7)
 env = mjrec.Monitor(env, sys.argv[1], False, trajectory_callable=True)
-start = env.unwrapped.init_qpos, env.unwrapped.init_qvel
+start, action = (env.unwrapped.init_qpos, env.unwrapped.init_qvel), numpy.zeros(1)
 env.reset(seed=0)
 for step in range(int(sys.argv[2])):
     if step % 10 == 0:
         env.unwrapped.set_state(*start)
-    env.step(numpy.zeros(1))
+    env.step(action)
 env.close()
 print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
 """
