@@ -352,9 +352,10 @@ def test_a_tail_of_something_else_or_older_ends_a_recording(logs, path, tail):
 
 def test_a_full_disk_when_a_log_is_made_leaves_nothing(logs, path):
     """Its tail finds no room, or the journal; with room again it is begun."""
-    for room in (0, 100, 4096):
+    long = {"text": "x" * 20_000}
+    for room, facts in ((0, FACTS), (100, FACTS), (4096, FACTS), (9000, long)):
         with file_size_limit(room), pytest.raises(FileNotWritten, match=r"openaigym\."):
-            logs.begin(path.stem, FACTS, DTYPE)
+            logs.begin(path.stem, facts, DTYPE)
         assert list(spans.log_paths(path.parent)) == []
     write(logs, 3)
     check(read(path), 3)
