@@ -10,7 +10,7 @@ import signal
 os.environ.setdefault("MUJOCO_GL", "egl")
 
 from pathlib import Path
-from typing import Any
+from typing import ClassVar
 
 import gymnasium
 import numpy as np
@@ -43,8 +43,7 @@ def own_state_home(tmp_path_factory):
 def default_signals():
     """Have child processes start with SIGINT and SIGHUP as in a terminal.
 
-    Under `nohup` and in a background job they are ignored, in every child too. So a
-    test that sends one asks for this.
+    Under `nohup` and in a background job they are ignored, in every child too.
     """
     earlier = {s: signal.getsignal(s) for s in (signal.SIGINT, signal.SIGHUP)}
     signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -64,7 +63,7 @@ def pytest_report_header():
 class Corridor(gymnasium.Env):
     """Walks `length` steps and ends; draws its position. Needs no simulator."""
 
-    metadata: dict[str, Any] = {  # noqa: RUF012  Gymnasium's own way
+    metadata: ClassVar = {
         "render_modes": ["rgb_array", "ansi", "rgb_array_list"],
         "render_fps": 10,
     }
@@ -75,9 +74,7 @@ class Corridor(gymnasium.Env):
         self.length = length
         self.render_mode = render_mode
         self.size = size
-        self.position = 0
-        self.closed = 0
-        self.rendered = 0
+        self.position = self.closed = self.rendered = 0
 
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
@@ -161,17 +158,18 @@ def play():
 
 
 @pytest.fixture
+def kill_ffmpeg():
+    """Return a function that kills this process's encoders."""
+    return lambda: kill_children("ffmpeg")
+
+
+@pytest.fixture
 def no_process_is_left():
     """See that a test leaves no process that was not there before, zombies included."""
     before = children()
     yield
+    gc.collect()
     assert children() <= before
-
-
-@pytest.fixture
-def kill_ffmpeg():
-    """Return a function that kills this process's encoders."""
-    return lambda: kill_children("ffmpeg")
 
 
 @pytest.fixture

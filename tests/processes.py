@@ -3,24 +3,22 @@
 
 import functools
 import os
+import re
 import signal
 import time
 from pathlib import Path
 
 
 def children(of="self"):
-    """Return those that are still there, be it as zombies.
-
-    Without the one in which multiprocessing tracks what processes share: it starts
-    it with the first process that it spawns, and keeps it to the very end.
-    """
+    """Return those that are still there, zombies too, but not multiprocessing's own."""
+    own = re.compile(b"resource_tracker|forkserver")
     while True:
         try:
             return {
                 int(pid)
                 for thread in Path(f"/proc/{of}/task").iterdir()
                 for pid in (thread / "children").read_text().split()
-                if b"resource_tracker" not in Path("/proc", pid, "cmdline").read_bytes()
+                if not own.search(Path("/proc", pid, "cmdline").read_bytes())
             }
         except (FileNotFoundError, ProcessLookupError):
             # A thread or a child ended meanwhile; a thread's children went to another.

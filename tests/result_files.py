@@ -45,19 +45,12 @@ def stats_of(*episodes, start=98.0, types=""):
     )
 
 
-def write_saved(
-    directory,
-    infix,
-    *episodes,
-    stats=None,
-    env_info=ENV_INFO,
-    videos=(),
-    details=None,
-    **options,
-):
-    """Write statistics, and the manifest that names them; return the latter."""
+def write_saved(directory, infix, *episodes, stats=None, **options):
+    """Write statistics, and the manifest that names them, with options of both."""
+    env_info, details = options.pop("env_info", ENV_INFO), options.pop("details", None)
+    videos = tuple(options.pop("videos", ()))
     name = f"openaigym.episode_batch.{infix}.stats.json"
     write_stats_file(directory / name, stats or stats_of(*episodes, **options))
     path = directory / f"openaigym.manifest.{infix}.manifest.json"
-    write_manifest(path, Manifest(name, tuple(videos), env_info, details))
+    write_manifest(path, Manifest(name, videos, env_info, details))
     return path

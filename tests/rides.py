@@ -5,10 +5,8 @@ A camera rides over an infinite plane, which is drawn around the camera of the f
 before; on the way the terrain, a texture and a colour change.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
@@ -52,7 +50,7 @@ class Ride(NamedTuple):
     """A recorded episode, and the frames that were seen of it."""
 
     path: Path
-    frames: list[Any]
+    frames: list
 
 
 def start(xml=PLAIN):
@@ -87,15 +85,8 @@ def record(directory, *, camera="rider", fresh=False, count=FRAMES, facts=None):
     option = mujoco.MjvOption()
     option.flags[mujoco.mjtVisFlag.mjVIS_INERTIA] = True
     shown = resolve_camera(model, camera)
-    view = SceneView(
-        camera=shown,
-        option=option,
-        max_geom=1000,
-        fresh=fresh,
-        height=HEIGHT,
-        width=WIDTH,
-        label="rider",
-    )
+    size = {"height": HEIGHT, "width": WIDTH, "max_geom": 1000, "fresh": fresh}
+    view = SceneView(camera=shown, option=option, label="rider", **size)
     kind = snapshot_dtype(model, data, option)
     store = ModelStore(directory)
     known = {
@@ -115,15 +106,7 @@ def record(directory, *, camera="rider", fresh=False, count=FRAMES, facts=None):
     span = logs.begin(name, known, row_dtype(snapshot=kind))
     snapshot = np.empty(kind.itemsize // 8, np.uint64)
     seen = []
-    with SceneRenderer(
-        model,
-        height=HEIGHT,
-        width=WIDTH,
-        camera=shown,
-        scene_option=option,
-        max_geom=1000,
-        fresh=fresh,
-    ) as renderer:
+    with SceneRenderer(model, camera=shown, scene_option=option, **size) as renderer:
         for number in range(count):
             names = change(model, number)
             move(model, data, number)

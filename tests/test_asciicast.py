@@ -6,6 +6,7 @@ from fractions import Fraction
 
 import pytest
 from full_disk import file_size_limit
+from other_python import run_python
 
 from mjrec import FileNotWritten
 from mjrec.formats.asciicast import AsciicastWriter
@@ -27,13 +28,7 @@ def test_frames_last_one_over_the_rate_and_clear_the_screen(tmp_path):
     assert (cast["width"], cast["height"]) == (7, 3)
     assert cast["stdout"][1][1] == "\x1b[2J\x1b[1;1Hworld\r\n"
     player = [sys.executable, "-m", "asciinema", "play", "--speed", "100", str(path)]
-    done = subprocess.run(
-        [sys.executable, "-c", f"import pty; pty.spawn({player})"],
-        stdin=subprocess.DEVNULL,
-        capture_output=True,
-        text=True,
-        check=True,
-    )
+    done = run_python(f"import pty; pty.spawn({player})", stdin=subprocess.DEVNULL)
     assert "éé" in done.stdout
     assert "world" in done.stdout
 

@@ -12,11 +12,6 @@ from dm_env import test_utils as dm_env_test_utils  # noqa: E402  after importor
 from recordings import frames_in, journal_of, metadata_of  # noqa: E402  after importorskip
 
 import mjrec  # noqa: E402  after importorskip
-from mjrec import (  # noqa: E402  after importorskip
-    InvalidArgument,
-    NoPictures,
-    ResetNotAllowed,
-)
 
 pytestmark = pytest.mark.dm_control
 
@@ -55,15 +50,6 @@ class Countdown(dm_env.Environment):
         return np.array([self.left], np.float64)
 
 
-@pytest.fixture
-def cheetah():
-    """dm_control's cheetah-run, four steps long."""
-    suite = pytest.importorskip("dm_control.suite", reason="dm_control not installed")
-    env = suite.load("cheetah", "run", task_kwargs={"random": 0, "time_limit": 0.04})
-    yield env
-    env.close()
-
-
 def zeros(env):
     return np.zeros(env.action_spec().shape)
 
@@ -96,53 +82,47 @@ def test_steps_that_are_resets(tmp_path):
     assert env.episode_id == 2
 
 
-def test_reset_is_allowed_at_any_time(tmp_path):
-    """The unfinished episode has a number and no statistics; it can be forbidden."""
-    with mjrec.Monitor(Countdown(), tmp_path, video_callable=False) as env:
+@pytest.mark.parametrize(("discount", "terminated"), [(0.0, True), (1.0, False)])
+def test_reset_is_allowed_at_any_time(tmp_path, discount, terminated):
+    """If not forbidden; a last step's discount tells the task's end from a limit."""
+    inner = Countdown(discount=discount)
+    with mjrec.Monitor(inner, tmp_path, video_callable=False) as env:
         env.reset()
         env.step(zeros(env))
         env.reset()
         for _ in range(3):
             env.step(zeros(env))
     assert env.get_episode_lengths() == [3]
-    assert journal_of(tmp_path)[0]["episode_id"] == 1
-    with mjrec.Monitor(
-        Countdown(), tmp_path / "b", video_callable=False, allow_early_reset=False
-    ) as env:
+    [line] = journal_of(tmp_path)
+    assert line["episode_id"] == 1
+    assert (line["terminated"], line["truncated"]) == (terminated, not terminated)
+    options = {"video_callable": False, "allow_early_reset": False}
+    with mjrec.Monitor(Countdown(), tmp_path / "b", **options) as env:
         env.reset()
         env.step(zeros(env))
-        with pytest.raises(ResetNotAllowed):
+        with pytest.raises(mjrec.ResetNotAllowed):
             env.reset()
 
 
-@pytest.mark.parametrize(("discount", "terminated"), [(0.0, True), (1.0, False)])
-def test_discount_tells_termination_from_truncation(tmp_path, discount, terminated):
-    """A last step with discount 0 ends the task; another is a limit."""
-    with mjrec.Monitor(
-        Countdown(discount=discount), tmp_path, video_callable=False
-    ) as env:
-        for _ in range(4):
-            env.step(zeros(env))
-    [line] = journal_of(tmp_path)
-    assert (line["terminated"], line["truncated"]) == (terminated, not terminated)
-
-
 def test_environment_that_cannot_be_drawn_is_an_error(tmp_path):
-    """It names the way out, and nothing is left."""
+    """It names the way out, and nothing is left; nor where an option does nothing."""
     inner = Countdown()
-    with pytest.raises(NoPictures, match="video_callable=False"):
+    with pytest.raises(mjrec.NoPictures, match="video_callable=False"):
         mjrec.Monitor(inner, tmp_path / "new")
-    with pytest.raises(InvalidArgument, match="no physics"):
-        mjrec.Monitor(inner, tmp_path / "new", camera=0)
+    for option, said in ({"camera": 0}, "no physics"), ({"episode_info": True}, "info"):
+        with pytest.raises(mjrec.InvalidArgument, match=said):
+            mjrec.Monitor(inner, tmp_path / "new", **option)
     assert not (tmp_path / "new").exists()
     assert inner.closed == 0
 
 
-def test_records_dm_control(cheetah, tmp_path):
+def test_records_dm_control(tmp_path):
     """Five frames of four steps; the environment's own attributes are there."""
-    with mjrec.Monitor(
-        cheetah, tmp_path, width=64, height=48, env_id="dm_control/cheetah-run"
-    ) as env:
+    suite = pytest.importorskip("dm_control.suite", reason="dm_control not installed")
+    task_kwargs = {"random": 0, "time_limit": 0.04}
+    cheetah = suite.load("cheetah", "run", task_kwargs=task_kwargs)
+    view = {"width": 64, "height": 48}
+    with mjrec.Monitor(cheetah, tmp_path, env_id="dm_control/cheetah", **view) as env:
         assert env.physics is cheetah.physics
         assert env.control_timestep() == cheetah.control_timestep()
         with pytest.raises(AttributeError, match="no_such_thing"):
@@ -154,9 +134,7 @@ def test_records_dm_control(cheetah, tmp_path):
     assert frames[0].shape == (48, 64, 3)
     assert frames[0].std() > 10
     metadata = metadata_of(tmp_path, 0)
-    assert metadata["fps"] == "100"
-    assert metadata["playback_speed"] == 1.0
-    assert metadata["truncated"] is True
-    assert metadata["env_id"] == "dm_control/cheetah-run"
+    known = "fps playback_speed truncated camera env_id"
+    values = ["100", 1.0, True, -1, "dm_control/cheetah"]
+    assert [metadata[key] for key in known.split()] == values
     assert metadata["gl_renderer"]
-    assert metadata["camera"] == -1

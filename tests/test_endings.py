@@ -16,29 +16,33 @@ from mjrec.recorder.endings import ending
 class Breaking(gymnasium.Wrapper):
     """Raises `error` in the step, or at the reset, that is its turn."""
 
-    error: BaseException | None = None
+    error = None
 
     def step(self, action):
-        if self.error is not None:
-            raise self.error
+        self._break()
         return self.env.step(action)
 
     def reset(self, **options):
-        if self.error is not None:
-            raise self.error
+        self._break()
         return self.env.reset(**options)
+
+    def _break(self):
+        if self.error is not None:
+            error, self.error = self.error, None
+            raise error
+
+
+def pendulum(steps=None):
+    view = {"render_mode": "rgb_array", "height": 32, "width": 48}
+    return gymnasium.make("InvertedPendulum-v5", max_episode_steps=steps, **view)
 
 
 @pytest.fixture(params=["live", "deferred"])
 def monitored(request, tmp_path):
     """A pendulum that breaks on demand, and its monitor."""
-    env = gymnasium.make(
-        "InvertedPendulum-v5", render_mode="rgb_array", height=32, width=48
-    )
-    broken = Breaking(env)
-    return broken, Monitor(
-        broken, tmp_path, lambda _: True, render=request.param, workers=1
-    )
+    env = Breaking(pendulum())
+    options = {"render": request.param, "workers": 1, "allow_early_reset": True}
+    return env, Monitor(env, tmp_path, lambda _: True, **options)
 
 
 def steps(monitor, count):
@@ -46,17 +50,19 @@ def steps(monitor, count):
         monitor.step(monitor.action_space.sample() * 0)
 
 
-def test_step_that_raises(monitored, tmp_path):
+def test_a_step_that_raises_ends_its_episode_unless_another_one_follows(
+    monitored, tmp_path
+):
     """What was captured is kept and marked; the exception is the environment's own."""
-    broken, monitor = monitored
-    monitor.reset(seed=0)
-    steps(monitor, 3)
-    broken.error = ValueError("the simulation is unstable")
-    with pytest.raises(ValueError, match="unstable") as caught:
-        steps(monitor, 1)
-    assert caught.value is broken.error
-    broken.error = None
-    monitor.reset(seed=1)
+    env, monitor = monitored
+    for seed in range(2):
+        monitor.reset(seed=seed)
+        steps(monitor, 2)
+        env.error = error = ValueError("the simulation is unstable")
+        with pytest.raises(ValueError, match="unstable") as caught:
+            steps(monitor, 1)
+        assert caught.value is error
+    # This one goes on, and nothing is wrong with it.
     steps(monitor, 2)
     monitor.close()
     metadata = metadata_of(tmp_path, 0)
@@ -65,54 +71,26 @@ def test_step_that_raises(monitored, tmp_path):
         "type": "ValueError",
         "message": "the simulation is unstable",
     }
-    assert len(frames_in(tmp_path, 0)) == 4
     assert metadata_of(tmp_path, 1)["reason"] == "close"
-    assert len(frames_in(tmp_path, 1)) == 3
+    assert [len(frames_in(tmp_path, number)) for number in (0, 1)] == [3, 5]
 
 
 def test_reset_that_raises(monitored, tmp_path):
-    """The episode before it, which was not over, is marked with that."""
-    broken, monitor = monitored
-    monitor.stats_recorder.allow_early_reset = True
-    monitor.reset(seed=0)
-    steps(monitor, 2)
-    broken.error = RuntimeError("no such level")
-    with pytest.raises(RuntimeError, match="no such level"):
-        monitor.reset()
-    monitor.close()
-    metadata = metadata_of(tmp_path, 0)
-    assert (metadata["reason"], metadata["exception"]["type"]) == (
-        "exception",
-        "RuntimeError",
-    )
-    assert len(frames_in(tmp_path, 0)) == 3
-
-
-def test_first_reset_that_raises_leaves_a_monitor_that_works(monitored):
-    """There is no episode to be marked, and the next reset begins the first."""
-    broken, monitor = monitored
-    broken.error = RuntimeError("not yet")
-    with pytest.raises(RuntimeError, match="not yet"):
-        monitor.reset()
-    broken.error = None
-    monitor.reset(seed=0)
+    """The episode before it, if one was not over, is marked with that."""
+    env, monitor = monitored
+    for _ in range(2):
+        env.error = RuntimeError("no such level")
+        with pytest.raises(RuntimeError, match="no such level"):
+            monitor.reset()
+        if monitor.episode_id == 0:
+            monitor.reset(seed=0)
+            steps(monitor, 2)
     assert monitor.episode_id == 1
     monitor.close()
-
-
-def test_step_that_succeeds_the_second_time(monitored, tmp_path):
-    """The episode goes on, and nothing is wrong with it."""
-    broken, monitor = monitored
-    monitor.reset(seed=0)
-    steps(monitor, 1)
-    broken.error = TimeoutError("again")
-    with pytest.raises(TimeoutError):
-        steps(monitor, 1)
-    broken.error = None
-    steps(monitor, 2)
-    monitor.close()
-    assert metadata_of(tmp_path, 0)["reason"] == "close"
-    assert len(frames_in(tmp_path, 0)) == 4
+    metadata = metadata_of(tmp_path, 0)
+    assert metadata["reason"] == "exception"
+    assert metadata["exception"]["type"] == "RuntimeError"
+    assert len(frames_in(tmp_path, 0)) == 3
 
 
 def test_an_exception_that_has_no_text_or_much():
@@ -142,10 +120,6 @@ for seed in range(2):
 """
 
 
-def run(code, directory, status, *, under=()):
-    return run_python(PROGRAM + code, directory, under=under, status=status)
-
-
 @pytest.mark.usefixtures("default_signals")
 @pytest.mark.parametrize(
     ("code", "status", "reason"),
@@ -156,24 +130,28 @@ def run(code, directory, status, *, under=()):
         ("raise OverflowError('too far')", 1, "exception"),
         ("sys.exit(7)", 7, "close"),
         ("", 0, "close"),
+        # Python ignores what finalisers raise, and there is no second SIGTERM.
+        (
+            "class Last:\n"
+            "    def __del__(self): os.kill(os.getpid(), signal.SIGTERM)\n"
+            "Last()\n"
+            "import time; time.sleep(30)",
+            *(143, "interrupt"),
+        ),
     ],
 )
 def test_ways_of_ending_a_program(code, status, reason, tmp_path):
     """Without `with`, every file is closed and named, nothing is rendered, and said."""
-    done = run(code, tmp_path, status)
+    done = run_python(PROGRAM + code, tmp_path, status=status)
     assert done.stderr.count("2 videos pending: mjrec render") == 1
     assert len(stats_of(tmp_path)["episode_lengths"]) == 1
     assert len(manifest_of(tmp_path)["mjrec"]["pending"]) == 2
     assert not list(tmp_path.glob("*.mp4"))
-    [trajectory] = [
-        mjrec.load_trajectory(path)
-        for path in in_flight(tmp_path)
-        if "episode000001" in path.name
-    ]
-    assert trajectory.facts["complete"] is False
-    assert trajectory.facts["reason"] == reason
+    facts = mjrec.load_trajectory(in_flight(tmp_path)[-1]).facts
+    assert (facts["episode_id"], facts["complete"]) == (1, False)
+    assert facts["reason"] == reason
     if reason == "exception":
-        assert trajectory.facts["exception"]["message"] == "too far"
+        assert facts["exception"]["message"] == "too far"
 
 
 def test_a_full_disk_at_exit_is_one_line(tmp_path):
@@ -186,30 +164,15 @@ def test_a_full_disk_at_exit_is_one_line(tmp_path):
 
 def test_a_hangup_that_is_ignored_stays_ignored(tmp_path):
     """`nohup` asks for it; a SIGTERM closes the files all the same."""
-    done = run(
+    code = (
         "os.kill(os.getpid(), signal.SIGHUP)\n"
         "print('still here', flush=True)\n"
-        "os.kill(os.getpid(), signal.SIGTERM)\n",
-        tmp_path,
-        143,
-        under=("env", "--ignore-signal=HUP"),
+        "os.kill(os.getpid(), signal.SIGTERM)\n"
     )
+    ignoring = ("env", "--ignore-signal=HUP")
+    done = run_python(PROGRAM + code, tmp_path, status=143, under=ignoring)
     assert done.stdout == "still here\n"
     assert done.stderr.count("2 videos pending: mjrec render") == 1
-
-
-def test_a_signal_whose_exception_is_lost_comes_again(tmp_path):
-    """Python ignores what finalisers raise, and there is no second SIGTERM."""
-    done = run(
-        "class Last:\n"
-        "    def __del__(self): os.kill(os.getpid(), signal.SIGTERM)\n"
-        "Last()\n"
-        "import time\n"
-        "time.sleep(30)\n",
-        tmp_path,
-        143,
-    )
-    assert "2 videos pending" in done.stderr
 
 
 @pytest.mark.usefixtures("default_signals")
@@ -218,8 +181,7 @@ def test_a_signal_whose_exception_is_lost_comes_again(tmp_path):
 )
 def test_the_end_of_an_episode_that_is_interrupted(moment, tmp_path, monkeypatch):
     """Ctrl-C while that is written down: recovery makes it, and the next, complete."""
-    env = gymnasium.make("InvertedPendulum-v5", max_episode_steps=3)
-    monitor = Monitor(env, tmp_path, lambda _: True, workers=0)
+    monitor = Monitor(pendulum(3), tmp_path, lambda _: True, workers=0)
     monitor.reset(seed=0)
     steps(monitor, 2)
     with monkeypatch.context() as patch:
@@ -233,29 +195,9 @@ def test_the_end_of_an_episode_that_is_interrupted(moment, tmp_path, monkeypatch
     steps(monitor, 3)
     monitor.close()
     mjrec.recover(tmp_path)
-    paths = list(tmp_path.glob("*.h5"))
-    assert len(paths) == 2
+    paths = sorted(tmp_path.glob("*.h5"))
     for facts in (mjrec.load_trajectory(path).facts for path in paths):
         ending = [facts[key] for key in ("complete", "truncated", "length")]
         assert ending == [True, True, 3]
     assert stats_of(tmp_path)["episode_lengths"] == [3, 3]
-
-
-def test_a_handlers_exception_between_a_step_and_its_row(tmp_path, monkeypatch):
-    """The step is not counted and has no row: it is that exception that ended it."""
-    env = gymnasium.make("InvertedPendulum-v5", max_episode_steps=1)
-    monitor = Monitor(env, tmp_path, lambda _: True, workers=0)
-    monitor.reset(seed=0)
-
-    def handler(*_, **__):
-        raise ArithmeticError("the handler's")
-
-    row = "mjrec.recorder.states.StateRecorder.step"
-    monkeypatch.setattr(row, handler)
-    with pytest.raises(ArithmeticError), monitor:
-        steps(monitor, 1)
-    [path] = in_flight(tmp_path)
-    facts = mjrec.load_trajectory(path).facts
-    assert (facts["complete"], facts["reason"]) == (False, "exception")
-    assert facts["exception"]["message"] == "the handler's"
-    assert stats_of(tmp_path)["episode_lengths"] == []
+    assert len(paths) == 2

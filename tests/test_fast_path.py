@@ -2,48 +2,42 @@
 """Steps of which nothing but the state is new are recorded as all others are."""
 
 import itertools
+import os
 import signal
 import sys
+import types
 
 import gymnasium
 import mujoco
 import numpy as np
 import pytest
-from other_python import run_python
-from recorded_states import assert_same, is_fast, trajectories
+from processes import forked, kill_self
 from recordings import stats_of
 
 import mjrec
 from mjrec import Monitor
 from mjrec.formats.trajectory import added_up
+from mjrec.recorder import fast_path
 
 CHEETAH, HOPPER = "HalfCheetah-v5", "Hopper-v5"
-INTEGRATION = mujoco.mjtState.mjSTATE_INTEGRATION
 
 
-class Rewarding(gymnasium.Wrapper):
-    """Gives the rewards of the steps another type."""
-
-    def __init__(self, env, reward):
-        super().__init__(env)
-        self.reward = reward
-
-    def step(self, action):
-        observation, reward, *rest = self.env.step(action)
-        return (observation, self.reward(float(reward)), *rest)
+def make(env_id=CHEETAH, steps=8, *, give=None):
+    """Return an environment whose steps are usual; `give` changes its rewards."""
+    env = gymnasium.make(env_id, width=48, height=32, max_episode_steps=steps)
+    if give is not None:
+        env = gymnasium.wrappers.TransformReward(env, lambda r: give(float(r)))
+    return env
 
 
-def make(env_id=CHEETAH, steps=8):
-    """Return an environment nearly all of whose steps are usual."""
-    return gymnasium.make(env_id, width=48, height=32, max_episode_steps=steps)
+def is_fast(monitor):
+    """Return whether the coming step may be recorded the fast way."""
+    return monitor._recorder.fast is not None
 
 
-def dm_control_task(domain, task):
-    """Return a dm_control task with Gymnasium's actions; its episodes have 8 steps."""
-    suite = pytest.importorskip("dm_control.suite", reason="dm_control not installed")
-    timestep = 0.02 if domain in ("reacher", "hopper") else 0.01
-    task_kwargs = {"random": 0, "time_limit": 8 * timestep}
-    return suite.load(domain, task, task_kwargs=task_kwargs)
+def trajectories(directory):
+    """Return those of all episodes that are over, in their order."""
+    return [mjrec.load_trajectory(path) for path in sorted(directory.glob("*.h5"))]
 
 
 def monitored(env, directory, schedule=None, **options):
@@ -62,14 +56,12 @@ def begin(monitor):
         monitor.reset()
 
 
-def go(monitor, count, *, usual=True, before=None):
+def go(monitor, count, *, usual=True):
     """Take so many steps, and return what they returned."""
     results = []
     for number in range(1, count + 1):
         if not usual:
             monitor._recorder.fast = None
-        if before is not None:
-            before(number, monitor)
         if isinstance(monitor, gymnasium.Env):
             action = monitor.action_space.sample()
         else:
@@ -80,39 +72,31 @@ def go(monitor, count, *, usual=True, before=None):
     return results
 
 
-def recorded(env, directory, *, camera=None, max_fps=None, **steps):
+def recorded(env, directory, **options):
     """Record an episode of eight steps and return its trajectory."""
-    with monitored(env, directory, camera=camera, max_fps=max_fps) as monitor:
+    is_usual = options.pop("usual")
+    with monitored(env, directory, **options) as monitor:
         begin(monitor)
-        go(monitor, 8, **steps)
+        go(monitor, 8, usual=is_usual)
     [trajectory] = trajectories(directory)
     return trajectory
-
-
-def state_of(env):
-    model, data = env.unwrapped.model, env.unwrapped.data
-    state = np.empty(mujoco.mj_stateSize(model, INTEGRATION))
-    mujoco.mj_getState(model, data, state, INTEGRATION)
-    return state
-
-
-@pytest.fixture
-def cheetah():
-    """An environment nearly all of whose steps are usual."""
-    env = make()
-    yield env
-    env.close()
 
 
 # --- what is recorded ----------------------------------------------------------------
 
 
-def _dm_control(domain, task, camera, *marks):
-    return pytest.param(
-        *(lambda: dm_control_task(domain, task), camera, None, [*range(9)]),
-        id=f"{domain} {camera!s:.4}",
-        marks=[pytest.mark.dm_control, *marks],
-    )
+def dm_control(domain, task, camera, *marks):
+    """Return a case of a dm_control task whose episodes have eight steps."""
+
+    def new():
+        suite = pytest.importorskip("dm_control.suite", reason="no dm_control")
+        timestep = 0.02 if domain in ("reacher", "hopper") else 0.01
+        task_kwargs = {"random": 0, "time_limit": 8 * timestep}
+        return suite.load(domain, task, task_kwargs=task_kwargs)
+
+    marks = [pytest.mark.dm_control, *marks]
+    name = f"{domain} {camera!s:.4}"
+    return pytest.param(new, camera, None, [*range(9)], id=name, marks=marks)
 
 
 @pytest.mark.parametrize(
@@ -121,46 +105,27 @@ def _dm_control(domain, task, camera, *marks):
         (lambda: make(HOPPER), None, None, [*range(9)]),
         # At most 50 of 125 steps a second are every third one, and the last of all.
         (lambda: make(HOPPER), None, 50, [0, 3, 6, 8]),
-        _dm_control("cheetah", "run", None),
-        _dm_control("cheetah", "run", "side", pytest.mark.thorough),
-        _dm_control("cheetah", "run", mujoco.MjvCamera(), pytest.mark.thorough),
-        _dm_control("cartpole", "balance", None, pytest.mark.thorough),
-        _dm_control("reacher", "easy", 0, pytest.mark.thorough),
-        _dm_control("hopper", "stand", None, pytest.mark.thorough),
+        dm_control("cheetah", "run", None),
+        dm_control("cheetah", "run", mujoco.MjvCamera(), pytest.mark.thorough),
+        dm_control("reacher", "easy", 0, pytest.mark.thorough),
+        dm_control("hopper", "stand", None, pytest.mark.thorough),
     ],
 )
 def test_usual_steps_are_recorded_as_others_are(new, camera, max_fps, frames, tmp_path):
     """States, actions, rewards, ends and frames are the same, bit for bit."""
+    view = {"camera": camera, "max_fps": max_fps}
     usual, other = (
-        recorded(
-            *(new(), tmp_path / str(is_usual)),
-            usual=is_usual,
-            camera=camera,
-            max_fps=max_fps,
-        )
+        recorded(new(), tmp_path / str(is_usual), usual=is_usual, **view)
         for is_usual in (True, False)
     )
     assert len(usual) == 8
     assert usual.frame_steps.tolist() == frames
-    assert_same(usual, other)
-
-
-@pytest.mark.parametrize(
-    ("max_fps", "schedule", "slow"), [(None, None, 1), (8, None, 1), (None, False, 0)]
-)
-def test_all_steps_but_the_first_of_the_run_are_usual(
-    max_fps, schedule, slow, cheetah, tmp_path
-):
-    """Recorded or counted; the first tells what actions are, and how long it is."""
-    with monitored(cheetah, tmp_path, schedule, max_fps=max_fps) as monitor:
-        seen = []
-        for _ in range(2):
-            begin(monitor)
-            for _ in range(8):
-                seen.append(is_fast(monitor))
-                go(monitor, 1)
-            assert not is_fast(monitor)
-    assert seen == [*slow * [False], *(16 - slow) * [True]]
+    for name in ("states", "actions", "rewards", "terminated", "truncated"):
+        np.testing.assert_array_equal(getattr(usual, name), getattr(other, name))
+    np.testing.assert_array_equal(usual.frame_steps, other.frame_steps)
+    assert usual.snapshots.keys() == other.snapshots.keys()
+    for name, values in other.snapshots.items():
+        np.testing.assert_array_equal(usual.snapshots[name], values)
 
 
 def test_the_first_step_of_another_episode_may_be_unlike(tmp_path):
@@ -175,44 +140,35 @@ def test_the_first_step_of_another_episode_may_be_unlike(tmp_path):
         def step(self, action):
             return self.env.step(np.resize(action, 6))
 
+    shapes = [(6,), (6,), (2, 3), (6,)]
     with monitored(Other(make(steps=2)), tmp_path) as monitor:
-        for shape in (6, 6, (2, 3), 6):
+        for shape in shapes:
             monitor.reset(seed=0)
             for value in (0.5, -0.5):
                 monitor.step(np.full(shape, value))
     found = trajectories(tmp_path)
-    assert [each.actions.shape for each in found if each.actions is not None] == [
-        *((2, 6), (2, 6), (2, 2, 3), (2, 6))
-    ]
+    assert [each.actions.shape for each in found] == [(2, *shape) for shape in shapes]
     assert all(each.frame_steps.tolist() == [0, 1, 2] for each in found)
-    assert [each.facts["timestep"] for each in found] == [
-        "1/20",
-        "1/40",
-        "1/60",
-        "1/80",
-    ]
+    paces = [each.facts["timestep"] for each in found]
+    assert paces == ["1/20", "1/40", "1/60", "1/80"]
 
 
-# --- statistics ----------------------------------------------------------------------
-
-
+@pytest.mark.parametrize("schedule", [None, False], ids=["recorded", "counted"])
 @pytest.mark.parametrize(
     "kind",
     [
         int,
-        np.float64,
         np.float32,
         np.array,
         lambda reward: np.array([reward]),
-        lambda reward: reward > 0,
         # Another one in mid-episode.
-        lambda reward: int(reward) if reward > 0 else np.float32(reward),
+        lambda reward: reward > 0 if reward > 0 else np.float64(reward),
     ],
-    ids=["int", "float64", "float32", "0-d", "1-d", "bool", "mixed"],
+    ids=["int", "float32", "0-d", "1-d", "mixed"],
 )
-def test_rewards_of_any_type_are_numbers(kind, tmp_path):
+def test_rewards_of_any_type_are_numbers(kind, schedule, tmp_path):
     """In the trajectory and, added up in their order, in the statistics."""
-    with monitored(Rewarding(make(), kind), tmp_path) as monitor:
+    with monitored(make(give=kind), tmp_path, schedule) as monitor:
         begin(monitor)
         stats, rewards = monitor.stats_recorder, []
         for number in range(1, 9):
@@ -223,74 +179,65 @@ def test_rewards_of_any_type_are_numbers(kind, tmp_path):
             assert (stats.rewards, type(stats.rewards)) == (added_up(rewards), float)
         [total] = monitor.get_episode_rewards()
     assert (total, type(total)) == (added_up(rewards), float)
-    [trajectory] = trajectories(tmp_path)
-    assert trajectory.rewards.tolist() == rewards
+    recorded = [each.rewards.tolist() for each in trajectories(tmp_path)]
+    assert recorded == ([rewards] if schedule is None else [])
     assert stats_of(tmp_path)["episode_rewards"] == [total]
 
 
-def test_a_reward_that_is_no_number_is_told(tmp_path):
-    """The step is not recorded, and the next one is."""
-    rewards = iter([1.0, 1.0, "much", 1.0, 1.0])
-    env = Rewarding(make(), lambda _: next(rewards))
-    with monitored(env, tmp_path) as monitor:
-        begin(monitor)
-        go(monitor, 2)
-        with pytest.raises(mjrec.InvalidArgument, match="much"):
-            go(monitor, 1)
-        go(monitor, 2)
-        assert monitor.get_total_steps() == 4
+def test_a_step_whose_reward_is_no_number_is_not_recorded(tmp_path):
+    """The next one is; a monitor that is closed within a step returns it as ever."""
+    rewards = iter([1.0, 1.0, "much", 1.0])
+
+    def give(reward):
+        if monitor.get_total_steps() == 3:
+            monitor.close()
+        return next(rewards, reward)
+
+    env = make(give=give)
+    monitor = monitored(env, tmp_path)
+    begin(monitor)
+    go(monitor, 2)
+    with pytest.raises(mjrec.InvalidArgument, match="much"):
+        go(monitor, 1)
+    go(monitor, 1)
+    last = env.unwrapped.data.qpos.copy()
+    assert is_fast(monitor)
+    [(observation, *_)] = go(monitor, 1)
+    assert observation.shape == (17,)
     [trajectory] = trajectories(tmp_path)
-    np.testing.assert_array_equal(trajectory.states[-1], state_of(env))
-    assert trajectory.rewards.tolist() == [1.0] * 4
+    np.testing.assert_array_equal(trajectory.component("qpos")[-1], last)
+    assert trajectory.rewards.tolist() == [1.0] * 3
 
 
-# --- actions -------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("kind", "value"),
-    [
-        ("dtype", np.linspace(-1, 1, 6, dtype=np.float64)),
-        ("integers", np.array([1, 0, -1, 1, 0, 1])),
-        ("list", [0.5, -0.25, 0.0, 1.0, -1.0, 0.125]),
-        ("tuple", (0, 1, 0, -1, 0, 1)),
-        ("byte order", np.linspace(-1, 1, 6).astype(">f4")),
-        ("every second", np.linspace(-1, 1, 12, dtype=np.float32)[::2]),
-    ],
-    ids=lambda value: value if isinstance(value, str) else "",
-)
-def test_actions_of_another_kind_are_recorded_as_they_are(
-    kind, value, tmp_path, caplog
-):
-    """In mid-episode, with no word about it; and those after them too."""
-    env = make()
-    actions = [env.action_space.sample() for _ in range(8)]
-    actions[3] = actions[5] = value
-    with monitored(env, tmp_path) as monitor:
-        begin(monitor)
-        for action in actions:
-            monitor.step(action)
-    [trajectory] = trajectories(tmp_path)
-    np.testing.assert_array_equal(trajectory.actions, np.array(actions, np.float64))
-    assert "different type or shape" not in caplog.text
-
-
-def test_an_action_that_the_environment_overwrites(tmp_path):
-    """Is recorded as it was given."""
+def test_actions_are_recorded_as_they_are_given(tmp_path, caplog):
+    """Of any type in mid-episode, also where the environment overwrites them."""
 
     class Overwriting(gymnasium.Wrapper):
         def step(self, action):
             result = self.env.step(action)
-            action[:] = 7
+            if isinstance(action, np.ndarray):
+                action[:] = 7
             return result
 
-    with monitored(Overwriting(make()), tmp_path) as monitor:
+    usual = [np.full(6, 0.125 * k, np.float32) for k in range(6)]
+    other = [
+        np.linspace(-1, 1, 6),
+        np.array([1, 0, -1, 1, 0, 1]),
+        [0.5, -0.25, 0.0, 1.0, -1.0, 0.125],
+        (0, 1, 0, -1, 0, 1),
+        np.linspace(-1, 1, 6).astype(">f4"),
+        np.linspace(-1, 1, 12, dtype=np.float32)[::2],
+    ]
+    # Also where the first are whole numbers.
+    actions = [other[3], *itertools.chain(*zip(usual, other, strict=True))]
+    expected = np.array(actions, np.float64)
+    with monitored(Overwriting(make(steps=len(actions))), tmp_path) as monitor:
         begin(monitor)
-        for k in range(8):
-            monitor.step(np.full(6, 0.125 * k))
+        for action in actions:
+            monitor.step(action)
     [trajectory] = trajectories(tmp_path)
-    assert trajectory.actions is not None
-    assert trajectory.actions[:, 0].tolist() == [0.125 * k for k in range(8)]
+    np.testing.assert_array_equal(trajectory.actions, expected)
+    assert "different type or shape" not in caplog.text
 
 
 # --- errors, and the end -------------------------------------------------------------
@@ -329,8 +276,9 @@ def interrupt_in(monitor, event_number):
 )
 def test_an_interrupted_step_is_recorded_or_is_not(max_fps, schedule, tmp_path):
     """Wherever it is interrupted, who goes on has statistics and rows of all others."""
-    numbers = itertools.count(1)
-    for number in numbers:
+    was_interrupted, number = True, 0
+    while was_interrupted:
+        number += 1
         directory = tmp_path / str(number)
         with monitored(make(), directory, schedule, max_fps=max_fps) as monitor:
             begin(monitor)
@@ -350,67 +298,35 @@ def test_an_interrupted_step_is_recorded_or_is_not(max_fps, schedule, tmp_path):
             assert trajectory.complete
             steps = trajectory.frame_steps.tolist()
             assert steps == sorted({*steps, length})
-        if not was_interrupted:
-            break
     assert number > 4
 
 
-KILLED = """
-import os, signal, sys
-import gymnasium, mjrec
-from mjrec.recorder import fast_path
-
-rows = 0
-
-class Words:
-    def take(self, *arguments):
-        global rows
-        rows += 1
-        words.take(*arguments)
-        kill_at("being filled")
-
-def add(*rewards):
-    kill_at("filled")
-    return total(*rewards)
-
-def kill_at(moment):
-    if rows == 7 and sys.argv[2] == moment:
-        os.kill(os.getpid(), signal.SIGKILL)
-
-words, fast_path.WORDS = fast_path.WORDS, Words()
-total, fast_path._sum = fast_path._sum, add
-env = gymnasium.make("InvertedPendulum-v5", max_episode_steps=3)
-env = mjrec.Monitor(env, sys.argv[1], lambda _: True, workers=0)
-while True:
-    env.reset(seed=0)
-    for _ in range(3):
-        env.step(env.action_space.sample() * 0)
-"""
-
-
+@pytest.mark.filterwarnings("ignore:This process:DeprecationWarning")
 @pytest.mark.parametrize("moment", ["being filled", "filled"])
 def test_a_kill_at_a_row_loses_that_row(moment, tmp_path):
     """Between filling it and counting it, too: all rows before it are there."""
-    run_python(KILLED, tmp_path, moment, status=-signal.SIGKILL)
+
+    def record(_):
+        rows = itertools.count(1)
+        words = fast_path.WORDS
+
+        def take(*arguments):
+            words.take(*arguments)
+            if next(rows) == 7:
+                if moment == "being filled":
+                    kill_self()
+                fast_path._sum = kill_self
+
+        fast_path.WORDS = types.SimpleNamespace(take=take)
+        monitor = monitored(make("InvertedPendulum-v5", 3), tmp_path)
+        while True:
+            begin(monitor)
+            for _ in range(3):
+                monitor.step(np.zeros(1))
+
+    _, status = forked(record)
+    assert os.WTERMSIG(status) == signal.SIGKILL
     mjrec.recover(tmp_path)
     # The first step of all did not go the fast way.
     assert [len(each) for each in trajectories(tmp_path)] == [3, 3, 1]
     assert [each.complete for each in trajectories(tmp_path)] == [True, True, False]
-
-
-def test_a_monitor_may_be_closed_within_a_step(tmp_path):
-    """As by a signal's handler that only closes it: the step returns as ever."""
-
-    def close_at(reward):
-        if monitor.get_total_steps() == 3:
-            monitor.close()
-        return reward
-
-    monitor = monitored(Rewarding(make(), close_at), tmp_path)
-    begin(monitor)
-    go(monitor, 3)
-    assert is_fast(monitor)
-    [(observation, *_)] = go(monitor, 1)
-    assert observation.shape == (17,)
-    [trajectory] = trajectories(tmp_path)
-    assert len(trajectory) == 3

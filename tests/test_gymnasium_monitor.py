@@ -3,27 +3,15 @@ import threading
 import warnings
 
 import gymnasium
+import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
-from other_python import run_python
-from parts import parametrize
-from recordings import (
-    frames_in,
-    journal_of,
-    manifest_of,
-    metadata_of,
-    stats_of,
-    videos_in,
-)
+from gymnasium.wrappers import RecordEpisodeStatistics
+from recordings import frames_in, manifest_of, metadata_of, stats_of, videos_in
 
 import mjrec
 from mjrec import ResetNeeded, ResetNotAllowed
-
-
-def finish_episode(env):
-    while not env.stats_recorder.done:
-        env.step(0)
-
+from mjrec.monitors.gymnasium_monitor import success_in
 
 BAR = [4, 8, 12, 16]
 
@@ -55,42 +43,52 @@ def test_records_the_scheduled_episodes(corridor, tmp_path, play, names, caplog)
     assert [name for name in names(tmp_path) if name.startswith(".")] == []
 
 
-def test_video_and_its_metadata(corridor, tmp_path, play):
-    """N + 1 frames of n steps, each with its hash; keys of gym and the episode's."""
-    with mjrec.Monitor(corridor, tmp_path, fps=50) as env:
-        play(env, 1, seed=7)
-    assert shown(tmp_path, 0) == BAR
-    expected = {
-        "episode_id": 0,
-        "content_type": "video/mp4",
-        "complete": True,
-        "terminated": True,
-        "truncated": False,
-        "length": 3,
-        "reward": 1.5,
-        "seed": 7,
-        "frame_count": 4,
-        "fps": "50",
-        "height": 32,
-        "width": 48,
-        "recording": "live",
-        "pictures": "env.render",
-    }
+def test_video_and_its_metadata(make_corridor, tmp_path, play):
+    """N + 1 frames of n steps and their facts; a close in mid-episode keeps them."""
+    listed = []
+
+    class Watching(make_corridor):
+        def close(self):
+            listed.append(any(tmp_path.glob("openaigym.manifest.*")))
+
+    env = mjrec.Monitor(Watching(), tmp_path, fps=50)
+    assert env.episode_id == 0
+    play(env, 1, seed=7)
+    env.reset()
+    env.step(0)
+    assert isinstance(env.stats_recorder, mjrec.StatsRecorder)
+    assert isinstance(env.video_recorder, mjrec.VideoRecorder)
+    env.close()
+    env.close()
+    assert listed == [True]
+    # After close nothing counts; total steps cover the unfinished episode.
+    env.reset()
+    env.step(0)
+    assert (env.episode_id, env.get_total_steps()) == (2, 4)
+    assert (env.get_episode_lengths(), env.get_episode_rewards()) == ([3], [1.5])
+    assert (shown(tmp_path, 0), shown(tmp_path, 1)) == (BAR, BAR[:2])
     metadata = metadata_of(tmp_path, 0)
-    assert metadata.items() >= expected.items()
+    known = "episode_id length reward seed frame_count fps height width recording"
+    values = [0, 3, 1.5, 7, 4, "50", 32, 48, "live"]
+    assert [metadata[key] for key in known.split()] == values
+    ends = [metadata[key] for key in ("complete", "terminated", "truncated")]
+    assert ends == [True, True, False]
+    assert metadata["content_type"] == "video/mp4"
     assert metadata["versions"].keys() >= {"mjrec", "mujoco", "gymnasium", "python"}
+    cut = metadata_of(tmp_path, 1)
+    assert (cut["complete"], cut["reason"]) == (False, "close")
+    assert len(manifest_of(tmp_path)["videos"]) == 2
 
 
 @pytest.mark.parametrize("pop_frames", [True, False])
 def test_frame_collections_lose_and_double_nothing(
-    tmp_path, make_corridor, play, pop_frames
+    corridor, tmp_path, play, pop_frames
 ):
     """Whether or not RenderCollection forgets the frames it has given."""
-    env = gymnasium.wrappers.RenderCollection(make_corridor(), pop_frames=pop_frames)
+    env = gymnasium.wrappers.RenderCollection(corridor, pop_frames=pop_frames)
     with mjrec.Monitor(env, tmp_path) as env:
         play(env, 2)
-    for episode in (0, 1):
-        assert shown(tmp_path, episode) == BAR
+    assert shown(tmp_path, 0) == shown(tmp_path, 1) == BAR
 
 
 def test_write_upon_reset_writes_at_each_reset(make_corridor, tmp_path, play):
@@ -114,29 +112,13 @@ def test_wrong_use_is_refused(corridor, tmp_path, play):
         with pytest.raises(ResetNotAllowed, match="allow_early_reset=True"):
             env.reset()
         assert corridor.position == 1
-        finish_episode(env)
+        env.step(0)
+        env.step(0)
         with pytest.raises(ResetNeeded, match="after the end"):
             env.step(0)
         play(env, 1)
     assert stats_of(tmp_path)["episode_lengths"] == [3, 3]
     assert shown(tmp_path, 0) == BAR
-
-
-def test_gyms_questions_have_gyms_answers(corridor, tmp_path, play):
-    """Total steps cover the unfinished episode; after close nothing counts."""
-    env = mjrec.Monitor(corridor, tmp_path)
-    assert env.episode_id == 0
-    play(env, 2)
-    env.reset()
-    env.step(0)
-    assert isinstance(env.stats_recorder, mjrec.StatsRecorder)
-    assert isinstance(env.video_recorder, mjrec.VideoRecorder)
-    env.close()
-    env.reset()
-    env.step(0)
-    assert (env.episode_id, env.get_total_steps()) == (3, 7)
-    assert env.get_episode_lengths() == [3, 3]
-    assert env.get_episode_rewards() == [1.5, 1.5]
 
 
 def test_the_schedule_is_asked_once_for_each_number(corridor, tmp_path, play):
@@ -172,13 +154,6 @@ def test_check_env_passes(tmp_path):
 
 def test_environments_that_reset_themselves_begin_episodes(make_corridor, tmp_path):
     """In the step after the end; in that of the end, as gym's own, a frame is lost."""
-    env = gymnasium.wrappers.Autoreset(make_corridor())
-    with mjrec.Monitor(env, tmp_path / "next", lambda _: True) as env:
-        env.reset()
-        for _ in range(7):
-            env.step(0)
-    assert stats_of(tmp_path / "next")["episode_lengths"] == [3, 3]
-    assert shown(tmp_path / "next", 0) == shown(tmp_path / "next", 1) == BAR
 
     class Looping(make_corridor):
         metadata = make_corridor.metadata | {"semantics.autoreset": True}
@@ -189,33 +164,17 @@ def test_environments_that_reset_themselves_begin_episodes(make_corridor, tmp_pa
                 self.reset()
             return result
 
-    with mjrec.Monitor(Looping(), tmp_path / "same", lambda _: True) as env:
-        env.reset()
-        for _ in range(6):
-            env.step(0)
-    assert stats_of(tmp_path / "same")["episode_lengths"] == [3, 3]
-    assert shown(tmp_path / "same", 0) == shown(tmp_path / "same", 1) == BAR[:3]
-    assert metadata_of(tmp_path / "same", 0)["final_frame"] == "missing"
-
-
-def test_close_in_mid_episode_keeps_the_video(make_corridor, tmp_path):
-    """Marked incomplete, and listed before the environment is closed, once."""
-    seen = []
-
-    class Watching(make_corridor):
-        def close(self):
-            seen.append(any(tmp_path.glob("openaigym.manifest.*")))
-
-    with mjrec.Monitor(Watching(), tmp_path) as env:
-        env.reset()
-        env.step(0)
-    env.close()
-    assert seen == [True]
-    assert shown(tmp_path, 0) == BAR[:2]
-    metadata = metadata_of(tmp_path, 0)
-    assert (metadata["complete"], metadata["reason"]) == (False, "close")
-    assert len(manifest_of(tmp_path)["videos"]) == 1
-    assert stats_of(tmp_path)["episode_lengths"] == []
+    for env, steps, bar in (
+        (gymnasium.wrappers.Autoreset(make_corridor()), 7, BAR),
+        (Looping(), 6, BAR[:3]),
+    ):
+        with mjrec.Monitor(env, tmp_path, lambda _: True, force=True) as monitor:
+            monitor.reset()
+            for _ in range(steps):
+                monitor.step(0)
+        assert stats_of(tmp_path)["episode_lengths"] == [3, 3]
+        assert shown(tmp_path, 0) == shown(tmp_path, 1) == bar
+    assert metadata_of(tmp_path, 0)["final_frame"] == "missing"
 
 
 @pytest.mark.parametrize("thread", ["main", "mjrec-encoder"])
@@ -233,30 +192,6 @@ def test_garbage_collection_closes(corridor, tmp_path, play, thread):
     assert corridor.closed == 1
 
 
-LEAVING = """
-import sys
-import gymnasium, mjrec
-env = gymnasium.make("HalfCheetah-v5", render_mode="rgb_array", width=32, height=32)
-env = mjrec.Monitor(env, sys.argv[1], render="live")
-env.reset(seed=0)
-for _ in range(3):
-    env.step(env.action_space.sample())
-"""
-
-
-@parametrize(
-    ("how", "status"),
-    [("", 0), ("sys.exit(3)", 3), ("raise RuntimeError('on purpose')", 1)],
-    ids=["end", "exit", "exception"],
-)
-def test_leaving_the_interpreter_closes(tmp_path, how, status):
-    """Without close(): a live video, statistics and manifest, without noise."""
-    done = run_python(LEAVING + how, tmp_path, status=status)
-    assert len(frames_in(tmp_path, 0)) == 4
-    assert manifest_of(tmp_path)["videos"]
-    assert "Exception ignored" not in done.stderr
-
-
 def test_a_frame_that_fails_is_left_out(make_corridor, tmp_path):
     """The error goes through; the episode goes on, or is complete."""
 
@@ -268,15 +203,14 @@ def test_a_frame_that_fails_is_left_out(make_corridor, tmp_path):
 
     with mjrec.Monitor(Blinking(length=5), tmp_path) as env:
         env.reset()
-        for step in range(1, 6):
-            if step in (2, 5):
-                with pytest.raises(RuntimeError, match="on purpose"):
-                    env.step(0)
-            else:
+        for count in (1, 2):
+            for _ in range(count):
+                env.step(0)
+            with pytest.raises(RuntimeError, match="on purpose"):
                 env.step(0)
     assert metadata_of(tmp_path, 0)["frame_steps"] == [[0, 1], [3, 4]]
     assert metadata_of(tmp_path, 0)["complete"] is True
-    assert journal_of(tmp_path)[0]["length"] == 5
+    assert stats_of(tmp_path)["episode_lengths"] == [5]
 
 
 def test_users_exception_is_not_hidden_by_a_failing_close(
@@ -294,3 +228,58 @@ def test_users_exception_is_not_hidden_by_a_failing_close(
     with pytest.raises(KeyError, match="of the user") as raised:
         fail()
     assert "ffmpeg" in raised.value.__notes__[0]
+
+
+# --- `episode_info=True`, and what is known of success --------------------------------
+
+
+def last_info(env):
+    """Run CartPole to its end; return the info of every step."""
+    env.reset(seed=3)
+    infos, done = [], False
+    while not done:
+        *_, terminated, truncated, info = env.step(1)
+        infos.append(info)
+        done = terminated or truncated
+    return infos
+
+
+def monitor(directory, env=None, **options):
+    made = gymnasium.make("CartPole-v1") if env is None else env
+    return mjrec.Monitor(made, directory, video_callable=False, **options)
+
+
+def test_last_step_has_what_gymnasium_gives(tmp_path):
+    """Keys, types and values are those of RecordEpisodeStatistics; its own stay."""
+    theirs = RecordEpisodeStatistics(gymnasium.make("CartPole-v1"))
+    expected = last_info(theirs)[-1]["episode"]
+    with monitor(tmp_path, episode_info=True) as env:
+        *before, last = last_info(env)
+    assert not any("episode" in info for info in before)
+    episode = last["episode"]
+    assert list(episode) == list(expected) == ["r", "l", "t"]
+    assert (episode["r"], episode["l"]) == (expected["r"], expected["l"])
+    assert 0 < episode["t"] < 60
+    # Gymnasium's own asserts that the key is absent: it is off by default.
+    with monitor(tmp_path / "off") as env:
+        assert last_info(RecordEpisodeStatistics(env))[-1]["episode"]["l"] > 0
+    with monitor(tmp_path / "around", theirs, episode_info=True) as env:
+        episode = last_info(env)[-1]["episode"]
+    assert episode["t"] == theirs.time_queue[-1]
+
+
+@pytest.mark.parametrize(
+    ("info", "expected"),
+    [
+        ({}, None),
+        ({"is_success": True}, True),
+        ({"is_success": 0.0}, False),
+        ({"success": np.array([False])}, False),
+        ({"is_success": None, "success": True}, True),
+        ({"success": "no"}, None),
+        ({"success": np.zeros(2)}, None),
+    ],
+)
+def test_success_is_what_the_info_says(info, expected):
+    """Under either name; what is no truth value says nothing."""
+    assert success_in(info) is expected

@@ -5,13 +5,9 @@ Each is recorded as a user would, and what was drawn later is compared with what
 environment itself draws.
 """
 
-import gc
 import hashlib
-import json
 import os
 import shutil
-import subprocess
-import sys
 
 import gymnasium
 import mujoco
@@ -19,7 +15,7 @@ import numpy as np
 import pytest
 from compiled_tasks import growing
 from other_python import run_python
-from recordings import hashes_at
+from recordings import events_of, hashes_at
 from robots import robots_that_reset
 
 import mjrec
@@ -65,15 +61,6 @@ def _see(env, seen):
         seen.append(hashlib.sha256(env.render().tobytes()).hexdigest())
 
 
-def play_task(env, episodes):
-    """Play episodes of a dm_control task with small actions."""
-    for _ in range(episodes):
-        timestep, number = env.reset(), 0
-        while not timestep.last():
-            number += 1
-            timestep = env.step(np.full(env.action_spec().shape, 0.1 * (number % 3)))
-
-
 def hashes(directory):
     """Return the hashes of all frames of all videos, in the order of their names."""
     return [
@@ -86,75 +73,40 @@ def trajectories(directory):
         yield mjrec.load_trajectory(path)
 
 
-def live_and_later(make, play, out, **options):
-    """Record the same twice, drawn while it runs and from its states."""
-    for way in ("live", "deferred"):
-        with mjrec.Monitor(make(), out / way, render=way, workers=1, **options) as env:
-            play(env)
-        del env
-        # dm_control frees its OpenGL context here, not on whichever thread comes next.
-        gc.collect()
-    assert hashes(out / "live")
-    assert hashes(out / "live") == hashes(out / "deferred")
-    recordings = {
-        json.loads(path.read_text())["recording"]
-        for path in (out / "deferred").glob("*.meta.json")
-    }
-    assert recordings == {"deferred"}
+def paint(number, env):
+    """Change colours, as those do that show touch sensors."""
+    env.model.geom_rgba[:, 0] = number % 5 / 4
 
 
-def test_a_model_whose_colours_change_at_every_step(tmp_path):
-    """As those that show touch sensors do."""
+def grow(number, env):
+    """Change what contexts scale shadows by, and what they are created anew for."""
+    env.model.stat.extent *= 1.2
+    env.model.vis.rgba.fog[:3] = number // 4 / 4
 
-    def paint(number, env):
-        env.model.geom_rgba[:, 0] = number % 5 / 4
 
-    env = Around(pendulum(), before=paint)
+@pytest.mark.parametrize(
+    ("env_id", "before", "workers"),
+    [
+        ("InvertedPendulum-v5", paint, 1),
+        ("HalfCheetah-v5", grow, 1),
+        ("HalfCheetah-v5", grow, 2),
+    ],
+)
+def test_a_model_that_changes_at_every_step(tmp_path, env_id, before, workers):
+    """Each frame is that of its step, whichever worker draws it."""
+    made = {"max_episode_steps": 5, "render_mode": "rgb_array", **SIZE}
+    env = Around(gymnasium.make(env_id, **made), before=before)
     seen = []
-    with mjrec.Monitor(env, tmp_path, lambda _: True, workers=1) as monitor:
+    with mjrec.Monitor(env, tmp_path, lambda _: True, workers=workers) as monitor:
         play(monitor, 10, seen=seen)
     assert len(set(seen)) > 5
     assert hashes(tmp_path) == seen
 
 
-@pytest.mark.parametrize("workers", [1, 2])
-def test_a_model_whose_extent_changes_at_every_step(tmp_path, workers):
-    """Contexts scale shadows by it, and are created anew for another field."""
-
-    def grow(number, env):
-        env.model.stat.extent *= 1.2
-        env.model.vis.rgba.fog[:3] = number // 4 / 4
-
-    cheetah = gymnasium.make("HalfCheetah-v5", render_mode="rgb_array", **SIZE)
-    env = Around(cheetah, before=grow)
-    seen = []
-    with mjrec.Monitor(env, tmp_path, lambda _: True, workers=workers) as monitor:
-        play(monitor, 10, seen=seen)
-    assert hashes(tmp_path) == seen
-
-
-@pytest.mark.dm_control
-@pytest.mark.parametrize(
-    "options", [{}, {"step_trigger": lambda step: step == 2, "video_length": 9}]
-)
-def test_a_task_that_compiles_its_model_at_each_reset(options, tmp_path):
-    """Videos of episodes, and a clip that crosses such resets."""
-    whole = {} if options else {"video_callable": lambda _: True}
-    live_and_later(
-        growing,
-        lambda env: play_task(env, 3),
-        tmp_path,
-        **{**options, **whole, "env_id": "dm_control/growing", **SIZE},
-    )
-
-
 @pytest.mark.dm_control
 @pytest.mark.parametrize("is_older", [False, True])
 def test_another_renderer_is_closed_between_live_frames(is_older, tmp_path):
-    """It frees objects in the current context, and leaves none current or dm_control's.
-
-    dm_control notices neither. Its own drawing afterwards works as well.
-    """
+    """None is current then, or dm_control's, which does not notice; all is drawn."""
     model = mujoco.MjModel.from_xml_string("<mujoco/>")
     options = {"video_callable": lambda _: True, "render": "live", **SIZE}
     drawn = []
@@ -166,64 +118,56 @@ def test_another_renderer_is_closed_between_live_frames(is_older, tmp_path):
                 if way == "beside":
                     (other or mujoco.Renderer(model, 8, 8)).close()
                 timestep = env.step(np.zeros(env.action_spec().shape))
-            drawn.append(env.physics.render(**SIZE).tobytes())
-    assert hashes(tmp_path / "beside") == hashes(tmp_path / "alone")
+            drawn.append([env.physics.render(**SIZE).tobytes()])
+        drawn[-1] += hashes(tmp_path / way)
     assert drawn[0] == drawn[1]
 
 
 def test_an_environment_that_moves_things_while_it_draws(tmp_path):
-    """Fetch puts its target at the goal in `_render_callback`; not every step is drawn.
-
-    The simulation goes on as if nothing had been drawn.
-    """
+    """Fetch moves its target in `_render_callback`; the simulation is left alone."""
     pytest.importorskip("gymnasium_robotics")
-
-    def make():
-        return gymnasium.make(
-            "FetchReach-v4", max_episode_steps=5, render_mode="rgb_array", **SIZE
-        )
-
-    options = {"video_callable": lambda _: True, "max_fps": 10}
-    with robots_that_reset():
-        live_and_later(make, lambda env: play(env, 5), tmp_path, **options)
+    made = {"max_episode_steps": 5, "render_mode": "rgb_array", **SIZE}
+    options = {"max_fps": 10, "workers": 1}
+    for way in ("live", "deferred"):
+        with robots_that_reset():
+            env = gymnasium.make("FetchReach-v4", **made)
+            with mjrec.Monitor(env, tmp_path / way, render=way, **options) as env:
+                play(env, 5)
+    assert hashes(tmp_path / "live") == hashes(tmp_path / "deferred")
     [trajectory] = trajectories(tmp_path / "deferred")
     assert trajectory.frame_steps.tolist() == [0, 3, 5]
 
 
 def test_large_observations_and_actions_that_change(tmp_path):
     """300 KiB for each step; one action is of another shape than those before."""
-
-    def enlarge(number, result):
-        return (np.full((300, 1024), number, np.uint8), *result[1:])
-
-    env = Around(pendulum(9), after=enlarge)
+    env = Around(
+        pendulum(9),
+        after=lambda number, result: (
+            np.full((300, 1024), number, np.uint8),
+            *result[1:],
+        ),
+    )
     env.reset = lambda **options: (
         np.zeros((300, 1024), np.uint8),
         env.env.reset(**options)[1],
     )
-    with mjrec.Monitor(
-        env, tmp_path, False, trajectory_callable=True, observations=True
-    ) as monitor:
+    options = {"trajectory_callable": True, "observations": True}
+    with mjrec.Monitor(env, tmp_path, False, **options) as monitor:
         monitor.reset(seed=1)
         for number in range(9):
-            shape = (1, 1) if number == 4 else (1,)
-            action = np.full(shape, 0.1, np.float32)
+            action = np.full((1, 1) if number == 4 else (1,), 0.1, np.float32)
             env.before = lambda *_, a=action: a.resize((1,), refcheck=False)
             monitor.step(action)
     [trajectory] = trajectories(tmp_path)
-    assert trajectory.observations is not None
     assert (trajectory.observations[:, 0, 0] == np.arange(10)).all()
-    assert trajectory.actions is not None
     given = np.full((9, 1), np.float32(0.1))
     given[4] = 0
     np.testing.assert_array_equal(trajectory.actions, given)
     assert trajectory.facts["irregular_actions_from"] == 4
     assert trajectory.facts["action_dtypes"] == [[0, "float32"]]
-    [journal] = tmp_path.glob("*.jsonl")
-    events = [json.loads(line) for line in journal.read_text().splitlines()]
-    [odd] = [event["action"] for event in events if "action" in event]
-    given = {"value": [[float(np.float32(0.1))]], "dtype": "float32"}
-    assert odd == {"episode_id": 0, "step": 4, **given}
+    odd = {"value": [[float(np.float32(0.1))]], "dtype": "float32"}
+    said = {"episode_id": 0, "step": 4, **odd}
+    assert events_of(tmp_path, "action") == [said]
 
 
 @pytest.mark.skipif(
@@ -265,34 +209,6 @@ def test_a_fork_in_mid_episode(tmp_path):
     assert len(hashes(tmp_path)) == 6
 
 
-def test_two_monitors_of_which_one_never_ends(tmp_path):
-    """What the other recorded is drawn and loaded beside it."""
-    program = (
-        "import sys, gymnasium, mjrec\n"
-        "env = gymnasium.make('InvertedPendulum-v5')\n"
-        "env = mjrec.Monitor(env, sys.argv[1], resume=True, uid='a', workers=0)\n"
-        "env.reset(seed=0); env.step(env.action_space.sample())\n"
-        "print('begun', flush=True); sys.stdin.read()\n"
-    )
-    with subprocess.Popen(
-        [sys.executable, "-c", program, str(tmp_path)],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-    ) as other:
-        assert other.stdout is not None
-        assert other.stdout.readline() == b"begun\n"
-        before = sorted(path.name for path in tmp_path.glob("*.a*"))
-        options = {"resume": True, "uid": "b", "workers": 1}
-        with mjrec.Monitor(pendulum(), tmp_path, lambda _: True, **options) as env:
-            play(env, 10)
-        assert len(list(tmp_path.glob("*.b.*.mp4"))) == 2
-        results = mjrec.load_results(tmp_path)
-        assert results is not None
-        assert results["episode_lengths"] == [5, 5]
-        assert sorted(path.name for path in tmp_path.glob("*.a*")) == before
-        other.kill()
-
-
 def test_a_run_that_another_machine_renders(tmp_path, monkeypatch):
     """`close(wait=False)` draws and converts nothing; a copy of what it left does."""
     seen = []
@@ -307,27 +223,27 @@ def test_a_run_that_another_machine_renders(tmp_path, monkeypatch):
     assert hashes(tmp_path / "there") == seen
 
 
+MILLION = """
+import resource, sys, gymnasium, mjrec, numpy
+env = gymnasium.make("InvertedPendulum-v5", max_episode_steps=10**7)
+env = mjrec.Monitor(env, sys.argv[1], False, trajectory_callable=True)
+start, action = (env.unwrapped.init_qpos, env.unwrapped.init_qvel), numpy.zeros(1)
+env.reset(seed=0)
+for step in range(int(sys.argv[2])):
+    if step % 10 == 0:
+        env.unwrapped.set_state(*start)
+    env.step(action)
+env.close()
+print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
+"""
+
+
 # Takes more than five seconds: a million steps.
 @pytest.mark.thorough
 def test_an_episode_of_a_million_steps_needs_no_more_memory(tmp_path):
     """Neither while it is recorded nor while its file is written."""
-    program = (
-        "import resource, sys, gymnasium, mjrec, numpy\n"
-        "env = gymnasium.make('InvertedPendulum-v5', max_episode_steps=10**7)\n"
-        "steps = int(sys.argv[2])\n"
-        "env = mjrec.Monitor(env, sys.argv[1], False, trajectory_callable=True)\n"
-        "action = numpy.zeros(1)\n"
-        "start = env.unwrapped.init_qpos, env.unwrapped.init_qvel\n"
-        "env.reset(seed=0)\n"
-        "for step in range(steps):\n"
-        "    if step % 10 == 0:\n"
-        "        env.unwrapped.set_state(*start)\n"
-        "    env.step(action)\n"
-        "env.close()\n"
-        "print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)\n"
+    few, many = (
+        int(run_python(MILLION, tmp_path / str(steps), steps).stdout) << 10
+        for steps in (10_000, 1_000_000)
     )
-    used = {}
-    for steps in (10_000, 1_000_000):
-        done = run_python(program, tmp_path / str(steps), steps)
-        used[steps] = int(done.stdout) << 10
-    assert used[1_000_000] - used[10_000] < 32 << 20, used
+    assert many - few < 32 << 20

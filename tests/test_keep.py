@@ -1,31 +1,22 @@
 # SPDX-License-Identifier: Apache-2.0
 """Monitors that decide after the episodes which of them get a video."""
 
+import contextlib
 import logging
 import signal
-import subprocess
-import sys
 from pathlib import Path
 
 import gymnasium
 import pytest
 from full_disk import file_size_limit
+from other_python import run_python
 from parts import parametrize
-from recordings import (
-    frames_in,
-    in_flight,
-    journal_of,
-    manifest_of,
-    metadata_of,
-    videos_in,
-)
+from recordings import frames_in, in_flight, manifest_of, metadata_of, videos_in
 from waiting import wait_until
 
 import mjrec
 from mjrec.formats import video_sink
-from mjrec.formats.trajectory_file import open_trajectory
 from mjrec.recorder.tracking import Tracker
-from mjrec.rendering.finish import finish
 
 # Of the episodes of `pendulum`, in their order.
 RETURNS = [5.0, 2.0, 4.0, 1.0, 4.0, 2.0, 3.0, 6.0]
@@ -51,71 +42,35 @@ class Limited(gymnasium.Wrapper):
         return observation, 1.0, False, self.left == 0, info
 
 
-class OneStep(Limited):
-    """Ends an episode after a step, with its return as the reward."""
-
-    def step(self, action):
-        observation, *_, info = self.env.step(action)
-        return observation, float(self.left), False, True, info
-
-
-def pendulum(returns=RETURNS, *, kind=Limited, **arguments):
+def pendulum(returns=RETURNS, **arguments):
     """Return a small environment."""
     size = {"width": 64, "height": 64, "render_mode": "rgb_array"}
-    return kind(gymnasium.make("InvertedPendulum-v5", **size), returns, **arguments)
+    return Limited(gymnasium.make("InvertedPendulum-v5", **size), returns, **arguments)
+
+
+def finish_episode(env):
+    """Take steps to the end of an episode."""
+    while not any(env.step(env.action_space.sample())[2:4]):
+        pass
 
 
 def run(env, episodes):
     """Run whole episodes."""
     for _ in range(episodes):
         env.reset(seed=0)
-        while not any(env.step(env.action_space.sample())[2:4]):
-            pass
+        finish_episode(env)
 
 
-def h5_of(directory):
-    """Return the numbers of the episodes with a finished trajectory."""
-    return sorted(int(path.stem[-6:]) for path in directory.glob("*.h5"))
+def numbers(paths):
+    """Return the numbers of the episodes that paths are of."""
+    return sorted(int(path.stem[-6:]) for path in paths)
 
 
-def logs_of(directory):
-    """Return the numbers of the episodes in flight."""
-    return [int(path.stem[-6:]) for path in in_flight(directory)]
-
-
-def pending_in(directory):
-    """Return the numbers of the episodes whose videos the manifest calls pending."""
-    entries = manifest_of(directory)["mjrec"]["pending"]
-    return [entry["episode_id"] for entry in entries]
-
-
-def facts_of(directory, episode):
-    """Return the facts of a trajectory."""
-    found = {*directory.glob("*.h5"), *in_flight(directory)}
-    [path] = [p for p in found if p.name.endswith(f".episode{episode:06d}.h5")]
-    with open_trajectory(path) as reader:
-        return dict(reader.facts)
-
-
-def render(directory):
-    """Render what is pending."""
-    outcomes = finish(directory, workers=1)
-    assert not any(each.failures for each in outcomes)
-
-
-class Listener(Tracker):
-    """Notes of which videos it is notified, and how long their episodes were."""
-
-    def __init__(self):
-        self.videos = {}
-
-    def video(self, run, video):
-        assert video.path.exists()
-        assert video.episode is not None
-        self.videos[video.episode_id] = video.episode.length
-
-
-# --- what is kept --------------------------------------------------------------------
+def decided(directory):
+    """Return which episodes were recorded, and what is said of the choice."""
+    details = manifest_of(directory)["mjrec"]
+    keep = details["keep"]
+    return details["schedule"]["recorded"], keep["decided"], keep["chosen"]
 
 
 both_ways = pytest.mark.parametrize("way", ["live", "deferred"])
@@ -124,24 +79,28 @@ both_ways = pytest.mark.parametrize("way", ["live", "deferred"])
 @both_ways
 def test_the_worst_n_are_kept(tmp_path, way):
     """Never more candidates than N; only the chosen are drawn, named, notified."""
-    listener = Listener()
-    options = {"workers": 1, "trackers": listener, "name_prefix": "w"}
-    with mjrec.Monitor(
-        pendulum(), tmp_path, keep="worst:2", render=way, **options
-    ) as monitor:
+    notified = {}
+    tracker = Tracker()
+    tracker.video = lambda _, video: notified.update(
+        {video.episode_id: (video.episode.length, video.path.exists())}
+    )
+    options = {"workers": 1, "trackers": tracker, "name_prefix": "w", "render": way}
+    with mjrec.Monitor(pendulum(), tmp_path, keep="worst:2", **options) as monitor:
         for number in range(8):
-            run(monitor, 1)
+            monitor.reset(seed=0)
+            # The candidates' logs, and that of the running episode.
+            assert len(list(tmp_path.glob("*.log"))) <= 3
+            finish_episode(monitor)
             so_far = sorted(range(number + 1), key=lambda k: (RETURNS[k], k))[:2]
-            assert logs_of(tmp_path) == sorted(so_far)
+            assert numbers(in_flight(tmp_path)) == sorted(so_far)
             assert videos_in(tmp_path) == (sorted(so_far) if way == "live" else [])
         assert not list(tmp_path.glob("w-*"))
-        assert listener.videos == {}
-    assert videos_in(tmp_path) == h5_of(tmp_path) == [1, 3]
-    assert not list(tmp_path.glob(".*"))
-    assert not list(tmp_path.glob("*00000[024567]*"))
+        assert notified == {}
+    assert videos_in(tmp_path) == numbers(tmp_path.glob("*.h5")) == [1, 3]
+    assert not [*tmp_path.glob(".*"), *tmp_path.glob("*00000[024567]*")]
     named = sorted(path.name for path in tmp_path.glob("w-*.mp4"))
     assert named == ["w-episode-1.mp4", "w-episode-3.mp4"]
-    assert listener.videos == {1: 2, 3: 1}
+    assert notified == {1: (2, True), 3: (1, True)}
     manifest = manifest_of(tmp_path)
     assert len(manifest["videos"]) == 2
     details = manifest["mjrec"]
@@ -151,34 +110,18 @@ def test_the_worst_n_are_kept(tmp_path, way):
     assert details["keep"] == {**chosen, "chosen": [1, 3]}
     for number in (1, 3):
         assert metadata_of(tmp_path, number)["selection"] == chosen
-        assert facts_of(tmp_path, number)["video"]["selection"] == chosen
+        [path] = tmp_path.glob(f"*.episode{number:06d}.h5")
+        assert mjrec.load_trajectory(path).facts["video"]["selection"] == chosen
         assert len(frames_in(tmp_path, number)) == RETURNS[number] + 1
-    assert len(journal_of(tmp_path)) == 8
-
-
-@parametrize("episodes", [100, 1000])
-def test_the_disk_holds_n_candidates_and_the_running_episode(tmp_path, episodes):
-    """However long the run is; each goes when it is out."""
-    # Most are worse than those before.
-    returns = [episodes - number + 7 * number % 5 for number in range(episodes)]
-    env = pendulum(returns, kind=OneStep)
-    with mjrec.Monitor(env, tmp_path, keep="worst:3", workers=0) as monitor:
-        for _ in returns:
-            monitor.reset()
-            assert len(list(tmp_path.glob("*.log"))) <= 4
-            assert len(list(tmp_path.glob("openaigym.states.*"))) <= 4 * 3
-            monitor.step(monitor.action_space.sample())
-    worst = sorted(range(episodes), key=lambda k: (returns[k], k))[:3]
-    assert h5_of(tmp_path) == sorted(worst)
+    assert len(mjrec.load_results(tmp_path)["episode_lengths"]) == 8
 
 
 @both_ways
 def test_failures_are_what_the_environment_calls_so(tmp_path, way):
     """Drawn at the end of each; after N no frame is recorded any more."""
     made = pendulum(success=[True, False, True, False, False, True, False, False])
-    with mjrec.Monitor(
-        made, tmp_path, keep="failures:2", mode="training", render=way, workers=1
-    ) as env:
+    options = {"keep": "failures:2", "render": way, "workers": 1}
+    with mjrec.Monitor(made, tmp_path, **options) as env:
         run(env, 3)
         wait_until(lambda: videos_in(tmp_path) == [1])
         run(env, 5)
@@ -186,25 +129,26 @@ def test_failures_are_what_the_environment_calls_so(tmp_path, way):
     assert videos_in(tmp_path) == [1, 3]
     selection = {"rule": "failures:2", "decided": True, "finished": 2}
     assert metadata_of(tmp_path, 1)["selection"] == selection
-    assert manifest_of(tmp_path)["mjrec"]["keep"]["chosen"] == [1, 3]
+    assert decided(tmp_path) == ([1, 3], True, [1, 3])
 
 
-def longest_two(episodes):
-    """Choose by length."""
+def longest(episodes):
     return [e.episode_id for e in sorted(episodes, key=lambda e: -e.length)[:2]]
 
 
 @pytest.mark.parametrize(
     # 1 2 2 3 4 4 5 6: the lower middle is episode 6.
     ("keep", "way", "kept"),
-    [("median", "deferred", [6]), (longest_two, "live", [0, 7])],
+    [("median", "deferred", [6]), (longest, "live", [0, 7])],
 )
 def test_what_is_decided_at_the_end_holds_all(keep, way, kept, tmp_path, caplog):
     """It says so once; the rule or the function's name stands in the manifest."""
     caplog.set_level(logging.INFO, "mjrec")
     with mjrec.Monitor(pendulum(), tmp_path, keep=keep, render=way, workers=1) as env:
         run(env, 8)
-        assert (logs_of if way == "deferred" else videos_in)(tmp_path) == [*range(8)]
+        assert [*range(8)] == (
+            numbers(in_flight(tmp_path)) if way == "deferred" else videos_in(tmp_path)
+        )
     assert caplog.text.count("kept on disk") == 1
     assert videos_in(tmp_path) == kept
     name = getattr(keep, "__name__", keep)
@@ -223,38 +167,32 @@ def test_trajectories_are_kept_as_asked(tmp_path, options, kept):
     """Whatever becomes of the videos; those that fell out promise none."""
     with mjrec.Monitor(pendulum([3, 2, 4, 1]), tmp_path, keep="best:1", **options) as e:
         run(e, 4)
-    assert h5_of(tmp_path) == kept
+    assert numbers(tmp_path.glob("*.h5")) == kept
     if not options["workers"]:
-        promised = [bool(facts_of(tmp_path, k)["video"]) for k in kept]
-        assert promised == [False, False, True, False]
-        render(tmp_path)
+        paths = sorted(tmp_path.glob("*.h5"))
+        promised = [mjrec.load_trajectory(path).facts["video"] for path in paths]
+        assert [bool(each) for each in promised] == [False, False, True, False]
+        mjrec.render_videos(tmp_path, workers=1)
     assert videos_in(tmp_path) == [2]
-    assert logs_of(tmp_path) == []
+    assert numbers(in_flight(tmp_path)) == []
     assert metadata_of(tmp_path, 2)["selection"]["rule"] == "best:1"
 
 
 @both_ways
 def test_incomplete_episodes_are_never_chosen(tmp_path, way):
     """Neither one that was reset nor the one that was closed; nothing of them stays."""
-    options = {"render": way, "allow_early_reset": True}
-    with mjrec.Monitor(
-        pendulum([3, 5, 4]), tmp_path, keep="worst:3", workers=1, **options
-    ) as monitor:
+    options = {"render": way, "allow_early_reset": True, "workers": 1}
+    with mjrec.Monitor(pendulum(), tmp_path, keep="worst:3", **options) as monitor:
         run(monitor, 1)
         for _ in range(2):
             monitor.reset()
             monitor.step(monitor.action_space.sample())
     assert videos_in(tmp_path) == [0]
-    assert not list(tmp_path.glob("*00000[12]*"))
-    assert not list(tmp_path.glob(".*"))
-    assert manifest_of(tmp_path)["mjrec"]["keep"]["chosen"] == [0]
-
-
-# --- ends ----------------------------------------------------------------------------
+    assert not [*tmp_path.glob(".*"), *tmp_path.glob("*00000[12]*")]
+    assert decided(tmp_path)[2] == [0]
 
 
 def confused(episodes):
-    """Return a number that is none of an episode."""
     return [len(episodes)]
 
 
@@ -271,14 +209,11 @@ def test_a_function_that_cannot_choose_loses_nothing(tmp_path, way, options):
         env.close(**options)
     env.close()
     assert not list(tmp_path.glob(".*"))
+    assert decided(tmp_path) == ([0, 1, 2], False, [])
     details = manifest_of(tmp_path)["mjrec"]
-    assert details["schedule"]["recorded"] == [0, 1, 2]
-    assert not details["keep"]["decided"]
-    assert details["keep"]["chosen"] == []
     assert "returned 3" in details["keep"]["failure"]
-    if way == "deferred":
-        assert pending_in(tmp_path) == [0, 1, 2]
-        render(tmp_path)
+    assert len(details["pending"]) == (3 if way == "deferred" else 0)
+    mjrec.render_videos(tmp_path, workers=1)
     assert videos_in(tmp_path) == [0, 1, 2]
     assert len(manifest_of(tmp_path)["videos"]) == 3
     selection = {"rule": "confused", "decided": False}
@@ -288,23 +223,21 @@ def test_a_function_that_cannot_choose_loses_nothing(tmp_path, way, options):
 @parametrize("on_error", ["warn", "raise"])
 def test_a_full_disk_at_the_end_loses_no_chosen_video(tmp_path, on_error):
     """What the journal has no room for waits; it is pending all the same."""
-    env = mjrec.Monitor(
-        pendulum(), tmp_path, keep="worst:2", workers=0, on_error=on_error
-    )
+    options = {"keep": "worst:2", "workers": 0, "on_error": on_error}
+    env = mjrec.Monitor(pendulum(), tmp_path, **options)
     run(env, 8)
     [journal] = tmp_path.glob("*.jsonl")
-    size = journal.stat().st_size
-    with file_size_limit(size + 20):
-        if on_error == "raise":
-            with pytest.raises(mjrec.FileNotWritten):
-                env._recorder.finish()
-        else:
-            env._recorder.finish()
+    raised = pytest.raises(mjrec.FileNotWritten)
+    with (
+        file_size_limit(journal.stat().st_size + 20),
+        raised if on_error == "raise" else contextlib.nullcontext(),
+    ):
+        env._recorder.finish()
     env.close()
-    assert pending_in(tmp_path) == [1, 3]
-    assert manifest_of(tmp_path)["mjrec"]["schedule"]["recorded"] == [1, 3]
+    assert decided(tmp_path)[0] == [1, 3]
+    assert len(manifest_of(tmp_path)["mjrec"]["pending"]) == 2
     assert not list(tmp_path.glob("*episode00000[024567]*"))
-    render(tmp_path)
+    mjrec.render_videos(tmp_path, workers=1)
     assert videos_in(tmp_path) == [1, 3]
 
 
@@ -350,19 +283,17 @@ os.kill(os.getpid(), 9)
 )
 def test_a_killed_run_leaves_its_candidates(tmp_path, kind, recovers):
     """And the running episode, and nothing of what had fallen out; undecided."""
-    here = str(Path(__file__).parent)
-    command = [sys.executable, "-c", PROGRAM, str(tmp_path), kind, here]
-    assert subprocess.run(command, check=False).returncode == -signal.SIGKILL
-    assert logs_of(tmp_path) == [1, 3, 5]
+    here = Path(__file__).parent
+    run_python(PROGRAM, tmp_path, kind, here, status=-signal.SIGKILL)
+    assert numbers(in_flight(tmp_path)) == [1, 3, 5]
     if recovers:
         mjrec.recover(tmp_path)
         details = manifest_of(tmp_path)["mjrec"]
         assert details["schedule"]["name"] == "keep:worst:2"
         assert details["keep"]["rule"] == "worst:2"
-        assert not details["keep"]["decided"]
-        assert details["keep"]["chosen"] == []
-        assert pending_in(tmp_path) == ([] if kind == "live" else [1, 3, 5])
-    render(tmp_path)
+        assert decided(tmp_path)[1:] == (False, [])
+        assert len(details["pending"]) == (0 if kind == "live" else 3)
+    mjrec.render_videos(tmp_path, workers=1)
     assert set(videos_in(tmp_path)) - {5} == {1, 3}
     assert kind == "live" or videos_in(tmp_path) == [1, 3, 5]
     selection = {"rule": "worst:2", "decided": False}

@@ -7,32 +7,29 @@ import pytest
 
 from mjrec.machine import cgroup_cpu_quota, gpu_device_files, usable_cpus
 
-_DEEP = {
-    "a/cpu.max": "100000 100000\n",
-    "a/b/cpu.max": "400000 100000\n",
-    "a/b/c/cpu.max": "max 100000\n",
-}
-
 
 @pytest.mark.parametrize(
-    ("own", "files", "expected"),
+    ("own", "quotas", "expected"),
     [
-        ("0::/\n", {"cpu.max": "250000 100000\n"}, 2.5),
+        ("0::/\n", {"": "250000 100000"}, 2.5),
         # The least quota on the way up counts.
-        ("0::/a/b/c\n", _DEEP, 1.0),
+        (
+            "0::/a/b/c\n",
+            {"a": "100000 100000", "a/b": "400000 100000", "a/b/c": "max 100000"},
+            1.0,
+        ),
         # No limit is said, or none is to be found.
-        ("0::/\n", {"cpu.max": "max 100000\n"}, None),
+        ("0::/\n", {"": "max 100000"}, None),
         ("0::/\n", {}, None),
-        ("1:cpu:/\n", {"cpu.max": "100000 100000\n"}, None),
-        ("", {}, None),
+        ("1:cpu:/\n", {"": "100000 100000"}, None),
     ],
 )
-def test_cpus_that_the_cgroup_grants(own, files, expected, tmp_path):
+def test_cpus_that_the_cgroup_grants(own, quotas, expected, tmp_path):
     """None where nothing limits them."""
     root = tmp_path / "cgroup"
-    for name, content in files.items():
-        (root / name).parent.mkdir(parents=True, exist_ok=True)
-        (root / name).write_text(content)
+    for group, quota in quotas.items():
+        (root / group).mkdir(parents=True, exist_ok=True)
+        (root / group / "cpu.max").write_text(f"{quota}\n")
     (tmp_path / "own").write_text(own)
     assert cgroup_cpu_quota(root=root, own=tmp_path / "own") == expected
 

@@ -4,7 +4,6 @@
 import gc
 
 import gymnasium
-import numpy as np
 import pytest
 
 import mjrec
@@ -12,17 +11,13 @@ from conftest import Corridor
 from mjrec.recorder.tracking import Tracker
 
 
-class Overlay(gymnasium.Wrapper):
-    """Draws something on top."""
-
-    def render(self):
-        frame = np.array(self.env.render())
-        frame[:4] = 255
-        return frame
-
-
 def cheetah():
     return gymnasium.make("HalfCheetah-v5", render_mode="rgb_array")
+
+
+class Overlay(gymnasium.Wrapper):
+    def render(self):
+        return self.env.render() // 2
 
 
 ENVIRONMENTS = {
@@ -37,8 +32,14 @@ IMPOSSIBLE = {
         ({"mode": "testing"}, "InvalidArgument", "training"),
         ({"fps": True}, "InvalidArgument", "fps"),
         ({"trajectory_callable": 5}, "InvalidArgument", "trajectory_callable"),
-        ({"uid": "a/b"}, "InvalidArgument", "uid"),
-        ({"resume": "yes"}, "InvalidArgument", "resume"),
+        *(
+            ({"uid": uid}, "InvalidArgument", "uid")
+            for uid in ("", "a/b", ".hidden", "a b", "é", "x" * 101)
+        ),
+        *(
+            ({"resume": value}, "InvalidArgument", 'True, False, or "join"')
+            for value in ("yes", 1, None)
+        ),
         ({"camera": "side"}, "InvalidArgument", "camera"),
         ({"width": 100}, "InvalidArgument", "width"),
         *(

@@ -1,38 +1,30 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Results are found, merged and cleared as in gym, without its mistakes."""
+"""Results are found, merged, listed and cleared as in gym, without its mistakes."""
 
 import json
-import logging
-import math
+import tracemalloc
 from pathlib import Path
 
 import pytest
-from result_files import ENV_INFO, write_journal, write_saved
+from parts import parametrize
+from result_files import entry, write_journal, write_saved
+from trajectories_by_hand import write_finished, write_log
 
 import mjrec
 from mjrec.errors import DirectoryInUse, UnreadableFile
 from mjrec.formats.locks import Lock
-from mjrec.formats.manifest import StatsFile
+from mjrec.formats.manifest import StatsFile, read_manifest
+from mjrec.reporting.gathering import gather
 
+VIDEO = "openaigym.video.0.1.video000000"
 MONITOR_FILES = [
     "openaigym.episode_batch.0.1.stats.json",
     "openaigym.episodes.0.1.jsonl",
     "openaigym.manifest.0.1.manifest.json",
-    "openaigym.video.0.1.video000000.json",
-    "openaigym.video.0.1.video000000.meta.json",
-    "openaigym.video.0.1.video000000.mp4",
+    *(f"{VIDEO}.{end}" for end in ("json", "meta.json", "mp4")),
 ]
-HIDDEN_FILES = [
-    ".openaigym.0.1.lock",
-    ".openaigym.video.0.1.video000008.mp4.01234567.part",
-]
+HIDDEN_FILES = [".openaigym.0.1.lock", f".{VIDEO}.mp4.01234567.part"]
 OTHER_FILES = ["openaigym.notes.txt", "openaigymfoo", "policy.pt", ".hidden"]
-
-
-def load(directory):
-    results = mjrec.load_results(directory)
-    assert results is not None
-    return results
 
 
 def touch(directory, *names):
@@ -56,9 +48,8 @@ def test_detecting_takes_exact_names_in_order(tmp_path):
     assert named == [str(tmp_path / "x" / early), str(tmp_path / "x" / late)]
 
 
-def test_clearing_removes_monitor_files_and_nothing_else(tmp_path, caplog):
-    """Locks and unfinished files too; a link and not its target; none while in use."""
-    caplog.set_level(logging.INFO, "mjrec")
+def test_clearing_removes_monitor_files_and_nothing_else(tmp_path, monkeypatch):
+    """First what lists the rest; a link and not its target; none while in use."""
     touch(tmp_path, *MONITOR_FILES[:-1], HIDDEN_FILES[1], *OTHER_FILES)
     (tmp_path / MONITOR_FILES[-1]).symlink_to("policy.pt")
     folder = tmp_path / "openaigym.video.9.9.video000000.mp4"
@@ -70,80 +61,56 @@ def test_clearing_removes_monitor_files_and_nothing_else(tmp_path, caplog):
     assert set(tmp_path.iterdir()) == before
     # As a killed process leaves it.
     lock.let_go()
+    removed, real = [], Path.unlink
+    monkeypatch.setattr(
+        Path, "unlink", lambda p, **rest: (removed.append(p.name), real(p, **rest))
+    )
     mjrec.clear_monitor_files(str(tmp_path))
     assert {path.name for path in tmp_path.iterdir()} == {*OTHER_FILES, folder.name}
-    assert "Removed 8 monitor files" in caplog.text
-    mjrec.clear_monitor_files(tmp_path / "missing")
-
-
-def test_clearing_removes_first_what_lists_the_rest(tmp_path, monkeypatch):
-    """If it is interrupted, no results are left without their files."""
-    write_saved(tmp_path, "0.7", 1)
-    write_journal(tmp_path, "1.7", 1)
-    removed = []
-    monkeypatch.setattr(Path, "unlink", lambda path, **_: removed.append(path.name))
-    mjrec.clear_monitor_files(tmp_path)
     assert {name.split(".")[1] for name in removed[:2]} == {"manifest", "episodes"}
-    assert len(removed) == 3
+    assert len(removed) == 8
+    mjrec.clear_monitor_files(tmp_path / "missing")
 
 
 def test_merging_sorts_by_time_and_keeps_rows_together(tmp_path):
     """Lengths, rewards, types and sources follow their timestamps; it is stable."""
     write_saved(tmp_path, "0.7", 1, 4, start=0.5, types="te")
-    write_saved(tmp_path, "1.7", 2, 3, start=0.25, types="et")
-    paths = [tmp_path / f"openaigym.episode_batch.{i}.7.stats.json" for i in (0, 1)]
+    # Gym noted a type at each reset, so that there are more than episodes.
+    write_saved(tmp_path, "1.7", 2, 3, start=0.25, types="ette")
+    # Episodes without a type are training.
+    write_saved(tmp_path, "2.7", 5, types=None)
+    paths = sorted(tmp_path.glob("*.stats.json"))
     assert mjrec.merge_stats_files(paths) == (
-        [0, 1, 1, 0],
-        [0.5, 0.25],
-        [101.0, 102.0, 103.0, 104.0],
-        [11, 12, 13, 14],
-        [1.0, 2.0, 3.0, 4.0],
-        ["t", "e", "t", "e"],
+        [0, 1, 1, 0, 2],
+        [0.5, 0.25, 98.0],
+        [101.0, 102.0, 103.0, 104.0, 105.0],
+        [11, 12, 13, 14, 15],
+        [1.0, 2.0, 3.0, 4.0, 5.0],
+        ["t", "e", "t", "e", "t"],
         0.25,
     )
     assert mjrec.merge_stats_files([]) == ([], [], [], [], [], None, 0)
-    for infix in ("0.7", "1.7"):
+    for infix in ("0.7", "1.7", "2.7"):
         same = StatsFile(0.0, (1.0,) * 100, tuple(range(100)), (0.0,) * 100, None)
         write_saved(tmp_path, infix, stats=same)
-    results = load(tmp_path)
-    assert results["data_sources"] == [0] * 100 + [1] * 100
-    assert results["episode_lengths"] == [*range(100), *range(100)]
-
-
-@pytest.mark.parametrize(
-    ("types", "merged"),
-    [
-        # Gym noted a type at each reset, so that there are more than episodes.
-        (("ttt", "eee"), ["t", "e", "e"]),
-        ((None, "ee"), ["t", "e", "e"]),
-        ((None, None), None),
-    ],
-)
-def test_types_belong_to_their_episodes(tmp_path, types, merged):
-    """Surplus ones are dropped; episodes without one are training."""
-    write_saved(tmp_path, "0.7", 1, types=types[0])
-    write_saved(tmp_path, "1.7", 2, 3, types=types[1])
-    assert load(tmp_path)["episode_types"] == merged
+    results = mjrec.load_results(tmp_path)
+    assert results["data_sources"] == [0] * 100 + [1] * 100 + [2] * 100
+    assert results["episode_lengths"] == [*range(100)] * 3
+    assert results["episode_types"] is None
 
 
 def test_every_monitor_keeps_its_place_in_every_list(tmp_path, caplog):
-    """With a manifest or without, with episodes or without; in gym's order.
-
-    Where there is none, or no directory, the result is None, as in gym.
-    """
+    """With or without manifest and episodes; where there is none the result is None."""
     assert mjrec.load_results(tmp_path / "missing") is None
     assert mjrec.load_results(str(tmp_path)) is None
-    assert [record.levelname for record in caplog.records] == ["ERROR", "ERROR"]
     assert f"directory {tmp_path / 'missing'} does not exist" in caplog.text
     assert f"There are no manifests or journals in {tmp_path}" in caplog.text
-    write_saved(tmp_path, "0.7", start=None)
-    write_saved(tmp_path, "1.7", start=0.1)
+    first = write_saved(tmp_path, "0.7", start=None)
+    second = write_saved(tmp_path, "1.7", start=0.1)
     third = write_journal(tmp_path, "2.7", 1)
     last = write_saved(tmp_path, "3.7", 0, start=0.5)
-    results = load(tmp_path)
-    infixes = [path.split(".", 2)[2][:3] for path in results["manifests"]]
-    assert infixes == ["0.7", "1.7", "2.7", "3.7"]
-    assert results["manifests"][2:] == [str(third), str(last)]
+    results = mjrec.load_results(tmp_path)
+    assert results["manifests"] == [str(path) for path in (first, second, third, last)]
     assert results["initial_reset_timestamps"] == [None, 0.1, 100.5, 0.5]
     assert results["data_sources"] == [3, 2]
     assert results["initial_reset_timestamp"] == 0.5
@@ -153,15 +120,15 @@ def test_unequal_env_infos_are_merged_with_one_warning(tmp_path, caplog):
     """It shows what differs and where; the newest results' info counts."""
     newest = {"gym_version": "mjrec-1", "extra": [1]}
     write_saved(tmp_path, "0.7", 9, start=99.0, env_info=newest)
-    assert load(tmp_path)["env_info"] == newest
+    assert mjrec.load_results(tmp_path)["env_info"] == newest
     assert not caplog.records
     write_saved(tmp_path, "1.7", 1, env_info={"gym_version": "0.21.0"})
-    results = load(tmp_path)
+    results = mjrec.load_results(tmp_path)
     assert results["env_info"] == newest
     assert results["timestamps"] == [101.0, 109.0]
-    (record,) = caplog.records
-    assert "0.7.manifest.json has {'gym_version': 'mjrec-1'" in record.getMessage()
-    assert "1.7.manifest.json has {'gym_version': '0.21.0'}" in record.getMessage()
+    [said] = caplog.messages
+    assert "0.7.manifest.json has {'gym_version': 'mjrec-1'" in said
+    assert "1.7.manifest.json has {'gym_version': '0.21.0'}" in said
 
 
 def test_videos_are_pairs_of_paths_in_order(tmp_path, caplog):
@@ -172,20 +139,17 @@ def test_videos_are_pairs_of_paths_in_order(tmp_path, caplog):
     write_saved(tmp_path / "old", "0.7", videos=pairs[1:])
     touch(tmp_path / "old", *pairs[0], *pairs[2])
     new = (tmp_path / "old").rename(tmp_path / "new")
-    assert load(new)["videos"] == [
+    assert mjrec.load_results(new)["videos"] == [
         tuple(str(new / name) for name in pairs[number]) for number in (2, 0)
     ]
-    (record,) = caplog.records
-    assert "2 of the 4 videos" in record.getMessage()
-    assert "v1.mp4, v3.mp4" in record.getMessage()
+    [said] = caplog.messages
+    assert "2 of the 4 videos" in said
+    assert "v1.mp4, v3.mp4" in said
 
 
 def test_missing_and_damaged_files_are_named(tmp_path):
-    """First the statistics, then the manifest. NaN and infinity are no damage."""
-    times, rewards = (1.0, 2.0, 3.0), (math.nan, math.inf, -math.inf)
-    stats = StatsFile(0.0, times, (1,) * 3, rewards, None)
-    manifest = write_saved(tmp_path, "0.7", stats=stats, env_info=ENV_INFO)
-    assert repr(load(tmp_path)["episode_rewards"]) == "[nan, inf, -inf]"
+    """First the statistics, then the manifest."""
+    manifest = write_saved(tmp_path, "0.7", 1)
     path = tmp_path / "openaigym.episode_batch.0.7.stats.json"
     path.write_text(path.read_text()[:-5])
     with pytest.raises(UnreadableFile, match=path.name):
@@ -196,3 +160,125 @@ def test_missing_and_damaged_files_are_named(tmp_path):
     manifest.write_text(json.dumps({"stats": "../secret"}))
     with pytest.raises(UnreadableFile, match=manifest.name):
         mjrec.load_results(tmp_path)
+
+
+# --- episodes ------------------------------------------------------------------------
+
+
+def video(directory, infix, episode_id, suffix):
+    path = directory / f"openaigym.video.{infix}.video{episode_id:06d}{suffix}"
+    path.touch()
+    return path
+
+
+def test_an_episode_of_a_journal_has_its_files(tmp_path):
+    """Numbers, seeds and flags as the monitor knew them; no other monitor's video."""
+    facts = {"type": "e", "options": {"x": 1}, "terminated": False, "truncated": True}
+    write_journal(tmp_path, "0.7", entry(27, **facts), 28)
+    # The same monitor's statistics hold less of each.
+    write_saved(tmp_path, "0.7", 27, 28)
+    mp4, meta = (video(tmp_path, "0.7", 27, end) for end in (".mp4", ".meta.json"))
+    for infix, end in (("0.7", ".side.mp4"), ("0.7", ".framehash"), ("1.7", ".mp4")):
+        video(tmp_path, infix, 28, end)
+    first, second = mjrec.iter_episodes(str(tmp_path))
+    known = {"episode_id": 27, "length": 37, "reward": 27.0, "seed": 27}
+    known |= {"start_time": 126.5, "end_time": 127.0, "monitor": "0.7"}
+    assert first == mjrec.Episode(video=mp4, metadata=meta, **known, **facts)
+    assert (second.episode_id, second.video, second.metadata) == (28, None, None)
+
+
+@pytest.mark.parametrize("has_journal", [True, False])
+def test_pending_is_what_was_promised_and_is_not_there(tmp_path, has_journal):
+    """In flight or finished; neither what is there, nor what failed or is live."""
+    pending = []
+    if has_journal:
+        kinds = ["deferred"] * 4 + ["live"]
+        entries = [entry(n, recording=kind) for n, kind in enumerate(kinds)]
+        write_journal(tmp_path, "0.7", *entries, run={"env_info": {}})
+    else:
+        names = [f"openaigym.video.0.7.video00000{n}.mp4" for n in range(4)]
+        pending = [{"episode_id": n, "video": name} for n, name in enumerate(names)]
+    details = {"next_episode_id": 5, "pending": pending}
+    write_saved(tmp_path, "0.7", *range(5), details=details)
+    trajectories = [write_log(tmp_path, 0, infix="0.7")]
+    trajectories += [write_finished(tmp_path, n, infix="0.7") for n in range(1, 5)]
+    video(tmp_path, "0.7", 2, ".mp4")
+    video(tmp_path, "0.7", 3, ".meta.json")
+    episodes = list(mjrec.iter_episodes(tmp_path))
+    assert [each.pending for each in episodes] == [True, True, False, False, False]
+    assert [each.trajectory for each in episodes] == trajectories
+
+
+def test_gyms_episodes_have_what_gym_wrote(tmp_path):
+    """Numbered by their index; the rest is None. A gym may die before its manifest."""
+    write_saved(tmp_path, "0.7", 1, 2, types="te").unlink()
+    text, meta = (video(tmp_path, "0.7", 1, end) for end in (".json", ".meta.json"))
+    _, episode = mjrec.iter_episodes(tmp_path)
+    known = {"episode_id": 1, "length": 12, "reward": 2.0, "type": "e"}
+    known |= {"end_time": 102.0, "monitor": "0.7", "video": text, "metadata": meta}
+    assert episode == mjrec.Episode(**known)
+
+
+@pytest.mark.parametrize(
+    ("types", "linked"), [(None, True), ("ttt", True), ("tttt", False)]
+)
+def test_a_video_is_never_shown_for_another_episode(tmp_path, types, linked):
+    """Gym numbers videos by resets; more of them than ends and a next are in doubt."""
+    write_saved(tmp_path, "0.7", 1, 2, types=types)
+    video(tmp_path, "0.7", 0, ".mp4")
+    first, second = mjrec.iter_episodes(tmp_path)
+    assert (first.video is not None) == linked
+    assert (first.type, second.type) == ("t", "t")
+
+
+def test_monitors_come_in_the_order_of_their_numbers(tmp_path):
+    """10 after 9; a missing directory is an error before the first episode."""
+    infixes = ["0.9", "0.10", "1.7", "9.7", "10.7"]
+    for infix in reversed(infixes):
+        write_journal(tmp_path, infix, 0)
+    assert [episode.monitor for episode in mjrec.iter_episodes(tmp_path)] == infixes
+    with pytest.raises(UnreadableFile, match="directory does not exist"):
+        mjrec.iter_episodes(tmp_path / "missing")
+
+
+# --- memory --------------------------------------------------------------------------
+
+
+def peak_of(read, path):
+    """Return the most bytes that were held while something was read."""
+    # The first time, things are loaded that stay.
+    read(path)
+    tracemalloc.start()
+    try:
+        read(path)
+        return tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+
+
+def list_episodes(directory):
+    """Return how many episodes there are."""
+    return sum(1 for _ in mjrec.iter_episodes(directory))
+
+
+def test_memory_does_not_grow_with_the_episodes(tmp_path):
+    """Episodes are read as they are asked for."""
+    items = (entry(number, options="x" * 1000) for number in range(5000))
+    path = write_journal(tmp_path, "0.7", *items)
+    assert peak_of(list_episodes, tmp_path) < path.stat().st_size / 10
+
+
+@parametrize("read", [mjrec.load_results, list_episodes, gather])
+def test_manifests_are_not_kept(tmp_path, read):
+    """What many say of packages takes no more than what a few do."""
+    packages = {
+        f"package-{n}": {"version": "1.0", "hash": "0" * 64} for n in range(999)
+    }
+    large, small = tmp_path / "large", tmp_path / "small"
+    for directory, said in ((large, packages), (small, {})):
+        directory.mkdir()
+        for number in range(40):
+            details = {"provenance": {"packages": said}}
+            path = write_saved(directory, f"{number}.1", 1, details=details)
+    one = peak_of(read_manifest, large / path.name)
+    assert peak_of(read, large) - peak_of(read, small) < 4 * one

@@ -43,27 +43,15 @@ PLAN = EvaluationPlan(
 
 
 def result(seed, episode, total, **more):
-    return EpisodeResult(
-        task="a,b-v0",
-        seed=seed,
-        episode=episode,
-        total_reward=total,
-        length=5,
-        terminated=None if total is None else False,
-        truncated=None if total is None else True,
-        **more,
-    )
+    is_over = None if total is None else False
+    ends = {"terminated": is_over, "truncated": None if total is None else True}
+    facts = {"task": "a,b-v0", "total_reward": total, "length": 5, **ends, **more}
+    return EpisodeResult(seed=seed, episode=episode, **facts)
 
 
+TIMES = {"monitor": "0.w", "episode_id": 0, "start_time": 1.25, "seconds": 0.5}
 RESULTS = [
-    result(
-        *(7, 0, 0.1 + 0.2),
-        success=True,
-        monitor="0.w",
-        episode_id=0,
-        start_time=1.25,
-        seconds=0.5,
-    ),
+    result(7, 0, 0.1 + 0.2, success=True, **TIMES),
     result(7, 1, math.nan),
     result(3, 0, None, failure='it said "no",\nand\0 went =1+1 \udc80'),
     result(3, 1, -math.inf),
@@ -94,25 +82,26 @@ def files_of(result):
 
 
 def test_what_is_written_is_read_back(tmp_path):
-    """Plan, summaries, choice, versions, files, and each number bit for bit."""
+    """Each number bit for bit, and all the rest; results may lack the times."""
     read = read_results(written(tmp_path))
     assert read.plan == PLAN
-    assert read.summaries == (SUMMARY,)
-    assert read.across == ACROSS
+    assert (read.summaries, read.across) == ((SUMMARY,), ACROSS)
     assert read.bootstrap == Bootstrap(resamples=10)
     assert read.selection == {"a,b-v0": (ChosenEpisode(7, 0, "best"),)}
     assert read.versions == {"mujoco": "3.4"}
     first, nan, failed, infinite = read
-    assert first == RESULTS[0]
-    assert nan.total_reward is not None
+    assert (first, infinite) == (RESULTS[0], RESULTS[3])
     assert math.isnan(nan.total_reward)
     assert failed.total_reward is None
     assert failed.failure == 'it said "no", and went =1+1 \\udc80'
-    assert infinite == RESULTS[3]
     columns = read.by_task["a,b-v0"]
     assert columns.videos == {0: VIDEO}
     assert columns.places == {("a,b-v0/seed-007", "0.w"): 0}
     assert columns.failed.tolist() == [False, False, True, False]
+    (tmp_path / "timing.csv").unlink()
+    first, *_ = read_results(tmp_path)
+    assert first.total_reward == 0.1 + 0.2
+    assert (first.start_time, first.monitor) == (None, None)
 
 
 def test_the_files_are_what_the_documentation_says(tmp_path):
@@ -128,33 +117,20 @@ def test_the_files_are_what_the_documentation_says(tmp_path):
     json.loads((tmp_path / "results.json").read_text(), parse_constant=pytest.fail)
 
 
-def test_results_without_timing_are_read(tmp_path):
-    """Results may be published without the times."""
-    (written(tmp_path) / "timing.csv").unlink()
-    first, *_ = read_results(tmp_path)
-    assert first.total_reward == 0.1 + 0.2
-    assert first.start_time is None
-    assert first.monitor is None
-
-
-def test_an_unfinished_evaluation_is_told_from_none(tmp_path):
-    """The way on is to resume it; where there is none, it says so."""
+def test_results_are_gone_while_they_are_rewritten(tmp_path):
+    """No tables stand beside another plan's summaries; the way on is to resume."""
     with pytest.raises(UnreadableFile, match="the directory contains no evaluation"):
         read_results(tmp_path)
     assert not is_evaluation(tmp_path)
     (tmp_path / "evaluation.json").write_text("{}")
     assert is_evaluation(tmp_path)
-    with pytest.raises(UnreadableFile, match="--resume"):
-        read_results(tmp_path)
-
-
-def test_results_are_gone_while_they_are_rewritten(tmp_path):
-    """Tables of one plan never stand beside the summaries of another."""
     written(tmp_path)
     with pytest.raises(ZeroDivisionError):
         written(tmp_path, files=lambda _: 1 / 0)
     assert not (tmp_path / "results.json").exists()
     assert not list(tmp_path.glob(".*"))
+    with pytest.raises(UnreadableFile, match="--resume"):
+        read_results(tmp_path)
 
 
 DAMAGE = {
@@ -212,26 +188,19 @@ def test_a_link_out_of_the_directory_is_not_followed(tmp_path):
 def test_many_episodes_need_little_memory(tmp_path):
     """A hundred bytes each at most, so that a million fit into 100 MB."""
     count = 20_000
+    task = {"tasks": (EvaluatedTask("T-v0", "T"),), "seeds": (0,), "episodes": count}
     written(
         tmp_path,
-        plan=dataclasses.replace(
-            PLAN, tasks=(EvaluatedTask("T-v0", "T"),), seeds=(0,), episodes=count
-        ),
+        plan=dataclasses.replace(PLAN, **task),
         results=[],
         summaries=[TaskSummary(task="T-v0", runs=1, episodes=count)],
         selection={},
     )
-    rows = {
-        "results": [f"T-v0,0,{n},{n / 7!r},1000,false,true,,\n" for n in range(count)],
-        "timing": [
-            f"T-v0,0,{n},1790000000.{n},0.5,T/seed-000,0.worker,{n},,\n"
-            for n in range(count)
-        ],
-    }
-    for name, lines in rows.items():
+    row = "T-v0,0,{n},{reward!r},1000,false,true,,\n"
+    times = "T-v0,0,{n},1790000000.{n},0.5,T/seed-000,0.worker,{n},,\n"
+    for name, line in (("results", row), ("timing", times)):
         with (tmp_path / f"{name}.csv").open("a") as file:
-            file.writelines(lines)
-    del rows, lines
+            file.writelines(line.format(n=n, reward=n / 7) for n in range(count))
     tracemalloc.start()
     try:
         read = read_results(tmp_path)

@@ -40,50 +40,20 @@ RECORDED = [f"{version}/{case}" for version in sorted(VERSIONS) for case in PLAY
 ENV_INFO = {"gym_version": "mjrec-1", "env_id": "Hopper-v5"}
 
 
-def load(directory):
-    results = mjrec.load_results(directory)
-    assert results is not None
-    return results
-
-
-@pytest.mark.parametrize("version", VERSIONS)
-def test_monitors_and_text_recordings_of_a_gym_are_found(version):
-    """Also past the one that only began; texts with their episodes."""
-    results = load(DATA / version / "two_monitors")
-    assert results["data_sources"] == [0, 2, 0, 2]
-    starts = results["initial_reset_timestamps"]
-    assert len(starts) == len(results["manifests"]) == 3
-    for source, end in zip(results["data_sources"], results["timestamps"], strict=True):
-        assert starts[source] < end
-    assert results["initial_reset_timestamp"] == starts[0] == min(starts)
-    videos = load(DATA / version / "text")["videos"]
-    ends = [Path(video).name[-16:] for video, _ in videos]
-    assert ends == ["video000000.json", "video000002.json"]
-    first, second, third = mjrec.iter_episodes(DATA / version / "text")
-    assert [(str(e.video), str(e.metadata)) for e in (first, third)] == videos
-    assert second.video is None
-
-
 def write_ours(directory):
     """Write two monitors with videos, a key of our own, and infinity."""
     directory.mkdir()
     for monitor, (name, shift) in enumerate([("0.7", 0.0), ("1.7", 0.5)]):
         video = f"openaigym.video.{name}.video000000"
-        for suffix in (".mp4", ".meta.json"):
-            (directory / (video + suffix)).touch()
-        write_saved(
-            *(directory, name),
-            stats=StatsFile(
-                initial_reset_timestamp=1790000000.0 + shift,
-                timestamps=(1790000001.0 + shift, 1790000002.0 + shift),
-                episode_lengths=(10, 20),
-                episode_rewards=(math.inf, 0.1 + monitor),
-                episode_types=("t", "e"),
-            ),
-            videos=[(f"{video}.mp4", f"{video}.meta.json")],
-            env_info=ENV_INFO,
-            details={"format": 1, "keys": ["cubic", [True, True]]},
-        )
+        videos = (f"{video}.mp4", f"{video}.meta.json")
+        for each in videos:
+            (directory / each).touch()
+        start = 1790000000.0 + shift
+        rewards = (math.inf, 0.1 + monitor)
+        stats = StatsFile(start, (start + 1, start + 2), (10, 20), rewards, ("t", "e"))
+        details = {"format": 1, "keys": ["cubic", [True, True]]}
+        options = {"env_info": ENV_INFO, "details": details}
+        write_saved(directory, name, stats=stats, videos=[videos], **options)
 
 
 def recorded_answer(name):
@@ -93,9 +63,9 @@ def recorded_answer(name):
 
 def as_ours(answer):
     """JSON has no tuples."""
-    videos = answer.get("videos")
-    pairs = {} if videos is None else {"videos": [tuple(pair) for pair in videos]}
-    return {**answer, **pairs}
+    if answer and answer.get("videos"):
+        answer["videos"] = [tuple(pair) for pair in answer["videos"]]
+    return answer
 
 
 def assert_same(ours, gyms, *, but=()):
@@ -111,7 +81,7 @@ def test_what_a_gym_wrote_is_read(name, monkeypatch):
     """What was played, and as gym read it, except where gym is known to be wrong."""
     monkeypatch.chdir(DATA)
     version, _, case = name.partition("/")
-    ours, gyms = load(Path(name)), recorded_answer(name)
+    ours, gyms = mjrec.load_results(Path(name)), recorded_answer(name)
     lengths, rewards, types = PLAYED[case]
     assert ours["episode_lengths"] == lengths
     assert ours["episode_rewards"] == pytest.approx(rewards, nan_ok=True)
@@ -135,6 +105,11 @@ def test_what_a_gym_wrote_is_read(name, monkeypatch):
             assert gyms["initial_reset_timestamps"] == []
         case _:
             assert_same(ours, gyms)
+    if case == "text":
+        first, second, third = mjrec.iter_episodes(name)
+        assert second.video is None
+        videos = [(str(each.video), str(each.metadata)) for each in (first, third)]
+        assert videos == ours["videos"]
 
 
 def test_gym_agreed_on_what_we_write(tmp_path, monkeypatch):
@@ -143,7 +118,7 @@ def test_gym_agreed_on_what_we_write(tmp_path, monkeypatch):
     write_ours(Path("ours"))
     gyms = recorded_answer("ours")
     assert gyms["episode_types"] == ["t", "t", "e", "e"]
-    assert_same(load(Path("ours")), gyms)
+    assert_same(mjrec.load_results(Path("ours")), gyms)
 
 
 def test_a_monitor_writes_the_keys_of_gym(tmp_path, corridor, play):
@@ -151,63 +126,55 @@ def test_a_monitor_writes_the_keys_of_gym(tmp_path, corridor, play):
     with mjrec.Monitor(corridor, tmp_path) as env:
         play(env, 1)
     for kind, added in (("manifest", {"mjrec"}), ("stats", set())):
-        pattern = f"*.{kind}.json"
-        [gyms] = (DATA / "0.21.0" / "plain").glob(pattern)
-        [ours] = tmp_path.glob(pattern)
-        assert keys_of(ours) == keys_of(gyms) | added
+        gyms, ours = (
+            json.loads(next(directory.glob(f"*.{kind}.json")).read_text()).keys()
+            for directory in (DATA / "0.21.0" / "plain", tmp_path)
+        )
+        assert ours == gyms | added
 
 
-def keys_of(path):
-    return set(json.loads(path.read_text()))
-
-
-@pytest.fixture(scope="session")
-def gym_python():
-    """Return the Python of an environment that holds gym 0.21.0."""
+@pytest.fixture
+def ask_gym():
+    """Return what asks gym 0.21.0 in its own environment for its `load_results`."""
     if "MJREC_TEST_GYM" not in os.environ:
         pytest.skip("no environment with gym 0.21.0: scripts/test --all makes one")
-    return Path(os.environ["MJREC_TEST_GYM"])
-
-
-def run(*command):
-    """Run a program; show what it said where it fails."""
     # Warnings are errors in these tests, not in gym.
     environment = {k: v for k, v in os.environ.items() if k != "PYTHONWARNINGS"}
-    done = subprocess.run(
-        [str(part) for part in command],
-        check=False,
-        capture_output=True,
-        text=True,
-        env=environment,
-        timeout=240,
-    )
-    assert done.returncode == 0, f"{command}\n{done.stdout}\n{done.stderr}"
-    return done.stdout
 
+    def ask(*directories):
+        script = TESTS / "legacy" / "gym_load_results.py"
+        command = [os.environ["MJREC_TEST_GYM"], script, *directories]
+        done = subprocess.run(
+            command, capture_output=True, text=True, env=environment, timeout=240
+        )
+        assert done.returncode == 0, done.stdout + done.stderr
+        return {k: as_ours(v) for k, v in json.loads(done.stdout).items()}
 
-def ask_gym(python, *directories):
-    """Return what gym's own `load_results` returns for each directory."""
-    script = TESTS / "legacy" / "gym_load_results.py"
-    answers = json.loads(run(python, script, *directories))
-    return {k: v if v is None else as_ours(v) for k, v in answers.items()}
+    return ask
 
 
 @pytest.mark.old_gym
-def test_gym_answers_as_recorded(gym_python, tmp_path, monkeypatch):
+def test_gym_answers_as_recorded(ask_gym, tmp_path, monkeypatch):
     """About all the directories that the tests above compare."""
     monkeypatch.chdir(tmp_path)
     for version in VERSIONS:
         Path(version).symlink_to(DATA / version)
     write_ours(Path("ours"))
-    for name, answer in ask_gym(gym_python, *RECORDED, "ours").items():
+    for name, answer in ask_gym(*RECORDED, "ours").items():
         assert repr(answer) == repr(recorded_answer(name)), name
 
 
 @pytest.mark.old_gym
 def test_gym_agrees_on_what_a_monitor_writes(
-    gym_python, tmp_path, corridor, make_corridor, play
+    ask_gym, tmp_path, corridor, make_corridor, play
 ):
-    """Two runs, the second resumed, with videos, a mode, and an unfinished episode."""
+    """Two runs with all that a monitor writes; a NaN is null, and harms no other."""
+    stats = StatsFile(1.0, (2.0, 3.0), (1, 1), (math.nan, 2.5), ("t", "t"))
+    write_saved(tmp_path, "0.7", stats=stats, env_info=ENV_INFO)
+    [gyms] = ask_gym(tmp_path).values()
+    assert gyms["episode_rewards"] == [None, 2.5]
+    assert_same(mjrec.load_results(tmp_path), gyms, but=("episode_rewards",))
+    mjrec.clear_monitor_files(tmp_path)
     with mjrec.Monitor(corridor, tmp_path) as env:
         play(env, 2)
         env.reset()
@@ -216,17 +183,7 @@ def test_gym_agrees_on_what_a_monitor_writes(
         make_corridor(length=2), tmp_path, resume=True, mode="evaluation"
     ) as env:
         play(env, 2)
-    [gyms] = ask_gym(gym_python, tmp_path).values()
+    [gyms] = ask_gym(tmp_path).values()
     assert gyms["episode_lengths"] == [3, 3, 2, 2]
     assert gyms["episode_types"] == ["t", "t", "e", "e"]
-    assert_same(load(tmp_path), gyms)
-
-
-@pytest.mark.old_gym
-def test_gym_reads_null_where_we_wrote_nan(gym_python, tmp_path):
-    """The file is JSON; the other episodes' rewards are unharmed."""
-    stats = StatsFile(1.0, (2.0, 3.0), (1, 1), (math.nan, 2.5), ("t", "t"))
-    write_saved(tmp_path, "0.7", stats=stats, env_info=ENV_INFO)
-    [gyms] = ask_gym(gym_python, tmp_path).values()
-    assert gyms["episode_rewards"] == [None, 2.5]
-    assert_same(load(tmp_path), gyms, but=("episode_rewards",))
+    assert_same(mjrec.load_results(tmp_path), gyms)

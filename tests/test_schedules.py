@@ -4,38 +4,23 @@ import doctest
 import numpy as np
 import pytest
 
-from mjrec import (
-    InvalidArgument,
-    capped_cubic_video_schedule,
-    disable_videos,
-    schedules,
-)
+from mjrec import InvalidArgument, schedules
 from mjrec.schedules import schedule_from_text, schedule_name, to_schedule
 
 
 def test_cubes_below_1000_and_then_every_1000th():
     """The docstring's example runs; the answer is a bool for any whole number."""
-    chosen = [n for n in range(5000) if capped_cubic_video_schedule(n)]
+    chosen = [n for n in range(5000) if schedules.capped_cubic_video_schedule(n)]
     assert chosen == [n**3 for n in range(10)] + [1000, 2000, 3000, 4000]
     assert doctest.testmod(schedules).failed == 0
-    assert capped_cubic_video_schedule(np.int64(27)) is True
-    assert capped_cubic_video_schedule(-8) is False
-
-
-def test_none_is_cubic_and_what_equals_false_disables():
-    """As in gym; a function is itself."""
-    assert to_schedule(None) is capped_cubic_video_schedule
+    assert schedules.capped_cubic_video_schedule(np.int64(27)) is True
+    assert schedules.capped_cubic_video_schedule(-8) is False
+    # As in gym; a function is itself.
+    assert to_schedule(None) is schedules.capped_cubic_video_schedule
     assert to_schedule(max) is max
     for never in (False, 0, np.False_):
-        assert to_schedule(never) is disable_videos
-    assert not any(disable_videos(n) for n in (0, 1, 8, 1000))
-
-
-@pytest.mark.parametrize("wrong", [True, 1, "cubic", [0, 1], np.array([0, 1])])
-def test_other_values_are_an_error(wrong):
-    """The error says what may be given."""
-    with pytest.raises(InvalidArgument, match="must be a function"):
-        to_schedule(wrong)
+        assert to_schedule(never) is schedules.disable_videos
+    assert not any(schedules.disable_videos(n) for n in (0, 1, 8, 1000))
 
 
 @pytest.mark.parametrize(
@@ -56,10 +41,22 @@ def test_schedules_by_name(text, chosen, name):
 
 
 @pytest.mark.parametrize(
-    "text",
-    ["", "cube", "every", "every:", "every:0", "every:x", "at:", "at:-1", "at:a"],
+    ("make", "values", "words"),
+    [
+        (
+            to_schedule,
+            (True, 1, "cubic", [0, 1], np.array([0, 1])),
+            "must be a function",
+        ),
+        (
+            schedule_from_text,
+            ("", "cube", "every", "every:", "every:0", "every:x", "at:", "at:-1"),
+            None,
+        ),
+    ],
 )
-def test_unknown_names_are_an_error(text):
-    """And nothing is guessed."""
-    with pytest.raises(InvalidArgument):
-        schedule_from_text(text)
+def test_other_values_are_an_error(make, values, words):
+    """It says what may be given; nothing is guessed."""
+    for value in values:
+        with pytest.raises(InvalidArgument, match=words):
+            make(value)

@@ -22,45 +22,29 @@ FULL = """
   {equality}
 </mujoco>
 """
-EQUALITY = '<equality><weld body1="moved" body2="free"/></equality>'
 
 
-def simulated(xml):
+@pytest.mark.parametrize("xml", [FULL.format(equality=""), "<mujoco/>"])
+def test_the_words_of_a_state_are_what_mujoco_gives(xml):
+    """Mocap bodies, user data, activations and forces from outside as well."""
     model = mujoco.MjModel.from_xml_string(xml)
-    return model, mujoco.MjData(model)
-
-
-def check_memory(model, data):
-    """Check that the same words hold the state, step after step."""
+    data = mujoco.MjData(model)
+    data.mocap_pos[:] = 7
+    data.userdata[:] = np.arange(len(data.userdata))
     words = state_words(model, data)
-    assert words is not None
     for step in range(5):
         data.ctrl[:] = 0.1 * step
         data.xfrc_applied[1:] = step
         data.qfrc_applied[:] = -step
         mujoco.mj_step(model, data, nstep=step)
         assert WORDS.take(words).tobytes() == read_state(model, data).tobytes()
-    mujoco.mj_resetData(model, data)
-    assert WORDS.take(words).tobytes() == read_state(model, data).tobytes()
-
-
-@pytest.mark.parametrize("xml", [FULL.format(equality=""), "<mujoco/>"])
-def test_the_words_of_a_state_are_what_mujoco_gives(xml):
-    """Mocap bodies, user data, activations and forces from outside as well."""
-    model, data = simulated(xml)
-    data.mocap_pos[:] = 7
-    data.userdata[:] = np.arange(len(data.userdata))
-    check_memory(model, data)
-
-
-def test_a_component_of_another_type_has_to_be_asked_for():
-    """Whether an equality is active is a byte here and a number there."""
-    assert state_words(*simulated(FULL.format(equality=EQUALITY))) is None
 
 
 def test_components_are_where_mujoco_puts_them():
     """The arrays of `MjData` are found in its vector by name; empty ones are none."""
-    model, data = simulated(FULL.format(equality=EQUALITY))
+    equality = '<equality><weld body1="moved" body2="free"/></equality>'
+    model = mujoco.MjModel.from_xml_string(FULL.format(equality=equality))
+    data = mujoco.MjData(model)
     data.ctrl[:], data.xfrc_applied[:], data.userdata[:] = 0.3, 0.1, [7, 8, 9]
     mujoco.mj_step(model, data, nstep=20)
     row = read_state(model, data)
@@ -71,5 +55,5 @@ def test_components_are_where_mujoco_puts_them():
         np.testing.assert_array_equal(values, np.ravel(expected), err_msg=name)
     assert {"qpos", "qvel", "act", "ctrl", "eq_active", "mocap_quat"} <= parts.keys()
     assert sum(map(len, parts.values())) == len(row)
-    # The forces on the world are part of every state.
-    assert state_dtype(simulated("<mujoco/>")[0]).names == ("time", "xfrc_applied")
+    # Whether an equality is active is a byte here and a number there.
+    assert state_words(model, data) is None

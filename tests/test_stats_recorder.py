@@ -7,13 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mjrec import (
-    ClosedError,
-    InvalidArgument,
-    ResetNeeded,
-    ResetNotAllowed,
-    StatsRecorder,
-)
+from mjrec import ClosedError, InvalidArgument, ResetNeeded, StatsRecorder
 from mjrec.formats.manifest import read_stats_file
 
 
@@ -32,6 +26,8 @@ def run_episode(recorder, rewards, *, end=True):
 
 def test_only_complete_episodes_are_written(recorder):
     """With length, return, type and wall clock; a closed recorder refuses."""
+    with pytest.raises(ResetNeeded, match="Env-v0 before the first reset"):
+        recorder.before_step(None)
     before = time.time()
     run_episode(recorder, [1.0, 2.5])
     run_episode(recorder, [1.0], end=False)
@@ -40,7 +36,6 @@ def test_only_complete_episodes_are_written(recorder):
     stats = read_stats_file(Path(recorder.path))
     assert (stats.episode_lengths, stats.episode_rewards) == ((2,), (3.5,))
     assert stats.episode_types == ("t",)
-    assert stats.initial_reset_timestamp is not None
     [end] = stats.timestamps
     assert before <= stats.initial_reset_timestamp <= end <= time.time()
     for refused in (recorder.before_reset, recorder.before_step):
@@ -51,8 +46,7 @@ def test_only_complete_episodes_are_written(recorder):
 @pytest.mark.parametrize(
     ("rewards", "total"),
     [
-        *(([one], 1.0) for one in (1, np.float32(1), np.array([1.0]), np.array(1))),
-        *(([one], 1.0) for one in (np.int8(1), True)),
+        ([1, np.array([1.0]), np.array(1), np.int8(1), True], 5.0),
         # In float32 the ones would be lost.
         ([np.float32(1e8), np.float32(1), np.float32(1)], 1e8 + 2),
         *(([value], value) for value in (math.nan, math.inf, -math.inf)),
@@ -67,36 +61,6 @@ def test_rewards_add_up_in_float64(recorder, rewards, total):
     assert read == pytest.approx((total,), nan_ok=True, abs=0, rel=0)
 
 
-@pytest.mark.parametrize("reward", [None, "much", np.zeros(2), [1.0, 2.0]])
-def test_other_rewards_are_an_error(recorder, reward):
-    """What is not one number is named in the error."""
-    with pytest.raises(InvalidArgument, match="one number"):
-        run_episode(recorder, [reward])
-
-
-def test_calls_out_of_order_are_errors(recorder):
-    """They name the environment, how far the episode is, and the way out."""
-    with pytest.raises(ResetNeeded, match="Env-v0 before the first reset"):
-        recorder.before_step(None)
-    run_episode(recorder, [0.0])
-    with pytest.raises(ResetNeeded, match="after the end"):
-        recorder.before_step(None)
-    run_episode(recorder, [0.0], end=False)
-    with pytest.raises(ResetNotAllowed, match=r"after 1 steps.*allow_early_reset=True"):
-        recorder.before_reset()
-
-
-def test_an_early_reset_drops_the_episode(tmp_path):
-    """Its steps count only in the total; without a step nothing is lost."""
-    recorder = StatsRecorder(str(tmp_path), "x", allow_early_reset=True)
-    run_episode(recorder, [5.0], end=False)
-    run_episode(recorder, [])
-    run_episode(recorder, [1.0])
-    assert recorder.episode_rewards == [1.0]
-    assert recorder.episode_types == ["t"]
-    assert recorder.total_steps == 2
-
-
 def test_a_type_takes_effect_at_the_next_reset(recorder):
     """Types stay aligned with the completed episodes; there are two."""
     run_episode(recorder, [0.0], end=False)
@@ -107,3 +71,6 @@ def test_a_type_takes_effect_at_the_next_reset(recorder):
     assert recorder.episode_types == ["t", "e"]
     with pytest.raises(InvalidArgument, match="training"):
         recorder.type = "x"
+    for reward in (None, "much", np.zeros(2), [1.0, 2.0]):
+        with pytest.raises(InvalidArgument, match="one number"):
+            run_episode(recorder, [reward])

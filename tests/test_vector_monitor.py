@@ -1,16 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
+import contextlib
 import functools
 import gc
-import json
+import hashlib
 import pickle
+from pathlib import Path
 
 import gymnasium
 import numpy as np
 import pytest
 from gymnasium.vector import AsyncVectorEnv, SyncVectorEnv
 from gymnasium.wrappers.vector import RecordEpisodeStatistics, TransformReward
-from processes import children
-from recordings import frames_of
+from parts import parametrize
+from recordings import frames_of, hashes_at
 from vector_environments import (
     DISABLED,
     MODES,
@@ -31,83 +33,61 @@ from mjrec import (
     ResetNeeded,
     ResetNotAllowed,
 )
+from mjrec.frames import grid_frame
 
 LENGTHS = (2, 3)
+pytestmark = pytest.mark.usefixtures("no_process_is_left")
 
 
 @pytest.fixture
 def corridors(make_corridor):
-    """Make corridors that are 2 and 3 steps long, in a list or in one object."""
+    """Make corridors, 2 and 3 steps long if not said, in a list or in one object."""
 
-    def make(mode=NEXT_STEP, *, inside=True):
-        if not inside:
-            return VectorCorridor(LENGTHS, mode)
-        each = [functools.partial(make_corridor, length) for length in LENGTHS]
-        return SyncVectorEnv(each, autoreset_mode=mode)
+    def make(mode=NEXT_STEP, *, where="here", lengths=LENGTHS, size=(32, 48)):
+        if where == "one object":
+            return VectorCorridor(lengths, mode)
+        each = [functools.partial(make_corridor, n, size=size) for n in lengths]
+        kind = {"here": SyncVectorEnv, "other processes": AsyncVectorEnv}[where]
+        return kind(each, autoreset_mode=mode)
 
     return make
 
 
-@pytest.mark.parametrize(
-    ("inside", "mode"),
-    [*((True, mode) for mode in MODES), (False, NEXT_STEP), (False, DISABLED)],
-)
-def test_every_sub_environment_has_whole_videos(corridors, tmp_path, inside, mode):
-    """Each shows its reset and all its steps, the terminal one included."""
-    with mjrec.Monitor(corridors(mode, inside=inside), tmp_path) as env:
-        play(env, 8)
-    for monitor, length in zip(env.monitors, LENGTHS, strict=True):
+def pendulums(count):
+    """Return small pendulums whose episodes have two steps."""
+    make = functools.partial(
+        gymnasium.make, "InvertedPendulum-v5", max_episode_steps=2, height=16, width=16
+    )
+    return SyncVectorEnv([make] * count)
+
+
+@pytest.mark.parametrize("where", ["here", "one object", "other processes"])
+@pytest.mark.parametrize("mode", MODES)
+def test_every_sub_environment_has_whole_videos(
+    corridors, tmp_path, caplog, where, mode
+):
+    """Where a reset hides the terminal frame, metadata and one warning say so."""
+    is_hidden = where != "here" and mode == SAME_STEP
+    with mjrec.Monitor(corridors(mode, where=where), tmp_path) as env:
+        play(env, 8, seed=8)
+    for index, (monitor, length) in enumerate(zip(env.monitors, LENGTHS, strict=True)):
         for episode in (0, 1):
             path = path_of(monitor, episode, "mp4")
-            assert shown(path, step=4 if inside else 16) == list(range(length + 1))
-            assert "final_frame" not in metadata_at(path.with_suffix(".meta.json"))
-
-
-def test_a_frame_that_nobody_sees_is_said_to_be_missing(tmp_path, caplog):
-    """In SAME_STEP the metadata says so, and one warning for all."""
-    with mjrec.Monitor(VectorCorridor(LENGTHS, SAME_STEP), tmp_path) as env:
-        play(env, 8)
-    for monitor, length in zip(env.monitors, LENGTHS, strict=True):
-        path = path_of(monitor, 1, "mp4")
-        assert shown(path, step=16) == list(range(length))
-        assert metadata_at(path.with_suffix(".meta.json"))["final_frame"] == "missing"
-    [warning] = [r.message for r in caplog.records if "last frame" in r.message]
-    assert "Monitor inside each of the functions" in warning
-    caplog.clear()
-    vector = VectorCorridor(LENGTHS, SAME_STEP)
-    with mjrec.Monitor(vector, tmp_path / "no videos", False) as env:
-        play(env, 4)
-    assert "frame" not in caplog.text
-
-
-@pytest.mark.parametrize("mode", MODES)
-def test_statistics_are_those_of_gymnasium(tmp_path, mode):
-    """Lengths and returns are those that RecordEpisodeStatistics has."""
-    counted = RecordEpisodeStatistics(VectorCorridor((2, 3, 5), mode))
-    with mjrec.Monitor(counted, tmp_path, False) as env:
-        play(env, 12)
-    ours = sorted(
-        (length, reward)
-        for monitor in env.monitors
-        for length, reward in zip(
-            monitor.get_episode_lengths(), monitor.get_episode_rewards(), strict=True
-        )
-    )
-    if mode != DISABLED:  # whose mask Gymnasium's own wrapper loses
-        theirs = zip(counted.length_queue, counted.return_queue, strict=True)
-        assert ours == sorted((int(n), float(r)) for n, r in theirs)
-    expected = {NEXT_STEP: 4 + 3 + 2, SAME_STEP: 6 + 4 + 2, DISABLED: 6 + 4 + 2}
-    assert len(ours) == expected[mode]
+            frames = list(range(length + (not is_hidden)))
+            assert shown(path, step=16 if where == "one object" else 4) == frames
+            said = metadata_at(path.with_suffix(".meta.json"))
+            assert said.get("final_frame") == ("missing" if is_hidden else None)
+            if episode == 0:
+                assert said["seed"] == (8 if where == "one object" else 8 + index)
+    messages = [r.message for r in caplog.records if "last frame" in r.message]
+    of_all = ["Monitor inside each of the functions" in each for each in messages]
+    assert of_all == [True] * is_hidden
 
 
 # Takes more than five seconds: 64 videos.
 def test_sixty_four_sub_environments(tmp_path):
     """Each has its trajectory and its video; their logs' tails have 4 MiB together."""
-    make = functools.partial(
-        gymnasium.make, "InvertedPendulum-v5", max_episode_steps=2, height=16, width=16
-    )
-    vector = SyncVectorEnv([make] * 64)
-    with mjrec.Monitor(vector, tmp_path, workers=2, quality="draft") as env:
+    with mjrec.Monitor(pendulums(64), tmp_path, workers=2, quality="draft") as env:
         env.reset(seed=1)
         env.step(env.action_space.sample())
         tails = [path.stat().st_size for path in tmp_path.glob("*.tail")]
@@ -116,18 +96,14 @@ def test_sixty_four_sub_environments(tmp_path):
         env.step(env.action_space.sample())
     assert env.get_episode_lengths() == [[2]] * 64
     for monitor in env.monitors:
-        name = f"openaigym.{{}}.{monitor.infix}.{{}}000000.{{}}"
-        trajectory = tmp_path / name.format("trajectory", "episode", "h5")
-        assert len(mjrec.load_trajectory(trajectory).actions) == 2
-        assert len(frames_of(tmp_path / name.format("video", "video", "mp4"))) == 3
+        name = f"openaigym.trajectory.{monitor.infix}.episode000000.h5"
+        assert len(mjrec.load_trajectory(tmp_path / name).actions) == 2
+        assert len(frames_of(path_of(monitor, 0, "mp4"))) == 3
 
 
 def test_each_monitor_reports_its_own_failures(tmp_path):
     """Although the sub-environments share the processes that render."""
-    make = functools.partial(
-        gymnasium.make, "InvertedPendulum-v5", max_episode_steps=2, height=16, width=16
-    )
-    env = mjrec.Monitor(SyncVectorEnv([make] * 2), tmp_path, workers=1, quality="draft")
+    env = mjrec.Monitor(pendulums(2), tmp_path, workers=1, quality="draft")
     good, bad = env.monitors
     path_of(bad, 0, "mp4").mkdir()
     env.reset(seed=0)
@@ -149,25 +125,23 @@ def test_closing_puts_the_environments_back(corridors, tmp_path):
     env = mjrec.Monitor(scaled, tmp_path, False, name_prefix="walk")
     assert all(a is b for a, b in zip(vector.envs, env.monitors, strict=True))
     env.set_monitor_mode("evaluation")
-    env.reset(seed=40)
+    env.reset()
     assert list(env.step(np.array([0, 0]))[1]) == [5.0, 5.0]
     env.step(np.array([0, 0]))
     assert vector.get_attr("length") == LENGTHS
     assert len(vector.render()) == 2
-    env.close()
-    env.close()
-    assert vector.envs == originals
-    assert [each.closed for each in originals] == [1, 1]
-    env.reset()
-    env.step(np.array([0, 0]))
+    for _ in range(2):
+        env.close()
+        assert vector.envs == originals
+        assert [each.closed for each in originals] == [1, 1]
+        env.reset()
+        env.step(np.array([0, 0]))
     # Rewards are those below vector wrappers; after close nothing is recorded.
     assert env.get_episode_rewards() == [[1.0], []]
     assert [m.stats_recorder.episode_types for m in env.monitors] == [["e"], []]
-    for index, monitor in enumerate(env.monitors):
-        # Links of two sub-environments have different names.
-        assert monitor._options.name_prefix == f"walk-env-{index}"
-        journal = tmp_path / f"openaigym.episodes.{monitor.infix}.jsonl"
-        assert ('"seed": 40' in journal.read_text()) is (index == 0)
+    # Links of two sub-environments have different names.
+    prefixes = [monitor._options.name_prefix for monitor in env.monitors]
+    assert prefixes == ["walk-env-0", "walk-env-1"]
 
 
 @pytest.mark.parametrize("resume", [False, True])
@@ -175,25 +149,21 @@ def test_a_failing_constructor_leaves_no_trace(make_corridor, tmp_path, names, r
     """The last sub-environment cannot be drawn: nothing was made of the first."""
     target = tmp_path / "a" / "b"
     if resume:
-        with mjrec.Monitor(make_corridor(), target) as env:
-            env.reset()
-    before = names(target) if resume else None
+        mjrec.Monitor(make_corridor(), target).close()
+    before = names(target if resume else tmp_path)
     vector = SyncVectorEnv([make_corridor, lambda: make_corridor(render_mode=None)])
     originals = list(vector.envs)
     with pytest.raises(NoPictures, match="render_mode"):
         mjrec.Monitor(vector, target, resume=resume)
     assert vector.envs == originals
     assert [each.closed for each in originals] == [0, 0]
-    if resume:
-        assert names(target) == before
-    else:
-        assert not list(tmp_path.iterdir())
+    assert names(target if resume else tmp_path) == before
 
 
-@pytest.mark.parametrize("inside", [True, False])
-def test_errors_are_noted_in_all_running_episodes(corridors, tmp_path, inside):
+@pytest.mark.parametrize("where", ["here", "one object"])
+def test_errors_are_noted_in_all_running_episodes(corridors, tmp_path, where):
     """Their videos say what has ended them; nothing can be pickled or misused."""
-    vector = corridors(inside=inside)
+    vector = corridors(where=where)
 
     def explode(action):
         raise RuntimeError("the motor burns")
@@ -204,21 +174,13 @@ def test_errors_are_noted_in_all_running_episodes(corridors, tmp_path, inside):
     with pytest.raises(ResetNeeded):
         env.step(np.array([0, 0]))
     env.reset()
-    (vector.envs[1].unwrapped if inside else vector).step = explode
+    (vector.envs[1].unwrapped if where == "here" else vector).step = explode
     with pytest.raises(RuntimeError):
         env.step(np.array([0, 0]))
     env.close()
     for monitor in env.monitors:
         said = metadata_at(path_of(monitor, 0, "meta.json"))
         assert said["exception"]["message"] == "the motor burns"
-
-
-def test_an_unknown_autoreset_mode_is_refused(tmp_path):
-    """The error says what to set; nothing is made."""
-    target = tmp_path / "run"
-    with pytest.raises(InvalidArgument, match="autoreset_mode"):
-        mjrec.Monitor(VectorCorridor(mode=None), target)
-    assert not target.exists()
 
 
 def test_sub_environments_of_different_names_need_a_common_one(corridors, tmp_path):
@@ -255,10 +217,8 @@ def test_trajectories_hold_what_can_be_seen(tmp_path):
         for step in range(3):
             env.step(np.array([step, 8 - step]))
     first, second = (
-        mjrec.load_trajectory(
-            tmp_path / f"openaigym.trajectory.{m.infix}.episode000000.h5"
-        )
-        for m in env.monitors
+        mjrec.load_trajectory(path)
+        for path in sorted(tmp_path.glob("*.episode000000.h5"))
     )
     assert first.actions.tolist() == [0, 1]
     assert second.actions.tolist() == [8, 7, 6]
@@ -268,125 +228,219 @@ def test_trajectories_hold_what_can_be_seen(tmp_path):
 
 
 @pytest.mark.parametrize("mode", MODES)
-def test_episode_info_is_that_of_gymnasium(tmp_path, mode):
-    """The step that ends episodes says their return and length, as a wrapper does."""
-    arguments = {"episode_info": True, "video_callable": False}
-    ours = mjrec.Monitor(VectorCorridor(LENGTHS, mode), tmp_path, **arguments)
+def test_statistics_and_episode_info_are_those_of_gymnasium(tmp_path, mode):
+    """Lengths and returns, in the step that ends episodes and of all together."""
     theirs = RecordEpisodeStatistics(VectorCorridor(LENGTHS, mode))
+    ours = mjrec.Monitor(
+        VectorCorridor(LENGTHS, mode), tmp_path, False, episode_info=True
+    )
     with ours:
         for env in (ours, theirs):
             env.reset()
             env.step(np.array([0, 0]))
-        infos = [env.step(np.array([0, 0]))[4] for env in (ours, theirs)]
-    for name in ("r", "l"):
-        assert list(infos[0]["episode"][name]) == list(infos[1]["episode"][name])
-    assert list(infos[0]["_episode"]) == list(infos[1]["_episode"]) == [True, False]
-    assert infos[0]["episode"]["t"].shape == (2,)
-
-
-def test_a_list_of_seeds_is_told_one_by_one(tmp_path):
-    """A single seed, for one generator of all, is what each is told."""
-    with mjrec.Monitor(VectorCorridor((2, 2), DISABLED), tmp_path, False) as env:
-        for seed in ([5, 9], 3):
-            env.reset(seed=seed, options={"reset_mask": np.array([True, True]), "a": 1})
-            for _ in range(2):
-                env.step(np.array([0, 0]))
-    said = []
-    for monitor in env.monitors:
-        lines = (tmp_path / f"openaigym.episodes.{monitor.infix}.jsonl").read_text()
-        entries = [json.loads(line) for line in lines.splitlines()]
-        said.append([e["seed"] for e in entries if "seed" in e])
-        assert [e["options"] for e in entries if "seed" in e] == [{"a": 1}] * 2
-    assert said == [[5, 3], [9, 3]]
+        (*_, info), (*_, expected) = (
+            env.step(np.array([0, 0])) for env in (ours, theirs)
+        )
+        for name in ("r", "l"):
+            assert list(info["episode"][name]) == list(expected["episode"][name])
+        assert list(info["_episode"]) == list(expected["_episode"]) == [True, False]
+        assert info["episode"]["t"].shape == (2,)
+        if mode != DISABLED:  # whose mask Gymnasium's own wrapper loses
+            for _ in range(10):
+                for env in (ours, theirs):
+                    env.step(np.array([0, 0]))
+            counted = zip(theirs.length_queue, theirs.return_queue, strict=True)
+            lengths = np.concatenate(ours.get_episode_lengths())
+            rewards = np.concatenate(ours.get_episode_rewards())
+            assert sorted(zip(lengths, rewards, strict=True)) == sorted(counted)
+            assert len(lengths) == {NEXT_STEP: 4 + 3, SAME_STEP: 6 + 4}[mode]
 
 
 def test_a_masked_reset_leaves_the_others_alone(tmp_path):
-    """Their episodes go on. Others are refused before anything is reset, if asked."""
+    """Their episodes go on; others are refused before anything is reset, if asked."""
     with mjrec.Monitor(
         VectorCorridor(LENGTHS, DISABLED), tmp_path, allow_early_reset=False
     ) as env:
-        env.reset()
+        both, first = np.array([True, True]), np.array([True, False])
+        env.reset(seed=[5, 9], options={"reset_mask": both, "a": 1})
         for _ in range(2):
             env.step(np.array([0, 0]))
         with pytest.raises(ResetNeeded):
             env.step(np.array([0, 0]))
         with pytest.raises(ResetNotAllowed, match=r"\[1\]"):
             env.reset()
-        env.reset(options={"reset_mask": np.array([True, False])})
+        env.reset(options={"reset_mask": first})
         assert [m.episode_id for m in env.monitors] == [2, 1]
         env.step(np.array([0, 0]))
-    assert env.get_episode_lengths() == [[2], [3]]
+    episodes = list(mjrec.iter_episodes(tmp_path))
+    said = [(each.seed, each.options, each.length) for each in episodes]
+    assert said == [(5, {"a": 1}, 2), (9, {"a": 1}, 3)]
     assert shown(path_of(env.monitors[1], 0, "mp4"), step=16) == [0, 1, 2, 3]
 
 
-def test_frames_must_be_one_for_each(tmp_path):
-    """Said at the first reset."""
-    vector = VectorCorridor()
-    vector.render = lambda: (np.zeros((8, 8, 3), np.uint8),)
-    with (
-        mjrec.Monitor(vector, tmp_path) as env,
-        pytest.raises(InvalidArgument, match="each of its 2 sub-environments"),
-    ):
-        env.reset()
-
-
 @pytest.mark.parametrize(
-    ("options", "error", "message"),
+    ("made", "options", "error", "message"),
     [
-        ({"render": "deferred"}, PicturesDiffer, "inside"),
-        ({"camera": 0}, InvalidArgument, "Create them with the camera and size"),
-        ({"height": 64, "width": 64}, InvalidArgument, "height, width cannot"),
-        ({}, NoPictures, "render_mode"),
+        ({}, {"render": "deferred"}, PicturesDiffer, "inside"),
+        ({}, {"camera": 0}, InvalidArgument, "Create them with the camera and size"),
+        ({}, {"height": 64, "width": 64}, InvalidArgument, "height, width cannot"),
+        ({"render_mode": None}, {}, NoPictures, "render_mode"),
+        ({"mode": None}, {}, InvalidArgument, "autoreset_mode"),
     ],
 )
-def test_what_cannot_be_had_from_outside(tmp_path, options, error, message):
+def test_what_cannot_be_had_from_outside(tmp_path, made, options, error, message):
     """The error says where it can be had, and nothing is left."""
-    vector = VectorCorridor(render_mode="rgb_array" if options else None)
     with pytest.raises(error, match=message):
-        mjrec.Monitor(vector, tmp_path / "run", **options)
+        mjrec.Monitor(VectorCorridor(**made), tmp_path / "run", **options)
     assert not list(tmp_path.iterdir())
-    with mjrec.Monitor(vector, tmp_path / "run", render="off") as env:
-        play(env, 2)
-
-
-@pytest.mark.parametrize("mode", MODES)
-def test_environments_of_other_processes(make_corridor, tmp_path, mode):
-    """Videos of all their frames, but the last where nobody sees it."""
-    each = [lambda length=n: make_corridor(length) for n in LENGTHS]
-    vector = AsyncVectorEnv(each, autoreset_mode=mode)
-    with mjrec.Monitor(vector, tmp_path) as env:
-        play(env, 3, seed=8)
-    for index, (monitor, length) in enumerate(zip(env.monitors, LENGTHS, strict=True)):
-        frames = length if mode == SAME_STEP else length + 1
-        path = path_of(monitor, 0, "mp4")
-        assert shown(path) == list(range(frames))
-        assert metadata_at(path.with_suffix(".meta.json"))["seed"] == 8 + index
-    assert vector.closed
 
 
 def test_what_other_processes_know(tmp_path):
     """Their name and the time of their steps are asked for."""
+    view = {"render_mode": "rgb_array", "width": 64, "height": 64}
+    # What was forked from a process with an OpenGL context hangs in its own.
     vector = AsyncVectorEnv(
-        [
-            lambda: gymnasium.make(
-                "Hopper-v5", render_mode="rgb_array", width=64, height=64
-            )
-        ],
-        # What was forked from a process with an OpenGL context hangs in its own.
-        context="spawn",
+        [lambda: gymnasium.make("Hopper-v5", **view)], context="spawn"
     )
     with mjrec.Monitor(vector, tmp_path) as env:
         play(env, 2, seed=1)
     said = metadata_at(path_of(env.monitors[0], 0, "meta.json"))
-    assert said["env_id"] == "Hopper-v5"
-    assert said["fps"] == "125"
+    assert (said["env_id"], said["fps"]) == ("Hopper-v5", "125")
     assert said["recording_reason"].endswith("not objects in this process")
 
 
-@pytest.fixture(autouse=True)
-def no_process_is_left():
-    """See that every test ends its processes."""
-    before = children()
-    yield
+def monitored_hopper(directory):
+    """Return what makes a monitored environment, in whichever process."""
+
+    def make():
+        # In here, because a spawned process has imported nothing.
+        import gymnasium
+
+        import mjrec
+
+        env = gymnasium.make("Hopper-v5", max_episode_steps=3, width=64, height=64)
+        return mjrec.Monitor(env, directory, resume=True, render="deferred", workers=1)
+
+    return make
+
+
+@parametrize(
+    ("context", "mode"),
+    [("spawn", NEXT_STEP), ("forkserver", SAME_STEP), ("fork", DISABLED)],
+)
+def test_each_worker_records_its_own(tmp_path, context, mode):
+    """Videos are rendered from states, whole, also in daemonic processes."""
+    make = monitored_hopper(tmp_path)
+    env = AsyncVectorEnv([make, make], context=context, autoreset_mode=mode)
+    workers = {process.pid for process in env.processes}
+    play(env, 4, seed=3)
+    env.close()
+    for worker in workers:
+        [hashes] = tmp_path.glob(f"*.{worker}.video000000.framehash")
+        assert len(hashes_at(hashes)) == 4
+        assert hashes.with_suffix(".mp4").exists()
+    results = mjrec.load_results(tmp_path)
+    assert list(results["episode_lengths"]) == [3, 3]
+    assert not list(tmp_path.glob(".*"))
+
+
+# --- tiled videos --------------------------------------------------------------------
+
+
+def tiles_at(path, *, step):
+    """Return the position that each tile of a 2x2 grid of 32x64 frames shows."""
+    shown = []
+    for frame in frames_of(path):
+        assert frame.shape == (64, 128, 3)
+        tiles = [frame[y, x : x + 64, 0] for y in (16, 48) for x in (0, 64)]
+        shown.append([round(int((row > 128).sum()) / step) - 1 for row in tiles])
+    return shown
+
+
+@pytest.mark.parametrize("where", ["here", "one object"])
+@pytest.mark.parametrize("mode", MODES)
+def test_one_video_shows_all(corridors, tmp_path, mode, where):
+    """It follows the first's episodes and manifest; a frame that is hidden is noted."""
+    vector = corridors(mode, where=where, lengths=(2, 3, 2), size=(32, 64))
+    with mjrec.Monitor(vector, tmp_path, tiled=True) as env:
+        play(env, 8)
+    first, second = (path_of(env.monitors[0], k, "tiled.mp4") for k in (0, 1))
+    last = [0, 2, 0, -1] if mode == SAME_STEP else [2, 2, 2, -1]
+    # The last of the four is the padding.
+    step = 4 if where == "here" else 16
+    assert tiles_at(first, step=step) == [[0, 0, 0, -1], [1, 1, 1, -1], last]
+    assert [tiles[0] for tiles in tiles_at(second, step=step)] == [0, 1, last[0]]
+    said = metadata_at(first.with_suffix(".meta.json"))
+    assert (said["tiled"], said["rows"], said["columns"]) == (True, 2, 2)
+    assert (said["complete"], said["length"], said["reward"]) == (True, 2, 1.0)
+    assert said.get("final_frame") == ("missing" if mode == SAME_STEP else None)
+    assert len(hashes_at(first.with_suffix(".framehash"))) == 3
+    videos = mjrec.load_results(tmp_path)["videos"]
+    names = {Path(video).name for video, _ in videos}
+    assert names >= {first.name, path_of(env.monitors[0], 0, "mp4").name}
+
+
+@pytest.mark.parametrize("how", ["reset", "close", "error"])
+def test_a_video_that_is_cut_off_says_so(corridors, tmp_path, how):
+    """Its metadata has the reason."""
+    vector = corridors(where="one object", lengths=(2, 3, 2))
+    with (
+        contextlib.suppress(RuntimeError),
+        mjrec.Monitor(vector, tmp_path, tiled=True) as env,
+    ):
+        env.reset()
+        env.step(np.array([0, 0, 0]))
+        if how == "reset":
+            env.reset()
+        if how == "error":
+            raise RuntimeError("enough")
+    said = metadata_at(path_of(env.monitors[0], 0, "tiled.meta.json"))
+    assert said["complete"] is False
+    assert said["reason"] == {"error": "exception"}.get(how, how)
+    assert (said["length"], said["frame_count"]) == (1, 2)
+
+
+def drawn_by(env):
+    """Return its frame; Gymnasium draws into whichever context is current."""
+    env.unwrapped.mujoco_renderer.viewer.make_context_current()
+    return env.render()
+
+
+# Takes more than five seconds: every environment alone, and all in one video.
+def test_pixels_are_those_of_each_environment(tmp_path):
+    """Each tile is what its own environment's `render()` gives."""
+    view = {"render_mode": "rgb_array", "width": 64, "height": 64}
+    several = [gymnasium.make("Hopper-v5", **view) for _ in range(2)]
+    vector = SyncVectorEnv([lambda e=e: e for e in several])
+    expected = []
+    # What earlier tests have left would take its OpenGL context along at any moment.
     gc.collect()
-    assert children() <= before
+    with mjrec.Monitor(vector, tmp_path, tiled=True) as env:
+        env.reset(seed=4)
+        for _ in range(2):
+            env.step(env.action_space.sample())
+            drawn = grid_frame([drawn_by(each) for each in several])
+            expected.append(hashlib.sha256(drawn.tobytes()).hexdigest())
+    path = path_of(env.monitors[0], 0, "tiled.framehash")
+    assert hashes_at(path)[1:] == expected
+
+
+def test_a_bad_frame_can_be_tolerated(tmp_path, caplog):
+    """With `on_error="warn"` there is no tiled video; too few frames are an error."""
+    vector = VectorCorridor(heights=(32, 48))
+    with (
+        mjrec.Monitor(vector, tmp_path / "raise", tiled=True) as env,
+        pytest.raises(InvalidArgument, match="64x32, 64x48"),
+    ):
+        env.reset()
+    with mjrec.Monitor(vector, tmp_path, tiled=True, on_error="warn") as env:
+        play(env, 3)
+    assert "64x32, 64x48" in caplog.text
+    assert not list(tmp_path.glob("*.tiled.mp4"))
+    vector.render = lambda: (np.zeros((8, 8, 3), np.uint8),)
+    with (
+        mjrec.Monitor(vector, tmp_path / "few") as few,
+        pytest.raises(InvalidArgument, match="each of its 2 sub-environments"),
+    ):
+        few.reset()
+    assert path_of(env.monitors[1], 0, "mp4").exists()

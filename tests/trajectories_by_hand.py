@@ -5,12 +5,7 @@ Frame k of one is a grey frame of brightness `grey(k)`, which `Painter` draws fr
 its snapshots, with a white pixel in a corner.
 """
 
-from __future__ import annotations
-
 import itertools
-from collections.abc import Callable, Iterator, Sequence
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -24,7 +19,7 @@ from mjrec.formats.monitor_directory import (
     video_prefix,
 )
 from mjrec.formats.row_log import TAIL_BYTES
-from mjrec.formats.span_writer import SpanLogs, SpanWriter
+from mjrec.formats.span_writer import SpanLogs
 from mjrec.formats.spans import log_paths
 from mjrec.formats.trajectory import packed, row_dtype
 from mjrec.formats.trajectory_file import finish_trajectory, open_trajectory
@@ -38,7 +33,7 @@ GREY_ROWS = row_dtype(
 )
 
 
-def grey(frame: int) -> int:
+def grey(frame):
     """Return the brightness of a frame."""
     return 10 + 20 * frame
 
@@ -46,44 +41,26 @@ def grey(frame: int) -> int:
 class Painter:
     """Draws frames of trajectories of this module, as `WorkerPool` would.
 
-    Those of a camera that was asked for are a little brighter.
-
-    Args:
-        size: of the frames.
-        plain: whether to leave the white pixel out.
-
-    Attributes:
-        asked: what was to be drawn: trajectory, indices and view.
-        tiles: the cameras that were to be in one frame, for each of these.
-        breaks_at: called before each frame, with trajectory, view and index.
+    Those of a camera that was asked for are a little brighter; with `plain` the white
+    pixel is left out. `asked` and `tiles` tell of what was drawn, and `breaks_at` is
+    called before each frame, with trajectory, view and index.
     """
 
     gl_facts = {"gl_renderer": "a painter"}  # noqa: RUF012  as it is asked for
 
-    def __init__(
-        self, size: tuple[int, int] = (16, 24), *, plain: bool = False
-    ) -> None:
+    def __init__(self, size=(16, 24), *, plain=False):
         self.size = size
         self.plain = plain
-        self.asked: list[tuple[Path, list[int], View]] = []
-        self.tiles: list[Any] = []
-        self.breaks_at: Callable[[Path, View, int], object] = lambda *_: None
+        self.asked = []
+        self.tiles = []
+        self.breaks_at = lambda *_: None
 
-    def frames(
-        self,
-        trajectory: Path,
-        indices: Sequence[int],
-        view: View | None = None,
-        *,
-        cameras: Any = None,
-    ) -> Iterator[Any]:
+    def frames(self, trajectory, indices, view=None, *, cameras=None):
         view = view or View()
         self.asked.append((trajectory, list(indices), view))
         self.tiles.append(cameras)
         with open_trajectory(trajectory) as reader:
-            shown = [
-                int(reader.snapshots(i, i + 1)["geom_rgba"][0, 0]) for i in indices
-            ]
+            shown = [reader.snapshots(i, i + 1)["geom_rgba"].item() for i in indices]
         for index, brightness in enumerate(shown):
             self.breaks_at(trajectory, view, index)
             brighter = 0 if view.camera is None else 5
@@ -92,16 +69,12 @@ class Painter:
                 frame[-1, -1] = 255
             yield frame
 
-    def start(self) -> None: ...
+    def start(self): ...
 
-    def rest(self) -> None: ...
-
-    def close(self) -> None: ...
+    rest = close = start
 
 
-def new_logs(
-    directory: Path, infix: str = INFIX, *, tail_bytes: int = TAIL_BYTES
-) -> SpanLogs:
+def new_logs(directory, infix=INFIX, *, tail_bytes=TAIL_BYTES):
     """Return what writes recordings beside those that others have written."""
     used = [log_number(path.name) or 0 for path in log_paths(directory, infix)]
     return SpanLogs(
@@ -113,14 +86,11 @@ def new_logs(
     )
 
 
-def add_row(span: SpanWriter, step: int, **values: Any) -> None:
+def add_row(span, step, **values):
     """Add a row whose columns are `values`; with a snapshot it is a frame's, too."""
     slot = span.make_room()
-    commit = {
-        key: values.pop(key)
-        for key in ("reward", "terminated", "truncated", "is_step")
-        if key in values
-    }
+    known = ("reward", "terminated", "truncated", "is_step")
+    commit = {key: values.pop(key) for key in known if key in values}
     for name, column in span.log.columns.items():
         if name not in ("row", "step", "reward", "flags"):
             column[slot] = values.get(name, 0)
@@ -128,55 +98,44 @@ def add_row(span: SpanWriter, step: int, **values: Any) -> None:
 
 
 def write_log(
-    directory: Path,
-    episode_id: int = 0,
+    directory,
+    episode_id=0,
     *,
-    infix: str = INFIX,
-    steps: int = 4,
-    stride: int = 1,
-    frames: bool = True,
-    video: str | None = "deferred",
-    ended: bool = True,
-    over: bool | None = None,
-    fps: str | None = None,
-    **facts: Any,
-) -> Path:
-    """Record an episode at 20 steps a second; return the file that it would become.
-
-    Where it has `ended`, its last words are there; where it is `over`, its last row
-    says so.
-    """
+    infix=INFIX,
+    steps=4,
+    stride=1,
+    frames=True,
+    video="deferred",
+    ended=True,
+    over=None,
+    fps=None,
+    **facts,
+):
+    """Record an episode; `ended` adds its last event, `over` marks its last row."""
     logs = new_logs(directory, infix)
     name = trajectory_prefix(infix, episode_id)
-    span = logs.begin(
-        name,
-        {
-            "episode_id": episode_id,
-            "infix": str(infix),
-            "env_id": "Grey-v0",
-            "type": "t",
-            "seed": 5,
-            "options": None,
-            "versions": {"mjrec": "0"},
-            "scene": {"label": "side"},
-            "video": video
-            and {
-                "name": f"{video_prefix(infix, episode_id)}.mp4",
-                "quality": "full",
-                "fps": fps,
-                "max_fps": None,
-                "recording": video,
-            },
-            "rate": "20",
-            "timestep": "1/20",
-            "stride": stride,
-            **facts,
-        },
-        GREY_ROWS,
-    )
+    if video:
+        file = f"{video_prefix(infix, episode_id)}.mp4"
+        rates = {"fps": fps, "max_fps": None}
+        video = {"name": file, "quality": "full", "recording": video, **rates}
+    usual = {
+        "episode_id": episode_id,
+        "infix": str(infix),
+        "env_id": "Grey-v0",
+        "type": "t",
+        "seed": 5,
+        "options": None,
+        "versions": {"mjrec": "0"},
+        "scene": {"label": "side"},
+        "video": video,
+        "rate": "20",
+        "timestep": "1/20",
+        "stride": stride,
+    }
+    span = logs.begin(name, {**usual, **facts}, GREY_ROWS)
     taken = 0
     for step in range(steps + 1):
-        values: dict[str, Any] = {}
+        values = {}
         if frames and (step % stride == 0 or step == steps):
             values["snapshot"] = grey(taken)
             taken += 1
@@ -189,7 +148,7 @@ def write_log(
     return logs.path_of(name)
 
 
-def write_finished(directory: Path, episode_id: int = 0, **rest: Any) -> Path:
+def write_finished(directory, episode_id=0, **rest):
     """Write the finished trajectory of an episode, and nothing else."""
     note_models([directory_digest(directory)])
     path = finish_trajectory(write_log(directory, episode_id, **rest))
@@ -202,9 +161,7 @@ def write_finished(directory: Path, episode_id: int = 0, **rest: Any) -> Path:
     return path
 
 
-def write_pending_manifest(
-    directory: Path, *episode_ids: int, infix: str = INFIX, **rest: Any
-) -> Path:
+def write_pending_manifest(directory, *episode_ids, infix=INFIX, **rest):
     """Write the manifest of a closed monitor whose videos are all pending."""
     path = directory / manifest_name(infix)
     pending = [
@@ -215,13 +172,8 @@ def write_pending_manifest(
         }
         for episode_id in episode_ids
     ]
-    write_manifest(
-        path,
-        Manifest(
-            stats="openaigym.episode_batch.0.7.stats.json",
-            videos=(),
-            env_info={"gym_version": "mjrec-1", "env_id": "Grey-v0"},
-            mjrec={"format_version": 1, "pending": pending, "broken": [], **rest},
-        ),
-    )
+    stats = "openaigym.episode_batch.0.7.stats.json"
+    env_info = {"gym_version": "mjrec-1", "env_id": "Grey-v0"}
+    details = {"format_version": 1, "pending": pending, "broken": [], **rest}
+    write_manifest(path, Manifest(stats, (), env_info, details))
     return path
