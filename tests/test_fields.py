@@ -116,10 +116,7 @@ def test_facts_are_json_and_come_back_as_the_same_view(view):
 def test_facts_that_cannot_be_are_refused_by_name(view, name, value):
     """They may come from a file."""
     facts = view.facts()
-    struct, _, member = name.partition(".")
-    if member:
-        facts[struct][member] = value
-    else:
-        facts[struct] = value
+    *struct, member = name.split(".")
+    (facts[struct[0]] if struct else facts)[member] = value
     with pytest.raises(InvalidArgument, match=name):
         view_from_facts(facts)
