@@ -13,10 +13,7 @@ import pytest
 
 from mjrec.errors import PicturesDiffer
 from mjrec.simulation.capture import Capture
-from mjrec.simulation.fields import apply_fields
-from mjrec.simulation.model_store import load_model
-from mjrec.simulation.snapshot import differences, restore_snapshot, updated_scene
-from mjrec.simulation.view import SceneView, view_from_facts
+from mjrec.simulation.view import SceneView
 
 BALL = """
 <mujoco>
@@ -72,39 +69,6 @@ def show(simulation, flag, shown=True):
 
 def words_of(start):
     return np.zeros(start.snapshot.itemsize // 8, np.uint64)
-
-
-def test_changes_of_model_and_view_are_told_once(simulation, states, tmp_path):
-    """And the stored model, facts, a row and these changes give the scene."""
-    show(simulation, "INERTIA")
-    model, data = simulation.model, simulation.data
-    model.geom_rgba[0] = (1, 0, 0, 1)
-    start = states.begin_episode()
-    assert start.refusal is None
-    words = words_of(start)
-    mujoco.mj_step(model, data, nstep=7)
-    assert states.capture_snapshot(words) is None
-    model.site_rgba[0] = (0, 1, 0, 1)
-    model.vis.headlight.ambient[:] = 0.5
-    model.opt.gravity[2] = -1
-    model.stat.extent = 3
-    simulation.camera.lookat[0] = 2
-    show(simulation, "TRANSPARENT")
-    changed = states.capture_snapshot(words)
-    assert changed.keys() == {
-        *("site_rgba", "vis.headlight.ambient", "opt.gravity", "stat.extent"),
-        *("camera.lookat", "option.flags"),
-    }
-    assert states.capture_snapshot(words) is None
-    states.finish()
-    again, view = load_model(tmp_path, start.model), view_from_facts(start.scene)
-    apply_fields(again, changed, camera=view.camera, option=view.option)
-    restored = mujoco.MjData(again)
-    restore_snapshot(words.view(start.snapshot)[0], again, restored)
-    live = updated_scene(model, data, view_of(simulation))
-    assert (
-        list(differences(live, updated_scene(again, restored, view), view.option)) == []
-    )
 
 
 def test_a_model_that_consists_of_other_things_is_stored_anew(simulation, states):

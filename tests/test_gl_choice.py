@@ -119,18 +119,6 @@ def test_nothing_renders(tmp_path):
             ["mujoco was imported with glfw", "switch to egl", "before anything"],
         ),
         (
-            "import mujoco\ndel os.environ['MUJOCO_GL']\n"
-            "before = dict(os.environ)\nmjrec.use_gl()",
-            {"MUJOCO_GL": "off"},
-            ["mujoco was imported without a backend"],
-        ),
-        # What mujoco took is tried, and all reasons are given.
-        (
-            "import mujoco\nmjrec.use_gl()",
-            {},
-            ["egl: mujoco was imported with glfw", "glfw: GLFW needs a display"],
-        ),
-        (
             "import OpenGL.GL\nbefore = dict(os.environ)\nmjrec.use_gl('egl')",
             {"PYOPENGL_PLATFORM": "glx"},
             ["PyOpenGL was imported with glx in this process"],
@@ -144,7 +132,7 @@ def test_nothing_renders(tmp_path):
             ["dm_control was imported with osmesa"],
         ),
     ],
-    ids=["other", "off", "any", "PyOpenGL", "dm_control"],
+    ids=["mujoco", "PyOpenGL", "dm_control"],
 )
 def test_what_was_imported_before(code, variables, said):
     """A backend is taken once; the one that was is named, and the way out."""

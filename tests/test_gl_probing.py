@@ -42,14 +42,7 @@ def test_egl_renders_and_says_with_what(monkeypatch):
 @pytest.mark.parametrize(
     ("backend", "variables", "cause", "fix"),
     [
-        ("glfw", {}, "DISPLAY is not set", "xvfb-run"),
         ("glfw", {"DISPLAY": ":77"}, "cannot open :77", "MUJOCO_GL to egl"),
-        (
-            "egl",
-            {"PYOPENGL_PLATFORM": "glx"},
-            "PYOPENGL_PLATFORM (glx) contradicts MUJOCO_GL (egl)",
-            "unset PYOPENGL_PLATFORM",
-        ),
         (
             "egl",
             {"MUJOCO_EGL_DEVICE_ID": "99"},
@@ -57,7 +50,6 @@ def test_egl_renders_and_says_with_what(monkeypatch):
             "Set MUJOCO_EGL_DEVICE_ID to",
         ),
         ("off", {}, "MUJOCO_GL=off turns rendering off", "Unset MUJOCO_GL"),
-        ("nonsense", {}, "MUJOCO_GL=nonsense is not the name", "egl, osmesa, glfw"),
         (
             "egl",
             {"__EGL_VENDOR_LIBRARY_FILENAMES": "/nonexistent"},

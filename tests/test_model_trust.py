@@ -20,6 +20,7 @@ from sound_files import stored
 
 import mjrec
 from mjrec import UnreadableFile, UntrustedModel, load_trajectory
+from mjrec.commands import main
 from mjrec.formats.spans import recordings_in_flight
 from mjrec.rendering.finish import VideoWorker
 from mjrec.simulation import model_trust
@@ -265,8 +266,10 @@ def test_trust_is_said_by_an_argument_or_a_variable(
 # --- recordings ----------------------------------------------------------------------
 
 
-def test_frames_of_a_strangers_recording_need_a_word(directory, become_another_user):
-    """Of the trajectory, which goes to the workers too."""
+def test_frames_of_a_strangers_recording_need_a_word(
+    directory, become_another_user, tmp_path, capsys
+):
+    """Of the trajectory, which goes to the workers too, or of the command."""
     theirs = record(directory)
     become_another_user()
     trajectory = load_trajectory(theirs.path)
@@ -277,6 +280,11 @@ def test_frames_of_a_strangers_recording_need_a_word(directory, become_another_u
     trusted = load_trajectory(theirs.path, trust_models=True)
     assert trusted.model().ngeom == 3
     np.testing.assert_array_equal(list(mjrec.render(trusted)), theirs.frames)
+    again = ["render", str(theirs.path), "--out", str(tmp_path / "again.mp4")]
+    assert main(again) == 1
+    assert "mjrec render --trust-models" in capsys.readouterr().out
+    assert main([*again, "--trust-models"]) == 0
+    assert TRUST_VARIABLE not in os.environ
 
 
 def test_sources_show_what_the_environment_showed(

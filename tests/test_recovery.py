@@ -28,11 +28,7 @@ from waiting import wait_until
 
 import mjrec
 from mjrec.formats.locks import Lock, is_locked, try_lock
-from mjrec.formats.monitor_directory import (
-    lock_name,
-    log_name,
-    video_prefix,
-)
+from mjrec.formats.monitor_directory import lock_name, log_name, video_prefix
 
 # A corridor of 12 steps, or a cheetah's 12 steps; what is to be done comes in code.
 PROGRAM = f"""
@@ -71,8 +67,15 @@ def die(env=None):
 
 def kill(code, directory):
     """Run a program, which kills itself, on a directory; return that."""
+    others = held_in(directory)
     run_python(PROGRAM + code, directory, status=-signal.SIGKILL)
+    # A child between fork and exec holds its parent's lock for a moment.
+    wait_until(lambda: held_in(directory) <= others)
     return directory
+
+
+def held_in(directory):
+    return set(filter(is_locked, directory.glob(".*.lock")))
 
 
 @pytest.fixture(scope="module")
@@ -242,7 +245,7 @@ def test_a_killed_encoder_is_reported(options, then, is_fed, tmp_path):
     for part in directory.glob(".*.mp4.????????.part"):
         assert part.name in str(recovery)
     assert not mjrec.recover(directory)
-    assert any(directory.glob(".*.mp4.????????.part")) is ("ftyp" in then)
+    assert any(directory.glob(".*.mp4.????????.part")) is is_fed
     assert len(manifest_of(directory)["mjrec"]["broken"]) == ("ftyp" in then)
 
 

@@ -19,10 +19,7 @@ from trajectories_by_hand import write_log, write_pending_manifest
 from mjrec import BlankVideo, Monitor, RenderError
 from mjrec.formats.ffmpeg import ffmpeg_executable
 from mjrec.formats.spans import find_trajectory, recordings_in_flight
-from mjrec.formats.trajectory_file import (
-    finish_trajectory,
-    open_trajectory,
-)
+from mjrec.formats.trajectory_file import finish_trajectory, open_trajectory
 from mjrec.formats.video_metadata import metadata_path
 from mjrec.rendering import finish as module
 from mjrec.rendering.recordings import recordings

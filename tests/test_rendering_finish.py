@@ -15,10 +15,7 @@ from trajectories_by_hand import (
 
 from mjrec import UnreadableFile
 from mjrec.formats.locks import Lock
-from mjrec.formats.monitor_directory import (
-    lock_name,
-    video_prefix,
-)
+from mjrec.formats.monitor_directory import lock_name, video_prefix
 from mjrec.formats.spans import is_in_flight
 from mjrec.rendering import finish as module
 from mjrec.rendering.jobs import RecordingKey

@@ -118,14 +118,6 @@ def test_a_grid_is_what_each_camera_shows(ride, three, tmp_path):
         assert not lower[:, WIDTH:].any()
 
 
-def test_the_plane_depends_on_the_frame_before(ride, one, tmp_path):
-    """Or the tests above would show nothing of it; fresh scenes do not depend."""
-    fresh = record(tmp_path, fresh=True)
-    assert not np.array_equal(fresh.frames[4], ride.frames[4])
-    drawn = list(one.frames(fresh.path, range(FRAMES)))
-    assert np.array_equal(drawn, fresh.frames)
-
-
 # What goes wrong
 
 

@@ -100,11 +100,12 @@ THINGS = """
 
 
 # With a skin, which follows positions and orientations of bodies.
-SKIN = (Path(__file__).parent.parent / "assets/showcase.xml").read_text()
+SKIN = str(Path(__file__).parent.parent / "assets/showcase.xml")
 
 
 def simulated(xml):
-    model = mujoco.MjModel.from_xml_string(xml)
+    load = getattr(mujoco.MjModel, f"from_xml_{'path' if xml == SKIN else 'string'}")
+    model = load(xml)
     data = mujoco.MjData(model)
     data.ctrl[:] = 0.7
     data.xfrc_applied[-1, :3] = (1, 2, 3)
