@@ -2,6 +2,7 @@
 """What is drawn from recorded states is what `render()` shows, byte for byte."""
 
 import contextlib
+import copy
 import gc
 import importlib.util
 import json
@@ -320,16 +321,59 @@ def test_deferred_where_it_would_lie_is_an_error_and_never_chosen(
     assert np.abs(frame.astype(int) - shown).mean() < 12
 
 
-def test_frames_end_where_markers_come(tmp_path, caplog):
+POINTS = {int(mujoco.mjtVisFlag.mjVIS_CONTACTPOINT): True}
+
+
+@pytest.mark.parametrize(
+    ("options", "arrays", "said"),
+    [
+        ({"visual_options": POINTS}, None, "mjVIS_CONTACTPOINT of the visual options"),
+        # The first frame is compared, whatever the reason for a difference is.
+        ({}, ("geom_xmat",), "drawn from its snapshot differs"),
+    ],
+)
+def test_what_states_do_not_tell_is_drawn_live(
+    options, arrays, said, tmp_path, monkeypatch, caplog
+):
+    """Why is in the log; it is an error where another way was asked for."""
+    if arrays:
+        monkeypatch.setattr("mjrec.simulation.captured_arrays.ALWAYS", arrays)
+    env = make("InvertedPendulum-v5", **options)
+    with pytest.raises(mjrec.PicturesDiffer, match=said):
+        monitored(env, tmp_path / "deferred").reset(seed=0)
+    with mjrec.Monitor(env, tmp_path / "live", allow_early_reset=True) as monitor:
+        monitor.reset(seed=0)
+    assert said in caplog.text
+    assert len(frames_in(tmp_path / "live", 0)) == 1
+
+
+def show(viewer, what):
+    viewer.vopt.flags[int(mujoco.mjtVisFlag.__members__[f"mjVIS_{what}"])] = True
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda env, viewer: viewer.add_marker(pos=np.zeros(3)), "markers were added"),
+        (
+            lambda env, viewer: setattr(env, "model", copy.copy(env.model)),
+            "switched to another model",
+        ),
+        (lambda env, viewer: env.model.geom_type.fill(6), "geom_type of the model"),
+        (lambda env, viewer: show(viewer, "CONTACTPOINT"), "mjVIS_CONTACTPOINT"),
+        (lambda env, viewer: show(viewer, "INERTIA"), "xipos"),
+    ],
+)
+def test_frames_end_where_they_would_lie(change, said, tmp_path, caplog):
     """In the middle of an episode; nothing is shown that `render()` does not."""
     env = make("InvertedPendulum-v5")
     monitor = monitored(env, tmp_path)
     monitor.reset(seed=0)
     monitor.render()
-    env.unwrapped.mujoco_renderer.viewer.add_marker(pos=np.zeros(3))
+    change(env.unwrapped, env.unwrapped.mujoco_renderer.viewer)
     monitor.step(np.zeros(1))
     monitor.close()
-    assert "markers were added to the viewer" in caplog.text
+    assert said in caplog.text
     [path] = tmp_path.glob("*.trajectory.*")
     with open_trajectory(path) as trajectory:
         assert trajectory.frame_count == 1
