@@ -20,7 +20,7 @@ from waiting import wait_until
 from mjrec import Monitor
 from mjrec.formats.spans import find_recording, is_in_flight
 from mjrec.formats.trajectory_file import open_trajectory
-from mjrec.rendering.background import Background, Share
+from mjrec.rendering.background import Background
 
 # A program around it, with the directory at argv[1].
 PROGRAM = """
@@ -150,26 +150,6 @@ def test_a_model_that_is_still_being_written_is_waited_for(recorded, start):
     [reason] = background.failures.values()
     assert "model" in reason
     assert len(list(recorded.glob("*.mp4"))) == 1
-
-
-def test_several_monitors_share_one(tmp_path, start):
-    """None of them ends it, and all are waited for at once."""
-    background = start()
-    shares = []
-    for number in (0, 1):
-        log = write_log(tmp_path, infix=f"{number}.7")
-        shares.append(Share(background))
-        shares[-1].submit(log)
-    for rows in tmp_path.glob("*.log"):
-        rows.unlink()
-        rows.mkdir()
-    with background.waiting_at_the_end(lambda _: None):
-        for share in shares:
-            share.wait()
-            share.stop()
-        assert background.waiting
-    names = {f"openaigym.video.{number}.7.video000000.mp4" for number in (0, 1)}
-    assert all(share.failures.keys() == names for share in shares)
 
 
 # How it ends

@@ -188,7 +188,7 @@ def half_a_line(descriptor, line):
 
 def fed(encoding):
     # What waits for the encoder is lost with the process.
-    while encoding._encoded < 5:
+    while encoding._encoded < 3:
         time.sleep(0.001)
     return True
 
@@ -219,7 +219,8 @@ env = Corridor(length=4)
 if render == "deferred":
     env = gymnasium.make("InvertedPendulum-v5", max_episode_steps=4)
 with mjrec.Monitor(
-    env, directory, lambda _: True, env_id="Short-v0", render=render, workers=0
+    env, directory, lambda _: True, env_id="Short-v0", render=render, workers=0,
+    max_fps=4 if render == "live" else None,
 ) as monitor:
     for _ in range(2):
         monitor.reset(seed=0)
@@ -246,8 +247,10 @@ def test_a_recorder_killed_between_two_things_loses_no_episode(place, tmp_path):
     assert lengths == [4, 4]
     assert [each.length for each in mjrec.iter_episodes(tmp_path)] == lengths
     if place in LIVE:
-        assert [len(frames_in(tmp_path, number)) for number in (0, 1)] == [5, 5]
+        assert [len(frames_in(tmp_path, number)) for number in (0, 1)] == [3, 3]
         facts = [metadata_of(tmp_path, number) for number in (0, 1)]
+        # At most four a second, and the last one.
+        assert [each["frame_steps"] for each in facts] == [[[0, 3], [4, 4]]] * 2
     else:
         paths = sorted(tmp_path.glob("*.h5"))
         facts = [mjrec.load_trajectory(path).facts for path in paths]

@@ -13,8 +13,6 @@ import numpy as np
 import pytest
 from other_python import run_python
 
-from mjrec.errors import InvalidArgument
-from mjrec.simulation import gl_context
 from mjrec.simulation.renderer import SceneRenderer
 
 ASSETS = Path(__file__).parents[1] / "assets"
@@ -233,17 +231,6 @@ def test_an_environment_keeps_its_context(make):
 
 
 # --- its life ------------------------------------------------------------------------
-
-
-def test_a_frame_beyond_the_driver_is_refused(table, monkeypatch):
-    """The limit that OpenGL tells is named; here a smaller one than any real one."""
-
-    def tell(_, limit):
-        limit[:] = 64
-
-    monkeypatch.setattr(gl_context.raw_opengl(), "glGetIntegerv", tell)
-    with pytest.raises(InvalidArgument, match=r"70x50 pixels is too large.*64x64"):
-        SceneRenderer(table[0], **SIZE)
 
 
 def test_a_frame_beyond_memory_is_an_error():

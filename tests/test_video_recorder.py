@@ -129,6 +129,8 @@ def test_a_frame_list_is_drained_in_order(make_corridor, path):
     recorded = [round(float(frame.mean()) / 25) for frame in frames_of(recorder.path)]
     assert recorded == list(range(1, 10))
     assert (metadata["frame_count"], metadata["fps"]) == (9, "30")
+    runs = [[0, 0], [0, 0], [0, 1], [1, 1], [1, 2], [2, 2], [2, 2]]
+    assert metadata["frame_steps"] == runs
     assert metadata["playback_speed"] == 1.0
 
 
