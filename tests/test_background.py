@@ -3,7 +3,6 @@
 
 import functools
 import os
-import shutil
 import signal
 import subprocess
 import sys
@@ -21,40 +20,37 @@ from waiting import wait_until
 from mjrec import Monitor
 from mjrec.formats.spans import find_recording, is_in_flight
 from mjrec.formats.trajectory_file import open_trajectory
-from mjrec.rendering.background import Background, Share
+from mjrec.rendering.background import Background
 
 # A program around it, with the directory at argv[1].
 PROGRAM = """
-import pathlib, sys
+import os, pathlib, sys, threading, time
 from mjrec.formats.spans import recordings_in_flight
 from mjrec.rendering.background import Background
 directory = pathlib.Path(sys.argv[1])
 background = Background(directory, workers=1)
 for recording in recordings_in_flight(directory):
     background.submit(recording.path)
+assert threading.active_count() == 1
+assert not {'mujoco', 'OpenGL', 'h5py'} & set(sys.modules)
+if os.fork() == 0:
+    time.sleep(60)
+    os._exit(0)
+print(background._child.pid, flush=True)
+time.sleep(60)
 """
 
 
-@pytest.fixture(scope="module")
-def _recorded(tmp_path_factory):
+@pytest.fixture
+def recorded(tmp_path, play):
     """Two short episodes of a simulation, as yet without videos."""
-    directory = tmp_path_factory.mktemp("recorded")
-    env = gymnasium.make(
-        "InvertedPendulum-v5", width=40, height=32, max_episode_steps=3
-    )
+    small = {"width": 40, "height": 32, "max_episode_steps": 3}
+    env = gymnasium.make("InvertedPendulum-v5", **small)
+    directory = tmp_path / "recorded"
     monitor = Monitor(env, directory, lambda _: True, workers=0, quality="draft")
-    for seed in (0, 1):
-        monitor.reset(seed=seed)
-        for _ in range(3):
-            monitor.step(env.action_space.sample())
+    play(monitor, 2)
     monitor.close(wait=False)
     return directory
-
-
-@pytest.fixture
-def recorded(_recorded, tmp_path):
-    """A copy of it."""
-    return Path(shutil.copytree(_recorded, tmp_path / "recorded"))
 
 
 @pytest.fixture
@@ -137,11 +133,6 @@ def test_submitting_never_waits(others, tmp_path, start):
     assert is_finished(log)
 
 
-def make_unreadable(log):
-    log.unlink()
-    log.mkdir()
-
-
 def test_a_model_that_is_still_being_written_is_waited_for(recorded, start):
     """It is compressed beside the simulation; once nobody writes, it is an error."""
     [model] = recorded.glob("*.mjb.gz")
@@ -159,27 +150,6 @@ def test_a_model_that_is_still_being_written_is_waited_for(recorded, start):
     [reason] = background.failures.values()
     assert "model" in reason
     assert len(list(recorded.glob("*.mp4"))) == 1
-
-
-def test_several_monitors_share_one(tmp_path, start):
-    """None of them ends it, and all are waited for at once."""
-    background = start()
-    shares = {}
-    for number in (0, 1):
-        infix = f"{number}.7"
-        write_log(tmp_path, infix=infix)
-        shares[number] = Share(background)
-        for log in in_flight(tmp_path)[number:]:
-            shares[number].submit(log)
-    for rows in tmp_path.glob("*.log"):
-        make_unreadable(rows)
-    with background.waiting_at_the_end(lambda _: None):
-        for share in shares.values():
-            share.wait()
-            share.stop()
-        assert background.waiting
-    names = {f"openaigym.video.{number}.7.video000000.mp4" for number in shares}
-    assert all(share.failures.keys() == names for share in shares.values())
 
 
 # How it ends
@@ -347,18 +317,11 @@ def test_it_ends_with_its_parent(tmp_path):
     The parent has no thread for it, and no library that draws or writes HDF5.
     """
     log = write_log(tmp_path, model={"mjb": "none"})
-    code = (
-        "import threading\nassert threading.active_count() == 1\n"
-        "assert not {'mujoco', 'OpenGL', 'h5py'} & set(sys.modules)\n"
-        "import os, time\nif os.fork() == 0:\n    time.sleep(60)\n    os._exit(0)\n"
-        "print(background._child.pid, flush=True)\ntime.sleep(60)\n"
-    )
     with subprocess.Popen(
-        [sys.executable, "-c", PROGRAM + code, str(tmp_path)],
+        [sys.executable, "-c", PROGRAM, str(tmp_path)],
         stdout=subprocess.PIPE,
         start_new_session=True,
     ) as program:
-        assert program.stdout is not None
         process = int(program.stdout.readline())
         program.kill()
         program.wait()

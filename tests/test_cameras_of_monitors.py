@@ -2,11 +2,11 @@
 """Several cameras, captions and second names, through `mjrec.Monitor`."""
 
 import json
+import sys
 
 import gymnasium
 import numpy as np
 import pytest
-from other_python import run_python
 from recordings import frames_of, hashes_at, manifest_of
 
 import mjrec
@@ -37,6 +37,10 @@ def record(directory, steps=3, render="deferred", **options):
     }
 
 
+def metadata_of(video):
+    return json.loads(video.with_suffix(".meta.json").read_text())
+
+
 # Takes more than five seconds: several monitors with workers of their own.
 @pytest.mark.parametrize("render", WAYS)
 def test_several_cameras(tmp_path, render):
@@ -48,17 +52,14 @@ def test_several_cameras(tmp_path, render):
     assert both[""] != both[f".{second}"]
     other = record(tmp_path / "second", camera=second, render=render)
     assert other == {"": both[f".{second}"]}
-    names = [video for video, _ in manifest_of(tmp_path / "both")["videos"]]
     videos = sorted((tmp_path / "both").glob("*.mp4"), key=lambda p: len(p.name))
-    assert sorted(names) == sorted(path.name for path in videos)
-    cameras = [
-        json.loads(path.with_suffix(".meta.json").read_text())["camera"]
-        for path in videos
-    ]
-    assert cameras[0] == first != cameras[1]
+    assert {v for v, _ in manifest_of(tmp_path / "both")["videos"]} == {
+        path.name for path in videos
+    }
+    assert metadata_of(videos[0])["camera"] == first != metadata_of(videos[1])["camera"]
     record(tmp_path / "tiled", tiled=True, **several)
     [video] = (tmp_path / "tiled").glob("*.mp4")
-    assert json.loads(video.with_suffix(".meta.json").read_text())["tiled"] is True
+    assert metadata_of(video)["tiled"] is True
     wide = frames_of(video)[-1]
     assert wide.shape == (48, 128, 3)
     for half, single in zip((wide[:, :64], wide[:, 64:]), videos, strict=True):
@@ -66,21 +67,9 @@ def test_several_cameras(tmp_path, render):
         assert difference.mean() < 4
 
 
-WITHOUT_PILLOW = """
-import sys
-
-sys.modules["PIL"] = None
-import gymnasium, mjrec
-
-try:
-    mjrec.Monitor(gymnasium.make("Hopper-v5"), sys.argv[1], annotate=True)
-except mjrec.MissingDependency as error:
-    print(error)
-"""
-
-
-def test_captions_without_pillow_are_an_error_of_the_constructor(tmp_path):
+def test_captions_without_pillow_are_an_error_of_the_constructor(tmp_path, monkeypatch):
     """It says how to install it, and nothing is left."""
-    said = run_python(WITHOUT_PILLOW, tmp_path / "run").stdout
-    assert "pip install 'mjrec[annotate]'" in said
+    monkeypatch.setitem(sys.modules, "PIL", None)
+    with pytest.raises(mjrec.MissingDependency, match=r"install 'mjrec\[annotate\]'"):
+        mjrec.Monitor(gymnasium.make("Hopper-v5"), tmp_path / "run", annotate=True)
     assert not (tmp_path / "run").exists()

@@ -4,6 +4,8 @@
 import subprocess
 import sys
 
+import pytest
+
 PROGRAM = """
 import os, pathlib, sys
 from mjrec.child_python import Child
@@ -15,22 +17,17 @@ with Child("mjrec.provenance", environ=os.environ) as child:
     found = f"{said} {child.how_it_ended()} {child.printed()}"
 pathlib.Path(sys.argv[1]).write_text(found)
 """
+# As some machines' `sitecustomize` prints.
+HELLO = "import os\nfor stream in (1, 2):\n    os.write(stream, b'hello ')\n"
 
 
-def outcome(folder, *, closed):
-    """Return what is sent, how the child ends and what it prints."""
-    command = [sys.executable, "-c", PROGRAM, folder / "outcome", closed]
-    subprocess.run(command, check=True, env={"PYTHONPATH": str(folder)})
-    return (folder / "outcome").read_text()
-
-
-def test_the_parent_may_have_no_standard_streams(tmp_path):
-    """Their numbers are those of pipes then."""
-    assert outcome(tmp_path, closed="012") == "[{}] ended with status 0 "
-
-
-def test_what_is_printed_early_is_no_message(tmp_path):
-    """As some machines' `sitecustomize` does, to either stream."""
-    code = "import os\nfor stream in (1, 2):\n    os.write(stream, b'hello ')\n"
-    (tmp_path / "sitecustomize.py").write_text(code)
-    assert outcome(tmp_path, closed="") == "[{}] ended with status 0 hello hello"
+@pytest.mark.parametrize(
+    ("closed", "customized", "printed"), [("012", "", ""), ("", HELLO, "hello hello")]
+)
+def test_messages_arrive(closed, customized, printed, tmp_path):
+    """Where the parent has no standard streams, and where a child prints early."""
+    (tmp_path / "sitecustomize.py").write_text(customized)
+    command = [sys.executable, "-c", PROGRAM, tmp_path / "outcome", closed]
+    subprocess.run(command, check=True, env={"PYTHONPATH": str(tmp_path)})
+    said = (tmp_path / "outcome").read_text()
+    assert said == f"[{{}}] ended with status 0 {printed}"

@@ -5,15 +5,13 @@ Each case ends a child process in one way at a random moment (seeded), and then 
 recovers and renders what it left. The default run tries one moment of a few of them.
 """
 
-from __future__ import annotations
-
+import itertools
 import json
 import random
 import signal
 import subprocess
 import sys
 import time
-from dataclasses import dataclass
 
 import pytest
 from parts import parametrize
@@ -68,6 +66,7 @@ while True:
     env.reset()
 """
 
+DEFAULT = [("SIGKILL", "live"), ("SIGKILL", "deferred"), ("exception", "live")]
 WAYS = {
     "SIGKILL": ("killed", -signal.SIGKILL),
     "SIGTERM": ("interrupt", 143),
@@ -77,21 +76,8 @@ WAYS = {
 }
 
 
-@dataclass(frozen=True)
-class Crash:
-    """What is known of a process that has ended.
-
-    Attributes:
-        rewards: of the episodes that it said were over, by their numbers.
-        reason: why its last episode ended.
-    """
-
-    rewards: dict[int, list[float]]
-    reason: str
-
-
 def crash(directory, render, way, delay):
-    """Record until the process ends in that way."""
+    """Record until the process ends in that way; return the rewards that it told."""
     with subprocess.Popen(
         [sys.executable, "-c", PROGRAM, str(directory), render, way, str(delay)],
         stdout=subprocess.PIPE,
@@ -100,58 +86,50 @@ def crash(directory, render, way, delay):
         bufsize=0,
         start_new_session=True,
     ) as process:
-        assert process.stdout is not None
         assert process.stdout.readline() == b"begun\n"
         if way.startswith("SIG"):
             time.sleep(delay)
             process.send_signal(signal.Signals[way])
         output, errors = process.communicate(timeout=60)
-    reason, status = WAYS[way]
-    assert process.returncode == status, errors.decode()
-    return Crash(dict(map(json.loads, output.splitlines())), reason)
+    assert process.returncode == WAYS[way][1], errors.decode()
+    return dict(map(json.loads, output.splitlines()))
 
 
-def check_statistics(directory, crashed):
+def check_statistics(directory, over):
     """Every episode that was over is counted; at most one more, just not said."""
     results = mjrec.load_results(directory)
     lengths = [] if results is None else results["episode_lengths"]
-    assert len(crashed.rewards) <= len(lengths) <= len(crashed.rewards) + 1
-    for episode, rewards in crashed.rewards.items():
+    assert len(over) <= len(lengths) <= len(over) + 1
+    for episode, rewards in over.items():
         assert lengths[episode] == len(rewards)
         assert results["episode_rewards"][episode] == pytest.approx(sum(rewards))
 
 
-def check_episodes(directory, crashed):
+def check_episodes(directory, over):
     """Trajectories bit for bit; of scheduled ones a video with every frame."""
-    for episode, rewards in crashed.rewards.items():
+    for episode, rewards in over.items():
         [path] = directory.glob(f"*.episode{episode:06d}.h5")
         trajectory = mjrec.load_trajectory(path)
         assert trajectory.rewards.tolist() == rewards
         assert trajectory.facts["complete"] is True
-        if episode % 5:
-            assert not list(directory.glob(f"*.video{episode:06d}.mp4"))
-        else:
+        assert any(directory.glob(f"*.video{episode:06d}.mp4")) is (episode % 5 == 0)
+        if episode % 5 == 0:
             assert len(frames_in(directory, episode)) == len(rewards) + 1
             assert metadata_of(directory, episode)["complete"] is True
-    # The one that was running says why it is not whole.
-    last = f"{len(crashed.rewards):06d}"
-    facts = [mjrec.load_trajectory(p).facts for p in directory.glob(f"*{last}.h5")]
-    facts += [json.loads(p.read_text()) for p in directory.glob(f"*{last}.meta.json")]
+
+
+def check_the_last(directory, number, reason):
+    """The episode that was running says how long it is and why it is not whole."""
+    trajectories = map(mjrec.load_trajectory, directory.glob(f"*{number:06d}.h5"))
+    facts = [{**each.facts, "rows": len(each.rewards)} for each in trajectories]
+    metadata = directory.glob(f"*{number:06d}.meta.json")
+    facts += [json.loads(path.read_text()) for path in metadata]
     # Both come from a signal's handler. If it runs while an episode ends, it leaves
     # what a kill leaves.
-    by_handler = crashed.reason in ("interrupt", "exception")
-    reasons = {crashed.reason, *(["killed"] * by_handler)}
+    by_handler = reason in ("interrupt", "exception")
     for each in facts:
-        assert each["complete"] or each["reason"] in reasons
-
-
-def check_nothing_is_half(directory):
-    """No hidden file is left, no log, and whatever is there can be read."""
-    hidden = [p.name for p in directory.glob(".*") if not p.name.endswith(".lock")]
-    assert hidden == []
-    assert list(directory.glob("openaigym.states.*")) == []
-    for path in directory.glob("*.json"):
-        json.loads(path.read_text())
+        assert each["complete"] or each["reason"] in (reason, *["killed"] * by_handler)
+        assert each.get("rows", each["length"]) == each["length"]
 
 
 def render_all(directory):
@@ -168,23 +146,23 @@ def render_all(directory):
 @pytest.mark.usefixtures("default_signals")
 @parametrize(
     ("way", "render", "moment"),
-    [(w, r, m) for w in WAYS for r in ("live", "deferred") for m in range(MOMENTS)],
-    default=[
-        ("SIGKILL", "live", 0),
-        ("SIGKILL", "deferred", 0),
-        ("exception", "live", 0),
-    ],
+    itertools.product(WAYS, ("live", "deferred"), range(MOMENTS)),
+    default=[(*case, 0) for case in DEFAULT],
     part=pytest.mark.crashes,
 )
 def test_what_was_complete_is_there(way, render, moment, tmp_path):
-    """Loaded, recovered, rendered and compared."""
+    """Loaded, recovered, rendered and compared; no hidden file or log is left."""
     delay = random.Random(f"{way} {render} {moment}").uniform(0, LONGEST)
-    crashed = crash(tmp_path, render, way, delay)
-    check_statistics(tmp_path, crashed)
+    over = crash(tmp_path, render, way, delay)
+    check_statistics(tmp_path, over)
     # A child between fork and exec may hold its parent's lock for a moment.
     wait_until(lambda: not mjrec.recover(tmp_path).open_monitors, seconds=60)
     assert not mjrec.recover(tmp_path), "something was left to recover"
     wait_until(lambda: render_all(tmp_path), seconds=60)
-    check_statistics(tmp_path, crashed)
-    check_episodes(tmp_path, crashed)
-    check_nothing_is_half(tmp_path)
+    check_statistics(tmp_path, over)
+    check_episodes(tmp_path, over)
+    check_the_last(tmp_path, len(over), WAYS[way][0])
+    left = [*tmp_path.glob(".*"), *tmp_path.glob("openaigym.states.*")]
+    assert [path.name for path in left if path.suffix != ".lock"] == []
+    for path in tmp_path.glob("*.json"):
+        json.loads(path.read_text())

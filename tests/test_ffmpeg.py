@@ -3,10 +3,11 @@
 
 import hashlib
 import os
-import time
+import shutil
 from pathlib import Path
 
 import pytest
+from waiting import wait_until
 
 from mjrec.errors import EncoderError, InvalidArgument, MissingDependency
 from mjrec.formats import ffmpeg
@@ -70,45 +71,51 @@ def test_a_program_that_cannot_be_started_is_told_from_one_that_failed(
 
 
 @pytest.fixture
-def impatient(monkeypatch):
-    """Let what makes no progress hang after a moment."""
+def hang_at(tmp_path, monkeypatch):
+    """Run a shell script for ffmpeg, which hangs after a moment without progress."""
     monkeypatch.setenv("MJREC_TIMEOUT", "0.3")
 
+    def run(text):
+        # Not replaced by what it starts: a wrapper script, that has to go with it.
+        program = script(tmp_path / "wrapper", f"echo begun >&2; {text}; exit 0")
+        monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", str(program))
 
-def hang_at(tmp_path, monkeypatch, text):
-    # Not replaced by what it starts: a wrapper script, that has to go with it.
-    program = script(tmp_path / "wrapper", f"echo begun >&2; {text}; exit 0")
-    monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", str(program))
+    return run
 
 
-@pytest.mark.usefixtures("impatient")
-@pytest.mark.parametrize("way", ["write", "read", "wait"])
-def test_a_process_that_hangs_is_ended(way, tmp_path, monkeypatch):
-    """Whether it takes nothing, gives nothing or does not end."""
-    hang_at(tmp_path, monkeypatch, "sleep 33.75")
-    process = FfmpegProcess(["-"], what="No.", reads=way == "write", writes=True)
+@pytest.mark.parametrize(
+    "wait",
+    [lambda p: p.write(bytes(3 << 20)), lambda p: p.read(1), FfmpegProcess.wait],
+    ids=["write", "read", "wait"],
+)
+def test_a_process_that_hangs_is_ended(wait, hang_at):
+    """With what it has started, whether it takes or gives nothing or does not end."""
+    hang_at("sleep 33.75")
+    process = FfmpegProcess(["-"], what="No.", reads=True, writes=True)
     try:
         with pytest.raises(EncoderError, match=r"No\. It made no progress for 0.3"):
-            {
-                "write": lambda: process.write(bytes(3 << 20)),
-                "read": lambda: process.read(1),
-                "wait": process.wait,
-            }[way]()
+            wait(process)
     finally:
         process.kill()
         process.release()
-    assert not still_runs("sleep", "33.75")
+    wait_until(
+        lambda: b"sleep\00033.75\0" not in map(command_of, Path("/proc").iterdir())
+    )
 
 
-@pytest.mark.usefixtures("impatient")
-def test_a_slow_process_does_not_hang(tmp_path, monkeypatch):
+def command_of(process):
+    try:
+        return (process / "cmdline").read_bytes()
+    except OSError:
+        return b""
+
+
+def test_a_slow_process_does_not_hang(tmp_path, hang_at):
     """As long as something moves: what it takes, gives, or writes into its file."""
     out = tmp_path / "out"
     hang_at(
-        tmp_path,
-        monkeypatch,
         "for k in 1 2 3 4 5; do head -c 65536 >/dev/null; echo $k; sleep 0.1; done; "
-        f"exec >&-; for k in 1 2 3 4 5; do echo $k >>{out}; sleep 0.1; done",
+        f"exec >&-; for k in 1 2 3 4 5; do echo $k >>{out}; sleep 0.1; done"
     )
     process = FfmpegProcess([f"file:{out}"], what="No.", reads=True, writes=True)
     process.write(bytes(1 << 20 | 3 << 16))
@@ -117,69 +124,30 @@ def test_a_slow_process_does_not_hang(tmp_path, monkeypatch):
     process.release()
 
 
-def still_runs(*command):
-    """Return whether it does so for another ten seconds, on a busy machine."""
-    wanted = "\0".join([*command, ""]).encode()
-    end = time.monotonic() + 10
-    while time.monotonic() < end:
-        lines = map(read_or_nothing, Path("/proc").glob("[0-9]*/cmdline"))
-        if wanted not in lines:
-            return False
-        time.sleep(0.05)
-    return True
-
-
-def read_or_nothing(path):
-    try:
-        return path.read_bytes()
-    except OSError:
-        return b""
-
-
 # What is remembered of a program, and of which
 
 
-@pytest.fixture
-def program(tmp_path):
-    path = tmp_path / "program"
-    path.write_text("one")
-    return path
+def test_a_program_is_asked_once(tmp_path, monkeypatch):
+    """Until its file is another one, or what was remembered cannot be read."""
+    program, cache = tmp_path / "program", tmp_path / "cache"
+    program.write_text("one")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(cache))
+    monkeypatch.setattr(ffmpeg, "ffmpeg_executable", lambda: str(program))
 
+    def ask(answer):
+        """Ask as a new process does."""
+        ffmpeg._answers.clear()
+        return remembered("does it work?", lambda: answer)
 
-@pytest.fixture
-def cache(tmp_path, monkeypatch):
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    return tmp_path / "cache" / "mjrec" / "programs.json"
-
-
-def ask(program, asked, answer="yes"):
-    """Ask as a new process does, and note where the program had to be asked."""
-    ffmpeg._answers.clear()
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(ffmpeg, "ffmpeg_executable", lambda: str(program))
-        return remembered("does it work?", lambda: asked.append("") or answer)
-
-
-def test_a_program_is_asked_once(program, cache):
-    """Another process need not ask, until the file is another one."""
-    asked = []
-    assert [ask(program, asked), ask(program, asked)] == ["yes", "yes"]
-    assert len(asked) == 1
+    assert [ask("yes"), ask("no")] == ["yes", "yes"]
     # Of the same size and time of change.
     before = program.stat()
     program.write_text("two")
     os.utime(program, ns=(before.st_atime_ns, before.st_mtime_ns))
-    assert ask(program, asked, "no") == "no"
-    assert len(asked) == 2
-
-
-@pytest.mark.parametrize("what", ["garbage", "no place"])
-def test_what_cannot_be_read_is_asked_anew(what, program, cache):
-    """Whatever stands in its place."""
-    asked = []
-    if what == "no place":
-        cache.parents[1].write_text("a file")
-    else:
-        ask(program, asked)
-        cache.write_text("[1]")
-    assert ask(program, asked, "no") == "no"
+    assert [ask("no"), ask("yes")] == ["no", "no"]
+    [answers] = (cache / "mjrec").iterdir()
+    answers.write_text("[1]")
+    assert ask("yes") == "yes"
+    shutil.rmtree(cache)
+    cache.write_text("no directory")
+    assert ask("no") == "no"

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Rendering on a given GPU: found among EGL's devices, and said where there is none."""
 
+import re
 from dataclasses import replace
 
 import pytest
@@ -14,27 +15,13 @@ from mjrec.gl.egl import EglDevice
 
 # As EGL told of them on a machine with one NVIDIA H100 (driver 580.159.04) while
 # CUDA_VISIBLE_DEVICES was not set, "0" or its UUID.
-H100 = EglDevice(
-    index=0,
-    device_file="",
-    cuda_id=0,
-    software=False,
-    in_use=True,
-    uuid="GPU-f3544f26-6dc5-5ba3-2ea8-e7c7c99e765b",
-)
+H100 = EglDevice(index=0, device_file="", cuda_id=0, software=False, in_use=True)
+H100 = replace(H100, uuid="GPU-f3544f26-6dc5-5ba3-2ea8-e7c7c99e765b")
 # There, while it was empty, "1", "-1" or another UUID.
 HIDDEN = replace(H100, cuda_id=None)
 # There, in front of the GPU or behind it as the vendor files were ordered.
-LLVMPIPE = EglDevice(index=0, device_file="", cuda_id=None, software=True, in_use=False)
-OTHER = replace(
-    HIDDEN, index=1, in_use=False, uuid="GPU-0f3e5d1c-2b4a-4968-8877-665544332211"
-)
-
-
-@pytest.fixture(autouse=True)
-def nothing_chosen(monkeypatch):
-    """No test begins with a GPU, and none leaves a choice behind."""
-    monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
+LLVMPIPE = replace(HIDDEN, software=True, in_use=False, uuid="")
+OTHER = replace(HIDDEN, index=1, uuid="GPU-0f3e5d1c-2b4a-4968-8877-665544332211")
 
 
 def run(code, **variables):
@@ -43,19 +30,14 @@ def run(code, **variables):
         "import logging, os, sys; logging.basicConfig(level='INFO')\n"
         "from mjrec.gl import render_on_given_gpu\n"
     )
-    return run_python(head + code, env=without_gl(**variables), status=None)
+    env = without_gl(**variables)
+    if "CUDA_VISIBLE_DEVICES" not in variables:
+        env.pop("CUDA_VISIBLE_DEVICES", None)
+    return run_python(head + code, env=env, status=None)
 
 
 def has_gpu():
     return any(not device.software for device in probe("egl").devices)
-
-
-needs_no_gpu = pytest.mark.skipif(
-    "has_gpu()", reason="there is a GPU that EGL can draw on"
-)
-needs_gpu = pytest.mark.skipif(
-    "not has_gpu()", reason="there is no GPU that EGL can draw on"
-)
 
 
 SHOWN = replace(H100, index=2, cuda_id=3)
@@ -84,23 +66,18 @@ def test_egls_device_of_a_gpu(devices, gpu, expected):
     assert device_of_gpu(devices, gpu) is expected
 
 
-@pytest.mark.parametrize(
-    ("text", "expected"),
-    [
-        ("2,0", ["2", "0"]),
-        (" 1 , GPU-1a2b ", ["1", "GPU-1a2b"]),
-        ("", []),
-        ("-1", []),
-        ("0,-1,2", ["0"]),
-    ],
-)
-def test_visible_gpus_are_the_variables_entries(text, expected):
-    """As CUDA reads it, up to the first that it does not understand."""
-    assert visible_gpus({"CUDA_VISIBLE_DEVICES": text}) == expected
+def test_visible_gpus(tmp_path):
+    """As CUDA reads its variable, up to the first entry that it does not understand.
 
-
-def test_visible_gpus_without_the_variable(tmp_path):
-    """CUDA counts those that may be opened, whatever their files are called."""
+    Without it, it counts those that may be opened, whatever their files are called.
+    """
+    for text, expected in {
+        " 2 , GPU-1a2b ": ["2", "GPU-1a2b"],
+        "": [],
+        "-1": [],
+        "0,-1,2": ["0"],
+    }.items():
+        assert visible_gpus({"CUDA_VISIBLE_DEVICES": text}) == expected
     for name in ("nvidia2", "nvidia5", "nvidiactl", "nvidia-uvm", "null"):
         (tmp_path / name).touch()
     # Nobody may open a directory for writing, as nobody a GPU that is not granted.
@@ -122,19 +99,8 @@ def test_what_is_no_entry_is_refused(gpu):
         ("None", {"CUDA_VISIBLE_DEVICES": ""}, "This process was not assigned a GPU"),
         ("None", {"CUDA_VISIBLE_DEVICES": "-1"}, "This process was not assigned a GPU"),
         # `MUJOCO_GL` stands, and what that means is said.
-        (
-            "'0'",
-            {"MUJOCO_GL": "osmesa"},
-            "GPU 0 was assigned for rendering, but",
-        ),
-        pytest.param(
-            *("'3'", {}, "GPU 3 was assigned for rendering, but EGL has only"),
-            marks=needs_no_gpu,
-        ),
-        pytest.param(
-            *("'77'", {}, "GPU 77 was assigned for rendering, but none of EGL's"),
-            marks=needs_gpu,
-        ),
+        ("'0'", {"MUJOCO_GL": "osmesa"}, "GPU 0 was assigned for rendering, but"),
+        ("'77'", {}, r"GPU 77 was assigned for rendering, but (EGL has only|none of)"),
     ],
 )
 def test_where_it_cannot_be_there_is_one_warning(gpu, variables, said):
@@ -146,11 +112,11 @@ def test_where_it_cannot_be_there_is_one_warning(gpu, variables, said):
         **variables,
     )
     assert done.stderr.count("WARNING") == 1
-    assert f"WARNING:mjrec.gl.devices:{said}" in done.stderr
-    assert f"GLError: {said}" in done.stderr
+    assert re.search(f"WARNING:mjrec.gl.devices:{said}", done.stderr)
+    assert re.search(f"GLError: {said}", done.stderr)
 
 
-@needs_gpu
+@pytest.mark.skipif("not has_gpu()", reason="EGL can draw on no GPU here")
 @pytest.mark.parametrize(
     "name", [lambda d: "0", lambda d: d.uuid, lambda d: d.uuid[:9]]
 )

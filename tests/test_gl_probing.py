@@ -3,15 +3,13 @@
 
 import json
 import os
-import shutil
 import subprocess
-import sys
 import sysconfig
 from pathlib import Path
 
 import numpy as np
 import pytest
-from other_python import without_gl
+from other_python import run_python, without_gl
 
 from mjrec.gl import choice
 from mjrec.gl.choice import Probe, probe, probe_environment
@@ -25,29 +23,18 @@ def probe_with(backend, **variables):
     return probe_environment(without_gl(MUJOCO_GL=backend, **variables))
 
 
-def let_python_start_with(code, folder, monkeypatch):
-    """Make every child run `code` first."""
-    (folder / "sitecustomize.py").write_text(code)
-    monkeypatch.syspath_prepend(folder)
-
-
-def test_egl_renders_and_says_with_what():
+def test_egl_renders_and_says_with_what(monkeypatch):
     """A real frame, its speed, OpenGL's words and EGL's devices."""
     answer = probe("egl", measure=True)
     assert answer.renders, f"{answer.cause}\n{answer.fix}\n{answer.output}"
     assert answer.gl_renderer
     assert answer.gl_vendor
     assert answer.gl_version[0].isdigit()
-    assert answer.frames_per_second is not None
     assert answer.frames_per_second > 0
     assert [device.index for device in answer.devices] == [*range(len(answer.devices))]
     assert sum(device.in_use for device in answer.devices) == 1
-
-
-def test_an_answer_is_kept_for_its_environment(monkeypatch):
-    """The second question starts no child process, unless a variable has changed."""
-    first = probe("egl", measure=True)
-    assert probe("egl") is probe("egl", measure=True) is first
+    # Asked again it starts no child process, unless a variable has changed.
+    assert probe("egl") is probe("egl", measure=True) is answer
     monkeypatch.setenv("MUJOCO_EGL_DEVICE_ID", "99")
     assert not probe("egl").renders
 
@@ -55,28 +42,14 @@ def test_an_answer_is_kept_for_its_environment(monkeypatch):
 @pytest.mark.parametrize(
     ("backend", "variables", "cause", "fix"),
     [
-        ("glfw", {}, "DISPLAY is not set", "xvfb-run"),
         ("glfw", {"DISPLAY": ":77"}, "cannot open :77", "MUJOCO_GL to egl"),
-        (
-            "egl",
-            {"PYOPENGL_PLATFORM": "glx"},
-            "PYOPENGL_PLATFORM (glx) contradicts MUJOCO_GL (egl)",
-            "unset PYOPENGL_PLATFORM",
-        ),
         (
             "egl",
             {"MUJOCO_EGL_DEVICE_ID": "99"},
             "MUJOCO_EGL_DEVICE_ID=99, but EGL sees",
             "Set MUJOCO_EGL_DEVICE_ID to",
         ),
-        (
-            "egl",
-            {"MUJOCO_EGL_DEVICE_ID": "abc"},
-            "MUJOCO_EGL_DEVICE_ID=abc is not a whole number.",
-            "unset MUJOCO_EGL_DEVICE_ID",
-        ),
         ("off", {}, "MUJOCO_GL=off turns rendering off", "Unset MUJOCO_GL"),
-        ("nonsense", {}, "MUJOCO_GL=nonsense is not the name", "egl, osmesa, glfw"),
         (
             "egl",
             {"__EGL_VENDOR_LIBRARY_FILENAMES": "/nonexistent"},
@@ -103,44 +76,39 @@ def test_driver_that_draws_nothing():
     assert "The driver renders incorrect frames." in answer.cause
 
 
+DEAF = "import signal; signal.pthread_sigmask(0, range(1, 64)); signal.pause()"
+
+
 @pytest.mark.parametrize(
-    ("code", "cause"),
+    ("code", "timeout", "cause"),
     [
-        ("import ctypes; ctypes.string_at(0)", "The driver crashed (SIGSEGV)"),
+        ("import ctypes; ctypes.string_at(0)", 120, "The driver crashed (SIGSEGV)"),
         # What nobody has explained yet is shown as it was said.
-        ("raise SystemExit('the moon is in another quarter')", "the moon is in"),
+        ("raise SystemExit('the moon is in another quarter')", 120, "the moon is in"),
+        (DEAF, 0.2, "The driver hangs"),
     ],
 )
-def test_the_end_of_the_child_is_an_answer(tmp_path, code, cause, monkeypatch):
-    """A crash ends the child only."""
-    let_python_start_with(code, tmp_path, monkeypatch)
-    answer = probe_environment({**os.environ, "MUJOCO_GL": "egl"})
+def test_the_end_of_the_child_is_an_answer(tmp_path, code, timeout, cause, monkeypatch):
+    """A crash ends the child only; one that is deaf to other signals is killed."""
+    (tmp_path / "sitecustomize.py").write_text(code)
+    monkeypatch.syspath_prepend(tmp_path)
+    answer = probe_environment({**os.environ, "MUJOCO_GL": "egl"}, timeout=timeout)
     assert cause in answer.cause
-
-
-def test_a_hang_is_an_answer(tmp_path, monkeypatch):
-    """The child is killed, also one that is deaf to other signals."""
-    deaf = "import signal; signal.pthread_sigmask(0, range(1, 64)); signal.pause()"
-    let_python_start_with(deaf, tmp_path, monkeypatch)
-    answer = probe_environment({**os.environ, "MUJOCO_GL": "egl"}, timeout=0.2)
-    assert "The driver hangs" in answer.cause
-    assert "no answer within 0.2 seconds" in answer.output
 
 
 def test_software_on_a_machine_with_a_gpu_is_odd(tmp_path, monkeypatch):
     """A GPU that is not used is named; without one there is nothing to say."""
     software = Probe("egl", renders=True, gl_renderer="llvmpipe (LLVM 15)")
     hardware = Probe("egl", renders=True, gl_renderer="NVIDIA H200/PCIe/SSE2")
-    assert software.software
-    assert not hardware.software
+    assert (software.software, hardware.software) == (True, False)
     monkeypatch.setattr(choice, "gpu_device_files", list)
     assert software.warning() == ""
     device = tmp_path / "nvidia0"
     device.touch()
     monkeypatch.setattr(choice, "gpu_device_files", lambda: [str(device)])
-    assert "llvmpipe (LLVM 15)" in software.warning()
-    assert str(device) in software.warning()
-    assert "NVIDIA_DRIVER_CAPABILITIES" in software.warning()
+    said = software.warning()
+    assert "llvmpipe (LLVM 15)" in said
+    assert str(device) in said
     assert hardware.warning() == ""
 
 
@@ -203,20 +171,14 @@ print(json.dumps(dataclasses.asdict(probe(sys.argv[1]))))
 @pytest.fixture(scope="module")
 def namespaces():
     """`unshare`, where this user may have mount namespaces."""
-    unshare = shutil.which("unshare")
-    if unshare is None:
-        pytest.skip("hiding a library takes `unshare`, which is not installed")
     tried = subprocess.run(
-        [unshare, "-Urm", "mount", "--bind", "/usr", "/usr"],
-        capture_output=True,
-        check=False,
+        "unshare -Urm mount --bind /usr /usr", shell=True, capture_output=True
     )
     if tried.returncode != 0:
-        said = tried.stderr.decode().strip()
-        pytest.skip(f"hiding a library takes a mount namespace: {said}")
+        pytest.skip(f"hiding a library takes a mount namespace: {tried.stderr}")
     if not (_LIBRARIES / "libEGL.so.1").exists():
         pytest.skip(f"libEGL.so.1 is not in {_LIBRARIES}, where it could be hidden")
-    return unshare
+    return "unshare"
 
 
 @pytest.mark.parametrize(
@@ -231,26 +193,15 @@ def namespaces():
             ["Mesa's driver swrast is not installed", "libEGL_mesa.so.0, named in"],
         ),
         ("osmesa", "libOSMesa.so*", "", "", ["OSMesa's library, libOSMesa.so.8, is"]),
-        (
-            *("osmesa", "libOSMesa.so*", "libgallium-25.1.3-1.so", ""),
-            ["Mesa 25.1.3 has no OSMesa"],
-        ),
+        # Mesa 25.1.3 has none any more.
+        ("osmesa", "libOSMesa.so*", "libgallium-25.1.3-1.so", "", ["has no OSMesa"]),
     ],
 )
 def test_missing_library(namespaces, backend, hidden, added, vendors, causes, tmp_path):
     """What is missing is named, and the packages that bring it."""
     hide = [str(_LIBRARIES), str(tmp_path), vendors, hidden, added]
-    done = subprocess.run(
-        [
-            *[namespaces, "-Urm", "bash", "-c", _HIDE, "hide", *hide],
-            *[sys.executable, "-P", "-c", _PROBE, backend],
-        ],
-        capture_output=True,
-        check=False,
-        text=True,
-    )
-    assert done.returncode == 0, done.stderr
-    answer = json.loads(done.stdout)
+    under = [namespaces, "-Urm", "bash", "-c", _HIDE, "hide", *hide]
+    answer = json.loads(run_python(_PROBE, backend, under=under).stdout)
     assert not answer["renders"]
     assert any(cause in answer["cause"] for cause in causes), answer
     assert ("libosmesa6" if not added and backend == "osmesa" else _EGL_PACKAGES) in (

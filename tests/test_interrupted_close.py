@@ -10,6 +10,7 @@ from pathlib import Path
 import gymnasium
 import pytest
 from parts import parametrize
+from recorded_states import trajectories
 from recordings import (
     frames_in,
     in_flight,
@@ -29,13 +30,8 @@ _ENTRANCE = ("close", "close_here", "call_all", "_leaving_if_interrupted")
 
 def record(directory, render):
     """Record two episodes, and the first steps of a third."""
-    env = gymnasium.make(
-        "InvertedPendulum-v5",
-        render_mode="rgb_array",
-        width=32,
-        height=32,
-        max_episode_steps=4,
-    )
+    size = {"width": 32, "height": 32, "max_episode_steps": 4}
+    env = gymnasium.make("InvertedPendulum-v5", render_mode="rgb_array", **size)
     monitor = mjrec.Monitor(env, directory, lambda _: True, render=render, workers=0)
     for steps in (4, 4, 2):
         monitor.reset(seed=0)
@@ -44,33 +40,32 @@ def record(directory, render):
     return monitor
 
 
-class Interrupting:
-    """Counts what functions of mjrec do, and presses Ctrl-C behind so many events."""
+def close(monitor, last=math.inf):
+    """Close it, press Ctrl-C behind so many calls and returns, and return their count.
 
-    def __init__(self, last=math.inf):
-        self.count = 0
-        self.last = last
+    They are those of mjrec's functions.
+    """
+    count = 0
 
-    def __call__(self, frame, event, _):
+    def interrupt(frame, event, _):
+        nonlocal count
         path = Path(frame.f_code.co_filename)
         # While HDF5 writes, signals wait.
         is_ours = "mjrec" in path.parts and path.stem != "trajectory_hdf5"
         if event in ("call", "return") and is_ours:
-            self.count += 1
+            count += 1
             # At its very entrance closing has not begun: the next call does all of it.
-            if self.count >= self.last and frame.f_code.co_name not in _ENTRANCE:
+            if count >= last and frame.f_code.co_name not in _ENTRANCE:
                 raise KeyboardInterrupt
 
-
-def close(monitor, interrupting):
-    """Close it, and be interrupted."""
-    sys.setprofile(interrupting)
+    sys.setprofile(interrupt)
     try:
         with contextlib.suppress(KeyboardInterrupt):
             monitor.close()
     finally:
         sys.setprofile(None)
         gc.collect()
+    return count
 
 
 # Takes more than five seconds: a run, its recovery and its videos for each moment. A
@@ -84,14 +79,12 @@ def close(monitor, interrupting):
 )
 def test_finish_completes_what_ctrl_c_has_cut_short(render, moment, tmp_path):
     """All episodes are there; the monitor is closed and lets go of its files."""
-    whole = Interrupting()
-    close(record(tmp_path / "whole", render), whole)
+    whole = close(record(tmp_path / "whole", render))
     directory = tmp_path / "cut"
     monitor = record(directory, render)
-    cut = Interrupting(whole.count * (moment + 0.5) // MOMENTS)
-    close(monitor, cut)
+    last = whole * (moment + 0.5) // MOMENTS
     # Python takes a profiler that has raised for a broken one.
-    assert cut.count >= cut.last
+    assert close(monitor, last) >= last
     # Closed: it does nothing more, and another process may put things in order.
     before = sorted(directory.iterdir())
     monitor.close()
@@ -102,13 +95,9 @@ def test_finish_completes_what_ctrl_c_has_cut_short(render, moment, tmp_path):
     assert stats_of(directory)["episode_lengths"] == [4, 4]
     assert videos_in(directory) == [0, 1, 2]
     assert [len(frames_in(directory, number)) for number in range(3)] == [5, 5, 3]
-    assert [metadata_of(directory, k)["complete"] for k in range(3)] == [
-        True,
-        True,
-        False,
-    ]
-    recorded = [mjrec.load_trajectory(path) for path in sorted(directory.glob("*.h5"))]
-    assert [len(each.rewards) for each in recorded] == [4, 4, 2]
+    complete = [metadata_of(directory, number)["complete"] for number in range(3)]
+    assert complete == [True, True, False]
+    assert [len(each.rewards) for each in trajectories(directory)] == [4, 4, 2]
     assert len(manifest_of(directory)["videos"]) == 3
     assert in_flight(directory) == []
     assert not list(directory.glob(".*"))

@@ -7,10 +7,6 @@ from engine_runs import run_python
 SIMULATORS = {"mujoco", "dm_control", "OpenGL"}
 CASES = [
     (
-        "import mjrec.environments.from_name, mjrec.environments.policies",
-        {*SIMULATORS, "gymnasium", "dm_env"},
-    ),
-    (
         "import mjrec.engines.jobs, mjrec.engines.child, mjrec.engines.choice",
         {*SIMULATORS, "numpy", "h5py", "ray", "submitit"},
     ),

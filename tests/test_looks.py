@@ -22,7 +22,7 @@ RICH = """
     <texture name="t" type="2d" builtin="checker" width="64" height="64"/>
     <material name="a" texture="t"/>
     <hfield name="h" nrow="40" ncol="40" size="1 1 1 1"/>
-    {mesh}
+    <mesh name="m" vertex="0 0 0 .2 0 0 0 .2 0 0 0 .2"/>
   </asset>
   <worldbody>
     <light/>
@@ -33,39 +33,17 @@ RICH = """
   </worldbody>
 </mujoco>
 """
-MESH = '<mesh name="m" builtin="sphere" params="5"/>'
 
 
 @pytest.fixture
 def model():
-    try:
-        return mujoco.MjModel.from_xml_string(RICH.format(mesh=MESH))
-    except ValueError:
-        # Built-in meshes came with mujoco 3.3.3.
-        return mujoco.MjModel.from_xml_string(RICH.format(mesh=""))
+    return mujoco.MjModel.from_xml_string(RICH)
 
 
 def view():
-    return SceneView(
-        camera=mujoco.MjvCamera(),
-        option=mujoco.MjvOption(),
-        max_geom=100,
-        fresh=False,
-        height=48,
-        width=64,
-        label=-1,
-    )
-
-
-@pytest.fixture
-def looks(model):
-    return following(model)
-
-
-def following(model):
-    looks = Looks(model)
-    looks.follow(view())
-    return looks
+    camera, option = mujoco.MjvCamera(), mujoco.MjvOption()
+    size = {"max_geom": 100, "height": 48, "width": 64}
+    return SceneView(camera=camera, option=option, fresh=False, label=-1, **size)
 
 
 def change(struct, name):
@@ -78,8 +56,10 @@ def change(struct, name):
         setattr(holder, last, value + 1)
 
 
-def test_a_change_of_any_field_is_noticed(model, looks):
+def test_a_change_of_any_field_is_noticed(model):
     """Every array with elements, every member of `opt`, `vis` and `stat`: by name."""
+    looks = Looks(model)
+    looks.follow(view())
     arrays = [name for name in array_names() if getattr(model, name).size]
     for name in (*arrays, *struct_names()):
         before = read_member(model, name)

@@ -40,15 +40,21 @@ BY_ROOT = pytest.mark.skipif(os.geteuid() != 0, reason="only root gives files aw
 
 
 @pytest.fixture(autouse=True)
-def state_home(tmp_path, monkeypatch):
-    """A user with a home, and a temporary directory that nobody else uses."""
+def listed(tmp_path, monkeypatch):
+    """A user with a home, and a temporary directory for this test; return the list."""
     temporary = tmp_path / "tmp"
     temporary.mkdir(mode=0o1777)
     monkeypatch.setenv("TMPDIR", str(temporary))
     monkeypatch.setattr(tempfile, "tempdir", None)
     monkeypatch.delenv(TRUST_VARIABLE, raising=False)
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "home/state"))
-    return tmp_path / "home/state"
+    return tmp_path / "home/state/mjrec/models"
+
+
+@pytest.fixture
+def fallback(tmp_path):
+    """Where the list is while the home cannot be written."""
+    return tmp_path / f"tmp/mjrec-{os.geteuid()}/models"
 
 
 @pytest.fixture
@@ -58,20 +64,15 @@ def directory(tmp_path):
     return path
 
 
-def become_another_user(patch, tmp_path):
-    patch.setenv("XDG_STATE_HOME", str(tmp_path / "elsewhere"))
+@pytest.fixture
+def become_another_user(tmp_path, monkeypatch):
+    elsewhere = str(tmp_path / "elsewhere")
+    return lambda: monkeypatch.setenv("XDG_STATE_HOME", elsewhere)
 
 
-def list_in(state_home):
-    return state_home / "mjrec/models"
-
-
-def fallback_in(tmp_path):
-    return tmp_path / f"tmp/mjrec-{os.geteuid()}/models"
-
-
-def mode_of(path):
-    return stat.S_IMODE(path.lstat().st_mode)
+def modes_of(path):
+    """Return the permissions of a file and of its directory."""
+    return [stat.S_IMODE(each.lstat().st_mode) for each in (path, path.parent)]
 
 
 def digest_of(content):
@@ -81,27 +82,26 @@ def digest_of(content):
 # --- the list ------------------------------------------------------------------------
 
 
-def test_the_list_is_the_users_alone(state_home, tmp_path, monkeypatch):
+def test_the_list_is_the_users_alone(listed, become_another_user):
     """Made with the first model, not by looking; each model is in it once, in order."""
     assert not is_stored(DIGEST)
     note_models([])
-    assert not state_home.exists()
+    assert not listed.parent.exists()
     note_models([DIGEST])
     note_models([OTHER, DIGEST])
-    path = list_in(state_home)
-    assert (mode_of(path), mode_of(path.parent)) == (0o600, 0o700)
-    assert path.read_text().split() == [DIGEST, OTHER]
+    assert modes_of(listed) == [0o600, 0o700]
+    assert listed.read_text().split() == [DIGEST, OTHER]
     assert is_stored(DIGEST)
     for said in (None, 7, "", DIGEST[:16], f"{DIGEST}\n", "\n", "\udc80"):
         assert not is_stored(said)
-    become_another_user(monkeypatch, tmp_path)
+    become_another_user()
     assert not is_stored(DIGEST)
 
 
-def test_many_processes_lose_nothing(state_home):
+def test_many_processes_lose_nothing(listed):
     """Of each other's lines, and none is torn, also after one that was cut off."""
     note_models([DIGEST])
-    with list_in(state_home).open("a") as file:
+    with listed.open("a") as file:
         file.write(OTHER[:30])
     program = (
         "import sys; from hashlib import sha256;"
@@ -114,37 +114,36 @@ def test_many_processes_lose_nothing(state_home):
     processes = [subprocess.Popen([*command, name]) for name in "abcd"]
     assert [process.wait() for process in processes] == [0] * 4
     expected = {digest_of(f"{name} {n}") for name in "abcd" for n in range(100)}
-    lines = list_in(state_home).read_text().split()
+    lines = listed.read_text().split()
     assert set(lines) == {DIGEST, OTHER[:30], *expected}
     assert len(lines) == 402
     assert not is_stored(OTHER)
 
 
-def test_the_list_does_not_grow_for_ever(state_home, monkeypatch):
+def test_the_list_does_not_grow_for_ever(listed, monkeypatch):
     """A task may compile a model for each episode; then the oldest are forgotten."""
     monkeypatch.setattr(model_trust, "_MOST_BYTES", 10 * 66)
     models = list(map(digest_of, range(35)))
     for model in models:
         note_models([model])
-    files = [path.stat().st_size for path in list_in(state_home).parent.iterdir()]
+    files = [path.stat().st_size for path in listed.parent.iterdir()]
     assert sum(files) < 20 * 67
     assert all(map(is_stored, models[-10:]))
     assert not is_stored(models[0])
 
 
 def test_where_the_home_cannot_be_written_the_other_place_has_a_list(
-    tmp_path, state_home, monkeypatch, caplog
+    tmp_path, fallback, monkeypatch, caplog
 ):
     """Nothing is said; and it is still good when there is room at home later."""
     note_models([DIGEST])
     with file_size_limit(70):
         note_models([OTHER])
-    path = fallback_in(tmp_path)
-    assert (mode_of(path), mode_of(path.parent)) == (0o600, 0o700)
-    assert path.read_text().split() == [OTHER]
-    monkeypatch.setenv("XDG_STATE_HOME", "/dev/null/state")
-    note_models([third := digest_of(3)])
-    monkeypatch.setenv("XDG_STATE_HOME", str(state_home))
+    assert modes_of(fallback) == [0o600, 0o700]
+    assert fallback.read_text().split() == [OTHER]
+    with monkeypatch.context() as patch:
+        patch.setenv("XDG_STATE_HOME", "/dev/null/state")
+        note_models([third := digest_of(3)])
     assert all(map(is_stored, [DIGEST, OTHER, third]))
     # Without variables, as in a cron job, the home is that of the password file.
     user = type("User", (), {"pw_dir": str(tmp_path / "home")})
@@ -152,43 +151,36 @@ def test_where_the_home_cannot_be_written_the_other_place_has_a_list(
     monkeypatch.setenv("XDG_STATE_HOME", "relative/is/ignored")
     monkeypatch.delenv("HOME")
     note_models([fourth := digest_of(4)])
-    assert fourth in list_in(tmp_path / "home/.local/state").read_text()
+    assert fourth in (tmp_path / "home/.local/state/mjrec/models").read_text()
     assert not caplog.records
-
-
-def a_pipe(path):
-    path.unlink()
-    os.mkfifo(path, 0o600)
-
-
-def a_link(path):
-    path.symlink_to(path.rename(path.parent.parent / "elsewhere"))
 
 
 @pytest.mark.parametrize(
     "spoil",
     [
-        *(a_pipe, a_link, lambda path: path.chmod(0o640)),
+        lambda path: path.unlink() or os.mkfifo(path, 0o600),
+        lambda path: path.symlink_to(path.rename(path.parent.parent / "elsewhere")),
+        lambda path: path.chmod(0o640),
         pytest.param(lambda path: os.chown(path, 65534, -1), marks=BY_ROOT),
     ],
+    ids=["pipe", "link", "mode", "owner"],
 )
 def test_a_list_that_others_may_have_written_is_not_used(
-    state_home, tmp_path, monkeypatch, caplog, spoil
+    listed, fallback, caplog, spoil
 ):
     """It stays for its owner to decide; a warning says what to do."""
     note_models([DIGEST])
-    path = list_in(state_home)
-    spoil(path)
-    left = path.lstat()
+    spoil(listed)
+    left = listed.lstat()
     assert not is_stored(DIGEST)
     note_models([OTHER])
     assert is_stored(OTHER)
-    assert path.lstat().st_ino == left.st_ino
+    assert listed.lstat().st_ino == left.st_ino
     [warned] = caplog.messages
-    assert str(path.parent) in warned or "symbolic links" in warned
+    assert str(listed.parent) in warned or "symbolic links" in warned
     assert "delete it" in warned
     # Nor the other place; then there is no list, and a model needs a word.
-    spoil(fallback_in(tmp_path))
+    spoil(fallback)
     note_models([digest_of(3)])
     assert not is_stored(digest_of(3))
     assert f"{TRUST_VARIABLE}=1" in caplog.messages[-1]
@@ -198,7 +190,7 @@ def test_a_list_that_others_may_have_written_is_not_used(
 
 
 def test_a_worker_elsewhere_loads_what_its_user_has_stored(
-    directory, tmp_path, monkeypatch
+    directory, tmp_path, become_another_user
 ):
     """Of the models in the directory, which its worker has reported."""
     with noting_models() as noted:
@@ -207,7 +199,7 @@ def test_a_worker_elsewhere_loads_what_its_user_has_stored(
     assert noted == [facts["sha256"], directory_digest(directory)]
     sent = stored_models([directory, tmp_path / "not there"])
     assert sent == [facts["sha256"]]
-    become_another_user(monkeypatch, tmp_path)
+    become_another_user()
     with pytest.raises(UntrustedModel):
         load_model(directory, facts)
     assert stored_models([directory]) == []
@@ -252,22 +244,13 @@ def test_mujoco_never_sees_what_nobody_vouches_for(directory, monkeypatch, said)
         load_model(directory, {**crafted, "sha256": facts["sha256"]})
 
 
-def test_where_a_strangers_sources_fail_the_ways_out_are_told(
-    directory, tmp_path, monkeypatch
+def test_trust_is_said_by_an_argument_or_a_variable(
+    directory, become_another_user, monkeypatch
 ):
-    """What they are compiled to is tried with recordings, below."""
-    facts = stored(directory)
-    become_another_user(monkeypatch, tmp_path)
-    (directory / facts["xml"]).write_bytes(b"no zip")
-    with pytest.raises(UntrustedModel, match=r"not a zip file.*--trust-models"):
-        load_model(directory, facts)
-
-
-def test_trust_is_said_by_an_argument_or_a_variable(directory, tmp_path, monkeypatch):
     """The hash is looked at all the same; one's own needs no word."""
     facts = {**stored(directory), "xml": None}
     assert load_model(directory, facts).ngeom == 1
-    become_another_user(monkeypatch, tmp_path)
+    become_another_user()
     for said in ("0", ""):
         monkeypatch.setenv(TRUST_VARIABLE, said)
         with pytest.raises(UntrustedModel, match="not written by this user"):
@@ -283,16 +266,12 @@ def test_trust_is_said_by_an_argument_or_a_variable(directory, tmp_path, monkeyp
 # --- recordings ----------------------------------------------------------------------
 
 
-@pytest.fixture
-def theirs(directory, tmp_path, monkeypatch):
-    """A stranger's recording, of which the compiled model is all there is."""
-    ride = record(directory)
-    become_another_user(monkeypatch, tmp_path)
-    return ride
-
-
-def test_frames_of_a_strangers_recording_need_a_word(theirs):
-    """Of the trajectory, which goes to the workers too."""
+def test_frames_of_a_strangers_recording_need_a_word(
+    directory, become_another_user, tmp_path, capsys
+):
+    """Of the trajectory, which goes to the workers too, or of the command."""
+    theirs = record(directory)
+    become_another_user()
     trajectory = load_trajectory(theirs.path)
     with pytest.raises(UntrustedModel, match="not written by this user"):
         trajectory.model()
@@ -301,58 +280,31 @@ def test_frames_of_a_strangers_recording_need_a_word(theirs):
     trusted = load_trajectory(theirs.path, trust_models=True)
     assert trusted.model().ngeom == 3
     np.testing.assert_array_equal(list(mjrec.render(trusted)), theirs.frames)
-
-
-@pytest.mark.thorough
-def test_the_command_takes_the_word(theirs, tmp_path, capsys):
-    """Without it, the reason says which; afterwards all is as before."""
     again = ["render", str(theirs.path), "--out", str(tmp_path / "again.mp4")]
     assert main(again) == 1
     assert "mjrec render --trust-models" in capsys.readouterr().out
     assert main([*again, "--trust-models"]) == 0
-    assert (tmp_path / "again.mp4").exists()
     assert TRUST_VARIABLE not in os.environ
 
 
-def cheetah():
-    env = gymnasium.make("HalfCheetah-v5", render_mode="rgb_array", width=64, height=48)
+def test_sources_show_what_the_environment_showed(
+    directory, become_another_user, monkeypatch
+):
+    """With what was set by hand in the model."""
+    size = {"width": 64, "height": 48}
+    env = gymnasium.make("HalfCheetah-v5", render_mode="rgb_array", **size)
     model = env.unwrapped.model
-    # Set by hand before the recording.
     model.vis.quality.shadowsize = 256
     model.geom_rgba[2] = (0, 1, 0, 1)
     model.geom_size[3, 0] *= 2
-    return env, env.render, {}
-
-
-def reach():
-    manipulation = pytest.importorskip("dm_control.manipulation")
-    env = manipulation.load("reach_site_features", seed=2)
-    size = {"height": 48, "width": 64}
-    options = {**size, "env_id": "dm_control/reach"}
-    return env, lambda: env.physics.render(**size), options
-
-
-@pytest.mark.parametrize(
-    "make",
-    [
-        cheetah,
-        pytest.param(reach, marks=[pytest.mark.thorough, pytest.mark.dm_control]),
-    ],
-)
-def test_sources_show_what_the_environment_showed(
-    directory, tmp_path, monkeypatch, make
-):
-    """With what was set by hand, and what composer has put together."""
-    env, frame, options = make()
-    with mjrec.Monitor(env, directory, lambda _: True, workers=0, **options) as monitor:
+    with mjrec.Monitor(env, directory, lambda _: True, workers=0) as monitor:
         monitor.reset()
-        shown = [frame()]
+        shown = [env.render()]
         for _ in range(2):
-            space = getattr(env, "action_space", None) or env.action_spec()
-            monitor.step(np.full(space.shape, 0.1))
-            shown.append(frame())
+            monitor.step(np.full(6, 0.1))
+            shown.append(env.render())
         monitor.close(wait=False)
-    become_another_user(monkeypatch, tmp_path)
+    become_another_user()
     forbid_compiled_models(monkeypatch, directory)
     [path] = (recording.path for recording in recordings_in_flight(directory))
     np.testing.assert_array_equal(list(mjrec.render(path)), shown)

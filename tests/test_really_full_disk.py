@@ -72,8 +72,8 @@ def test_episodes_of_a_full_disk_are_complete(room, ending, disk):
     assert len(paths) == (3 if room else 2)
     for trajectory in map(mjrec.load_trajectory, paths):
         facts = trajectory.facts
-        assert (len(trajectory.rewards), facts["complete"]) == (STEPS, True)
-        assert (facts["length"], facts["truncated"]) == (STEPS, True)
+        assert len(trajectory.rewards) == facts["length"] == STEPS
+        assert (facts["complete"], facts["truncated"]) == (True, True)
         assert "reason" not in facts
     assert len(manifest_of(run)["mjrec"]["pending"]) == len(paths)
     assert not list(run.glob(".*"))

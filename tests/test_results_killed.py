@@ -10,19 +10,17 @@ from result_files import ENV_INFO, entry, write_journal, write_saved
 import mjrec
 from mjrec.errors import UnreadableFile
 
+VIDEO = "openaigym.video.0.7.video{:06d}.mp4"
 FILMED = {"chosen": True, "recording": "live"}
 ENTRIES = [entry(number, **(FILMED if number in (0, 4) else {})) for number in range(5)]
+READERS = (mjrec.load_results, lambda path: list(mjrec.iter_episodes(path)))
 
 
 @pytest.fixture
 def late(tmp_path):
     """A monitor died after its fifth episode; its manifest has four, and one video."""
-    videos = [
-        tuple(
-            f"openaigym.video.0.7.video00000{n}.{end}" for end in ("mp4", "meta.json")
-        )
-        for n in (0, 4)
-    ]
+    names = map(VIDEO.format, (0, 4))
+    videos = [(name, name.replace("mp4", "meta.json")) for name in names]
     for mp4, metadata in videos:
         (tmp_path / mp4).touch()
         (tmp_path / metadata).write_text("{}")
@@ -33,19 +31,15 @@ def late(tmp_path):
 
 
 def load(directory):
+    """Return its results, which tell of as many episodes as there are."""
     results = mjrec.load_results(directory)
-    assert results is not None
+    episodes = list(mjrec.iter_episodes(directory))
+    assert [each.length for each in episodes] == results["episode_lengths"]
     return results
 
 
 def only(directory, pattern):
     (path,) = directory.glob(pattern)
-    return path
-
-
-def video(directory, number):
-    path = directory / f"openaigym.video.0.7.video{number:06d}.mp4"
-    path.touch()
     return path
 
 
@@ -60,14 +54,17 @@ def test_a_journal_is_enough(tmp_path, caplog):
     results = load(tmp_path)
     assert results["manifests"] == [str(journal)]
     assert results["env_info"] == ENV_INFO
-    assert results["data_sources"] == [0, 0, 0]
-    assert results["episode_lengths"] == [10, 11, 12]
-    assert results["episode_rewards"] == [0, 1, 2]
-    assert results["episode_types"] == ["t", "t", "e"]
-    assert results["timestamps"] == [100, 101, 102]
-    assert results["initial_reset_timestamps"] == [99.5]
-    assert results["initial_reset_timestamp"] == 99.5
-    assert results["videos"] == []
+    expected = {
+        "data_sources": [0, 0, 0],
+        "episode_lengths": [10, 11, 12],
+        "episode_rewards": [0, 1, 2],
+        "episode_types": ["t", "t", "e"],
+        "timestamps": [100, 101, 102],
+        "initial_reset_timestamps": [99.5],
+        "initial_reset_timestamp": 99.5,
+        "videos": [],
+    }
+    assert {key: results[key] for key in expected} == expected
     assert [e.seed for e in mjrec.iter_episodes(tmp_path)] == [0, 1, None]
     assert {record.levelname for record in caplog.records} == {"WARNING"}
 
@@ -112,8 +109,9 @@ def test_the_source_with_more_episodes_wins(tmp_path, journal, count):
     """Never both; the statistics file where they are equal. Lines do not count."""
     write_saved(tmp_path, "0.7", 1, 2, 3)
     write_journal(tmp_path, "0.7", *journal, *journal[-1:] * 4)
-    assert load(tmp_path)["episode_lengths"] == [11, 12, 13, 14][:count]
-    assert load(tmp_path)["initial_reset_timestamps"] == [98.0]
+    results = mjrec.load_results(tmp_path)
+    assert results["episode_lengths"] == [11, 12, 13, 14][:count]
+    assert results["initial_reset_timestamps"] == [98.0]
 
 
 @pytest.mark.parametrize("lock", ["dead", "link", "", "[1]"])
@@ -147,12 +145,11 @@ def test_a_journal_stands_in_for_damaged_files(tmp_path, pattern, content, caplo
     else:
         damaged.write_bytes(content)
     assert load(tmp_path)["episode_lengths"] == [11, 12]
-    assert len(list(mjrec.iter_episodes(tmp_path))) == 2
     # A manifest that is not there is what a killed monitor leaves.
     if content is not None or "stats" in pattern:
         assert [damaged.name in r.getMessage() for r in caplog.records] == [True] * 2
         journal.unlink()
-        for read in (mjrec.load_results, lambda path: list(mjrec.iter_episodes(path))):
+        for read in READERS:
             with pytest.raises(UnreadableFile, match=damaged.name):
                 read(tmp_path)
 
@@ -164,17 +161,15 @@ def test_statistics_stand_in_for_a_damaged_journal(tmp_path, caplog):
     journal = write_journal(tmp_path, "0.7")
     journal.write_bytes(b"\xff\n" * 5000)
     assert load(tmp_path)["episode_lengths"] == [11, 12]
-    assert [e.length for e in mjrec.iter_episodes(tmp_path)] == [11, 12]
     caplog.clear()
     journal.unlink()
     journal.symlink_to("/proc/self/status")
     assert load(tmp_path)["episode_lengths"] == [11, 12]
-    assert [e.length for e in mjrec.iter_episodes(tmp_path)] == [11, 12]
     said = [f"{journal}: it is a link" in each.getMessage() for each in caplog.records]
     assert said == [True, True]
     manifest.unlink()
     only(tmp_path, "*.stats.json").unlink()
-    for read in (mjrec.load_results, lambda path: list(mjrec.iter_episodes(path))):
+    for read in READERS:
         with pytest.raises(UnreadableFile, match="out of its directory"):
             read(tmp_path)
 
@@ -188,7 +183,7 @@ def test_a_lost_line_of_a_journal_costs_its_details_only(tmp_path, lost):
     lines = journal.read_bytes().splitlines(keepends=True)
     lines[lost] = b"\0" * 100 + b"\n"
     journal.write_bytes(b"".join(lines))
-    video(tmp_path, 5 + lost)
+    (tmp_path / VIDEO.format(5 + lost)).touch()
     expected = [(n, n) for n in (5, 6, 7, 8)]
     expected[lost] = (5 + lost, None)
     episodes = list(mjrec.iter_episodes(tmp_path))
@@ -215,7 +210,7 @@ def test_an_episode_in_doubt_shows_no_video(
     if journal:
         write_journal(tmp_path, "0.7", *journal)
     for number in range(5, 9):
-        video(tmp_path, number)
+        (tmp_path / VIDEO.format(number)).touch()
     episodes = list(mjrec.iter_episodes(tmp_path))
     assert [each.episode_id for each in episodes] == numbers
     assert [each.video is not None for each in episodes] == shown

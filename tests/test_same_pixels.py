@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """What is drawn from recorded states is what `render()` shows, byte for byte."""
 
+import contextlib
+import copy
 import gc
 import importlib.util
 import json
@@ -78,33 +80,31 @@ def record(env, directory, frame=None, *, each_step=lambda _: None, **options):
     # MuJoCo frees what an environment has drawn with in whatever OpenGL context is
     # current: one that an earlier test has left is not to go between two frames.
     gc.collect()
-    random = np.random.RandomState(1)
-    live = []
     with monitored(env, directory, **options) as monitor:
         frame = frame or monitor.render
-        for seed in SEEDS:
-            monitor.reset(**({"seed": seed} if hasattr(env, "unwrapped") else {}))
-            frames = [frame()]
-            for step in range(STEPS):
-                each_step(step)
-                outcome = monitor.step(_action(env, random))
-                frames.append(frame())
-                # A dm_env's discount is 1 while the episode goes on.
-                if hasattr(env, "action_space") and any(outcome[2:4]):
-                    break
-            live.append(frames)
+        live = list(episodes(env, monitor, lambda *_: frame(), each_step))
         monitor.close(wait=False)
     return live
 
 
-def _action(env, random):
-    if hasattr(env, "action_space"):
-        space = env.action_space
-        low, high, shape = space.low, space.high, space.shape
-    else:
-        spec = env.action_spec()
-        low, high, shape = spec.minimum, spec.maximum, spec.shape
-    return random.uniform(np.clip(low, -1, 1), np.clip(high, -1, 1), shape)
+def episodes(env, wrapped, look, each_step=lambda _: None):
+    """Play two episodes, and yield what is seen at the moments of each."""
+    random = np.random.RandomState(1)
+    is_gymnasium = hasattr(env, "unwrapped")
+    space = env.action_space if is_gymnasium else env.action_spec()
+    ends = ("low", "high") if is_gymnasium else ("minimum", "maximum")
+    low, high = (np.clip(getattr(space, end), -1, 1) for end in ends)
+    for seed in SEEDS:
+        outcome = wrapped.reset(**({"seed": seed} if is_gymnasium else {}))
+        seen = [look(outcome)]
+        for step in range(STEPS):
+            each_step(step)
+            outcome = wrapped.step(random.uniform(low, high, space.shape))
+            seen.append(look(outcome))
+            # A dm_env's discount is 1 while the episode goes on.
+            if is_gymnasium and any(outcome[2:4]):
+                break
+        yield seen
 
 
 def draw_quickly(model):
@@ -150,10 +150,13 @@ def test_gymnasium_cameras_of_the_model(env_id, workers, tmp_path):
         check_frames(tmp_path / f"{number} asked", live, workers[:1])
 
 
-def test_camera_and_options_that_the_user_gave(workers, tmp_path):
+def test_camera_and_options_that_the_user_gave(workers, tmp_path, monkeypatch):
     """Those of the environment's arguments, and of its viewer in mid-episode."""
+    # MuJoCo writes a log file when the scene is full.
+    monkeypatch.chdir(tmp_path)
     env = make(
         "Ant-v5",
+        max_geom=12,
         default_camera_config={"distance": 7.0, "lookat": np.array([0.5, 0, 0.2])},
         visual_options={int(mujoco.mjtVisFlag.mjVIS_COM): True},
     )
@@ -182,8 +185,8 @@ def record_dm(env, directory, camera):
     def frame():
         return env.physics.render(**SIZE, camera_id=-1 if camera is None else camera)
 
-    view = {"camera": camera, **SIZE}
-    return record(env, directory, frame, env_id="dm_control/any", **view)
+    view = {"env_id": "dm_control/any", "camera": camera, **SIZE}
+    return record(env, directory, frame, **view)
 
 
 @pytest.mark.dm_control
@@ -321,16 +324,59 @@ def test_deferred_where_it_would_lie_is_an_error_and_never_chosen(
     assert np.abs(frame.astype(int) - shown).mean() < 12
 
 
-def test_frames_end_where_markers_come(tmp_path, caplog):
+POINTS = {int(mujoco.mjtVisFlag.mjVIS_CONTACTPOINT): True}
+
+
+@pytest.mark.parametrize(
+    ("options", "arrays", "said"),
+    [
+        ({"visual_options": POINTS}, None, "mjVIS_CONTACTPOINT of the visual options"),
+        # The first frame is compared, whatever the reason for a difference is.
+        ({}, ("geom_xmat",), "drawn from its snapshot differs"),
+    ],
+)
+def test_what_states_do_not_tell_is_drawn_live(
+    options, arrays, said, tmp_path, monkeypatch, caplog
+):
+    """Why is in the log; it is an error where another way was asked for."""
+    if arrays:
+        monkeypatch.setattr("mjrec.simulation.captured_arrays.ALWAYS", arrays)
+    env = make("InvertedPendulum-v5", **options)
+    with pytest.raises(mjrec.PicturesDiffer, match=said):
+        monitored(env, tmp_path / "deferred").reset(seed=0)
+    with mjrec.Monitor(env, tmp_path / "live", allow_early_reset=True) as monitor:
+        monitor.reset(seed=0)
+    assert said in caplog.text
+    assert len(frames_in(tmp_path / "live", 0)) == 1
+
+
+def show(viewer, what):
+    viewer.vopt.flags[int(mujoco.mjtVisFlag.__members__[f"mjVIS_{what}"])] = True
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda env, viewer: viewer.add_marker(pos=np.zeros(3)), "markers were added"),
+        (
+            lambda env, viewer: setattr(env, "model", copy.copy(env.model)),
+            "switched to another model",
+        ),
+        (lambda env, viewer: env.model.geom_type.fill(6), "geom_type of the model"),
+        (lambda env, viewer: show(viewer, "CONTACTPOINT"), "mjVIS_CONTACTPOINT"),
+        (lambda env, viewer: show(viewer, "INERTIA"), "xipos"),
+    ],
+)
+def test_frames_end_where_they_would_lie(change, said, tmp_path, caplog):
     """In the middle of an episode; nothing is shown that `render()` does not."""
     env = make("InvertedPendulum-v5")
     monitor = monitored(env, tmp_path)
     monitor.reset(seed=0)
     monitor.render()
-    env.unwrapped.mujoco_renderer.viewer.add_marker(pos=np.zeros(3))
+    change(env.unwrapped, env.unwrapped.mujoco_renderer.viewer)
     monitor.step(np.zeros(1))
     monitor.close()
-    assert "markers were added to the viewer" in caplog.text
+    assert said in caplog.text
     [path] = tmp_path.glob("*.trajectory.*")
     with open_trajectory(path) as trajectory:
         assert trajectory.frame_count == 1
@@ -339,58 +385,47 @@ def test_frames_end_where_markers_come(tmp_path, caplog):
 # --- recording disturbs nothing ------------------------------------------------------
 
 
-def whole_run(env, wrapped, random_numbers):
-    """Return all that two episodes give, states and random numbers among it."""
-    simulation = simulation_in(env)
-    spec = int(mujoco.mjtState.mjSTATE_INTEGRATION)
-    random, given = np.random.RandomState(1), []
-    for seed in SEEDS:
-        is_gymnasium = hasattr(env, "unwrapped")
-        given.append(wrapped.reset(**({"seed": seed} if is_gymnasium else {})))
-        for _ in range(STEPS):
-            model, data = raw_model(simulation.model), raw_data(simulation.data)
-            state = np.empty(mujoco.mj_stateSize(model, spec))
-            given += [*wrapped.step(_action(env, random))[:4], state]
-            mujoco.mj_getState(model, data, state, spec)
-            given.append(model.hfield_data.copy())
-        given.append(random_numbers())
-    wrapped.close()
-    return given
+# dm_control's, without which there is no such task.
+QUADRUPED = pytest.param("quadruped-escape", marks=pytest.mark.dm_control)
 
 
 @every(
-    "env_id",
-    ["HalfCheetah-v5", *robotics_ids()],
-    *("HalfCheetah-v5", "FetchPickAndPlace-v4", "HandManipulateBlock-v1"),
+    "name",
+    ["HalfCheetah-v5", *robotics_ids(), QUADRUPED],
+    *("HalfCheetah-v5", "FetchPickAndPlace-v4", "HandManipulateBlock-v1", QUADRUPED),
 )
-def test_recording_disturbs_nothing(env_id, tmp_path):
-    """Everything is bit for bit as without, also where render() would change it."""
+def test_recording_disturbs_nothing(name, tmp_path):
+    """Bit for bit all is as without, random numbers too, also where render() disturbs.
+
+    And no viewer or context is made.
+    """
+    spec = int(mujoco.mjtState.mjSTATE_INTEGRATION)
 
     def run(wrap):
-        env = gymnasium.make(env_id)
-        inner = env.unwrapped
-        return env, whole_run(env, wrap(env), lambda: inner.np_random.random())
+        if name == "quadruped-escape":
+            from dm_control import suite
+
+            env = suite.load("quadruped", "escape", task_kwargs={"random": 0})
+        else:
+            env = gymnasium.make(name)
+        simulation = simulation_in(env)
+
+        def look(outcome):
+            model, data = raw_model(simulation.model), raw_data(simulation.data)
+            state = np.empty(mujoco.mj_stateSize(model, spec))
+            mujoco.mj_getState(model, data, state, spec)
+            return [*outcome[:4], state, model.hfield_data.copy()]
+
+        with contextlib.closing(wrap(env)) as wrapped:
+            seen = list(episodes(env, wrapped, look))
+        is_suites = name == "quadruped-escape"
+        random = env.task.random if is_suites else env.unwrapped.np_random
+        return simulation, [*seen, random.random()]
 
     with robots_that_reset():
         _, bare = run(lambda env: env)
-        env, recorded = run(lambda env: monitored(env, tmp_path))
+        drawn, recorded = run(lambda env: monitored(env, tmp_path, env_id=name))
     np.testing.assert_equal(bare, recorded)
-    viewers = getattr(simulation_in(env), "mujoco_renderer", None)
+    viewers = getattr(drawn, "mujoco_renderer", None)
     assert getattr(viewers, "viewer", None) is None
-
-
-@pytest.mark.dm_control
-def test_recording_disturbs_nothing_of_dm_controls(tmp_path):
-    """Random numbers included; and no context is made."""
-    from dm_control import suite
-
-    def run(wrap):
-        env = suite.load("quadruped", "escape", task_kwargs={"random": 0})
-        physics = env.physics
-        return physics, whole_run(env, wrap(env), lambda: env.task.random.rand())
-
-    _, bare = run(lambda env: env)
-    name = "dm_control/quadruped-escape"
-    physics, recorded = run(lambda env: monitored(env, tmp_path, env_id=name))
-    np.testing.assert_equal(bare, recorded)
-    assert physics._contexts is None
+    assert getattr(drawn, "_contexts", None) is None

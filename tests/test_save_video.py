@@ -1,66 +1,46 @@
 # SPDX-License-Identifier: Apache-2.0
 """`save_video` against Gymnasium's contract."""
 
-import av
 import numpy as np
 import pytest
+from recordings import frames_of
 
 import mjrec
 from mjrec.errors import InvalidArgument, UnknownName
 
-LEVELS = 6
 
-
-def shade(number):
-    return np.full((16, 16, 3), 20 + LEVELS * number, np.uint8)
-
-
-def shades(count):
-    return [shade(number) for number in range(count)]
+def shades(count, made=None):
+    """Yield one buffer again and again, and note the frames that are made."""
+    buffer = np.empty((16, 16, 3), np.uint8)
+    for number in range(count):
+        if made is not None:
+            made.append(number)
+        buffer[:] = 20 + 6 * number
+        yield buffer
 
 
 def shown(path):
     """Return the numbers of the shades that a video shows."""
-    with av.open(str(path)) as container:
-        frames = [frame.to_ndarray(format="gray") for frame in container.decode()]
-    return [round((frame.mean() - 20) / LEVELS) for frame in frames]
+    return [round((frame.mean() - 20) / 6) for frame in frames_of(path)]
 
 
-def names(folder):
-    return sorted(path.name for path in folder.iterdir())
-
-
-def test_the_default_is_the_capped_cubic_schedule(tmp_path):
+def test_the_default_is_the_capped_cubic_schedule(tmp_path, names):
     """Without triggers: cubes and thousands, under Gymnasium's name, every frame."""
     for episode in (2, 8, 999, 1000):
         mjrec.save_video(shades(30), tmp_path, fps=30, episode_index=episode)
-    due = [f"rl-video-episode-{episode}.mp4" for episode in (1000, 8)]
-    assert names(tmp_path) == due
+    assert names(tmp_path) == ["rl-video-episode-1000.mp4", "rl-video-episode-8.mp4"]
     for path in tmp_path.iterdir():
         assert shown(path) == list(range(30))
-
-
-def reused(count, made):
-    """Yield one buffer again and again, and note the frames that are made."""
-    buffer = shade(0)
-    for number in range(count):
-        made.append(number)
-        buffer[:] = shade(number)
-        yield buffer
 
 
 @pytest.mark.parametrize("kind", ["array", "generator"])
 def test_both_triggers_may_be_used(tmp_path, kind):
     """Videos end after `video_length` frames, or with the last one."""
-    frames = np.array(shades(8)) if kind == "array" else reused(8, [])
-    mjrec.save_video(
-        frames,
-        tmp_path,
-        lambda _: True,
-        lambda step: step in (1, 5),
-        video_length=3,
-        fps=30,
-    )
+    frames = shades(8)
+    if kind == "array":
+        frames = np.array([frame.copy() for frame in frames])
+    triggers = (lambda _: True, lambda step: step in (1, 5))
+    mjrec.save_video(frames, tmp_path, *triggers, video_length=3, fps=30)
     assert shown(tmp_path / "rl-video-episode-0.mp4") == [0, 1, 2]
     assert shown(tmp_path / "rl-video-step-1.mp4") == [2, 3, 4]
     assert shown(tmp_path / "rl-video-step-5.mp4") == [6, 7]
@@ -72,9 +52,8 @@ def test_a_generator_is_streamed_and_read_no_further_than_needed(
 ):
     """Only the asked-for frames are made."""
     made = []
-    mjrec.save_video(
-        reused(9, made), tmp_path, lambda _: True, video_length=length, fps=30
-    )
+    options = {"video_length": length, "fps": 30}
+    mjrec.save_video(shades(9, made), tmp_path, lambda _: True, **options)
     assert made == shown(tmp_path / "rl-video-episode-0.mp4") == [*range(count)]
 
 
@@ -101,5 +80,5 @@ def test_the_frames_before_an_error_are_kept(tmp_path):
 def test_options_are_checked_first(tmp_path, options, error, message):
     """Before the folder is made."""
     with pytest.raises(error, match=message):
-        mjrec.save_video(shades(2), tmp_path / "videos", **options)
-    assert names(tmp_path) == []
+        mjrec.save_video([*shades(2)], tmp_path / "videos", **options)
+    assert not list(tmp_path.iterdir())

@@ -1,25 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The bounded worker thread; what else it promises is seen in `test_video_writer`."""
 
-import pytest
 from other_python import run_python
-
-from mjrec.worker_thread import WorkerThread
-
-
-@pytest.mark.parametrize("call", ["close", "abort"])
-def test_an_end_on_the_thread_itself_waits_for_nothing(call):
-    """As when the consumer's garbage collection ends the worker's owner."""
-    seen = []
-
-    def consume(item):
-        seen.append(item)
-        getattr(worker, call)()
-
-    worker = WorkerThread[int](consume, capacity=5, name="w")
-    worker.put(1)
-    worker.close()
-    assert seen == [1]
 
 
 def test_neither_forks_nor_the_interpreter_wait_for_the_thread():
