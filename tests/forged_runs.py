@@ -5,19 +5,14 @@ A liar has mjrec too. So statistics follow from the journal, hashes from the fil
 what one file says of another is true; `mjrec.pack` then computes the rest.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import subprocess
 import zipfile
-from collections.abc import Callable, Mapping, Sequence
 from fractions import Fraction
-from pathlib import Path
-from typing import Any
 
 import numpy as np
-from trajectory_contents import TrajectoryContent, content_of
+from trajectory_contents import content_of
 
 import mjrec
 from mjrec.formats.ffmpeg import ffmpeg_executable
@@ -38,43 +33,43 @@ class ForgedRun:
         directory: the copy that is edited.
     """
 
-    def __init__(self, directory: Path) -> None:
+    def __init__(self, directory):
         self.directory = directory
 
     # What files there are.
 
-    def the(self, pattern: str) -> Path:
+    def the(self, pattern):
         """Return the one file that a pattern stands for."""
         [path] = self.directory.glob(pattern)
         return path
 
-    def trajectory(self, episode: int) -> Path:
+    def trajectory(self, episode):
         """Return the trajectory of an episode."""
         return self.the(f"*.episode{episode:06d}.h5")
 
-    def video(self, episode: int) -> Path:
+    def video(self, episode):
         """Return the video of an episode."""
         return self.the(f"*.video{episode:06d}.mp4")
 
-    def content(self, episode: int) -> TrajectoryContent:
+    def content(self, episode):
         """Return what a trajectory holds."""
         with open_trajectory(self.trajectory(episode)) as reader:
             return content_of(reader)
 
-    def frames(self, episode: int) -> list[Any]:
+    def frames(self, episode):
         """Return the frames of an episode, drawn from its trajectory as it is."""
         return list(mjrec.render(self.trajectory(episode)))
 
     # Edits of one file.
 
-    def edit_json(self, pattern: str, edit: Callable[[Any], object]) -> None:
+    def edit_json(self, pattern, edit):
         """Change what files of JSON hold."""
         for path in self.directory.glob(pattern):
             content = json.loads(path.read_text())
             edit(content)
             path.write_text(json.dumps(content))
 
-    def edit_journal(self, edit: Callable[[list[Any]], object]) -> None:
+    def edit_journal(self, edit):
         """Change the lines of the journal; statistics and manifest follow."""
         path = self.the("*.jsonl")
         lines = [json.loads(line) for line in path.read_text().splitlines()]
@@ -92,7 +87,7 @@ class ForgedRun:
             ),
         )
 
-    def rewrite_zip(self, path: Path, change: Callable[[bytes], bytes]) -> None:
+    def rewrite_zip(self, path, change):
         """Change what the sources of a model hold."""
         with zipfile.ZipFile(path) as archive:
             members = {name: archive.read(name) for name in archive.namelist()}
@@ -100,7 +95,7 @@ class ForgedRun:
             for name, content in members.items():
                 archive.writestr(name, change(content))
 
-    def edit_rows(self, episode: int, **arrays: Any) -> None:
+    def edit_rows(self, episode, **arrays):
         """Write a trajectory anew, with other arrays and facts.
 
         Args:
@@ -128,10 +123,10 @@ class ForgedRun:
 
     # Edits of what several files say.
 
-    def say(self, episode: int, **facts: Any) -> None:
+    def say(self, episode, **facts):
         """Say something of an episode wherever such a thing is said."""
 
-        def edit(lines: list[Any]) -> None:
+        def edit(lines):
             [line] = [each for each in lines if each.get("episode_id") == episode]
             line.update(facts)
 
@@ -142,16 +137,16 @@ class ForgedRun:
             f"*.video{episode:06d}*.meta.json", lambda said: said.update(known)
         )
 
-    def say_rewards(self, episode: int, change: Callable[[Any], Any]) -> None:
+    def say_rewards(self, episode, change):
         """Say other rewards of an episode, and the return that follows."""
         rewards = np.asarray(change(self.content(episode).rewards.copy()))
         self.edit_rows(episode, rewards=rewards)
         self.say(episode, reward=added_up(rewards))
 
-    def say_everywhere(self, edit: Callable[[dict[str, Any]], object]) -> None:
+    def say_everywhere(self, edit):
         """Edit every object of JSON: in the journal, manifest, metadata and facts."""
 
-        def walk(value: Any) -> None:
+        def walk(value):
             if isinstance(value, dict):
                 edit(value)
             for item in value.values() if isinstance(value, dict) else ():
@@ -171,14 +166,7 @@ class ForgedRun:
 
     # Edits of a video.
 
-    def film(
-        self,
-        episode: int,
-        frames: list[Any] | None = None,
-        *,
-        encoder_arguments: Sequence[str] = (),
-        **metadata: Any,
-    ) -> None:
+    def film(self, episode, frames=None, *, encoder_arguments=(), **metadata):
         """Put frames into the video of an episode, with hashes and metadata.
 
         Args:
@@ -201,13 +189,7 @@ class ForgedRun:
         padded = {f"padded_{name}": side + side % 2 for name, side in size.items()}
         self._note(path, {**said, **size, **padded, **metadata})
 
-    def mux(
-        self,
-        episode: int,
-        *arguments: str,
-        inputs: tuple[Path, ...] = (),
-        metadata: str = "-1",
-    ) -> None:
+    def mux(self, episode, *arguments, inputs=(), metadata="-1"):
         """Pass a video through ffmpeg, whose frames stay what they are."""
         path = self.video(episode)
         changed = path.with_suffix(".changed.mp4")
@@ -219,12 +201,12 @@ class ForgedRun:
         changed.replace(path)
         self.rehash(episode)
 
-    def rehash(self, episode: int) -> None:
+    def rehash(self, episode):
         """Let the metadata of a video say the hashes of the file."""
         path = self.video(episode)
         self._note(path, json.loads(path.with_suffix(".meta.json").read_text()))
 
-    def _note(self, path: Path, said: Mapping[str, Any]) -> None:
+    def _note(self, path, said):
         """Write the metadata of a video with the hashes of the file."""
         size = {side: said[f"padded_{side}"] for side in ("height", "width")}
         facts = content_facts(path, **size, pixel_format="yuv420p")
@@ -234,13 +216,13 @@ class ForgedRun:
 
     # Edits of which episodes there are.
 
-    def remove_video(self, episode: int) -> None:
+    def remove_video(self, episode):
         """Remove a video, and what names it but the journal."""
         for path in self.directory.glob(f"*.video{episode:06d}.*"):
             path.unlink()
         self.edit_json("*.manifest.json", lambda said: _without(said, episode))
 
-    def remove_episode(self, episode: int) -> None:
+    def remove_episode(self, episode):
         """Remove an episode as if it had never been."""
         self.remove_video(episode)
         self.trajectory(episode).unlink(missing_ok=True)
@@ -259,17 +241,17 @@ class ForgedRun:
             ),
         )
 
-    def renumber(self, old: int, new: int) -> None:
+    def renumber(self, old, new):
         """Give an episode another number, in all names and texts."""
         texts = {f"video{old:06d}": f"video{new:06d}"}
         texts[f"episode{old:06d}"] = f"episode{new:06d}"
 
-        def renamed(text: str) -> str:
+        def renamed(text):
             for before, after in texts.items():
                 text = text.replace(before, after)
             return text
 
-        def walk(value: Any) -> Any:
+        def walk(value):
             if isinstance(value, dict):
                 number = {"episode_id": new} if value.get("episode_id") == old else {}
                 return {key: walk(item) for key, item in {**value, **number}.items()}
@@ -293,7 +275,7 @@ class ForgedRun:
             ),
         )
 
-    def say_numbers(self, following: int) -> None:
+    def say_numbers(self, following):
         """Say how many episodes there were."""
         self.edit_json(
             "*.manifest.json",
@@ -308,13 +290,13 @@ class ForgedRun:
         )
 
 
-def _without(manifest: dict[str, Any], episode: int) -> None:
+def _without(manifest, episode):
     stem = f".video{episode:06d}."
     manifest["videos"] = [v for v in manifest["videos"] if stem not in v[0]]
 
 
-def _in_memory(path: Path, content: TrajectoryContent) -> TrajectoryReader:
-    def read(part: str, start: int, stop: int) -> Any:
+def _in_memory(path, content):
+    def read(part, start, stop):
         rows = getattr(content, f"{part}s")[start:stop]
         if part == "state":
             return np.ascontiguousarray(rows).view(content.dtype[part])[:, 0]

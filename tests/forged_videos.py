@@ -1,11 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Finished videos, and what a forger makes of them: files that fit in themselves."""
 
-from __future__ import annotations
-
 import json
-from pathlib import Path
-from typing import Any
 
 import mjrec
 from mjrec.formats.video_writer import VideoWriter
@@ -13,31 +9,30 @@ from mjrec.formats.video_writer import VideoWriter
 _ENDINGS = (".mp4", ".framehash", ".meta.json")
 
 
-def video(directory: Path, episode: int = 0) -> Path:
+def video(directory, episode=0):
     """Return the video of an episode."""
     [path] = directory.glob(f"*.video{episode:06d}.mp4")
     return path
 
 
-def metadata(path: Path) -> dict[str, Any]:
+def metadata(path):
     """Return what the metadata of a video says."""
-    said: dict[str, Any] = json.loads(path.with_suffix(".meta.json").read_text())
-    return said
+    return json.loads(path.with_suffix(".meta.json").read_text())
 
 
-def say(path: Path, **changes: Any) -> None:
+def say(path, **changes):
     """Change what the metadata of a video says."""
     said = {**metadata(path), **changes}
     path.with_suffix(".meta.json").write_text(json.dumps(said))
 
 
-def drawn(directory: Path, episode: int = 0) -> list[Any]:
+def drawn(directory, episode=0):
     """Return the frames of an episode, drawn again."""
     [path] = directory.glob(f"*.episode{episode:06d}.h5")
     return list(mjrec.render(path))
 
 
-def forge(path: Path, frames: list[Any], *, hashes: bool = True, **kw: Any) -> None:
+def forge(path, frames, *, hashes=True, **kw):
     """Put other frames into a video, and make all fit that anybody can."""
     said, kept = metadata(path), path.with_suffix(".framehash").read_bytes()
     options = {"fps": int(said["fps"]), "frame_hashes": True, **kw}
@@ -58,7 +53,7 @@ def forge(path: Path, frames: list[Any], *, hashes: bool = True, **kw: Any) -> N
     )
 
 
-def swap(one: Path, other: Path) -> None:
+def swap(one, other):
     """Give each of two videos the other's name, with all that belongs to them."""
     for ending in _ENDINGS:
         first, second = (path.with_suffix(ending) for path in (one, other))

@@ -1,14 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Monitor directories of short honest runs, one function for each kind of run."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import signal
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
 
 import gymnasium
 import numpy as np
@@ -19,7 +14,7 @@ import mjrec
 from mjrec.environments.mjcf_environments import MjcfEnvironment
 from mjrec.trackers import Tracker
 
-_SMALL: dict[str, Any] = {"render_mode": "rgb_array", "width": 32, "height": 32}
+_SMALL = {"render_mode": "rgb_array", "width": 32, "height": 32}
 _POLE = "InvertedPendulum-v5"
 
 _ROBOT = """
@@ -39,14 +34,7 @@ _ROBOT = """
 """
 
 
-def play(
-    env: Any,
-    episodes: int,
-    *,
-    seed: Callable[[int], int | None] = lambda episode: episode,
-    most: int = 20,
-    kind: type = np.float32,
-) -> None:
+def play(env, episodes, *, seed=lambda episode: episode, most=20, kind=np.float32):
     """Play episodes with random actions, and close the environment."""
     generator, space = np.random.default_rng(5), env.action_space
     with contextlib.closing(env):
@@ -59,9 +47,7 @@ def play(
                     break
 
 
-def pendulum(
-    directory: Path, episodes: int = 4, *, longest: int = 5, **options: Any
-) -> None:
+def pendulum(directory, episodes=4, *, longest=5, **options):
     """Record evaluated episodes that end by a fall or after five steps."""
     make = {**_SMALL, **options.pop("make", {})}
     env = gymnasium.make(_POLE, max_episode_steps=longest, **make)
@@ -69,22 +55,20 @@ def pendulum(
     play(mjrec.Monitor(env, directory, **options), episodes)
 
 
-def cheetah(directory: Path, **options: Any) -> None:
+def cheetah(directory, **options):
     """Record an environment that never falls, with one seed at the first reset."""
     env = gymnasium.make("HalfCheetah-v5", max_episode_steps=4, **_SMALL)
     monitor = mjrec.Monitor(env, directory, workers=1, mode="evaluation", **options)
     play(monitor, 3, seed=lambda episode: None if episode else 7)
 
 
-def suite(directory: Path, **options: Any) -> None:
+def suite(directory, **options):
     """Record a task of dm_control's suite."""
     tasks = pytest.importorskip("dm_control.suite")
     given = {"random": 3, "time_limit": 0.04}
     env = tasks.load("cartpole", "balance", task_kwargs=given)
     options = {"mode": "evaluation", "env_id": "dm_control/cartpole-balance", **options}
-    monitor: Any = mjrec.Monitor(
-        env, directory, workers=1, width=32, height=32, **options
-    )
+    monitor = mjrec.Monitor(env, directory, workers=1, width=32, height=32, **options)
     generator = np.random.default_rng(3)
     with contextlib.closing(monitor):
         for _ in range(2):
@@ -93,21 +77,19 @@ def suite(directory: Path, **options: Any) -> None:
                 monitor.step(generator.uniform(-1, 1, monitor.action_spec().shape))
 
 
-def vector(directory: Path, **options: Any) -> None:
+def vector(directory, **options):
     """Record one of two environments that reset themselves."""
     env = gymnasium.make_vec(
         _POLE, 2, vectorization_mode="sync", max_episode_steps=4, **_SMALL
     )
-    monitor: Any = mjrec.Monitor(
-        env, directory, mode="evaluation", workers=1, **options
-    )
+    monitor = mjrec.Monitor(env, directory, mode="evaluation", workers=1, **options)
     monitor.reset(seed=3)
     for _ in range(12):
         monitor.step(np.zeros(monitor.action_space.shape, np.float32))
     monitor.close()
 
 
-def evaluated(directory: Path, **options: Any) -> None:
+def evaluated(directory, **options):
     """Evaluate episodes in several chunks, whose videos are chosen among all."""
     given = {"policy": "random", "num_seeds": 3, "keep": "best,failures"}
     given |= {"max_steps": 4, **options}
@@ -122,10 +104,10 @@ def evaluated(directory: Path, **options: Any) -> None:
     )
 
 
-def evaluated_in_part(directory: Path) -> None:
+def evaluated_in_part(directory):
     """Evaluate a policy that raises in some episodes."""
 
-    def policy(observation: Any) -> Any:
+    def policy(observation):
         if observation[0] > 0:
             raise ValueError("it is on the right")
         return np.zeros(1, np.float32)
@@ -133,10 +115,10 @@ def evaluated_in_part(directory: Path) -> None:
     evaluated(directory, policy=policy)
 
 
-def evaluated_to_death(directory: Path) -> None:
+def evaluated_to_death(directory):
     """Evaluate a policy that kills its process in some episodes."""
 
-    def policy(observation: Any) -> Any:
+    def policy(observation):
         if observation[0] > 0:
             os.kill(os.getpid(), signal.SIGKILL)
         return np.zeros(1, np.float32)
@@ -144,11 +126,11 @@ def evaluated_to_death(directory: Path) -> None:
     evaluated(directory, policy=policy)
 
 
-def evaluated_again(directory: Path) -> None:
+def evaluated_again(directory):
     """Evaluate a policy that kills its process at its seventh action."""
     calls = []
 
-    def policy(observation: Any) -> Any:
+    def policy(observation):
         calls.append(observation)
         if len(calls) == 7:
             os.kill(os.getpid(), signal.SIGKILL)
@@ -157,49 +139,49 @@ def evaluated_again(directory: Path) -> None:
     evaluated(directory, policy=policy)
 
 
-def extended(directory: Path) -> None:
+def extended(directory):
     """Evaluate one seed, and later one more."""
     evaluated(directory, num_seeds=1)
     evaluated(directory, num_seeds=2, resume=True)
 
 
-def clips(directory: Path) -> None:
+def clips(directory):
     """Record clips of four steps, which cross episodes."""
     pendulum(directory, step_trigger=_every_sixth, video_length=4)
 
 
-def _every_sixth(step: int) -> bool:
+def _every_sixth(step):
     return step % 6 == 0
 
 
-def kept(directory: Path, *, rule: str = "worst:1") -> None:
+def kept(directory, *, rule="worst:1"):
     """Record the video of one episode, chosen when all had ended."""
     pendulum(directory, episodes=5, longest=9, keep=rule)
 
 
-def kept_in_training(directory: Path) -> None:
+def kept_in_training(directory):
     """Record as `mjrec record --keep` does, which keeps no actions of other videos."""
     pendulum(directory, episodes=4, longest=9, keep="best:1", mode="training")
 
 
-def live(directory: Path) -> None:
+def live(directory):
     """Record frames of `env.render()` itself."""
     pendulum(directory, episodes=2, render="live")
 
 
-def several(directory: Path) -> None:
+def several(directory):
     """Record two monitors in one directory."""
     pendulum(directory, episodes=2)
     pendulum(directory, episodes=2, uid="v", resume="join")
 
 
-def resumed(directory: Path) -> None:
+def resumed(directory):
     """Record on in a second monitor, where the first one stopped."""
     pendulum(directory, episodes=2)
     pendulum(directory, episodes=2, resume=True)
 
 
-def killed(directory: Path) -> None:
+def killed(directory):
     """Record in a process that is killed in its third episode, and finish that."""
     child = os.fork()
     if child == 0:
@@ -219,14 +201,14 @@ def killed(directory: Path) -> None:
     mjrec.render_videos(directory)
 
 
-def unseeded(directory: Path) -> None:
+def unseeded(directory):
     """Record episodes whose beginning nothing leads to."""
     env = gymnasium.make(_POLE, max_episode_steps=5, **_SMALL)
     monitor = mjrec.Monitor(env, directory, mode="evaluation", workers=1)
     play(monitor, 2, seed=lambda _: None)
 
 
-def early(directory: Path) -> None:
+def early(directory):
     """Record an episode that a reset cut off."""
     env = gymnasium.make(_POLE, max_episode_steps=9, **_SMALL)
     monitor = mjrec.Monitor(
@@ -235,48 +217,48 @@ def early(directory: Path) -> None:
     play(monitor, 3, most=2)
 
 
-def wrapped(directory: Path) -> None:
+def wrapped(directory):
     """Record with wrappers of Gymnasium's own between monitor and environment."""
-    env: Any = gymnasium.make("HalfCheetah-v5", max_episode_steps=4, **_SMALL)
+    env = gymnasium.make("HalfCheetah-v5", max_episode_steps=4, **_SMALL)
     env = gymnasium.wrappers.RescaleAction(env, np.float32(-1), np.float32(1))
     play(mjrec.Monitor(env, directory, mode="evaluation", workers=1), 2)
 
 
-def wrapped_in_code(directory: Path) -> None:
+def wrapped_in_code(directory):
     """Record with a wrapper that only its author has."""
-    env: Any = gymnasium.make("HalfCheetah-v5", max_episode_steps=4, **_SMALL)
+    env = gymnasium.make("HalfCheetah-v5", max_episode_steps=4, **_SMALL)
     env = gymnasium.wrappers.TransformReward(env, lambda reward: 2 * reward)
     play(mjrec.Monitor(env, directory, mode="evaluation", workers=1), 2)
 
 
 class _Away(Tracker):
-    def episode(self, *_: Any) -> None:
+    def episode(self, *_):
         raise ConnectionError("the server is away")
 
 
-def tracker_away(directory: Path) -> None:
+def tracker_away(directory):
     """Record on when a tracker has raised."""
     pendulum(directory, episodes=3, trackers=_Away())
 
 
-def _undecided(episode: int) -> bool:
+def _undecided(episode):
     if episode == 1:
         raise ValueError("no idea")
     return True
 
 
-def schedule_raises(directory: Path) -> None:
+def schedule_raises(directory):
     """Record on when a schedule has raised for the second of three episodes."""
     pendulum(directory, episodes=3, video_callable=_undecided, on_error="warn")
 
 
-def trigger_raises(directory: Path) -> None:
+def trigger_raises(directory):
     """Record on when the trigger of clips has raised."""
     clips = {"step_trigger": _undecided, "video_length": 3}
     pendulum(directory, episodes=2, on_error="warn", **clips)
 
 
-def encoder_killed(directory: Path) -> None:
+def encoder_killed(directory):
     """Record on when the encoder of a live video was killed in the second episode."""
     env = gymnasium.make(_POLE, max_episode_steps=5, **_SMALL)
     monitor = mjrec.Monitor(
@@ -291,13 +273,13 @@ def encoder_killed(directory: Path) -> None:
                 monitor.step(np.full(1, 0.1, np.float32))
 
 
-def frame_missing(directory: Path) -> None:
+def frame_missing(directory):
     """Record on when `render` has raised in the second episode of a live recording."""
     env = gymnasium.make(_POLE, max_episode_steps=5, **_SMALL)
     draw = env.unwrapped.render
     drawn = iter([*range(5), None])
 
-    def render() -> Any:
+    def render():
         if next(drawn, 0) is None:
             raise RuntimeError("the window is gone")
         return draw()
@@ -309,7 +291,7 @@ def frame_missing(directory: Path) -> None:
     play(monitor, 2)
 
 
-def text(directory: Path) -> None:
+def text(directory):
     """Record an environment that draws with letters."""
     env = gymnasium.make("Taxi-v4", render_mode="ansi", max_episode_steps=3)
     with mjrec.Monitor(env, directory, mode="evaluation") as monitor:
@@ -319,7 +301,7 @@ def text(directory: Path) -> None:
                 monitor.step(action)
 
 
-def mjcf(directory: Path) -> None:
+def mjcf(directory):
     """Record the environment of an MJCF file."""
     path = directory.with_name("robot.xml")
     path.write_text(_ROBOT)
@@ -327,12 +309,12 @@ def mjcf(directory: Path) -> None:
     play(mjrec.Monitor(env, directory, mode="evaluation", workers=1), 2)
 
 
-def training(directory: Path) -> None:
+def training(directory):
     """Record a training run, which keeps the actions of scheduled episodes only."""
     pendulum(directory, episodes=4, mode="training")
 
 
-def doubles(directory: Path) -> None:
+def doubles(directory):
     """Record actions in float64."""
     env = gymnasium.make("HalfCheetah-v5", max_episode_steps=4, **_SMALL)
     play(
@@ -340,7 +322,7 @@ def doubles(directory: Path) -> None:
     )
 
 
-def views(directory: Path) -> None:
+def views(directory):
     """Record from another camera, at another size and rate, with the observations."""
     env = gymnasium.make("HalfCheetah-v5", max_episode_steps=6, **_SMALL)
     monitor = mjrec.Monitor(

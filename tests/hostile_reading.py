@@ -5,8 +5,6 @@
 process, whatever that is, is an outcome. The forks have a gigabyte of memory.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import io
 import json
@@ -17,10 +15,7 @@ import subprocess
 import sys
 import time
 import traceback
-from collections.abc import Callable
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Self
 
 MEMORY = 1 << 30
 # A machine may be busy with other things.
@@ -47,7 +42,7 @@ class Outcome:
 class Inspector:
     """A process that reads files when it is told to."""
 
-    def __enter__(self) -> Self:
+    def __enter__(self):
         self._process = subprocess.Popen(
             [sys.executable, __file__],
             stdin=subprocess.PIPE,
@@ -57,15 +52,10 @@ class Inspector:
         )
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, kind, error, traceback):
         self._process.communicate()
 
-    def read(self, reader: str, path: Path) -> Outcome:
+    def read(self, reader, path):
         """Return what comes of reading `path` with one of `READERS`."""
         assert self._process.stdin is not None
         assert self._process.stdout is not None
@@ -73,13 +63,13 @@ class Inspector:
         self._process.stdin.flush()
         return Outcome(**json.loads(self._process.stdout.readline()))
 
-    def reads(self, reader: str, path: Path) -> None:
+    def reads(self, reader, path):
         """Check that `path` is read, soon."""
         outcome = self.read(reader, path)
         assert outcome.kind == "value", outcome
         assert outcome.seconds < SECONDS / 2, outcome
 
-    def refuses(self, reader: str, path: Path) -> str:
+    def refuses(self, reader, path):
         """Check that reading `path` is one error of ours, soon; return its reason."""
         outcome = self.read(reader, path)
         assert outcome.kind == "refused", outcome
@@ -89,7 +79,7 @@ class Inspector:
         return outcome.said
 
 
-def _trajectory(path: Path) -> None:
+def _trajectory(path):
     from mjrec import load_trajectory
     from mjrec.rendering.recorded_facts import open_for_rendering
 
@@ -101,7 +91,7 @@ def _trajectory(path: Path) -> None:
             pass
 
 
-def _finish(path: Path) -> None:
+def _finish(path):
     """Finish the episode that this is a file of."""
     from mjrec import UnreadableFile
     from mjrec.formats.trajectory_file import finish_trajectory
@@ -112,26 +102,26 @@ def _finish(path: Path) -> None:
         raise UnreadableFile(path, error) from error
 
 
-def _manifest(path: Path) -> None:
+def _manifest(path):
     from mjrec.formats.manifest import read_manifest
 
     read_manifest(path)
 
 
-def _stats(path: Path) -> None:
+def _stats(path):
     from mjrec.formats.manifest import read_stats_file
 
     read_stats_file(path)
 
 
-def _journal(path: Path) -> None:
+def _journal(path):
     from mjrec.formats.journal import read_journal
 
     for _ in read_journal(path):
         pass
 
 
-def _metadata(path: Path) -> None:
+def _metadata(path):
     from mjrec.formats.json_fields import read_object, unreadable
     from mjrec.formats.video_metadata import is_broken
 
@@ -140,27 +130,27 @@ def _metadata(path: Path) -> None:
         read_object(path)
 
 
-def _model(path: Path) -> None:
+def _model(path):
     """Read the model of these files that `facts.json` beside them is about."""
     from mjrec.simulation.model_store import load_model
 
     load_model(path.parent, json.loads((path.parent / "facts.json").read_text()))
 
 
-def _source(path: Path) -> None:
+def _source(path):
     """Read what a model is made from as the process that compiles it does."""
     from mjrec.simulation.model_sources import read_authored
 
     read_authored(path)
 
 
-def _mjcf(path: Path) -> None:
+def _mjcf(path):
     from mjrec.simulation.mjcf import load_mjcf
 
     load_mjcf(path)
 
 
-def _archive(path: Path) -> None:
+def _archive(path):
     from mjrec import ArchiveError, UnreadableFile, write_archive
 
     try:
@@ -169,7 +159,7 @@ def _archive(path: Path) -> None:
         raise UnreadableFile(path, error) from error
 
 
-READERS: dict[str, Callable[[Path], None]] = {
+READERS = {
     "manifest": _manifest,
     "stats": _stats,
     "journal": _journal,
@@ -183,7 +173,7 @@ READERS: dict[str, Callable[[Path], None]] = {
 }
 
 
-def _outcome(reader: str, path: Path) -> dict[str, Any]:
+def _outcome(reader, path):
     from mjrec import Error
 
     try:
@@ -196,7 +186,7 @@ def _outcome(reader: str, path: Path) -> dict[str, Any]:
     return {"kind": "value", "said": "", "names": None}
 
 
-def _forked(reader: str, path: Path) -> dict[str, Any]:
+def _forked(reader, path):
     beginning = time.monotonic()
     incoming, outgoing = os.pipe()
     child = os.fork()
@@ -218,7 +208,7 @@ def _forked(reader: str, path: Path) -> dict[str, Any]:
     return {**outcome, "seconds": time.monotonic() - beginning}
 
 
-def main() -> None:
+def main():
     """Read what is asked for, until nothing more is."""
     import h5py  # noqa: F401  once, not in every fork
     import mujoco  # noqa: F401

@@ -1,10 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Environments that are not what their name says, recorded as they are."""
 
-from __future__ import annotations
-
 import contextlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 
 import pytest
@@ -15,7 +13,7 @@ Change = Callable[[Any, tuple[Any, ...]], tuple[Any, ...]]
 
 
 @contextlib.contextmanager
-def doctored(change: Change) -> Iterator[None]:
+def doctored(change):
     """Let each step of a pendulum or a cheetah give what `change` makes of it.
 
     Args:
@@ -27,51 +25,51 @@ def doctored(change: Change) -> Iterator[None]:
         yield
 
 
-def _changed(step: Any, change: Change) -> Any:
-    def changed(self: Any, action: Any) -> Any:
+def _changed(step, change):
+    def changed(self, action):
         return change(self, step(self, action))
 
     return changed
 
 
-def double_reward(_: Any, result: tuple[Any, ...]) -> tuple[Any, ...]:
+def double_reward(_, result):
     """Give each reward twice."""
     observation, reward, *rest = result
     return observation, 2 * reward, *rest
 
 
-def hide_the_pole(env: Any, result: tuple[Any, ...]) -> tuple[Any, ...]:
+def hide_the_pole(env, result):
     """Make the pole invisible from the third step on."""
     if env.data.time > 2.5 * env.dt:
         env.model.geom_rgba[-1, 3] = 0
     return result
 
 
-def never_fall(_: Any, result: tuple[Any, ...]) -> tuple[Any, ...]:
+def never_fall(_, result):
     """Go on where the environment ends an episode."""
     observation, reward, _, *rest = result
     return observation, reward, False, *rest
 
 
-def push(env: Any, result: tuple[Any, ...]) -> tuple[Any, ...]:
+def push(env, result):
     """Help the pole to stand."""
     env.data.qvel[-1] *= 0.5
     return result
 
 
-def make_heavy(env: Any, result: tuple[Any, ...]) -> tuple[Any, ...]:
+def make_heavy(env, result):
     """Make another robot of it."""
     env.model.body_mass[1:] *= 2
     return result
 
 
-def raise_gravity(env: Any, result: tuple[Any, ...]) -> tuple[Any, ...]:
+def raise_gravity(env, result):
     """Play it on the moon."""
     env.model.opt.gravity[2] = -1.62
     return result
 
 
-def always_succeed(_: Any, result: tuple[Any, ...]) -> tuple[Any, ...]:
+def always_succeed(_, result):
     """Call each episode a success."""
     *rest, info = result
     return *rest, {**info, "is_success": True}

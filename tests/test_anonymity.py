@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Recordings that name nobody, of somebody who is named in all of them."""
 
-from __future__ import annotations
-
 import functools
 import hashlib
 import json
@@ -13,9 +11,7 @@ import subprocess
 import sys
 import tempfile
 import zipfile
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import gymnasium
 import mujoco
@@ -68,7 +64,7 @@ mjrec.pack(source, target, authors=authors, anonymous=how == "anonymous")
 """
 
 
-def _models_have_paths() -> bool:
+def _models_have_paths():
     """Return whether compiled models have their files' directories; not in 3.3.0."""
     with tempfile.TemporaryDirectory() as folder:
         model = Path(folder, "model.xml")
@@ -92,7 +88,7 @@ class Somebody:
         place: where the home directories are.
     """
 
-    def __init__(self, place: Path) -> None:
+    def __init__(self, place):
         self.home = place / "home" / "mbrunelli"
         self.work = self.home / "secret-gait"
         (self.work / "models").mkdir(parents=True)
@@ -107,16 +103,16 @@ class Somebody:
         self._git("commit", "--quiet", "--message", "Walk")
         self.commit = self._git("rev-parse", "HEAD").strip()
 
-    def run(self, *arguments: str) -> str:
+    def run(self, *arguments):
         """Run Python with arguments, and return what it says."""
         return self._called([*_on_another_host(), sys.executable, *arguments])
 
-    def record(self) -> Path:
+    def record(self):
         """Return a directory with a directory of each kind of recordings."""
         self.run("identity_recording.py", "runs")
         return self.work / "runs"
 
-    def _write_model(self) -> None:
+    def _write_model(self):
         assets = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets"
         xml = (assets / "inverted_pendulum.xml").read_text()
         texture = '<texture name="t" type="2d" file="logo.png"/>'
@@ -133,10 +129,10 @@ class Somebody:
             path.with_name("logo.png"), pnginfo=texts
         )
 
-    def _git(self, *arguments: str) -> str:
+    def _git(self, *arguments):
         return self._called(["git", *arguments])
 
-    def _called(self, command: list[str]) -> str:
+    def _called(self, command):
         names = dict.fromkeys(("USER", "LOGNAME"), "mbrunelli")
         done = subprocess.run(
             command,
@@ -152,7 +148,7 @@ class Somebody:
 
 
 @functools.cache
-def _on_another_host() -> list[str]:
+def _on_another_host():
     """Return what makes a command run on a machine of another name, if it may be."""
     script = 'hostname brunelli-ws7 && exec "$@"'
     command = ["unshare", "--uts", "sh", "-c", script, "sh"]
@@ -164,19 +160,17 @@ def _on_another_host() -> list[str]:
 
 
 @pytest.fixture(scope="module")
-def somebody(tmp_path_factory: pytest.TempPathFactory) -> Somebody:
+def somebody(tmp_path_factory):
     return Somebody(tmp_path_factory.mktemp("disk"))
 
 
 @pytest.fixture(scope="module")
-def recorded(somebody: Somebody) -> Path:
+def recorded(somebody):
     return somebody.record()
 
 
 @pytest.fixture(scope="module")
-def anonymous(
-    somebody: Somebody, recorded: Path, tmp_path_factory: pytest.TempPathFactory
-) -> Path:
+def anonymous(somebody, recorded, tmp_path_factory):
     """Copies of the recordings, as hard links, of which nobody says who made them."""
     stage = tmp_path_factory.mktemp("stage")
     for directory in recorded.iterdir():
@@ -189,9 +183,7 @@ def anonymous(
 
 
 @pytest.fixture(scope="module")
-def packed(
-    somebody: Somebody, recorded: Path, tmp_path_factory: pytest.TempPathFactory
-) -> dict[str, Path]:
+def packed(somebody, recorded, tmp_path_factory):
     """A directory of archives that name nobody, and one of archives that do."""
     directories = {how: tmp_path_factory.mktemp(how) for how in ("anonymous", "named")}
     for how, directory in directories.items():
@@ -201,15 +193,13 @@ def packed(
     return directories
 
 
-def test_nothing_of_the_identity_is_left(somebody: Somebody, anonymous: Path) -> None:
+def test_nothing_of_the_identity_is_left(somebody, anonymous):
     """No login, host, home, repository, address or author, in no form in no file."""
     assert find(anonymous, [*WORDS, somebody.commit]) == []
 
 
 @pytest.mark.thorough
-def test_nothing_of_the_identity_is_packed(
-    somebody: Somebody, packed: dict[str, Path]
-) -> None:
+def test_nothing_of_the_identity_is_packed(somebody, packed):
     """Nor is it in what describes the recordings."""
     assert find(packed["anonymous"], [*WORDS, somebody.commit]) == []
 
@@ -235,15 +225,13 @@ def test_nothing_of_the_identity_is_packed(
         r"statistics\.csv$",
     ],
 )
-def test_the_search_finds_it_where_it_was(packed: dict[str, Path], where: str) -> None:
+def test_the_search_finds_it_where_it_was(packed, where):
     """In what was packed with names, the same search finds them in each place."""
     assert any(re.search(where, place) for place, _ in find(packed["named"], WORDS))
 
 
 @pytest.mark.parametrize("encoding", ["utf-8", "utf-16-le", "utf-16-be"])
-def test_the_search_and_the_gate_find_it_in_every_encoding(
-    tmp_path: Path, encoding: str
-) -> None:
+def test_the_search_and_the_gate_find_it_in_every_encoding(tmp_path, encoding):
     """Both find a name amid bytes that are no text."""
     content = bytes(range(256)) + "MBrunelli".encode(encoding) + b"\xff\xfe"
     (tmp_path / "file").write_bytes(content)
@@ -252,9 +240,7 @@ def test_the_search_and_the_gate_find_it_in_every_encoding(
     assert remaining_identity(tmp_path, identity) == [("file", "MBrunelli")]
 
 
-def test_the_gate_finds_it_in_each_kind_of_place(
-    somebody: Somebody, recorded: Path
-) -> None:
+def test_the_gate_finds_it_in_each_kind_of_place(somebody, recorded):
     """What looks last of all finds the identity wherever another search does."""
     identity = Identity(users={"mbrunelli"}, people={"Margherita Brunelli"})
     left = {where for where, _ in remaining_identity(recorded, identity)}
@@ -266,7 +252,7 @@ def test_the_gate_finds_it_in_each_kind_of_place(
     assert any("@facts" in where for where in left)
 
 
-def test_all_is_readable_and_says_the_same(recorded: Path, anonymous: Path) -> None:
+def test_all_is_readable_and_says_the_same(recorded, anonymous):
     """Statistics, episodes and trajectories are as before, arrays bit for bit."""
     old, new = (mjrec.load_results(d / "pendulum") for d in (recorded, anonymous))
     assert new["episode_rewards"] == old["episode_rewards"]
@@ -285,7 +271,7 @@ def test_all_is_readable_and_says_the_same(recorded: Path, anonymous: Path) -> N
             np.testing.assert_array_equal(rows, after.snapshots[name])
 
 
-def test_files_are_renamed_and_so_is_what_refers_to_them(anonymous: Path) -> None:
+def test_files_are_renamed_and_so_is_what_refers_to_them(anonymous):
     """The uid with the name in it is another one, in every file."""
     directory = anonymous / "pendulum"
     manifest = _read(directory / "openaigym.manifest.0.user-final.manifest.json")
@@ -299,7 +285,7 @@ def test_files_are_renamed_and_so_is_what_refers_to_them(anonymous: Path) -> Non
     assert metadata["encoder_version"]["cmdline"][-1] == manifest["videos"][0][0]
 
 
-def test_placeholders_stand_for_what_was_there(anonymous: Path) -> None:
+def test_placeholders_stand_for_what_was_there(anonymous):
     """Options, arguments and reasons keep what names nobody."""
     [trajectory, _] = _trajectories(anonymous)
     assert trajectory.facts["options"] == {"goal": "<path>/goal.npy"}
@@ -317,7 +303,7 @@ def test_placeholders_stand_for_what_was_there(anonymous: Path) -> None:
     assert provenance["policy"]["file"] == "policy.pt"
 
 
-def test_names_of_environments_stay_in_commands(tmp_path: Path) -> None:
+def test_names_of_environments_stay_in_commands(tmp_path):
     """Only paths lose their directories."""
     command = ["mjrec", "record", "dm_control/cartpole-balance", "/opt/lab/policy.pt"]
     manifest = tmp_path / "openaigym.manifest.0.1.manifest.json"
@@ -327,7 +313,7 @@ def test_names_of_environments_stay_in_commands(tmp_path: Path) -> None:
     assert kept == [*command[:3], "policy.pt"]
 
 
-def test_the_model_compiles_to_the_same(recorded: Path, anonymous: Path) -> None:
+def test_the_model_compiles_to_the_same(recorded, anonymous):
     """From sources without comments, and without the compiled one if it had a path."""
     assert any((anonymous / "pendulum").glob("*.mjb.gz")) != MODELS_HAVE_PATHS
     [old, new] = [_trajectories(d)[0].model() for d in (recorded, anonymous)]
@@ -335,7 +321,7 @@ def test_the_model_compiles_to_the_same(recorded: Path, anonymous: Path) -> None
         np.testing.assert_array_equal(getattr(old, name), getattr(new, name))
 
 
-def test_frames_are_the_same(anonymous: Path) -> None:
+def test_frames_are_the_same(anonymous):
     """What is rendered of the recording without its author has the recorded hashes."""
     [trajectory, _] = _trajectories(anonymous)
     [hashes] = (anonymous / "pendulum").glob("*.video000000.framehash")
@@ -345,15 +331,15 @@ def test_frames_are_the_same(anonymous: Path) -> None:
 
 
 @pytest.mark.thorough
-def test_what_was_packed_is_whole(packed: dict[str, Path]) -> None:
+def test_what_was_packed_is_whole(packed):
     """Its lists name the files as they are called now."""
     for archive in packed["anonymous"].iterdir():
         assert mjrec.verify(archive, level="files").failures == ()
 
 
 def test_the_same_recordings_become_the_same_files(
-    somebody: Somebody, recorded: Path, tmp_path: Path, packed: dict[str, Path]
-) -> None:
+    somebody, recorded, tmp_path, packed
+):
     """However often, and whatever else was in the files' directory."""
     again = tmp_path / "pendulum.zip"
     somebody.run("-c", _PACK, str(recorded / "pendulum"), str(again), "anonymous")
@@ -361,7 +347,7 @@ def test_the_same_recordings_become_the_same_files(
     assert again.read_bytes() == first.read_bytes()
 
 
-def test_two_uids_do_not_become_one(tmp_path: Path) -> None:
+def test_two_uids_do_not_become_one(tmp_path):
     """Of two that differ in what is taken out, one gets a number."""
     for uid in ("mbrunelli", "lovelace", "user"):
         (tmp_path / f"openaigym.episodes.0.{uid}.jsonl").write_text(
@@ -373,7 +359,7 @@ def test_two_uids_do_not_become_one(tmp_path: Path) -> None:
     assert names == sorted(f"openaigym.episodes.0.{uid}.jsonl" for uid in uids)
 
 
-def test_texts_in_csv_and_in_torn_journals_are_nobodys(tmp_path: Path) -> None:
+def test_texts_in_csv_and_in_torn_journals_are_nobodys(tmp_path):
     """The header of the one is JSON; of the other, what is no JSON is left out."""
     csv = tmp_path / "openaigym.results.0.7.monitor.csv"
     csv.write_text('#{"t_start": 1.5, "env_id": "/home/ada/a.xml"}\nr,l,t\n1.0,2,0.5\n')
@@ -386,7 +372,7 @@ def test_texts_in_csv_and_in_torn_journals_are_nobodys(tmp_path: Path) -> None:
     assert journal.read_text() == '{"reward": 1e999, "seed": null}\n'
 
 
-def test_single_cards_are_not_named(tmp_path: Path) -> None:
+def test_single_cards_are_not_named(tmp_path):
     """Which of EGL's devices drew is left, and how many GPUs were given."""
     card = "GPU-8f1c2b0e-5d6a-4e3b-9c7d-112233445566"
     metadata = {
@@ -402,7 +388,7 @@ def test_single_cards_are_not_named(tmp_path: Path) -> None:
     }
 
 
-def test_films_are_searched_across_the_pieces_that_are_read(tmp_path: Path) -> None:
+def test_films_are_searched_across_the_pieces_that_are_read(tmp_path):
     """They are too large to be read at once, and a name may lie where one ends."""
     begin = b"\0\0\0\x18ftyp"
     filling = b"\xff" * ((1 << 24) - len(begin) - 4)
@@ -411,14 +397,14 @@ def test_films_are_searched_across_the_pieces_that_are_read(tmp_path: Path) -> N
     assert remaining_identity(tmp_path, identity) == [("film", "mbrunelli")]
 
 
-def test_what_cannot_be_unpacked_is_an_error_of_the_gate(tmp_path: Path) -> None:
+def test_what_cannot_be_unpacked_is_an_error_of_the_gate(tmp_path):
     """Nobody knows what is in it."""
     (tmp_path / "file").write_bytes(b"\x1f\x8b torn")
     with pytest.raises(mjrec.UnreadableFile, match="cannot be unpacked"):
         remaining_identity(tmp_path, Identity())
 
 
-def test_bodies_that_name_somebody_are_found_by_the_gate(tmp_path: Path) -> None:
+def test_bodies_that_name_somebody_are_found_by_the_gate(tmp_path):
     """What cannot be taken out of a model is said, with the place."""
     model = tmp_path / "openaigym.model.0123456789abcdef.zip"
     with zipfile.ZipFile(model, "w", zipfile.ZIP_DEFLATED) as archive:
@@ -430,18 +416,18 @@ def test_bodies_that_name_somebody_are_found_by_the_gate(tmp_path: Path) -> None
     ]
 
 
-def _trajectories(directory: Path) -> list[mjrec.Trajectory]:
+def _trajectories(directory):
     paths = sorted((directory / "pendulum").glob("*.h5"))
     return [mjrec.load_trajectory(path) for path in paths]
 
 
-def _read(path: Path) -> Any:
+def _read(path):
     return loads(path.read_bytes())
 
 
-def _contents(directory: Path) -> dict[str, bytes]:
+def _contents(directory):
     return {p.name: p.read_bytes() for p in _files(directory)}
 
 
-def _files(directory: Path) -> Iterator[Path]:
+def _files(directory):
     return (path for path in sorted(directory.rglob("*")) if path.is_file())

@@ -1,14 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """An archive is reproducible, and is written whole or not at all."""
 
-from __future__ import annotations
-
 import gzip
 import io
 import json
 import os
 import tarfile
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -19,7 +16,7 @@ from mjrec.formats.archive import MAX_VIDEOS, write_archive
 Pair = tuple[Path, Path]
 
 
-def make(directory: Path, name: str, suffix: str = ".mp4") -> Pair:
+def make(directory, name, suffix=".mp4"):
     """Make a video and its metadata, with a content each."""
     video, metadata = directory / f"{name}{suffix}", directory / f"{name}.meta.json"
     video.write_bytes(b"video " + name.encode())
@@ -27,7 +24,7 @@ def make(directory: Path, name: str, suffix: str = ".mp4") -> Pair:
     return video, metadata
 
 
-def refusal(videos: list[Pair]) -> str:
+def refusal(videos):
     """Return the message with which `videos` are refused, with nothing written."""
     archive = io.BytesIO()
     with pytest.raises(ArchiveError) as caught:
@@ -38,7 +35,7 @@ def refusal(videos: list[Pair]) -> str:
     return message.removeprefix("[Hopper-v5] ")
 
 
-def test_it_holds_the_files_and_then_their_list(tmp_path: Path) -> None:
+def test_it_holds_the_files_and_then_their_list(tmp_path):
     """A tar.gz of the pairs as given; nothing says anything of the machine."""
     first, second = make(tmp_path, "b"), make(tmp_path, "a", ".json")
     archive = io.BytesIO()
@@ -64,7 +61,7 @@ def test_it_holds_the_files_and_then_their_list(tmp_path: Path) -> None:
     }
 
 
-def test_the_same_videos_give_the_same_bytes(tmp_path: Path) -> None:
+def test_the_same_videos_give_the_same_bytes(tmp_path):
     """Whatever their times, permissions, directory and the archive's own name."""
     archives = []
     for name, mode in (("first", 0o600), ("second", 0o755)):
@@ -80,7 +77,7 @@ def test_the_same_videos_give_the_same_bytes(tmp_path: Path) -> None:
     assert b"first" not in gzip.decompress(archives[0])
 
 
-def test_a_hundred_videos_fit_and_no_more(tmp_path: Path) -> None:
+def test_a_hundred_videos_fit_and_no_more(tmp_path):
     """The message has the numbers the right way round, and comes first of all."""
     pairs = [make(tmp_path, f"v{index}") for index in range(MAX_VIDEOS)]
     write_archive(pairs, io.BytesIO())
@@ -111,9 +108,7 @@ NAMES = [
 
 
 @pytest.mark.parametrize(("names", "reason"), NAMES)
-def test_names_differ_are_plain_and_say_what_they_are(
-    tmp_path: Path, names: list[str], reason: str
-) -> None:
+def test_names_differ_are_plain_and_say_what_they_are(tmp_path, names, reason):
     """ASCII letters, digits and three signs; nothing after the ending."""
     (tmp_path / "other").mkdir()
     pairs = []
@@ -137,9 +132,7 @@ def test_names_differ_are_plain_and_say_what_they_are(
     ],
 )
 @pytest.mark.parametrize("name", ["x.mp4", "x.meta.json"])
-def test_only_regular_files_go_in(
-    tmp_path: Path, put: Callable[[Path], None], name: str
-) -> None:
+def test_only_regular_files_go_in(tmp_path, put, name):
     """No directory, no link, whole or broken, and no pipe, on either place."""
     video, metadata = make(tmp_path, "a")
     put(tmp_path / name)

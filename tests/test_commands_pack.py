@@ -1,12 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """`mjrec pack`: it says what it made, and how that is verified."""
 
-from __future__ import annotations
-
 import hashlib
 import json
-from collections.abc import Callable
-from pathlib import Path
 
 import pytest
 from packed_runs import the, unpacked
@@ -16,14 +12,12 @@ from mjrec.commands import main
 
 
 @pytest.fixture(scope="module")
-def recorded(pendulums: Callable[..., Path]) -> Path:
+def recorded(pendulums):
     """Return a directory with two episodes, each with a video."""
     return pendulums(2, longest=3)
 
 
-def test_it_says_what_it_made(
-    recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_it_says_what_it_made(recorded, tmp_path, capsys):
     """Where, how much, its hash, and the command that verifies it."""
     path = tmp_path / "run.zip"
     assert main(["pack", str(recorded), "-o", str(path)]) == 0
@@ -36,7 +30,7 @@ def test_it_says_what_it_made(
     assert main(["verify", str(path), "--level", "files"]) == 3
 
 
-def test_everything_can_be_stated(recorded: Path, tmp_path: Path) -> None:
+def test_everything_can_be_stated(recorded, tmp_path):
     """Several authors, and a choice of episodes."""
     path = tmp_path / "run.zip"
     arguments = ["--title", "T", "--author", "A B", "--author", "C D"]
@@ -51,7 +45,7 @@ def test_everything_can_be_stated(recorded: Path, tmp_path: Path) -> None:
     assert videos_in(folder / "data/recordings") == [1]
 
 
-def test_anonymous_is_a_flag(recorded: Path, tmp_path: Path) -> None:
+def test_anonymous_is_a_flag(recorded, tmp_path):
     """Without authors."""
     path = tmp_path / "run.zip"
     assert main(["pack", str(recorded), "-o", str(path), "--anonymous"]) == 0
@@ -67,13 +61,7 @@ def test_anonymous_is_a_flag(recorded: Path, tmp_path: Path) -> None:
         (["--max-size", "1k"], "The largest files"),
     ],
 )
-def test_errors_are_one_message(
-    arguments: list[str],
-    part: str,
-    recorded: Path,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_errors_are_one_message(arguments, part, recorded, tmp_path, capsys):
     """And nothing is made."""
     path = tmp_path / "run.zip"
     assert main(["pack", str(recorded), "-o", str(path), *arguments]) == 1

@@ -1,18 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Two packed runs compared: equal, with one edit, and with a claim that allows it."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import struct
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import gymnasium
-import h5py
 import numpy as np
 import pytest
 from forged_videos import forge, say
@@ -43,7 +39,7 @@ Edit = Callable[[Path], object]
 
 
 @pytest.fixture(scope="module")
-def packed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def packed(tmp_path_factory):
     """A packed run of two episodes, one with a video, unpacked."""
     directory = tmp_path_factory.mktemp("packed")
     env = gymnasium.make("HalfCheetah-v5", max_episode_steps=6, width=48, height=48)
@@ -60,14 +56,12 @@ def packed(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def given(packed: Path, tmp_path: Path) -> Path:
+def given(packed, tmp_path):
     """A copy to edit."""
     return shutil.copytree(packed, tmp_path / "run")
 
 
-def compared(
-    given: Path, made: Path, *, is_described: bool = False, **options: Any
-) -> Verification:
+def compared(given, made, *, is_described=False, **options):
     """Compare; the descriptions of what was edited fit, unless they fit before."""
     if not is_described:
         describe_again(given)
@@ -81,20 +75,20 @@ def compared(
     )
 
 
-def recorded(pattern: str, edit: Callable[[Path], object]) -> Edit:
+def recorded(pattern, edit):
     return lambda bag: edit(the(bag, pattern))
 
 
-def in_json(pattern: str, edit: Callable[[Any], object]) -> Edit:
+def in_json(pattern, edit):
     return recorded(pattern, lambda path: edit_json(path, edit))
 
 
-def in_hdf5(edit: Callable[[h5py.File], object]) -> Edit:
+def in_hdf5(edit):
     return recorded("*episode000000.h5", lambda path: edit_trajectory(path, edit))
 
 
-def in_states(row: int, member: str, add: float) -> Edit:
-    def edit(file: h5py.File) -> None:
+def in_states(row, member, add):
+    def edit(file):
         rows = file["states"][:]
         rows[member][row] += add
         file["states"][...] = rows
@@ -102,8 +96,8 @@ def in_states(row: int, member: str, add: float) -> Edit:
     return in_hdf5(edit)
 
 
-def in_text(pattern: str, old: str, new: str) -> Edit:
-    def edit(path: Path) -> None:
+def in_text(pattern, old, new):
+    def edit(path):
         text = path.read_text()
         assert old in text
         path.write_text(text.replace(old, new, 1))
@@ -111,8 +105,8 @@ def in_text(pattern: str, old: str, new: str) -> Edit:
     return recorded(pattern, edit)
 
 
-def in_mp4(edit: Callable[[bytearray], object]) -> Edit:
-    def change(path: Path) -> None:
+def in_mp4(edit):
+    def change(path):
         content = bytearray(path.read_bytes())
         edit(content)
         path.write_bytes(content)
@@ -120,13 +114,13 @@ def in_mp4(edit: Callable[[bytearray], object]) -> Edit:
     return recorded("*video000000.mp4", change)
 
 
-def slower(content: bytearray) -> None:
+def slower(content):
     at = content.index(b"mdhd") + 16
     [scale] = struct.unpack_from(">I", content, at)
     struct.pack_into(">I", content, at, scale // 2)
 
 
-def brighter(path: Path) -> None:
+def brighter(path):
     drawn = list(mjrec.render(the(path.parent, "*episode000000.h5")))
     forge(
         path,
@@ -135,7 +129,7 @@ def brighter(path: Path) -> None:
     )
 
 
-def test_equal_runs_are_made_again(packed: Path) -> None:
+def test_equal_runs_are_made_again(packed):
     """Each topic has its count."""
     verification = compared(packed, packed)
     assert verification.verdict is Verdict.PASS
@@ -214,11 +208,7 @@ def test_equal_runs_are_made_again(packed: Path) -> None:
             Topic.FILES,
             "#x",
         ),
-        (
-            in_text("README.md", "| 18 |", "| 19 |"),
-            Topic.FILES,
-            "line",
-        ),
+        (in_text("README.md", "| 18 |", "| 19 |"), Topic.FILES, "line"),
         (in_text("statistics.csv", ",t,6,", ",t,7,"), Topic.FILES, "line"),
         (in_text("CITATION.cff", "dataset", "software"), Topic.FILES, "line"),
         (
@@ -295,9 +285,7 @@ def test_equal_runs_are_made_again(packed: Path) -> None:
         ),
     ],
 )
-def test_a_single_edit_is_found(
-    packed: Path, given: Path, edit: Edit, topic: Topic, words: str
-) -> None:
+def test_a_single_edit_is_found(packed, given, edit, topic, words):
     """It fails, on the line of its topic, and says where."""
     edit(given)
     verification = compared(given, packed, is_described=True)
@@ -306,7 +294,7 @@ def test_a_single_edit_is_found(
     assert topic in {f.topic for f in found}, verification.failures
 
 
-def test_less_deep_levels_compare_less(packed: Path, given: Path) -> None:
+def test_less_deep_levels_compare_less(packed, given):
     """What they leave out is believed, with counts."""
     in_states(3, "qpos", 1e-3)(given)
     shallow = compared(given, packed, level=Level.STATS)
@@ -324,7 +312,7 @@ def test_less_deep_levels_compare_less(packed: Path, given: Path) -> None:
     assert compared(given, packed, level=Level.PHYSICS).verdict is Verdict.FAIL
 
 
-def test_the_level_of_statistics_compares_rewards(packed: Path, given: Path) -> None:
+def test_the_level_of_statistics_compares_rewards(packed, given):
     """Step by step, though not the states."""
     set_reward(the(given, "*episode000000.h5"), 2, 9.0)
     found = compared(given, packed, level=Level.STATS).failures
@@ -332,7 +320,7 @@ def test_the_level_of_statistics_compares_rewards(packed: Path, given: Path) -> 
     assert any("rewards[2]" in f.reason for f in found)
 
 
-def test_some_frames_are_drawn_and_compared(packed: Path, given: Path) -> None:
+def test_some_frames_are_drawn_and_compared(packed, given):
     """Each with its hash and with what the file shows."""
     made = shutil.copytree(packed, given.with_name("made"))
     name = the(given, "*video000000.mp4").name
@@ -357,11 +345,11 @@ def test_some_frames_are_drawn_and_compared(packed: Path, given: Path) -> None:
     assert {f.topic for f in failed} == {Topic.VIDEOS}
 
 
-def test_an_undrawn_run_has_the_same_videos_to_draw(packed: Path, given: Path) -> None:
+def test_an_undrawn_run_has_the_same_videos_to_draw(packed, given):
     """Below the level of frames a pending video stands for one that is there."""
     made = given
 
-    def undraw(manifest: Any) -> None:
+    def undraw(manifest):
         manifest["videos"] = []
         manifest["mjrec"]["pending"] = [{"episode_id": number} for number in (0, 1)]
 
@@ -373,7 +361,7 @@ def test_an_undrawn_run_has_the_same_videos_to_draw(packed: Path, given: Path) -
     assert "only the archive has 1" in found[0].reason
 
 
-def test_what_was_fed_to_the_maker_is_believed(packed: Path, given: Path) -> None:
+def test_what_was_fed_to_the_maker_is_believed(packed, given):
     """Its episode is not counted as recreated, though it is equal."""
     fed = note("episode 2 of 0.u", "actions not kept", "its return is believed")
     write_notes(given, [fed])
@@ -388,10 +376,10 @@ def test_what_was_fed_to_the_maker_is_believed(packed: Path, given: Path) -> Non
     assert [excuse.name for excuse in verification.excuses] == ["actions not kept"]
 
 
-def test_an_excuse_reaches_its_own_item_only(packed: Path, given: Path) -> None:
+def test_an_excuse_reaches_its_own_item_only(packed, given):
     """A wrapper of one recording excuses successes there, and no files."""
 
-    def succeed(episode: int) -> None:
+    def succeed(episode):
         path = the(given, "*.jsonl")
         lines = path.read_text().splitlines(keepends=True)
         begin = f'{{"episode_id": {episode}, '
@@ -412,12 +400,12 @@ def test_an_excuse_reaches_its_own_item_only(packed: Path, given: Path) -> None:
     assert compared(given, made).verdict is Verdict.FAIL
 
 
-def claim(bag: Path, **facts: Any) -> None:
+def claim(bag, **facts):
     for path in bag.rglob("*.meta.json"):
         say(path.with_name(path.name.replace(".meta.json", ".mp4")), **facts)
 
 
-def redrawn(path: Path, change: Callable[[np.ndarray], np.ndarray]) -> None:
+def redrawn(path, change):
     """Draw a video's frames otherwise, and let it say so."""
     drawn = list(mjrec.render(the(path.parent, f"*{path.stem[-6:]}.h5")))
     known = json.loads(path.with_suffix(".meta.json").read_text())
@@ -428,12 +416,12 @@ def redrawn(path: Path, change: Callable[[np.ndarray], np.ndarray]) -> None:
     path.with_suffix(".meta.json").write_text(json.dumps(known))
 
 
-def noisy(frame: np.ndarray) -> np.ndarray:
+def noisy(frame):
     noise = np.random.default_rng(0).integers(-3, 4, frame.shape)
     return np.clip(frame.astype(int) + noise, 0, 255).astype(np.uint8)
 
 
-def test_another_renderer_is_tried(packed: Path, given: Path) -> None:
+def test_another_renderer_is_tried(packed, given):
     """Frames that are alike pass with it; the claim and its costs are named."""
     for number in (0, 1):
         redrawn(the(given, f"*video00000{number}.mp4"), noisy)
@@ -446,9 +434,7 @@ def test_another_renderer_is_tried(packed: Path, given: Path) -> None:
     assert compared(given, packed, allow=["gl=nvidia h100"]).verdict is Verdict.PASS
 
 
-def test_a_false_claim_of_another_renderer_is_refuted(
-    packed: Path, given: Path
-) -> None:
+def test_a_false_claim_of_another_renderer_is_refuted(packed, given):
     """Half of the frames are equal bit for bit, so it was the same one."""
     redrawn(the(given, "*video000001.mp4"), noisy)
     claim(given, gl_renderer="NVIDIA H100 80GB HBM3")
@@ -458,7 +444,7 @@ def test_a_false_claim_of_another_renderer_is_refuted(
     assert [e.refuted for e in verification.excuses if e.name == "gl"] == [True]
 
 
-def test_a_false_claim_of_another_version_is_refuted(packed: Path, given: Path) -> None:
+def test_a_false_claim_of_another_version_is_refuted(packed, given):
     """The compiled model says which version wrote it."""
     version = json.loads(the(given, "*.manifest.json").read_text())["mjrec"][
         "versions"
@@ -468,7 +454,7 @@ def test_a_false_claim_of_another_version_is_refuted(packed: Path, given: Path) 
     assert any("the same version" in f.reason for f in verification.failures)
 
 
-def test_remarks_say_what_a_video_does_not_show(packed: Path, given: Path) -> None:
+def test_remarks_say_what_a_video_does_not_show(packed, given):
     """They lower no verdict: it was asked for so."""
     for bag in (given, made := shutil.copytree(packed, given.with_name("made"))):
         edit_json(the(bag, "*000000.meta.json"), lambda m: m.update(playback_speed=2.0))
@@ -478,7 +464,7 @@ def test_remarks_say_what_a_video_does_not_show(packed: Path, given: Path) -> No
     assert notes == ["plays at 2 times real time"]
 
 
-def test_time_is_linear_in_episodes(tmp_path: Path) -> None:
+def test_time_is_linear_in_episodes(tmp_path):
     """Four times the episodes take about four times as long."""
     seconds = []
     for count in (500, 2000):
@@ -505,7 +491,7 @@ def test_time_is_linear_in_episodes(tmp_path: Path) -> None:
     assert seconds[1] < 8 * seconds[0] + 0.1
 
 
-def test_findings_travel_between_processes() -> None:
+def test_findings_travel_between_processes():
     """What a finding says survives JSON."""
     finding = Finding(
         topic=Topic.PICTURES, item="a", outcome=Outcome.NOTED, figures={"psnr": 30.0}

@@ -1,10 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a confined process can see, write and reach."""
 
-from __future__ import annotations
-
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -38,7 +35,7 @@ say(
 
 
 @pytest.fixture
-def seen(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
+def seen(tmp_path, monkeypatch):
     """Return what a confined process says that it can do."""
     folders = {name: tmp_path / name for name in ("readable", "other", "place")}
     for folder in (*folders.values(), tmp_path / "modules"):
@@ -59,7 +56,7 @@ def seen(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
         return {**said, "own": str(folders["place"])}
 
 
-def test_a_confined_process_sees_what_it_is_given(seen: dict[str, Any]) -> None:
+def test_a_confined_process_sees_what_it_is_given(seen):
     """No other file, home or token; what drawing needs is there."""
     assert seen["home"] == seen["own"]
     assert not seen["token"]
@@ -71,13 +68,13 @@ def test_a_confined_process_sees_what_it_is_given(seen: dict[str, Any]) -> None:
         assert not seen["written_elsewhere"]
 
 
-def has_landlock() -> bool:
+def has_landlock():
     """Return whether this kernel has it."""
     path = Path("/sys/kernel/security/lsm")
     return not path.exists() or "landlock" in path.read_text()
 
 
-def test_confining_needs_no_library() -> None:
+def test_confining_needs_no_library():
     """It begins before anything is imported that could start a thread."""
     assert confine.__module__ == "mjrec.confined"
     text = Path(str(confine.__code__.co_filename)).read_text()

@@ -1,14 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """What cannot be packed is refused before anything is made, and nothing stays."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import sys
-from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
 from full_disk import file_size_limit
@@ -21,23 +17,22 @@ import mjrec
 from mjrec.evidence.bag import make_bag
 from mjrec.evidence.size_limit import byte_count
 from mjrec.evidence.statements import state
-from mjrec.rendering.jobs import Progress
 
 
 @pytest.fixture(scope="module")
-def recorded(pendulums: Callable[..., Path]) -> Path:
+def recorded(pendulums):
     """Return a directory with two episodes, each with a video."""
     return pendulums(2, longest=3)
 
 
 @pytest.fixture
-def directory(recorded: Path, tmp_path: Path) -> Path:
+def directory(recorded, tmp_path):
     """Return a copy of it, to be spoilt."""
     return Path(shutil.copytree(recorded, tmp_path / "runs"))
 
 
 @pytest.fixture
-def place(tmp_path: Path) -> Iterator[Path]:
+def place(tmp_path):
     """Return where an archive may be put; after the test, nothing is there."""
     folder = tmp_path / "place"
     folder.mkdir()
@@ -45,9 +40,7 @@ def place(tmp_path: Path) -> Iterator[Path]:
     assert list(folder.iterdir()) == []
 
 
-def refusal(
-    kind: type[mjrec.Error], directory: Path, path: Path, **options: Any
-) -> str:
+def refusal(kind, directory, path, **options):
     """Return the message with which packing is refused."""
     with pytest.raises(kind) as caught:
         mjrec.pack(directory, path, **options)
@@ -55,9 +48,7 @@ def refusal(
     return str(caught.value)
 
 
-def test_an_open_monitor_is_named(
-    tmp_path: Path, place: Path, make_corridor: Callable[..., Any]
-) -> None:
+def test_an_open_monitor_is_named(tmp_path, place, make_corridor):
     """Its files are still being written."""
     with mjrec.Monitor(make_corridor(), tmp_path / "runs") as env:
         env.reset()
@@ -66,7 +57,7 @@ def test_an_open_monitor_is_named(
         assert "Close the monitor" in message
 
 
-def test_pending_videos_are_to_be_rendered_first(tmp_path: Path, place: Path) -> None:
+def test_pending_videos_are_to_be_rendered_first(tmp_path, place):
     """The message has the command."""
     runs = tmp_path / "runs"
     honest_runs.pendulum(runs, episodes=1, workers=0)
@@ -75,7 +66,7 @@ def test_pending_videos_are_to_be_rendered_first(tmp_path: Path, place: Path) ->
     assert f"mjrec render {runs}" in message
 
 
-def test_a_killed_monitor_is_to_be_recovered_first(tmp_path: Path, place: Path) -> None:
+def test_a_killed_monitor_is_to_be_recovered_first(tmp_path, place):
     """The message has the command."""
     runs = tmp_path / "runs"
     runs.mkdir()
@@ -84,7 +75,7 @@ def test_a_killed_monitor_is_to_be_recovered_first(tmp_path: Path, place: Path) 
     assert f"mjrec recover {runs}" in message
 
 
-def test_files_without_a_manifest_are_refused(directory: Path, place: Path) -> None:
+def test_files_without_a_manifest_are_refused(directory, place):
     """Nothing says what they are."""
     video = the(directory, "*000000.mp4")
     stray = video.with_name("openaigym.video.9.x.video000000.mp4")
@@ -94,18 +85,14 @@ def test_files_without_a_manifest_are_refused(directory: Path, place: Path) -> N
     assert "manifest" in message
 
 
-def test_a_deferred_video_that_is_gone_can_be_rendered(
-    directory: Path, place: Path
-) -> None:
+def test_a_deferred_video_that_is_gone_can_be_rendered(directory, place):
     """It counts as pending."""
     the(directory, "*000000.mp4").unlink()
     message = refusal(mjrec.UnfinishedRecordings, directory, place)
     assert f"mjrec render {directory}" in message
 
 
-def test_a_live_video_that_is_gone_is_missed(
-    tmp_path: Path, place: Path, make_corridor: Callable[..., Any], play: Any
-) -> None:
+def test_a_live_video_that_is_gone_is_missed(tmp_path, place, make_corridor, play):
     """The archive would not be verified."""
     with mjrec.Monitor(make_corridor(), tmp_path / "runs") as env:
         play(env, 1)
@@ -115,16 +102,14 @@ def test_a_live_video_that_is_gone_is_missed(
     assert f"names {gone.name}, which is missing" in message
 
 
-def test_statistics_that_are_gone_are_to_be_recovered(
-    directory: Path, place: Path
-) -> None:
+def test_statistics_that_are_gone_are_to_be_recovered(directory, place):
     """They can be made again of the journal."""
     the(directory, "*.stats.json").unlink()
     message = refusal(mjrec.UnfinishedRecordings, directory, place)
     assert "results are missing" in message
 
 
-def test_a_damaged_trajectory_is_named(directory: Path, place: Path) -> None:
+def test_a_damaged_trajectory_is_named(directory, place):
     """The others are as good as before."""
     trajectory = the(directory, "*000001.h5")
     trajectory.write_bytes(trajectory.read_bytes()[:1000])
@@ -132,9 +117,7 @@ def test_a_damaged_trajectory_is_named(directory: Path, place: Path) -> None:
     assert trajectory.name in message
 
 
-def test_links_that_lead_out_are_refused(
-    directory: Path, tmp_path: Path, place: Path
-) -> None:
+def test_links_that_lead_out_are_refused(directory, tmp_path, place):
     """What is packed never comes from elsewhere."""
     video = the(directory, "*000000.mp4")
     secret = tmp_path / "secret"
@@ -144,7 +127,7 @@ def test_links_that_lead_out_are_refused(
     assert "leads out of its directory" in message
 
 
-def test_links_inside_are_packed_as_files(directory: Path, tmp_path: Path) -> None:
+def test_links_inside_are_packed_as_files(directory, tmp_path):
     """No archive holds a link."""
     video = the(directory, "*000000.mp4")
     video.rename(directory / "elsewhere")
@@ -155,7 +138,7 @@ def test_links_inside_are_packed_as_files(directory: Path, tmp_path: Path) -> No
     assert not packed.is_symlink()
 
 
-def test_unknown_episodes_are_named(recorded: Path, place: Path) -> None:
+def test_unknown_episodes_are_named(recorded, place):
     """With those that there are."""
     message = refusal(mjrec.UnknownName, recorded, place, episodes=[0, 9])
     assert message.endswith("with the number 9. Available: 0, 1.")
@@ -163,7 +146,7 @@ def test_unknown_episodes_are_named(recorded: Path, place: Path) -> None:
         refusal(mjrec.InvalidArgument, recorded, place, episodes=wrong)
 
 
-def test_an_existing_archive_is_never_replaced(recorded: Path, tmp_path: Path) -> None:
+def test_an_existing_archive_is_never_replaced(recorded, tmp_path):
     """Also a link that leads nowhere."""
     path = tmp_path / "run.zip"
     path.symlink_to("nowhere")
@@ -175,14 +158,12 @@ def test_an_existing_archive_is_never_replaced(recorded: Path, tmp_path: Path) -
 @pytest.mark.parametrize(
     "name", ["run.tar", "run", ".run.zip", "openaigym.zip", "\n.zip"]
 )
-def test_an_archive_has_a_name_of_its_own(
-    name: str, recorded: Path, place: Path
-) -> None:
+def test_an_archive_has_a_name_of_its_own(name, recorded, place):
     """Which is not that of a monitor's file."""
     refusal(mjrec.InvalidArgument, recorded, place.with_name(name))
 
 
-def test_there_must_be_recordings(tmp_path: Path, place: Path) -> None:
+def test_there_must_be_recordings(tmp_path, place):
     """The message says how to make some."""
     message = refusal(mjrec.InvalidArgument, tmp_path / "nothing", place)
     assert "does not exist" in message
@@ -204,14 +185,12 @@ def test_there_must_be_recordings(tmp_path: Path, place: Path) -> None:
         ({"max_size": 0}, "max_size"),
     ],
 )
-def test_what_is_stated_is_checked(
-    stated: dict[str, Any], part: str, recorded: Path, place: Path
-) -> None:
+def test_what_is_stated_is_checked(stated, part, recorded, place):
     """Before any work."""
     assert part in refusal(mjrec.InvalidArgument, recorded, place, **stated)
 
 
-def test_statements_are_understood() -> None:
+def test_statements_are_understood():
     """Names in both orders; a licence by its URL."""
     authors = ["Plato", "Ludwig van Beethoven <L@b.de>", "van Beethoven, Ludwig"]
     known = state(title=None, authors=authors, license=None).authors
@@ -227,7 +206,7 @@ def test_statements_are_understood() -> None:
     assert stated.license.spdx is None
 
 
-def test_sizes_are_read_as_people_write_them() -> None:
+def test_sizes_are_read_as_people_write_them():
     """A million each, as those count who limit uploads."""
     sizes = {
         "50M": 50_000_000,
@@ -239,16 +218,14 @@ def test_sizes_are_read_as_people_write_them() -> None:
     assert {text: byte_count(text) for text in sizes} == sizes
 
 
-def test_without_jinja_it_says_what_to_install(
-    recorded: Path, place: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_without_jinja_it_says_what_to_install(recorded, place, monkeypatch):
     """And does nothing."""
     monkeypatch.setitem(sys.modules, "jinja2", None)
     message = refusal(mjrec.MissingDependency, recorded, place)
     assert 'pip install "mjrec[evidence]"' in message
 
 
-def test_a_full_disk_leaves_nothing(recorded: Path, place: Path) -> None:
+def test_a_full_disk_leaves_nothing(recorded, place):
     """One error that names the archive's file."""
     with file_size_limit(2000):
         message = refusal(mjrec.FileNotWritten, recorded, place)
@@ -256,11 +233,11 @@ def test_a_full_disk_leaves_nothing(recorded: Path, place: Path) -> None:
 
 
 @pytest.mark.usefixtures("no_process_is_left")
-def test_ctrl_c_leaves_nothing(recorded: Path, tmp_path: Path, place: Path) -> None:
+def test_ctrl_c_leaves_nothing(recorded, tmp_path, place):
     """Here while videos are drawn smaller; no process goes on either."""
     size = mjrec.pack(recorded, tmp_path / "run.zip").stat().st_size
 
-    def interrupt(progress: Progress) -> None:
+    def interrupt(progress):
         if progress.frames_done:
             raise KeyboardInterrupt
 
@@ -268,9 +245,9 @@ def test_ctrl_c_leaves_nothing(recorded: Path, tmp_path: Path, place: Path) -> N
         mjrec.pack(recorded, place, max_size=size - 500, on_progress=interrupt)
 
 
-def test_too_large_is_refused_with_what_is_large(recorded: Path, place: Path) -> None:
+def test_too_large_is_refused_with_what_is_large(recorded, place):
     """Nothing is drawn where even no videos at all would not help."""
-    told: list[Any] = []
+    told = []
     options = {"max_size": 1000, "on_progress": told.append}
     with pytest.raises(mjrec.ArchiveTooLarge) as caught:
         mjrec.pack(recorded, place, **options)
@@ -283,9 +260,7 @@ def test_too_large_is_refused_with_what_is_large(recorded: Path, place: Path) ->
     assert told == []
 
 
-def test_live_videos_are_never_encoded_again(
-    tmp_path: Path, place: Path, make_corridor: Callable[..., Any], play: Any
-) -> None:
+def test_live_videos_are_never_encoded_again(tmp_path, place, make_corridor, play):
     """There is nothing to draw them from."""
     runs = tmp_path / "runs"
     with mjrec.Monitor(make_corridor(), runs) as env:
@@ -297,7 +272,7 @@ def test_live_videos_are_never_encoded_again(
 
 
 @parametrize("case", ["0.7.4/plain", "0.21.0/two_monitors", "0.12.1/text"])
-def test_what_gym_wrote_can_be_packed(case: str, tmp_path: Path) -> None:
+def test_what_gym_wrote_can_be_packed(case, tmp_path):
     """It has less to say, and nothing of it is wrong; episodes cannot be chosen."""
     directory = Path(__file__).parent / "data/gym" / case
     archive = mjrec.pack(directory, tmp_path / "run.zip")
@@ -308,7 +283,7 @@ def test_what_gym_wrote_can_be_packed(case: str, tmp_path: Path) -> None:
     assert "gym's own" in message
 
 
-def test_names_with_a_percent_sign_make_an_older_bag(tmp_path: Path) -> None:
+def test_names_with_a_percent_sign_make_an_older_bag(tmp_path):
     """Which the `bagit` package, and sha512sum, read as they are."""
     (tmp_path / "data").mkdir()
     (tmp_path / "data/video.front%2Fleft.mp4").write_bytes(b"1")
@@ -319,9 +294,9 @@ def test_names_with_a_percent_sign_make_an_older_bag(tmp_path: Path) -> None:
     )
 
 
-def test_anonymous_names_no_author(recorded: Path, tmp_path: Path) -> None:
+def test_anonymous_names_no_author(recorded, tmp_path):
     """Also where one was given; and what cannot be taken out is an error."""
-    options: dict[str, Any] = {"anonymous": True, "authors": ["Zebulon Quackenbush"]}
+    options = {"anonymous": True, "authors": ["Zebulon Quackenbush"]}
     folder = unpacked(
         mjrec.pack(recorded, tmp_path / "a.zip", **options), tmp_path / "x"
     )

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A packed run is an RO-Crate, by the validator of those who specify these."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess
@@ -15,14 +13,14 @@ import mjrec
 
 
 @pytest.fixture(scope="session")
-def validator() -> Path:
+def validator():
     """Return the Python of an environment that holds the validator."""
     if "MJREC_TEST_CRATE" not in os.environ:
         pytest.skip("no environment with roc-validator: scripts/test --all makes one")
     return Path(os.environ["MJREC_TEST_CRATE"])
 
 
-def issues(validator: Path, crate: Path) -> list[str]:
+def issues(validator, crate):
     """Return what the validator says is wrong with a crate."""
     script = Path(__file__).with_name("crate_validation.py")
     environment = {k: v for k, v in os.environ.items() if k != "PYTHONWARNINGS"}
@@ -41,9 +39,7 @@ def issues(validator: Path, crate: Path) -> list[str]:
 
 @pytest.mark.crate_validator
 @pytest.mark.parametrize("stated", [True, False])
-def test_the_validator_takes_the_crate(
-    stated: bool, validator: Path, tmp_path: Path
-) -> None:
+def test_the_validator_takes_the_crate(stated, validator, tmp_path):
     """All that is required, of our recordings and of gym's; and it can say no."""
     if stated:
         said = {"authors": ["A B <a@b.org>"], "license": "MIT"}

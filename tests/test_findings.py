@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The verdict that findings and excuses come to."""
 
-from __future__ import annotations
-
 import json
 
 import pytest
@@ -37,23 +35,18 @@ PARTLY = Verdict.PARTLY
         ((OF_FILES,), (), Level.FILES, Verdict.PARTLY),
     ],
 )
-def test_the_verdict_is_never_better_than_the_proof(
-    findings: tuple[Finding, ...],
-    excuses: tuple[Excuse, ...],
-    level: Level,
-    verdict: Verdict,
-) -> None:
+def test_the_verdict_is_never_better_than_the_proof(findings, excuses, level, verdict):
     """PASS only where all is equal or allowed; FAIL where nothing is proved."""
     assert verification(*findings, excuses=excuses, level=level).verdict is verdict
 
 
-def test_exit_statuses_tell_verdicts_apart() -> None:
+def test_exit_statuses_tell_verdicts_apart():
     """As documented, for CI."""
     statuses = [verdict.exit_status for verdict in Verdict]
     assert statuses == [0, 3, 1]
 
 
-def test_all_of_it_is_json() -> None:
+def test_all_of_it_is_json():
     """The verdict, findings, excuses, inputs and facts."""
     made = verification(MADE, excuses=(excuse(),), inputs={"a": 1}, facts={"b": 2})
     said = json.loads(json.dumps(made.as_json()))

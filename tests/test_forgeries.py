@@ -5,8 +5,6 @@ Each is made by an author who computes everything else again: returns, statistic
 hashes of files and frames, metadata, the table, the crate and the bag.
 """
 
-from __future__ import annotations
-
 import json
 import re
 import shutil
@@ -29,7 +27,7 @@ import lying_environments as lying
 import mjrec
 from forged_runs import ForgedRun
 from mjrec.evaluation.episode_results import recorded_results
-from mjrec.evidence.findings import Outcome, Verdict, Verification
+from mjrec.evidence.findings import Outcome, Verdict
 from mjrec.formats.trajectory import added_up
 from mjrec.formats.trajectory_file import open_trajectory
 from mjrec.formats.trajectory_hdf5 import write_hdf5
@@ -43,8 +41,8 @@ Lie = Callable[[ForgedRun], object]
 
 FLIP = "display_orientation=insert:rotate=180"
 
-SMALL: dict[str, Any] = {"render_mode": "rgb_array", "width": 32, "height": 32}
-EVALUATION: dict[str, Any] = {"mode": "evaluation", "workers": 1}
+SMALL = {"render_mode": "rgb_array", "width": 32, "height": 32}
+EVALUATION = {"mode": "evaluation", "workers": 1}
 
 
 @dataclass(frozen=True)
@@ -75,12 +73,12 @@ class Forgery:
 # Lies about numbers.
 
 
-def double_rewards(run: ForgedRun) -> None:
+def double_rewards(run):
     for episode in range(4):
         run.say_rewards(episode, lambda rewards: 2 * rewards)
 
 
-def leave_states_out(run: ForgedRun) -> None:
+def leave_states_out(run):
     """As `pack --episodes` does, but for what that would say in the manifest."""
     for episode in range(4):
         facts = {"states_left_out": True, "video": None, "model": None}
@@ -94,12 +92,12 @@ def leave_states_out(run: ForgedRun) -> None:
         )
 
 
-def leave_actions_out(run: ForgedRun) -> None:
+def leave_actions_out(run):
     for episode in range(4):
         run.edit_rows(episode, action=None)
 
 
-def call_actions_irregular(run: ForgedRun) -> None:
+def call_actions_irregular(run):
     for episode in range(4):
         actions = run.content(episode).actions
         run.edit_rows(episode, action=None)
@@ -117,16 +115,16 @@ def call_actions_irregular(run: ForgedRun) -> None:
         run.edit_journal(lambda all_, lines=lines: all_.__setitem__(slice(1, 1), lines))
 
 
-def repeat_last_states(run: ForgedRun) -> None:
+def repeat_last_states(run):
     """And call those that were there unknown."""
 
-    def edit(states: Any) -> None:
+    def edit(states):
         states[-2:] = np.nan
 
     run.edit_rows(1, states=edit)
 
 
-def cut(run: ForgedRun, episode: int, steps: int, **facts: Any) -> None:
+def cut(run, episode, steps, **facts):
     """Leave out the end of an episode, and of its video if it has one."""
     whole = run.content(episode)
     run.edit_rows(
@@ -146,40 +144,40 @@ def cut(run: ForgedRun, episode: int, steps: int, **facts: Any) -> None:
         run.film(episode)
 
 
-def hide_the_fall(run: ForgedRun) -> None:
+def hide_the_fall(run):
     run.film(1, run.frames(1)[:-2])
 
 
-def edit_a_state(run: ForgedRun) -> None:
+def edit_a_state(run):
     """By one unit in the last place."""
 
-    def edit(states: Any) -> None:
+    def edit(states):
         states[2, 2] = np.nextafter(states[2, 2], np.inf)
 
     run.edit_rows(1, states=edit)
 
 
-def edit_an_action(run: ForgedRun) -> None:
+def edit_an_action(run):
     run.edit_rows(1, actions=lambda actions: actions.__setitem__(1, -actions[1]))
 
 
-def name_another_seed(run: ForgedRun) -> None:
+def name_another_seed(run):
     run.say(1, seed=77)
 
 
-def forget_the_seed(run: ForgedRun) -> None:
+def forget_the_seed(run):
     """Of an episode whose beginning was chosen by hand."""
     run.say(1, seed=None)
     run.edit_rows(1, facts={"random_state": None})
     edit_a_state(run)
 
 
-def swap_episodes(run: ForgedRun) -> None:
+def swap_episodes(run):
     """Tell two episodes in the other order, each with its own seed and video."""
     for old, new in ((0, 9), (1, 0), (9, 1)):
         run.renumber(old, new)
 
-    def sort(lines: list[Any]) -> None:
+    def sort(lines):
         places = [n for n, line in enumerate(lines) if "length" in line]
         ordered = sorted((lines[n] for n in places), key=lambda e: e["episode_id"])
         for place, line in zip(places, ordered, strict=True):
@@ -188,7 +186,7 @@ def swap_episodes(run: ForgedRun) -> None:
     run.edit_journal(sort)
 
 
-def show_one_as_two(run: ForgedRun, seed: int | None = 99) -> None:
+def show_one_as_two(run, seed=99):
     """The best episode's rows and numbers again, with a new seed or its own."""
     facts = run.content(3).facts
     own = ("episode_id", "start_time", "end_time", "possible_video")
@@ -199,7 +197,7 @@ def show_one_as_two(run: ForgedRun, seed: int | None = 99) -> None:
     run.say(3, **same, seed=told["seed"] if seed is None else seed)
 
 
-def leave_the_worst_out(run: ForgedRun) -> None:
+def leave_the_worst_out(run):
     """And number the others on."""
     run.remove_episode(0)
     for old in (1, 2, 3):
@@ -208,14 +206,14 @@ def leave_the_worst_out(run: ForgedRun) -> None:
     run.edit_journal(lambda lines: None)
 
 
-def leave_the_first_out(run: ForgedRun) -> None:
+def leave_the_first_out(run):
     """And keep the numbers, as if another monitor had recorded before."""
     run.remove_episode(0)
     run.edit_json("*.manifest.json", lambda m: m["mjrec"].update(first_episode_id=1))
     run.edit_journal(lambda lines: lines[0]["run"].update(first_episode_id=1))
 
 
-def copy_the_recording(run: ForgedRun) -> None:
+def copy_the_recording(run):
     """One recording shown as two, by two names."""
     for path in list(run.directory.iterdir()):
         if ".0.u." in path.name:
@@ -223,7 +221,7 @@ def copy_the_recording(run: ForgedRun) -> None:
     replace_in_second(run, "0.u", "0.v")
 
 
-def replace_in_second(run: ForgedRun, old: str, new: str) -> None:
+def replace_in_second(run, old, new):
     """Replace a text in all that the second recording says."""
     for path in run.directory.glob("*.0.v.*"):
         if path.suffix in (".json", ".jsonl"):
@@ -235,19 +233,19 @@ def replace_in_second(run: ForgedRun, old: str, new: str) -> None:
                 write_hdf5(reader, path)
 
 
-def double_rewards_cut_off(run: ForgedRun) -> None:
+def double_rewards_cut_off(run):
     """Of an episode that is in no statistics, and has a video."""
     [cut_off] = {float(run.content(0).rewards.sum())}
     run.edit_rows(0, rewards=lambda r: r.__imul__(2), facts={"reward": 2 * cut_off})
     run.edit_json("*.video000000.meta.json", lambda m: m.update(reward=2 * cut_off))
 
 
-def double_the_return(run: ForgedRun) -> None:
+def double_the_return(run):
     """And leave the rewards of the steps as they are."""
     run.say(1, reward=2 * added_up(run.content(1).rewards))
 
 
-def give_no_plain_option(run: ForgedRun) -> None:
+def give_no_plain_option(run):
     """What is no plain value is given to no reset, so that nothing is recreated."""
     run.say(3, options={"note": "version 1.0"})
 
@@ -255,40 +253,40 @@ def give_no_plain_option(run: ForgedRun) -> None:
 # Lies about videos.
 
 
-def one_pixel(run: ForgedRun) -> None:
+def one_pixel(run):
     frames = [frame.copy() for frame in run.frames(1)]
     frames[2][20, 10] ^= 64
     run.film(1, frames)
 
 
-def one_pixel_each(run: ForgedRun) -> None:
+def one_pixel_each(run):
     for episode in (0, 1):
         frames = [frame.copy() for frame in run.frames(episode)]
         frames[-1][20, 10] ^= 64
         run.film(episode, frames)
 
 
-def negative(episode: int) -> Lie:
+def negative(episode):
     return lambda run: run.film(episode, [255 - f for f in run.frames(episode)])
 
 
-def double_a_frame(run: ForgedRun) -> None:
+def double_a_frame(run):
     frames = run.frames(1)
     run.film(1, [*frames[:2], frames[1], *frames[2:]])
 
 
-def replace_a_frame(run: ForgedRun) -> None:
+def replace_a_frame(run):
     frames = run.frames(1)
     run.film(1, [*frames[:2], frames[1], *frames[3:]])
 
 
-def swap_videos(run: ForgedRun) -> None:
+def swap_videos(run):
     frames = [run.frames(0), run.frames(1)]
     run.film(0, frames[1])
     run.film(1, frames[0])
 
 
-def negative_as_clip(run: ForgedRun) -> None:
+def negative_as_clip(run):
     """A video of something else, called a clip, whose states nobody keeps."""
     run.film(1, [255 - frame for frame in run.frames(1)])
     old, new = ".video000001.", ".video000001.step000003."
@@ -309,7 +307,7 @@ def negative_as_clip(run: ForgedRun) -> None:
     run.edit_rows(1, facts={"video": None})
 
 
-def live_and_doctored(run: ForgedRun) -> None:
+def live_and_doctored(run):
     """Frames of something else, called drawn by the environment itself."""
     said = {"recording": "live", "recording_reason": "render='live'"}
     run.film(1, [255 - frame for frame in run.frames(1)], **said)
@@ -317,12 +315,12 @@ def live_and_doctored(run: ForgedRun) -> None:
     run.edit_rows(1, facts={"video": {"recording": "live"}})
 
 
-def swift(run: ForgedRun) -> None:
+def swift(run):
     """Twice the speed, and metadata that says so."""
     run.film(1, fps="50", playback_speed=2.0)
 
 
-def swift_in_real_time(run: ForgedRun) -> None:
+def swift_in_real_time(run):
     """Twice the speed, called real time."""
     path, fps = run.video(1), json.loads(_metadata(run, 1).read_text())["fps"]
     run.film(1)
@@ -331,12 +329,12 @@ def swift_in_real_time(run: ForgedRun) -> None:
     assert path.exists()
 
 
-def slow_start(run: ForgedRun) -> None:
+def slow_start(run):
     """One frame stands for a second; the same frames, the same average."""
     run.mux(1, "-c", "copy", "-bsf:v", "setts=ts=if(eq(N\\,0)\\,TS\\,TS+1/TB)")
 
 
-def second_track(run: ForgedRun) -> None:
+def second_track(run):
     """A track on top of it, that players show."""
     other = run.directory.parent / "other.mp4"
     with VideoWriter(other, fps=25) as writer:
@@ -347,7 +345,7 @@ def second_track(run: ForgedRun) -> None:
     run.mux(1, *maps, *disposition, inputs=(other,))
 
 
-def sound(run: ForgedRun) -> None:
+def sound(run):
     """A commentary."""
     run.mux(
         1,
@@ -356,12 +354,12 @@ def sound(run: ForgedRun) -> None:
     )
 
 
-def title(run: ForgedRun) -> None:
+def title(run):
     said = ("-metadata", "title=Success rate 100 %")
     run.mux(1, "-c", "copy", *said, metadata="0")
 
 
-def rotation(run: ForgedRun) -> None:
+def rotation(run):
     """Players show a robot that lies as one that stands."""
     path = run.video(1)
     content = bytearray(path.read_bytes())
@@ -374,38 +372,38 @@ def rotation(run: ForgedRun) -> None:
     run.rehash(1)
 
 
-def wide_pixels(run: ForgedRun) -> None:
+def wide_pixels(run):
     run.mux(1, "-c", "copy", "-bsf:v", "h264_metadata=sample_aspect_ratio=4/1")
 
 
-def cropped(run: ForgedRun) -> None:
+def cropped(run):
     """What happens at the right is not shown."""
     run.mux(1, "-c", "copy", "-bsf:v", "h264_metadata=crop_right=16")
 
 
-def refilm(arguments: str) -> Lie:
+def refilm(arguments):
     """Encode the same frames again, with what only players go by."""
 
-    def lie(run: ForgedRun) -> None:
+    def lie(run):
         for episode in (0, 1):
             run.film(episode, encoder_arguments=("-bsf:v", arguments))
 
     return lie
 
 
-def hidden_bytes(run: ForgedRun) -> None:
+def hidden_bytes(run):
     path = run.video(1)
     path.write_bytes(path.read_bytes() + b"\0\0\0\x10free12345678")
     run.rehash(1)
 
 
-def small_called_large(run: ForgedRun) -> None:
+def small_called_large(run):
     """Drawn at a quarter of the size, and scaled up."""
     frames = [np.kron(f[::2, ::2], np.ones((2, 2, 1), np.uint8)) for f in run.frames(1)]
     run.film(1, frames)
 
 
-def add_a_close_up(run: ForgedRun) -> None:
+def add_a_close_up(run):
     """A further video that nothing asked for, from where it looks best."""
     path = run.video(1)
     for ending in (".mp4", ".meta.json", ".framehash"):
@@ -420,12 +418,12 @@ def add_a_close_up(run: ForgedRun) -> None:
     run.edit_json("*.manifest.json", lambda said: said["videos"].append([close, meta]))
 
 
-def draft_called_full(run: ForgedRun) -> None:
+def draft_called_full(run):
     frames = list(mjrec.render(run.trajectory(1), quality="draft"))
     run.film(1, frames)
 
 
-def call_it_broken(run: ForgedRun) -> None:
+def call_it_broken(run):
     """The video of an episode that should not be seen."""
     name = _metadata(run, 1).name
     run.video(1).unlink()
@@ -436,13 +434,13 @@ def call_it_broken(run: ForgedRun) -> None:
     run.edit_json("*.manifest.json", lambda said: _list_broken(said, name))
 
 
-def blame_the_schedule(run: ForgedRun) -> None:
+def blame_the_schedule(run):
     """For the video and the trajectory of an episode that should not be seen."""
     run.remove_video(1)
     run.trajectory(1).unlink()
     fault = {"episode_id": 1, "what": "video", "reason": "no idea"}
 
-    def edit(lines: list[Any]) -> None:
+    def edit(lines):
         [at] = [n for n, line in enumerate(lines) if line.get("episode_id") == 1]
         del lines[at]["recording"]
         lines.insert(at, {"fault": fault})
@@ -451,7 +449,7 @@ def blame_the_schedule(run: ForgedRun) -> None:
     run.edit_json("*.manifest.json", lambda said: said["mjrec"].update(faults=[fault]))
 
 
-def _list_broken(manifest: dict[str, Any], name: str) -> None:
+def _list_broken(manifest, name):
     manifest["videos"] = [pair for pair in manifest["videos"] if pair[1] != name]
     manifest["mjrec"]["broken"] = [name]
 
@@ -459,10 +457,10 @@ def _list_broken(manifest: dict[str, Any], name: str) -> None:
 # Lies about what was chosen.
 
 
-def call_the_best_worst(run: ForgedRun) -> None:
+def call_the_best_worst(run):
     """The rule said best:1."""
 
-    def edit(facts: dict[str, Any]) -> None:
+    def edit(facts):
         for key, value in facts.items():
             if value == "best:1":
                 facts[key] = "worst:1"
@@ -470,10 +468,10 @@ def call_the_best_worst(run: ForgedRun) -> None:
     run.say_everywhere(edit)
 
 
-def name_another_schedule(run: ForgedRun) -> None:
+def name_another_schedule(run):
     """Episodes 0 and 1 were chosen by hand."""
 
-    def edit(facts: dict[str, Any]) -> None:
+    def edit(facts):
         for key, value in facts.items():
             if value == "capped_cubic_video_schedule":
                 facts[key] = "every:2"
@@ -481,7 +479,7 @@ def name_another_schedule(run: ForgedRun) -> None:
     run.say_everywhere(edit)
 
 
-def choose_by_hand(run: ForgedRun) -> None:
+def choose_by_hand(run):
     """Another episode than the schedule names has the video."""
     run.remove_video(1)
     run.say(1, chosen=False, recording=None)
@@ -494,37 +492,37 @@ def choose_by_hand(run: ForgedRun) -> None:
 # Lies about identity.
 
 
-def hide_arguments(run: ForgedRun) -> None:
+def hide_arguments(run):
     """The environment was made with noise of its reset's own."""
 
-    def edit(facts: dict[str, Any]) -> None:
+    def edit(facts):
         facts.pop("reset_noise_scale", None)
 
     run.say_everywhere(edit)
 
 
-def call_it_another_environment(run: ForgedRun) -> None:
+def call_it_another_environment(run):
     run.say_everywhere(
         lambda facts: _replace(facts, "InvertedPendulum-v5", "Hopper-v5")
     )
 
 
-def call_it_by_another_name(run: ForgedRun) -> None:
+def call_it_by_another_name(run):
     """In what people read; it is made by its own id."""
 
-    def edit(facts: dict[str, Any]) -> None:
+    def edit(facts):
         _replace(facts, "InvertedPendulum-v5", "Humanoid-v5", key="env_id")
 
     run.say_everywhere(edit)
 
 
-def call_it_ones_own(run: ForgedRun) -> None:
+def call_it_ones_own(run):
     run.say_everywhere(
         lambda facts: _replace(facts, "InvertedPendulum-v5", "MyPendulum-v0")
     )
 
 
-def pretend_to_be_gym(run: ForgedRun) -> None:
+def pretend_to_be_gym(run):
     """Of gym's own directories hardly anything can be checked."""
     run.edit_json("*.manifest.json", lambda said: said.pop("mjrec"))
     run.edit_json(
@@ -535,7 +533,7 @@ def pretend_to_be_gym(run: ForgedRun) -> None:
             path.unlink()
 
 
-def put_another_model_before(run: ForgedRun) -> None:
+def put_another_model_before(run):
     """Two files of one name, of which a reader sees the first or the last."""
     path = run.the("*.model.*.zip")
     with zipfile.ZipFile(path) as archive:
@@ -548,7 +546,7 @@ def put_another_model_before(run: ForgedRun) -> None:
             archive.writestr(info, content)
 
 
-def swap_the_model(run: ForgedRun) -> None:
+def swap_the_model(run):
     """Sources of a lighter robot."""
     run.rewrite_zip(
         run.the("*.model.*.zip"),
@@ -556,25 +554,25 @@ def swap_the_model(run: ForgedRun) -> None:
     )
 
 
-def call_it_trained(run: ForgedRun) -> None:
+def call_it_trained(run):
     """Training episodes of an evaluation, whose actions nobody keeps."""
     run.say_everywhere(lambda facts: _replace(facts, "e", "t", key="type"))
     run.edit_journal(lambda lines: lines[0]["run"]["options"].pop("mode", None))
 
 
-def call_it_successful(run: ForgedRun) -> None:
+def call_it_successful(run):
     for episode in range(4):
         run.say(episode, success=True)
 
 
-def swap_the_ending(run: ForgedRun) -> None:
+def swap_the_ending(run):
     """A fall is called a limit of time."""
     content = run.content(1)
     run.edit_rows(1, terminated=content.truncated, truncated=content.terminated)
     run.say(1, terminated=False, truncated=True)
 
 
-def call_it_double(run: ForgedRun) -> None:
+def call_it_double(run):
     """The actions' own dtype is another."""
     for episode in range(3):
         run.edit_rows(episode, facts={"action_dtypes": [[0, "float64"]]})
@@ -583,64 +581,64 @@ def call_it_double(run: ForgedRun) -> None:
 # Additions.
 
 
-def add_to_hdf5(run: ForgedRun) -> None:
+def add_to_hdf5(run):
     with h5py.File(run.trajectory(1), "r+") as file:
         file["success"] = np.ones(3)
 
 
-def add_an_attribute(run: ForgedRun) -> None:
+def add_an_attribute(run):
     with h5py.File(run.trajectory(1), "r+") as file:
         file["rewards"].attrs["note"] = "doubled"
 
 
-def add_a_fact(run: ForgedRun) -> None:
+def add_a_fact(run):
     run.edit_rows(1, facts={"policy": "PPO"})
 
 
-def add_to(pattern: str) -> Lie:
+def add_to(pattern):
     return lambda run: run.edit_json(pattern, lambda said: said.update(success_rate=1))
 
 
-def add_to_manifest(run: ForgedRun) -> None:
+def add_to_manifest(run):
     run.edit_json("*.manifest.json", lambda said: said["mjrec"].update(award="best"))
 
 
-def add_to_facts(key: str) -> Lie:
+def add_to_facts(key):
     """Add to all objects that stand under a key."""
 
-    def edit(facts: dict[str, Any]) -> None:
+    def edit(facts):
         if isinstance(facts.get(key), dict):
             facts[key]["success_rate"] = 1
 
     return lambda run: run.say_everywhere(edit)
 
 
-def add_a_video(bag: Path) -> None:
+def add_a_video(bag):
     """Of a recording of which nothing else is there."""
     path = the(bag, "*.video000001.mp4")
     shutil.copy(path, path.with_name(path.name.replace(".0.u.", ".0.w.")))
     describe_again(bag)
 
 
-def add_a_line(run: ForgedRun) -> None:
+def add_a_line(run):
     run.edit_journal(lambda lines: lines.insert(-1, {"remark": {"success": True}}))
 
 
-def add_to_a_line(run: ForgedRun) -> None:
+def add_to_a_line(run):
     run.say(1)
 
-    def edit(lines: list[Any]) -> None:
+    def edit(lines):
         next(line for line in lines if "length" in line)["judged"] = "perfect"
 
     run.edit_journal(edit)
 
 
-def add_a_file(name: str) -> Callable[[Path], object]:
+def add_a_file(name):
     return lambda bag: (bag / name).write_text("All goals were reached.")
 
 
-def replace_in(name: str, old: str, new: str) -> Callable[[Path], object]:
-    def edit(bag: Path) -> None:
+def replace_in(name, old, new):
+    def edit(bag):
         path = the(bag, name)
         text = path.read_text()
         assert old in text
@@ -649,7 +647,7 @@ def replace_in(name: str, old: str, new: str) -> Callable[[Path], object]:
     return edit
 
 
-def pending_worst(bag: Path) -> None:
+def pending_worst(bag):
     """The worst episode's video is to be rendered some day."""
     run = ForgedRun(bag / "data/recordings")
     name, trajectory = run.video(0).name, run.trajectory(0).name
@@ -659,7 +657,7 @@ def pending_worst(bag: Path) -> None:
     describe_again(bag)
 
 
-def say_it_was_made_smaller(bag: Path) -> None:
+def say_it_was_made_smaller(bag):
     """Which would excuse blurred frames."""
     run = ForgedRun(bag / "data/recordings")
     run.edit_json(
@@ -668,7 +666,7 @@ def say_it_was_made_smaller(bag: Path) -> None:
     describe_again(bag)
 
 
-def add_a_line_about_rows(bag: Path) -> None:
+def add_a_line_about_rows(bag):
     """Which packing takes out."""
     path = the(bag, "*.jsonl")
     lines = path.read_text().splitlines()
@@ -677,9 +675,9 @@ def add_a_line_about_rows(bag: Path) -> None:
     describe_again(bag)
 
 
-def edit_environment(**facts: Any) -> Callable[[Path], object]:
-    def edit(bag: Path) -> None:
-        def change(said: dict[str, Any]) -> None:
+def edit_environment(**facts):
+    def edit(bag):
+        def change(said):
             [recording] = said["recordings"].values()
             recording.update(facts)
 
@@ -688,14 +686,14 @@ def edit_environment(**facts: Any) -> Callable[[Path], object]:
     return edit
 
 
-def tell_in_options(bag: Path) -> None:
-    def edit(said: dict[str, Any]) -> None:
+def tell_in_options(bag):
+    def edit(said):
         said["packed_with"]["options"]["anonymous"] = {"award": "best paper"}
 
     edit_json(the(bag, "environment.json"), edit)
 
 
-def edit_the_table(bag: Path) -> None:
+def edit_the_table(bag):
     path = the(bag, "statistics.csv")
     lines = path.read_text().splitlines()
     lines[2] = lines[2].replace(",2.0,", ",4.0,")
@@ -705,8 +703,8 @@ def edit_the_table(bag: Path) -> None:
 # What may be claimed beside a lie, where nothing of the kind is true.
 
 
-def claim_version(package: str, version: str) -> Lie:
-    def edit(facts: dict[str, Any]) -> None:
+def claim_version(package, version):
+    def edit(facts):
         if isinstance(facts.get("versions"), dict):
             facts["versions"][package] = version
         if "mujoco" in facts and package == "mujoco":
@@ -717,21 +715,21 @@ def claim_version(package: str, version: str) -> Lie:
     return lambda run: run.say_everywhere(edit)
 
 
-def claim_machine(run: ForgedRun) -> None:
-    def edit(facts: dict[str, Any]) -> None:
+def claim_machine(run):
+    def edit(facts):
         if "cpu_flags" in facts:
             facts["cpu_flags"] = "0" * 64
 
     run.say_everywhere(edit)
 
 
-def claim_gpu(run: ForgedRun) -> None:
+def claim_gpu(run):
     said = {"gl_vendor": "NVIDIA Corporation", "gl_version": "4.6.0 NVIDIA 580.95"}
     gpu = {**said, "gl_renderer": "NVIDIA H100 80GB HBM3/PCIe/SSE2"}
     run.edit_json("*.meta.json", lambda m: m.update(gpu))
 
 
-def claim_ffmpeg(run: ForgedRun) -> None:
+def claim_ffmpeg(run):
     run.edit_json("*.meta.json", lambda m: m.update(ffmpeg_sha256="0" * 64))
     run.edit_json(
         "*.meta.json",
@@ -739,8 +737,8 @@ def claim_ffmpeg(run: ForgedRun) -> None:
     )
 
 
-def claim_wrapper(run: ForgedRun) -> None:
-    def edit(facts: dict[str, Any]) -> None:
+def claim_wrapper(run):
+    def edit(facts):
         if facts.get("wrappers") == []:
             facts["wrappers"] = ["mylab.wrappers.Shaping"]
             facts["wrapper_arguments"] = [None]
@@ -748,7 +746,7 @@ def claim_wrapper(run: ForgedRun) -> None:
     run.say_everywhere(edit)
 
 
-CLAIMS: dict[str, Lie] = {
+CLAIMS = {
     "another Gymnasium": claim_version("gymnasium", "1.1.1"),
     "another MuJoCo": claim_version("mujoco", "3.5.0"),
     "another machine": claim_machine,
@@ -758,33 +756,33 @@ CLAIMS: dict[str, Lie] = {
 }
 
 
-def both(*lies: Lie) -> Lie:
-    def all_of_them(run: ForgedRun) -> None:
+def both(*lies):
+    def all_of_them(run):
         for lie in lies:
             lie(run)
 
     return all_of_them
 
 
-def doctored(change: lying.Change, of: Any = honest.pendulum) -> Callable[[Path], Any]:
+def doctored(change, of=honest.pendulum):
     """Return what records an environment that is not what its name says."""
 
-    def record(directory: Path) -> None:
+    def record(directory):
         with lying.doctored(change):
             of(directory)
 
     return record
 
 
-def noiseless(directory: Path) -> None:
+def noiseless(directory):
     honest.pendulum(directory, make={"reset_noise_scale": 0.0})
 
 
-def best(directory: Path) -> None:
+def best(directory):
     honest.kept(directory, rule="best:1")
 
 
-def close_and_go_on(directory: Path) -> None:
+def close_and_go_on(directory):
     """Close each time when an episode goes wrong."""
     for first in (0, 2):
         env = gymnasium.make("InvertedPendulum-v5", max_episode_steps=3, **SMALL)
@@ -796,11 +794,11 @@ def close_and_go_on(directory: Path) -> None:
         monitor.close()
 
 
-def by_hand(directory: Path) -> None:
+def by_hand(directory):
     honest.pendulum(directory, video_callable=lambda episode: episode in (0, 1))
 
 
-def evaluated_and_swapped(directory: Path) -> None:
+def evaluated_and_swapped(directory):
     """Call the worst episode of an evaluation its best, as `evaluate` writes it."""
     honest.evaluated(directory, keep="none")
     ended = [*recorded_results(directory)]
@@ -1147,11 +1145,11 @@ FORGERIES = (
 
 
 @pytest.fixture(scope="session")
-def recorded(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Path]:
+def recorded(tmp_path_factory):
     """Return what records once in a session, for tests that change copies."""
-    made: dict[Any, Path] = {}
+    made = {}
 
-    def directory(record: Callable[[Path], object]) -> Path:
+    def directory(record):
         if record not in made:
             made[record] = tmp_path_factory.mktemp("honest") / "run"
             record(made[record])
@@ -1160,7 +1158,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Path]:
     return directory
 
 
-def forged(forgery: Forgery, run: Path, into: Path) -> Path:
+def forged(forgery, run, into):
     """Return a forged archive, or an unpacked one."""
     directory = Path(shutil.copytree(run, into / "recorded"))
     forgery.lie(ForgedRun(directory))
@@ -1173,7 +1171,7 @@ def forged(forgery: Forgery, run: Path, into: Path) -> Path:
     return bag
 
 
-def told(found: Verification) -> str:
+def told(found):
     """Return all that speaks against an archive, or is believed."""
     lines = [
         f"{each.outcome} {each.topic} {each.item}: {each.reason} [{each.excuse}]"
@@ -1193,9 +1191,7 @@ def told(found: Verification) -> str:
     default=[each for each in FORGERIES if each.quick],
     ids=lambda each: each.what,
 )
-def test_forgery_is_seen(
-    forgery: Forgery, recorded: Callable[..., Path], tmp_path: Path
-) -> None:
+def test_forgery_is_seen(forgery, recorded, tmp_path):
     """With the verdict of the table, and a line that says where."""
     archive = forged(forgery, recorded(forgery.of), tmp_path)
     found = mjrec.verify(archive)
@@ -1203,15 +1199,15 @@ def test_forgery_is_seen(
     assert re.search(forgery.line, told(found)), told(found)
 
 
-def _lines(run: ForgedRun) -> list[Any]:
+def _lines(run):
     return [json.loads(line) for line in run.the("*.jsonl").read_text().splitlines()]
 
 
-def _metadata(run: ForgedRun, episode: int) -> Path:
+def _metadata(run, episode):
     return run.the(f"*.video{episode:06d}.meta.json")
 
 
-def _replace(facts: dict[str, Any], old: Any, new: Any, key: str | None = None) -> None:
+def _replace(facts, old, new, key=None):
     for name, value in facts.items():
         if value == old and key in (None, name):
             facts[name] = new

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Honest runs of each kind, packed: the verdict, and the excuses that it rests on."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -11,7 +9,7 @@ from parts import parametrize
 
 import honest_runs as honest
 import mjrec
-from mjrec.evidence.findings import Verdict, Verification
+from mjrec.evidence.findings import Verdict
 
 PASS, PARTLY = Verdict.PASS, Verdict.PARTLY
 
@@ -36,7 +34,7 @@ class Honest(NamedTuple):
     quick: bool = False
 
     @property
-    def name(self) -> str:
+    def name(self):
         """What the test is called."""
         options = {**self.packing, **self.verifying}
         return f"{self.record.__name__} {' '.join(map(str, options))}".strip()
@@ -86,7 +84,7 @@ HONEST = (
 )
 
 
-def said(found: Verification) -> str:
+def said(found):
     """Return what is not recreated."""
     return "\n".join(
         f"{each.outcome} {each.topic} {each.item}: {each.reason} [{each.excuse}]"
@@ -98,7 +96,7 @@ def said(found: Verification) -> str:
 @parametrize(
     "run", HONEST, default=[each for each in HONEST if each.quick], ids=lambda r: r.name
 )
-def test_honest_run_comes_out_again(run: Honest, tmp_path: Path) -> None:
+def test_honest_run_comes_out_again(run, tmp_path):
     """Nothing contradicts it, and what is believed has its excuse."""
     run.record(tmp_path / "recorded")
     archive = mjrec.pack(tmp_path / "recorded", tmp_path / "run.zip", **run.packing)

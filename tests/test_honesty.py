@@ -1,37 +1,29 @@
 # SPDX-License-Identifier: Apache-2.0
 """What inputs say of their author."""
 
-from __future__ import annotations
-
 import dataclasses
-from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 import pytest
 
 from mjrec.environments.episode_seeds import episode_seeds
-from mjrec.evidence.findings import Finding, Outcome
+from mjrec.evidence.findings import Outcome
 from mjrec.evidence.honesty import remarks
 from mjrec.evidence.inputs import EpisodeInputs, Inputs, RecordingInputs
 
 
-def seed_of(run: int, episode: int) -> int:
+def seed_of(run, episode):
     """Return the seed that the stated rule gives."""
     return episode_seeds(run, episode).environment
 
 
-def recording(
-    number: int, episodes: Sequence[EpisodeInputs], **inputs: Any
-) -> RecordingInputs:
+def recording(number, episodes, **inputs):
     """Return a recording of these episodes."""
     usual = {"infix": f"{number}.1", "env_id": "A-v0", "environment": None}
     return RecordingInputs(**{**usual, **inputs}, episodes=episodes)
 
 
-def said(
-    *recordings: Sequence[EpisodeInputs], first: int = 0, **options: Any
-) -> list[Finding]:
+def said(*recordings, first=0, **options):
     """Return what is said of recordings of these episodes."""
     more = {"options": options, "first_episode_id": first}
     inputs = Inputs(
@@ -46,7 +38,7 @@ def said(
     return list(remarks(inputs, arrays))
 
 
-def episode(number: int, **inputs: Any) -> EpisodeInputs:
+def episode(number, **inputs):
     """Return an episode, with actions if it has arrays."""
     has_actions = "arrays" in inputs
     return EpisodeInputs(episode_id=number, steps=3, has_actions=has_actions, **inputs)
@@ -82,16 +74,14 @@ def episode(number: int, **inputs: Any) -> EpisodeInputs:
         ),
     ],
 )
-def test_seeds_follow_a_stated_rule_or_are_the_authors(
-    episodes: list[EpisodeInputs], options: dict[str, Any], rule: str
-) -> None:
+def test_seeds_follow_a_stated_rule_or_are_the_authors(episodes, options, rule):
     """From the first episode of the recording on."""
     [finding] = said(episodes, **options)
     assert rule in finding.reason
     assert finding.outcome is Outcome.NOTED
 
 
-def test_gaps_are_in_the_first_line() -> None:
+def test_gaps_are_in_the_first_line():
     """An episode that is not there is no episode of a whole recording."""
     [finding] = said([episode(0), episode(1), episode(4)])
     assert finding.is_headline
@@ -99,7 +89,7 @@ def test_gaps_are_in_the_first_line() -> None:
     assert "missing: 2, 3" in finding.reason
 
 
-def test_a_missing_predecessor_is_in_the_first_line() -> None:
+def test_a_missing_predecessor_is_in_the_first_line():
     """Of a monitor that went on from others; where they are there, nothing is said."""
     [finding] = said([episode(2)], first=2)
     assert finding.is_headline
@@ -112,7 +102,7 @@ def test_a_missing_predecessor_is_in_the_first_line() -> None:
     assert any("0 are missing" in each.reason for each in found)
 
 
-def test_equal_episodes_count_once_and_are_named() -> None:
+def test_equal_episodes_count_once_and_are_named():
     """Wherever they are; other actions, or another beginning, are another episode."""
     first = [episode(0, seed=1, arrays="a"), episode(1, seed=2, arrays="a2")]
     second = [episode(0, seed=1, arrays="a3"), episode(1, seed=1, arrays="b")]
@@ -123,7 +113,7 @@ def test_equal_episodes_count_once_and_are_named() -> None:
     assert finding.count == 1
 
 
-def test_cut_episodes_are_in_the_first_line() -> None:
+def test_cut_episodes_are_in_the_first_line():
     """They are in no statistics."""
     [finding] = said([episode(0), episode(1, cut="reset")])
     assert finding.outcome is Outcome.NOTED
@@ -131,7 +121,7 @@ def test_cut_episodes_are_in_the_first_line() -> None:
     assert "cut off: 1" in finding.reason
 
 
-def test_closing_and_going_on_leaves_episodes_out() -> None:
+def test_closing_and_going_on_leaves_episodes_out():
     """A run is closed once; whoever resumes can drop each episode that goes wrong."""
     first = recording(0, [episode(0), episode(1, cut="close")])
     second = recording(1, [episode(2)], first_episode_id=2)
@@ -148,9 +138,7 @@ def test_closing_and_going_on_leaves_episodes_out() -> None:
         ("Hopper-v5", {"id": "Hopper-v5", "framework": "mjcf"}, Outcome.NOTED),
     ],
 )
-def test_an_environment_is_what_it_is_called(
-    name: str, environment: dict[str, Any], outcome: Outcome
-) -> None:
+def test_an_environment_is_what_it_is_called(name, environment, outcome):
     """All files bear the name, and another environment was run."""
     run = recording(0, [episode(0)], env_id=name, environment=environment)
     [finding] = remarks(Inputs(recordings=[run]), {})
@@ -158,14 +146,14 @@ def test_an_environment_is_what_it_is_called(
     assert finding.outcome is outcome
 
 
-def test_training_episodes_among_evaluations_are_named() -> None:
+def test_training_episodes_among_evaluations_are_named():
     """An average over the others would leave them out."""
     [finding] = said([episode(0, type="t"), episode(1, type="e")])
     assert finding.is_headline
     assert "1 of 2 episodes are labelled training" in finding.reason
 
 
-def test_episodes_of_an_evaluation_are_numbered_without_gaps() -> None:
+def test_episodes_of_an_evaluation_are_numbered_without_gaps():
     """The best of many would be a choice; chunks of one evaluation count together."""
     chunks = [
         [episode(k, evaluation={"seed": 2, "episode": n}) for k, n in enumerate(each)]
@@ -176,7 +164,7 @@ def test_episodes_of_an_evaluation_are_numbered_without_gaps() -> None:
     assert "3, 4" in finding.reason
 
 
-def test_huge_numbers_take_no_memory() -> None:
+def test_huge_numbers_take_no_memory():
     """A stranger's archive may have any."""
     [gap, absent] = said([episode(10**15)], first=10**14)
     assert "and 899999999999995 more" in gap.reason

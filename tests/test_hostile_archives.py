@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Archives that are made to do harm to whoever verifies them."""
 
-from __future__ import annotations
-
 import os
 import stat
 import struct
@@ -25,7 +23,7 @@ EVIL = Path("/tmp/evil-of-mjrec-tests")
 Make = Callable[[Path], object]
 
 
-def write(path: Path, *entries: tuple[str | zipfile.ZipInfo, bytes]) -> None:
+def write(path, *entries):
     """Write a zip file as it would never come from us."""
     with warnings.catch_warnings(), zipfile.ZipFile(path, "w") as file:
         warnings.simplefilter("ignore")  # of names that are there twice
@@ -33,7 +31,7 @@ def write(path: Path, *entries: tuple[str | zipfile.ZipInfo, bytes]) -> None:
             file.writestr(name, content)
 
 
-def write_called(name: str, path: Path, mode: int = 0) -> None:
+def write_called(name, path, mode=0):
     """Write an entry whose name is taken as it is."""
     info = zipfile.ZipInfo("x")
     info.filename = name
@@ -41,11 +39,11 @@ def write_called(name: str, path: Path, mode: int = 0) -> None:
     write(path, (GOOD, b""), (info, b"/etc/passwd"))
 
 
-def write_both(first: str, second: str, path: Path) -> None:
+def write_both(first, second, path):
     write(path, (first, b"1"), (second, b"2"))
 
 
-def damage(change: Callable[[bytearray], object], path: Path) -> None:
+def damage(change, path):
     """Write a sound archive with other bytes in it."""
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as file:
         file.writestr(GOOD, os.urandom(1000))
@@ -54,35 +52,35 @@ def damage(change: Callable[[bytearray], object], path: Path) -> None:
     path.write_bytes(changed if isinstance(changed, bytes | bytearray) else data)
 
 
-def stating(size: int, data: bytearray) -> None:
+def stating(size, data):
     """What is said to be small is counted while it is unpacked."""
     for place in (22, data.index(b"PK\x01\x02") + 24):
         struct.pack_into("<L", data, place, size)
 
 
-def encrypted(data: bytearray) -> None:
+def encrypted(data):
     data[6] |= 1
     data[data.index(b"PK\x01\x02") + 8] |= 1
 
 
-def one_bit(data: bytearray) -> None:
+def one_bit(data):
     data[500] ^= 1
 
 
-def with_bytes_between(data: bytearray) -> bytearray:
+def with_bytes_between(data):
     table = data.index(b"PK\x01\x02")
     moved = bytearray(data[:table] + b"evil" + data[table:])
     struct.pack_into("<L", moved, len(moved) - 6, table + 4)
     return moved
 
 
-def with_comment(path: Path) -> None:
+def with_comment(path):
     write(path, (GOOD, b"1"))
     with zipfile.ZipFile(path, "a") as file:
         file.comment = b"evil"
 
 
-def bomb(path: Path) -> None:
+def bomb(path):
     with (
         zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as file,
         file.open(GOOD, "w") as output,
@@ -91,13 +89,13 @@ def bomb(path: Path) -> None:
             output.write(bytes(1 << 20))
 
 
-def many_files(path: Path) -> None:
+def many_files(path):
     with zipfile.ZipFile(path, "w") as file:
         for number in range(100_001):
             file.writestr(f"r/{number}", b"")
 
 
-def two_entries_over_the_same_bytes(path: Path) -> None:
+def two_entries_over_the_same_bytes(path):
     """As in bombs that unpack one content any number of times."""
     write_both("run/data/a", "run/data/b", path)
     data = bytearray(path.read_bytes())
@@ -105,7 +103,7 @@ def two_entries_over_the_same_bytes(path: Path) -> None:
     path.write_bytes(data)
 
 
-def with_two_tables(path: Path) -> None:
+def with_two_tables(path):
     """Python follows a record of large archives; others see none, for it hides."""
     evil = "run/data/evil"
     begin = 30 + len(GOOD) + 1  # the second file, which holds the table that all see
@@ -130,24 +128,24 @@ def with_two_tables(path: Path) -> None:
     )
 
 
-def stored(name: str, content: bytes) -> bytes:
+def stored(name, content):
     facts = (0, 0, 33, zlib.crc32(content), len(content), len(content), len(name), 0)
     head = struct.pack("<4s2H3H3L2H", b"PK\3\4", 20, 0, *facts)
     return head + name.encode() + content
 
 
-def listing(name: str, content: bytes, offset: int, extra: int = 0) -> bytes:
+def listing(name, content, offset, extra=0):
     sizes = (zlib.crc32(content), len(content), len(content), len(name), extra)
     facts = (20, 20, 0, 0, 0, 33, *sizes, 0, 0, 0, 0, offset)
     return struct.pack("<4s6H3L5H2L", b"PK\1\2", *facts) + name.encode()
 
 
-def rare_compression(path: Path) -> None:
+def rare_compression(path):
     with zipfile.ZipFile(path, "w", zipfile.ZIP_BZIP2) as file:
         file.writestr(GOOD, b"1")
 
 
-def with_a_second_name(path: Path) -> None:
+def with_a_second_name(path):
     """Info-ZIP shows the name in this field, and Python the other one."""
     info = zipfile.ZipInfo(GOOD)
     called = b"\x01" + struct.pack("<L", zlib.crc32(GOOD.encode())) + b"run/data/evil"
@@ -155,13 +153,13 @@ def with_a_second_name(path: Path) -> None:
     write(path, (info, b"1"))
 
 
-def with_a_comment_on_an_entry(path: Path) -> None:
+def with_a_comment_on_an_entry(path):
     info = zipfile.ZipInfo(GOOD)
     info.comment = b"evil"
     write(path, (info, b"1"))
 
 
-def linked_folder(path: Path) -> None:
+def linked_folder(path):
     """An unpacked run whose recordings lie elsewhere."""
     elsewhere = path.with_name("elsewhere")
     (elsewhere / "recordings").mkdir(parents=True)
@@ -170,7 +168,7 @@ def linked_folder(path: Path) -> None:
     (path / "data").symlink_to(elsewhere)
 
 
-HARMS: list[tuple[Make, str]] = [
+HARMS = [
     # Names that lead elsewhere, whatever the system.
     *(
         (partial(write_called, name), reason)
@@ -237,7 +235,7 @@ HARMS: list[tuple[Make, str]] = [
 
 
 @pytest.fixture
-def temporary(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def temporary(tmp_path, monkeypatch):
     """Where temporary folders are made."""
     folder = tmp_path / "temporary"
     folder.mkdir()
@@ -248,7 +246,7 @@ def temporary(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 @pytest.mark.parametrize(
     ("make", "reason"), HARMS, ids=[f"{n} {why}" for n, (_, why) in enumerate(HARMS)]
 )
-def test_harm_is_refused(make: Make, reason: str, tmp_path: Path) -> None:
+def test_harm_is_refused(make, reason, tmp_path):
     """With its reason; nothing is written outside of the folder for it."""
     archive, place = tmp_path / "run.zip", tmp_path / "place"
     make(archive)
@@ -261,7 +259,7 @@ def test_harm_is_refused(make: Make, reason: str, tmp_path: Path) -> None:
     assert not EVIL.exists()
 
 
-def test_harm_in_a_verification_is_refused(tmp_path: Path, temporary: Path) -> None:
+def test_harm_in_a_verification_is_refused(tmp_path, temporary):
     """By the process that unpacks, of which nothing is left."""
     archive = tmp_path / "run.zip"
     write_called("../evil", archive)
@@ -270,9 +268,7 @@ def test_harm_in_a_verification_is_refused(tmp_path: Path, temporary: Path) -> N
     assert list(temporary.iterdir()) == []
 
 
-def test_archive_that_does_not_fit_on_the_disk_is_an_error(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_archive_that_does_not_fit_on_the_disk_is_an_error(tmp_path, monkeypatch):
     """Before anything is written, and with the room that it takes."""
     path = tmp_path / "run.zip"
     write(path, (GOOD, bytes(1000)))
@@ -283,7 +279,7 @@ def test_archive_that_does_not_fit_on_the_disk_is_an_error(
     assert not (tmp_path / "given").exists()
 
 
-def test_words_about_a_bad_archive_say_what_to_do(tmp_path: Path) -> None:
+def test_words_about_a_bad_archive_say_what_to_do(tmp_path):
     """It is one file that somebody has sent."""
     archive = tmp_path / "run.zip"
     archive.write_bytes(b"PK")

@@ -4,8 +4,6 @@
 Each is read in a fork with a gigabyte of memory (`hostile_reading`).
 """
 
-from __future__ import annotations
-
 import contextlib
 import functools
 import gzip
@@ -17,9 +15,8 @@ import socket
 import struct
 import zipfile
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import h5py
 import mujoco
@@ -62,20 +59,20 @@ Harm = Callable[[Path], object]
 
 
 @pytest.fixture(scope="module")
-def inspector() -> Iterator[Inspector]:
+def inspector():
     with Inspector() as one:
         yield one
 
 
 @pytest.fixture
-def directory(tmp_path: Path) -> Path:
+def directory(tmp_path):
     path = tmp_path / "theirs"
     path.mkdir()
     return path
 
 
 @pytest.mark.parametrize("kind", FILES)
-def test_a_sound_file_is_read(inspector: Inspector, directory: Path, kind: str) -> None:
+def test_a_sound_file_is_read(inspector, directory, kind):
     """So that what is refused below is refused for its harm."""
     reader, write = FILES[kind]
     inspector.reads(reader, write(directory))
@@ -84,13 +81,13 @@ def test_a_sound_file_is_read(inspector: Inspector, directory: Path, kind: str) 
 # --- what is no file at all ----------------------------------------------------------
 
 
-def listening_socket(path: Path) -> None:
+def listening_socket(path):
     # By a relative name, because those of sockets are short.
     with contextlib.chdir(path.parent), socket.socket(socket.AF_UNIX) as listening:
         listening.bind(path.name)
 
 
-PUT: dict[str, Harm] = {
+PUT = {
     "pipe": os.mkfifo,
     "folder": Path.mkdir,
     "socket": listening_socket,
@@ -112,8 +109,8 @@ FINE = {
     ("kind", "put"), [(k, p) for k in FILES for p in PUT if (k, p) not in FINE]
 )
 def test_only_regular_files_of_the_directory_are_opened(
-    inspector: Inspector, directory: Path, kind: str, put: str
-) -> None:
+    inspector, directory, kind, put
+):
     """No pipe is waited for, no device opened, no link followed, nothing removed."""
     reader, write = FILES[kind]
     path = write(directory)
@@ -129,7 +126,7 @@ def test_only_regular_files_of_the_directory_are_opened(
     assert sorted(directory.iterdir()) == before
 
 
-def test_links_within_the_directory_are_followed(directory: Path) -> None:
+def test_links_within_the_directory_are_followed(directory):
     """As are the user's own, from elsewhere, that bear no monitor file's name."""
     path = finished(directory)
     kept = path.rename(directory / "kept.h5")
@@ -142,12 +139,12 @@ def test_links_within_the_directory_are_followed(directory: Path) -> None:
 # --- what is not what its name says --------------------------------------------------
 
 
-def a_hole_of_a_terabyte(path: Path) -> None:
+def a_hole_of_a_terabyte(path):
     path.write_bytes(path.read_bytes()[:-1])
     os.truncate(path, 1 << 40)
 
 
-SPOILS: dict[str, Harm] = {
+SPOILS = {
     "nothing": lambda path: path.write_bytes(b""),
     "noise": lambda path: path.write_bytes(np.random.default_rng(1).bytes(5000)),
     "a hole of a terabyte": a_hole_of_a_terabyte,
@@ -157,9 +154,7 @@ SPOILS: dict[str, Harm] = {
 
 @pytest.mark.parametrize("spoil", SPOILS)
 @pytest.mark.parametrize("kind", [k for k in FILES if k != "video for an archive"])
-def test_other_content_is_refused(
-    inspector: Inspector, directory: Path, kind: str, spoil: str
-) -> None:
+def test_other_content_is_refused(inspector, directory, kind, spoil):
     """Of a journal and of logs there is what is whole; the rest is passed over."""
     reader, write = FILES[kind]
     path = write(directory)
@@ -193,20 +188,20 @@ JSON = {
 # --- trajectories --------------------------------------------------------------------
 
 
-def in_hdf5(change: Callable[[h5py.File], object], path: Path) -> None:
+def in_hdf5(change, path):
     with h5py.File(path, "r+") as file:
         change(file)
 
 
-def replaced(name: str, **options: Any) -> Callable[[h5py.File], None]:
-    def replace(file: h5py.File) -> None:
+def replaced(name, **options):
+    def replace(file):
         del file[name]
         file.create_dataset(name, **options)
 
     return replace
 
 
-def virtual(file: h5py.File) -> None:
+def virtual(file):
     """A dataset put together of files that are counted when its shape is asked for."""
     whole = h5py.h5s.create_simple((4,), (h5py.h5s.UNLIMITED,))
     whole.select_hyperslab((0,), (h5py.h5s.UNLIMITED,), (1,), (1,))
@@ -217,13 +212,13 @@ def virtual(file: h5py.File) -> None:
     h5py.h5d.create(file.id, b"rewards", h5py.h5t.IEEE_F64LE, whole, properties)
 
 
-def overflowing_frames(file: h5py.File) -> None:
+def overflowing_frames(file):
     steps = [2**62, 2**63 - 1, -(2**63) + 1, -(2**62), 0]
     replaced("frame_steps", data=np.array(steps))(file)
     replaced("snapshots", data=np.zeros(5, file["snapshots"].dtype))(file)
 
 
-def change_of(file: h5py.File, name: str, **options: Any) -> h5py.Group:
+def change_of(file, name, **options):
     group = file["model_changes"].create_group("0")
     group.attrs["step"] = np.int64(0)
     if options:
@@ -234,13 +229,13 @@ def change_of(file: h5py.File, name: str, **options: Any) -> h5py.Group:
 ZEROS = {"data": np.zeros(4 << 20), "compression": 9, "chunks": (4 << 20,)}
 
 
-def one_change_by_many_names(file: h5py.File) -> None:
+def one_change_by_many_names(file):
     group = change_of(file, "geom_rgba", **ZEROS)
     for index in range(1, 5000):
         file["model_changes"][str(index)] = group
 
 
-def gigabytes_of_observations(file: h5py.File) -> None:
+def gigabytes_of_observations(file):
     """Four, out of four megabytes: zeros pack a thousandfold."""
     rows, length = 500, 1 << 20
     for name, kind in [("rewards", "f8"), ("terminated", "?"), ("truncated", "?")]:
@@ -254,16 +249,16 @@ def gigabytes_of_observations(file: h5py.File) -> None:
         observations.id.write_direct_chunk((row, 0), packed)
 
 
-def linked_field(file: h5py.File) -> None:
+def linked_field(file):
     change_of(file, "")["geom_rgba"] = h5py.ExternalLink("/etc/passwd", "/x")
 
 
-def object_field(file: h5py.File) -> None:
+def object_field(file):
     change_of(file, "x", data=[b"cos\nsystem"], dtype=h5py.string_dtype())
 
 
 # Of one the process is ended when it has had its CPU time, which takes a while.
-HDF5: list[tuple[Callable[[h5py.File], object], str]] = [
+HDF5 = [
     (virtual, "in a way that mjrec does not write"),
     (overflowing_frames, "out of order"),
     (replaced("states", shape=(5, 2**35), dtype="f8"), "C int"),
@@ -280,13 +275,13 @@ HDF5: list[tuple[Callable[[h5py.File], object], str]] = [
 # --- recordings in flight ------------------------------------------------------------
 
 
-def head(rows: Any, version: int = 1) -> bytes:
+def head(rows, version=1):
     """Return the first line of somebody else's journal."""
     values = {"number": 0, "version": version, "dtype": rows, "facts": {}}
     return json.dumps({"rows": values}).encode() + b"\n"
 
 
-def beginning_with(line: bytes, path: Path) -> None:
+def beginning_with(line, path):
     path.write_bytes(line + b"".join(path.read_bytes().splitlines(True)[1:]))
 
 
@@ -308,7 +303,7 @@ CHANGES = (
 )
 
 
-def with_change(header: str, path: Path) -> None:
+def with_change(header, path):
     """Put an array with another header where the changes of a model are."""
     start = b"\x93NUMPY\1\0" + struct.pack("<H", len(header))
     payload = start + header.encode() + bytes(8)
@@ -318,12 +313,11 @@ def with_change(header: str, path: Path) -> None:
 # --- models --------------------------------------------------------------------------
 
 
-def facts_of(directory: Path) -> dict[str, Any]:
-    facts: dict[str, Any] = json.loads((directory / "facts.json").read_text())
-    return facts
+def facts_of(directory):
+    return json.loads((directory / "facts.json").read_text())
 
 
-def put_compiled(content: bytes, packed: bytes, path: Path, **facts: Any) -> None:
+def put_compiled(content, packed, path, **facts):
     """Put bytes in place of a compiled model, with facts that are true."""
     digest = hashlib.sha256(content).hexdigest()
     facts = {"sha256": digest, "bytes": len(content), "mjb": path.name, **facts}
@@ -337,7 +331,7 @@ CONTENT = bytes(1000)
 SOUND = gzip.compress(CONTENT)
 NOISE = np.random.default_rng(1).bytes(10_000)
 BOMB = gzip.compress(bytes(1 << 28))
-GZIP: dict[str, Harm] = {
+GZIP = {
     "no model": lambda path: put_compiled(NOISE, gzip.compress(NOISE), path),
     "a bomb": functools.partial(put_compiled, CONTENT, BOMB),
     "a true bomb": lambda path: put_compiled(CONTENT, BOMB, path, bytes=(1 << 31) - 1),
@@ -355,9 +349,7 @@ GZIP: dict[str, Harm] = {
 }
 
 
-def put_zip(
-    members: dict[str, bytes], path: Path, *, again: tuple[str, ...] = ()
-) -> None:
+def put_zip(members, path, *, again=()):
     contents = b'{"format": 1, "main": "main.xml"}'
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
         for name, content in {"contents.json": contents, **members}.items():
@@ -367,14 +359,14 @@ def put_zip(
                 archive.writestr(name, b"other")
 
 
-def npy(header: str) -> bytes:
+def npy(header):
     text = header.encode().ljust(117) + b"\n"
     return b"\x93NUMPY\x01\0" + len(text).to_bytes(2, "little") + text + bytes(64)
 
 
 MAIN = "source/main.xml"
 HUGE = npy("{'descr': '<f8', 'fortran_order': False, 'shape': (1099511627776,)}")
-ZIP: dict[str, dict[str, bytes]] = {
+ZIP = {
     "more memory than": {"fields/geom_rgba.npy": HUGE},
     "expected 4 bytes": {"fields/geom_rgba.npy": b"\x93NUMPY\x03\0"},
     "a file named": {"source/../../x": b""},
@@ -403,7 +395,7 @@ MJCF = (
 )
 
 # The kind of file, what is done to it, and what is said of it.
-HARMS: list[tuple[str, Harm, str]] = [
+HARMS = [
     *(
         ("manifest", functools.partial(Path.write_bytes, data=data), said)
         for said, data in JSON.items()
@@ -438,9 +430,7 @@ HARMS: list[tuple[str, Harm, str]] = [
     HARMS,
     ids=[f"{number} {kind} {said}" for number, (kind, _, said) in enumerate(HARMS)],
 )
-def test_harm_is_one_error(
-    inspector: Inspector, directory: Path, kind: str, harm: Harm, said: str
-) -> None:
+def test_harm_is_one_error(inspector, directory, kind, harm, said):
     """Before anything of it is used, within memory and time, and with its reason."""
     reader, write = FILES[kind]
     path = write(directory)
@@ -460,9 +450,7 @@ def test_harm_is_one_error(
     ],
     ids=["nested", "a fact twice", "large facts", "an endless line", "no lines"],
 )
-def test_hostile_lines_about_rows_take_little(
-    inspector: Inspector, directory: Path, lines: bytes
-) -> None:
+def test_hostile_lines_about_rows_take_little(inspector, directory, lines):
     """Time and memory; what was said before counts."""
     journal = journal_of_killed(directory)
     with journal.open("ab") as file:
@@ -470,7 +458,7 @@ def test_hostile_lines_about_rows_take_little(
     inspector.reads("finish", journal)
 
 
-def put_journal(directory: Path, name: str, version: int = 1) -> Path:
+def put_journal(directory, name, version=1):
     """Put a journal of somebody else's there that names a recording."""
     begin = {"name": name, "log": 0, "rows": 0, "row": 0, "look": 0, "facts": {}}
     path, line = directory / journal_name(INFIX), json.dumps({"begin": begin})
@@ -479,7 +467,7 @@ def put_journal(directory: Path, name: str, version: int = 1) -> Path:
     return path
 
 
-def test_only_names_of_the_monitor_are_believed(directory: Path) -> None:
+def test_only_names_of_the_monitor_are_believed(directory):
     """No path leads out of the directory, or to another monitor's files."""
     for name in (
         *("../x", "..", "", "a\0b", "\ud800", f"../{NAME}", f"{NAME}.h5", NAME * 9),
@@ -493,7 +481,7 @@ def test_only_names_of_the_monitor_are_believed(directory: Path) -> None:
     assert is_in_flight(directory / f"{NAME}.h5")
 
 
-def test_a_newer_format_is_refused_with_the_way_out(directory: Path) -> None:
+def test_a_newer_format_is_refused_with_the_way_out(directory):
     """Nothing of it is guessed at, and it is not removed."""
     journal, log = put_journal(directory, NAME, version=12), log_name(INFIX, 0)
     with pytest.raises(UnreadableFile, match=r"newer mjrec in .* 12.* 1: update mjr"):
@@ -509,7 +497,7 @@ def test_a_newer_format_is_refused_with_the_way_out(directory: Path) -> None:
 # --- names, and what a file says -----------------------------------------------------
 
 
-def test_a_pending_video_elsewhere_is_not_looked_at(directory: Path) -> None:
+def test_a_pending_video_elsewhere_is_not_looked_at(directory):
     """Though its name begins as that of a video of the directory does."""
     outside = directory.parent / "openaigym.video.0.7.video000000.mp4"
     outside.write_bytes(b"")
@@ -529,7 +517,7 @@ def test_a_pending_video_elsewhere_is_not_looked_at(directory: Path) -> None:
     assert not is_infix("0.7/../..")
 
 
-def test_an_environment_in_a_file_is_text(directory: Path) -> None:
+def test_an_environment_in_a_file_is_text(directory):
     """Nothing that a file names is imported or called, or made an environment of."""
     done = directory / "done"
     environment = {
@@ -546,16 +534,14 @@ def test_an_environment_in_a_file_is_text(directory: Path) -> None:
 
 
 @pytest.mark.parametrize("model", [5, "x", [], {"mjb": "../x"}, {"mjb": {}}])
-def test_what_a_trajectory_says_of_its_model_is_checked(
-    directory: Path, model: Any
-) -> None:
+def test_what_a_trajectory_says_of_its_model_is_checked(directory, model):
     """One error, of whatever type it is."""
     trajectory = load_trajectory(write_log(directory, model=model))
     with pytest.raises(UnreadableFile):
         trajectory.model()
 
 
-def test_a_model_change_that_fits_nothing_names_the_file(directory: Path) -> None:
+def test_a_model_change_that_fits_nothing_names_the_file(directory):
     """And not the field alone."""
     logs = new_logs(directory)
     span = logs.begin(NAME, {"model": stored(directory)}, row_dtype())
@@ -567,9 +553,7 @@ def test_a_model_change_that_fits_nothing_names_the_file(directory: Path) -> Non
     assert error.value.path == path
 
 
-def test_a_compiled_model_has_the_name_of_its_content(
-    inspector: Inspector, directory: Path
-) -> None:
+def test_a_compiled_model_has_the_name_of_its_content(inspector, directory):
     """So that one file cannot stand for two models."""
     path = FILES["mjb.gz"][1](directory)
     other = path.rename(path.with_name("openaigym.model.0123456789abcdef.mjb.gz"))
@@ -591,9 +575,7 @@ TEN_GIGABYTES = (
     [(FOR_EVER, 3, "longer than 3 seconds"), (TEN_GIGABYTES, 100, "memory|too large")],
     ids=["for ever", "ten gigabytes"],
 )
-def test_a_model_that_takes_too_much_is_given_up(
-    directory: Path, xml: str, seconds: int, reason: str
-) -> None:
+def test_a_model_that_takes_too_much_is_given_up(directory, xml, seconds, reason):
     """Time or memory; this process goes on."""
     path = FILES["zip"][1](directory)
     put_zip({MAIN: xml.encode()}, path)

@@ -1,13 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The inputs of a run: read from what it recorded, and nothing more."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
 
 import gymnasium
 import numpy as np
@@ -37,7 +32,7 @@ OTHERS = {
 
 
 @pytest.fixture(scope="module")
-def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def data(tmp_path_factory):
     """What would be in a packed run: a recording with all that is unusual."""
     place = tmp_path_factory.mktemp("inputs")
     env = gymnasium.make("InvertedPendulum-v5", max_episode_steps=4, frame_skip=3)
@@ -49,7 +44,7 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
         fps=29.97,
         workers=0,
     ) as monitor:
-        actions: list[Any] = [np.float32([0.1]), [0.25], np.zeros((2, 1)), np.ones(1)]
+        actions = [np.float32([0.1]), [0.25], np.zeros((2, 1)), np.ones(1)]
         monitor.reset(seed=3, options={"a": 1})
         for action in actions[:2]:
             monitor.step(action)
@@ -61,7 +56,7 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return place
 
 
-def test_inputs_are_what_was_asked_for_and_done(data: Path) -> None:
+def test_inputs_are_what_was_asked_for_and_done(data):
     """Environment, options, seeds, actions and what cut an episode off."""
     inputs, arrays = read_inputs(data)
     [recording] = inputs.recordings
@@ -72,7 +67,7 @@ def test_inputs_are_what_was_asked_for_and_done(data: Path) -> None:
     assert [a.tolist() for a in arrays[str(second.arrays)]][2:] == [[1.0], [1.0]]
 
 
-def test_actions_are_played_in_the_dtype_that_was_given(data: Path) -> None:
+def test_actions_are_played_in_the_dtype_that_was_given(data):
     """Where float32 became float64 in mid-episode, and where one fits nowhere."""
     inputs, arrays = read_inputs(data)
     first, second = inputs.recordings[0].episodes
@@ -85,7 +80,7 @@ def test_actions_are_played_in_the_dtype_that_was_given(data: Path) -> None:
     assert (whole.dtype.name, whole.shape) == ("float32", (2, 1))
 
 
-def test_dictionaries_are_played_as_dictionaries() -> None:
+def test_dictionaries_are_played_as_dictionaries():
     """They are recorded as one vector."""
     episode = EpisodeInputs(
         episode_id=0, steps=1, arrays="a", action_parts=[("x", [2]), ("y", [])]
@@ -95,7 +90,7 @@ def test_dictionaries_are_played_as_dictionaries() -> None:
     assert action["y"] == 3.0
 
 
-def test_inputs_go_through_a_folder_unchanged(data: Path, tmp_path: Path) -> None:
+def test_inputs_go_through_a_folder_unchanged(data, tmp_path):
     """Without pickles."""
     inputs, arrays = read_inputs(data)
     inputs.write(tmp_path, arrays)
@@ -108,7 +103,7 @@ def test_inputs_go_through_a_folder_unchanged(data: Path, tmp_path: Path) -> Non
         assert set(read) == set(arrays)
 
 
-def test_unusual_inputs_are_listed(data: Path) -> None:
+def test_unusual_inputs_are_listed(data):
     """For the report: all that is not the default."""
     inputs, _ = read_inputs(data)
     packed = dataclasses.replace(inputs, packing={"anonymous": True, "name": "run"})
@@ -123,7 +118,7 @@ def test_unusual_inputs_are_listed(data: Path) -> None:
     assert recording["environment"] == "InvertedPendulum-v5"
 
 
-def test_wrappers_are_listed_with_their_arguments() -> None:
+def test_wrappers_are_listed_with_their_arguments():
     """Gymnasium's own can give any reward."""
     environment = {
         "id": "A-v0",
@@ -149,9 +144,7 @@ def test_wrappers_are_listed_with_their_arguments() -> None:
         lambda run: run.update(first_episode_id="0"),
     ],
 )
-def test_what_is_no_input_is_refused(
-    change: Callable[[dict[str, Any]], None], data: Path, tmp_path: Path
-) -> None:
+def test_what_is_no_input_is_refused(change, data, tmp_path):
     """The list is closed, and each has its type."""
     folder = tmp_path / "recordings"
     folder.mkdir()
@@ -167,7 +160,7 @@ def test_what_is_no_input_is_refused(
         read_inputs(tmp_path)
 
 
-def test_each_option_is_an_input_or_has_a_reason_not_to_be() -> None:
+def test_each_option_is_an_input_or_has_a_reason_not_to_be():
     """An option that changes files, and is not an input, would never verify."""
     fields = {field.name for field in dataclasses.fields(RecorderOptions)}
     others = {name for names in OTHERS.values() for name in names.split()}

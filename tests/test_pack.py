@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A packed run holds what was recorded, conforms, and is the same every time."""
 
-from __future__ import annotations
-
 import csv
 import json
 import os
@@ -13,9 +11,7 @@ import subprocess
 import sys
 import threading
 import zipfile
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import gymnasium
 import numpy as np
@@ -31,7 +27,7 @@ from mjrec.evidence.pack import pack_folder
 from mjrec.evidence.packed_run import PackingOptions
 from mjrec.formats.journal import is_of_spans
 
-STATED: dict[str, Any] = {
+STATED = {
     "title": "Pendulums: «five» of them",
     "authors": ["Ada Lovelace <0000-0002-1825-0097>", "van Rossum, Guido <g@x.org>"],
     "license": "cc-by-4.0",
@@ -39,39 +35,39 @@ STATED: dict[str, Any] = {
 
 
 @pytest.fixture(scope="module")
-def recorded(pendulums: Callable[..., Path]) -> Path:
+def recorded(pendulums):
     """Return a directory with three episodes, of which two have a video."""
     return pendulums(3)
 
 
 @pytest.fixture(scope="module")
-def archive(recorded: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def archive(recorded, tmp_path_factory):
     """Return it packed."""
     path = tmp_path_factory.mktemp("packed") / "run.zip"
     return mjrec.pack(recorded, path, **STATED)
 
 
 @pytest.fixture(scope="module")
-def bag(archive: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def bag(archive, tmp_path_factory):
     """Return that unpacked."""
     return unpacked(archive, tmp_path_factory.mktemp("unpacked"))
 
 
 @pytest.fixture(scope="module")
-def infix(recorded: Path) -> str:
+def infix(recorded):
     """Return what the names of its files have in common."""
     name = the(recorded, "*.jsonl").name
     return name.removeprefix("openaigym.episodes.").removesuffix(".jsonl")
 
 
-def packed_bytes(path: Path) -> bytes:
+def packed_bytes(path):
     """Return what is packed of a file: of a journal all but the lines about logs."""
     lines = path.read_bytes().splitlines(keepends=True)
     is_journal = path.suffix == ".jsonl"
     return b"".join(x for x in lines if not (is_journal and is_of_spans(x)))
 
 
-def test_it_holds_the_recordings_unchanged(recorded: Path, bag: Path) -> None:
+def test_it_holds_the_recordings_unchanged(recorded, bag):
     """Every file of the directory, and not one byte of it is another."""
     assert bag.name == "run"
     packed = {path.name: path for path in (bag / "data/recordings").iterdir()}
@@ -80,7 +76,7 @@ def test_it_holds_the_recordings_unchanged(recorded: Path, bag: Path) -> None:
         assert path.read_bytes() == packed_bytes(recorded / name)
 
 
-def test_other_programs_take_the_bag(bag: Path) -> None:
+def test_other_programs_take_the_bag(bag):
     """The `bagit` package, and sha512sum, as the README says."""
     assert (bag / "bagit.txt").read_text().startswith("BagIt-Version: 1.0\n")
     for command in (
@@ -90,7 +86,7 @@ def test_other_programs_take_the_bag(bag: Path) -> None:
         subprocess.run(command, cwd=bag, check=True, capture_output=True)
 
 
-def test_names_in_the_zip_are_plain(archive: Path) -> None:
+def test_names_in_the_zip_are_plain(archive):
     """One folder, sorted, no times, no owners, what is compressed already stored."""
     with zipfile.ZipFile(archive) as packed:
         infos = packed.infolist()
@@ -103,12 +99,7 @@ def test_names_in_the_zip_are_plain(archive: Path) -> None:
     assert stored == {n for n in names if n.endswith((".mp4", ".h5", ".gz", ".zip"))}
 
 
-def test_the_same_input_gives_the_same_bytes(
-    recorded: Path,
-    archive: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_the_same_input_gives_the_same_bytes(recorded, archive, tmp_path, monkeypatch):
     """From a copy with other times, in another order, elsewhere, with another umask."""
     copy = tmp_path / "copy"
     copy.mkdir()
@@ -124,11 +115,11 @@ def test_the_same_input_gives_the_same_bytes(
     assert again.read_bytes() == archive.read_bytes()
 
 
-def test_packing_changes_nothing_else(recorded: Path, tmp_path: Path) -> None:
+def test_packing_changes_nothing_else(recorded, tmp_path):
     """Neither the recordings, nor the working directory, also from a thread."""
     before = {path: path.stat() for path in recorded.iterdir()}
     place = Path.cwd()
-    seen: set[Path] = set()
+    seen = set()
     packing = threading.Thread(target=mjrec.pack, args=(recorded, tmp_path / "a.zip"))
     packing.start()
     while packing.is_alive():
@@ -148,11 +139,11 @@ def test_packing_changes_nothing_else(recorded: Path, tmp_path: Path) -> None:
 
 
 def test_files_are_copied_where_there_are_no_links(
-    recorded: Path, archive: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    recorded, archive, tmp_path, monkeypatch
+):
     """Another file system, say; the archive is the same."""
 
-    def refuse(*_: object, **__: object) -> None:
+    def refuse(*_, **__):
         raise OSError(18, "Invalid cross-device link")
 
     monkeypatch.setattr(os, "link", refuse)
@@ -160,9 +151,7 @@ def test_files_are_copied_where_there_are_no_links(
     assert again.read_bytes() == archive.read_bytes()
 
 
-def test_the_table_says_what_the_journal_says(
-    recorded: Path, infix: str, bag: Path
-) -> None:
+def test_the_table_says_what_the_journal_says(recorded, infix, bag):
     """A row an episode, in order, with the same bits in every number."""
     with (bag / "data/statistics.csv").open(newline="") as file:
         head, *rows = csv.reader(file)
@@ -182,7 +171,7 @@ def test_the_table_says_what_the_journal_says(
     assert dict(zip(head, rows[0], strict=True))["video_sha256"] == digest
 
 
-def _entities(bag: Path) -> dict[str, Any]:
+def _entities(bag):
     crate = json.loads((bag / "data/ro-crate-metadata.json").read_text())
     assert crate["@context"] == "https://w3id.org/ro/crate/1.1/context"
     entities = {entity["@id"]: entity for entity in crate["@graph"]}
@@ -190,7 +179,7 @@ def _entities(bag: Path) -> dict[str, Any]:
     return entities
 
 
-def test_the_crate_has_what_its_specification_wants(bag: Path) -> None:
+def test_the_crate_has_what_its_specification_wants(bag):
     """What RO-Crate 1.1 and Process Run Crate 0.5 call MUST."""
     entities = _entities(bag)
     descriptor = entities["ro-crate-metadata.json"]
@@ -217,7 +206,7 @@ def test_the_crate_has_what_its_specification_wants(bag: Path) -> None:
     assert action["startTime"] < action["endTime"]
 
 
-def test_the_crate_describes_every_file_and_nothing_else(bag: Path) -> None:
+def test_the_crate_describes_every_file_and_nothing_else(bag):
     """Every reference leads to an entity, and every entity of a file to a file."""
     entities = _entities(bag)
     files = {
@@ -231,7 +220,7 @@ def test_the_crate_describes_every_file_and_nothing_else(bag: Path) -> None:
         size = (bag / "data" / name).stat().st_size
         assert entities[name]["contentSize"] == str(size)
 
-    def references(value: Any) -> Any:
+    def references(value):
         if isinstance(value, dict):
             return [value["@id"]] if set(value) == {"@id"} else []
         return (
@@ -257,7 +246,7 @@ def test_the_crate_describes_every_file_and_nothing_else(bag: Path) -> None:
     }
 
 
-def test_the_citation_is_valid(bag: Path) -> None:
+def test_the_citation_is_valid(bag):
     """YAML, with what the format demands."""
     cited = yaml.safe_load((bag / "data/CITATION.cff").read_text())
     assert cited["cff-version"] == "1.2.0"
@@ -273,9 +262,7 @@ def test_the_citation_is_valid(bag: Path) -> None:
     ]
 
 
-def test_the_environment_says_what_drew_and_encoded(
-    recorded: Path, infix: str, bag: Path
-) -> None:
+def test_the_environment_says_what_drew_and_encoded(recorded, infix, bag):
     """Beside what the recording says of its own provenance."""
     content = json.loads((bag / "data/environment.json").read_text())
     said, metadata = content["recordings"][infix], metadata_of(recorded, 0)
@@ -289,7 +276,7 @@ def test_the_environment_says_what_drew_and_encoded(
     assert content["packed_with"]["mjrec"] == mjrec.__version__
 
 
-def test_the_readme_leads_a_stranger(infix: str, recorded: Path, bag: Path) -> None:
+def test_the_readme_leads_a_stranger(infix, recorded, bag):
     """What it is, how to verify it, what was shown, by which rule."""
     returns = mjrec.load_results(recorded)["episode_rewards"]
     text = (bag / "data/README.md").read_text()
@@ -308,12 +295,12 @@ def test_the_readme_leads_a_stranger(infix: str, recorded: Path, bag: Path) -> N
     assert "has chosen" not in text
 
 
-def test_the_readme_says_what_environments_were_made_with(tmp_path: Path) -> None:
+def test_the_readme_says_what_environments_were_made_with(tmp_path):
     """Which makes another environment of one with a name that everybody knows."""
     env = gymnasium.make("HalfCheetah-v5", forward_reward_weight=100.0)
     env = gymnasium.wrappers.ClipReward(env, 1.0)
     directory = tmp_path / "run"
-    kept: dict[str, Any] = {"video_callable": False, "trajectory_callable": True}
+    kept = {"video_callable": False, "trajectory_callable": True}
     honest_runs.play(mjrec.Monitor(env, directory, **kept), 1, most=2)
     folder = unpacked(mjrec.pack(directory, tmp_path / "a.zip"), tmp_path / "x")
     text = (folder / "data/README.md").read_text()
@@ -324,7 +311,7 @@ def test_the_readme_says_what_environments_were_made_with(tmp_path: Path) -> Non
     assert "ClipReward(min_reward=1.0" in text
 
 
-def test_nothing_need_be_stated(recorded: Path, tmp_path: Path) -> None:
+def test_nothing_need_be_stated(recorded, tmp_path):
     """Then that is said, where something has to be."""
     folder = unpacked(mjrec.pack(recorded, tmp_path / "a.zip"), tmp_path / "x")
     root = _entities(folder)["./"]
@@ -337,16 +324,14 @@ def test_nothing_need_be_stated(recorded: Path, tmp_path: Path) -> None:
 
 
 @pytest.fixture(scope="module")
-def one_chosen(recorded: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def one_chosen(recorded, tmp_path_factory):
     """Return the folder of an archive of episode 1 alone, chosen by a NumPy integer."""
     path = tmp_path_factory.mktemp("chosen") / "one.zip"
     mjrec.pack(recorded, path, episodes=np.array([1]))
     return unpacked(path, path.parent / "x")
 
 
-def test_some_episodes_can_be_chosen(
-    recorded: Path, infix: str, one_chosen: Path, names: Callable[[Path], list[str]]
-) -> None:
+def test_some_episodes_can_be_chosen(recorded, infix, one_chosen, names):
     """Statistics stay whole, and everything says that a choice was made."""
     packed = one_chosen / "data/recordings"
     assert videos_in(packed) == [1]
@@ -363,9 +348,7 @@ def test_some_episodes_can_be_chosen(
     assert videos_in(recorded) == [0, 1]
 
 
-def test_actions_of_all_episodes_stay(
-    recorded: Path, infix: str, one_chosen: Path
-) -> None:
+def test_actions_of_all_episodes_stay(recorded, infix, one_chosen):
     """Anyone can make the others again, from their seeds; only states are left out."""
     name = f"openaigym.trajectory.{infix}.episode000000.h5"
     before, after = (
@@ -379,7 +362,7 @@ def test_actions_of_all_episodes_stay(
     assert not after.frame_steps.size
 
 
-def test_descriptions_claim_what_is_in_the_archive(one_chosen: Path) -> None:
+def test_descriptions_claim_what_is_in_the_archive(one_chosen):
     """Of episodes that were not chosen there are neither videos nor states."""
     held = (
         "statistics of 3 episodes of InvertedPendulum-v5, 1 video, actions of 2 "
@@ -394,13 +377,13 @@ def test_descriptions_claim_what_is_in_the_archive(one_chosen: Path) -> None:
     assert "as it was recorded" not in text
 
 
-def test_what_was_left_out_is_not_pending(one_chosen: Path) -> None:
+def test_what_was_left_out_is_not_pending(one_chosen):
     """Nothing promises a video of an episode that was not chosen."""
     episodes = mjrec.iter_episodes(one_chosen / "data/recordings")
     assert not [episode for episode in episodes if episode.pending]
 
 
-def test_commands_in_the_readme_can_be_pasted(recorded: Path, tmp_path: Path) -> None:
+def test_commands_in_the_readme_can_be_pasted(recorded, tmp_path):
     """A shell takes the archive's name as one argument, whatever is in it."""
     name = "it's $(here); a `run` & more.zip"
     folder = unpacked(mjrec.pack(recorded, tmp_path / name), tmp_path / "x")
@@ -409,9 +392,7 @@ def test_commands_in_the_readme_can_be_pasted(recorded: Path, tmp_path: Path) ->
     assert shlex.split(command) == ["mjrec", "verify", name]
 
 
-def test_more_files_than_verify_takes_are_refused(
-    recorded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_more_files_than_verify_takes_are_refused(recorded, tmp_path, monkeypatch):
     """Before any work, and with the way out."""
     monkeypatch.setattr("mjrec.evidence.pack.MOST_ENTRIES", 20)
     with pytest.raises(mjrec.PackError, match=r"at most 20 files.*--episodes"):
@@ -419,7 +400,7 @@ def test_more_files_than_verify_takes_are_refused(
     assert not list(tmp_path.iterdir())
 
 
-def test_the_options_of_packing_are_said(bag: Path, one_chosen: Path) -> None:
+def test_the_options_of_packing_are_said(bag, one_chosen):
     """Who makes the archive again packs in the same way."""
     said = [
         json.loads((folder / "data/environment.json").read_text())["packed_with"]
@@ -436,9 +417,7 @@ def test_the_options_of_packing_are_said(bag: Path, one_chosen: Path) -> None:
     assert said[1]["options"]["episodes"] == [1]
 
 
-def test_the_same_folder_comes_of_the_same_options(
-    recorded: Path, bag: Path, tmp_path: Path
-) -> None:
+def test_the_same_folder_comes_of_the_same_options(recorded, bag, tmp_path):
     """Without a zip file, for who compares with it."""
     authors = tuple(STATED["authors"])
     options = PackingOptions(name="run", **{**STATED, "authors": authors})
@@ -450,7 +429,7 @@ def test_the_same_folder_comes_of_the_same_options(
 
 
 @pytest.mark.thorough
-def test_models_of_other_episodes_are_left_out(tmp_path: Path) -> None:
+def test_models_of_other_episodes_are_left_out(tmp_path):
     """What nothing in the archive refers to would be called an extra file."""
     directory = tmp_path / "runs"
     record_pendulum(directory, 1)
@@ -466,7 +445,7 @@ def test_models_of_other_episodes_are_left_out(tmp_path: Path) -> None:
     }
 
 
-def test_two_monitors_are_two_actions(recorded: Path, tmp_path: Path) -> None:
+def test_two_monitors_are_two_actions(recorded, tmp_path):
     """Each with its own files; a choice of episodes is of both."""
     directory = tmp_path / "runs"
     shutil.copytree(recorded, directory)
@@ -481,7 +460,7 @@ def test_two_monitors_are_two_actions(recorded: Path, tmp_path: Path) -> None:
     assert len(_entities(folder)["./"]["mentions"]) == 2
 
 
-def _record(directory: Path, episodes: int, size: tuple[int, int], **rest: Any) -> None:
+def _record(directory, episodes, size, **rest):
     """Record episodes of four steps with frames of that height and width."""
     env = gymnasium.make(
         "HalfCheetah-v5",
@@ -499,18 +478,18 @@ def _record(directory: Path, episodes: int, size: tuple[int, int], **rest: Any) 
                 done = terminated or truncated
 
 
-def _largest_video(archive: Path) -> int:
+def _largest_video(archive):
     with zipfile.ZipFile(archive) as packed:
         return max(i.file_size for i in packed.infolist() if i.filename[-4:] == ".mp4")
 
 
 @pytest.mark.thorough
-def test_videos_are_drawn_smaller_for_a_limit(tmp_path: Path) -> None:
+def test_videos_are_drawn_smaller_for_a_limit(tmp_path):
     """All frames of them, with hashes of their own; the recording stays as it was."""
     directory = tmp_path / "runs"
     _record(directory, 2, size=(240, 320))
     whole = mjrec.pack(directory, tmp_path / "whole.zip")
-    told: list[Any] = []
+    told = []
     limit = whole.stat().st_size - _largest_video(whole) // 4
     small = mjrec.pack(
         directory, tmp_path / "small.zip", max_size=limit, on_progress=told.append
@@ -538,9 +517,7 @@ def test_videos_are_drawn_smaller_for_a_limit(tmp_path: Path) -> None:
     assert "packed_smaller" not in metadata_of(directory, 0)
 
 
-def test_a_limit_that_is_kept_anyway_changes_no_recording(
-    recorded: Path, tmp_path: Path
-) -> None:
+def test_a_limit_that_is_kept_anyway_changes_no_recording(recorded, tmp_path):
     """No video is drawn again."""
     packed = mjrec.pack(recorded, tmp_path / "run.zip", max_size="5M")
     for path in (unpacked(packed, tmp_path / "x") / "data/recordings").iterdir():

@@ -1,14 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """The wheel: what is in it, what it says of itself, and that it works alone."""
 
-from __future__ import annotations
-
 import email
 import os
 import subprocess
 import sys
 import zipfile
-from email.message import Message
 from pathlib import Path
 
 import pytest
@@ -20,7 +17,7 @@ SOURCE = ROOT / "src"
 
 
 @pytest.fixture(scope="module")
-def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def wheel(tmp_path_factory):
     """Build the wheel from the working tree, without a network."""
     pytest.importorskip("build", reason="the packages' tools are not here")
     folder = tmp_path_factory.mktemp("wheel")
@@ -37,7 +34,7 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_wheel_holds_the_package_and_nothing_else(wheel: Path) -> None:
+def test_wheel_holds_the_package_and_nothing_else(wheel):
     """Every file of the package, templates and tables too; no tests or benchmarks."""
     with zipfile.ZipFile(wheel) as packed:
         names = set(packed.namelist())
@@ -51,11 +48,11 @@ def test_wheel_holds_the_package_and_nothing_else(wheel: Path) -> None:
     assert any(name.endswith("licenses/LICENSE") for name in names)
 
 
-def test_metadata_says_what_it_is_for(wheel: Path) -> None:
+def test_metadata_says_what_it_is_for(wheel):
     """README, licence, Pythons, and a typed package; no address that is made up."""
     with zipfile.ZipFile(wheel) as packed:
         [name] = [n for n in packed.namelist() if n.endswith("dist-info/METADATA")]
-        about: Message = email.message_from_bytes(packed.read(name))
+        about = email.message_from_bytes(packed.read(name))
     assert about["Name"] == "mjrec"
     assert about["Version"] == mjrec.__version__
     assert about["License-Expression"] == "Apache-2.0"
@@ -65,13 +62,13 @@ def test_metadata_says_what_it_is_for(wheel: Path) -> None:
 
 
 @pytest.mark.wheel
-def test_wheel_alone_records_renders_evaluates_and_reports(tmp_path: Path) -> None:
+def test_wheel_alone_records_renders_evaluates_and_reports(tmp_path):
     """In an environment that holds it and what it depends on, far from the sources."""
     python = os.environ.get("MJREC_TEST_WHEEL")
     if python is None:
         pytest.fail("scripts/test --all names an environment with the wheel.")
 
-    def run(*arguments: str) -> str:
+    def run(*arguments):
         done = subprocess.run(
             [python, *arguments],
             cwd=tmp_path,

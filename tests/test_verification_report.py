@@ -1,23 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
 """The page of a verification: what it says, and that nothing can be slipped into it."""
 
-from __future__ import annotations
-
 import html.parser
 import re
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
 
 import pytest
 from verifications import HOSTILE, excuse, finding, verification
 
-from mjrec.evidence.findings import Finding, Outcome, Topic
+from mjrec.evidence.findings import Outcome, Topic
 from mjrec.evidence.verification_report import write_verification_report
 
 
-def page(tmp_path: Path, *findings: Finding, **changes: Any) -> str:
+def page(tmp_path, *findings, **changes):
     path = tmp_path / "verify.html"
     write_verification_report(verification(*findings, **changes), path)
     return path.read_text(encoding="utf-8")
@@ -28,32 +25,32 @@ class Elements(html.parser.HTMLParser):
 
     VOID = ("meta", "img", "br")
 
-    def __init__(self, text: str) -> None:
+    def __init__(self, text):
         super().__init__()
-        self.found: list[tuple[str, dict[str, str | None]]] = []
-        self.open: list[str] = []
-        self.text: list[str] = []
+        self.found = []
+        self.open = []
+        self.text = []
         self.feed(text)
         self.close()
 
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+    def handle_starttag(self, tag, attrs):
         self.found.append((tag, dict(attrs)))
         if tag not in self.VOID:
             self.open.append(tag)
 
-    def handle_endtag(self, tag: str) -> None:
+    def handle_endtag(self, tag):
         assert self.open.pop() == tag
 
-    def handle_data(self, data: str) -> None:
+    def handle_data(self, data):
         if self.open and self.open[-1] != "style":
             self.text.append(" ".join(data.split()))
 
 
-def words(text: str) -> str:
+def words(text):
     return " ".join(filter(None, Elements(text).text))
 
 
-def test_the_verdict_comes_first_and_then_what_differs(tmp_path: Path) -> None:
+def test_the_verdict_comes_first_and_then_what_differs(tmp_path):
     """With excuses, inputs, a line for each topic, and all findings."""
     shown = words(
         page(
@@ -81,7 +78,7 @@ def test_the_verdict_comes_first_and_then_what_differs(tmp_path: Path) -> None:
     assert all(str(topic) in shown for topic in Topic)
 
 
-def test_it_says_how_to_make_it_again(tmp_path: Path) -> None:
+def test_it_says_how_to_make_it_again(tmp_path):
     """With the options that it was made with."""
     facts = {"sample": 20, "seed": 7, "trust": ["A b-v0"], "allow": ["gl=H100"]}
     shown = words(page(tmp_path, facts=facts))
@@ -93,7 +90,7 @@ def test_it_says_how_to_make_it_again(tmp_path: Path) -> None:
     assert "It runs no code that the archive names" in words(page(tmp_path))
 
 
-def test_the_page_is_whole_and_loads_nothing(tmp_path: Path) -> None:
+def test_the_page_is_whole_and_loads_nothing(tmp_path):
     """Its elements close, and no attribute leads anywhere."""
     text = page(tmp_path, *map(finding, Outcome), excuses=(excuse(),))
     elements = Elements(text)
@@ -106,9 +103,9 @@ def test_the_page_is_whole_and_loads_nothing(tmp_path: Path) -> None:
     assert not re.search(r"url\(|@import|https?:", text)
 
 
-def test_hostile_text_stays_text(tmp_path: Path) -> None:
+def test_hostile_text_stays_text(tmp_path):
     """Wherever it comes from: nothing is marked up, nothing is hidden."""
-    given: dict[str, Any] = {
+    given = {
         "excuses": (excuse(),),
         "inputs": {"a": {"b": "c"}},
         "facts": {"a": {"b": "c"}},
@@ -133,7 +130,7 @@ def test_hostile_text_stays_text(tmp_path: Path) -> None:
     assert "{{7*7}}" in text
 
 
-def test_many_findings_make_no_endless_page(tmp_path: Path) -> None:
+def test_many_findings_make_no_endless_page(tmp_path):
     """What is left out is counted."""
     many = [finding(Outcome.DIFFERENT, reason=f"{n} {'x' * 5000}") for n in range(1500)]
     text = page(tmp_path, *many)
@@ -142,7 +139,7 @@ def test_many_findings_make_no_endless_page(tmp_path: Path) -> None:
     assert "1300 more are not listed" in words(text)
 
 
-def test_without_jinja_it_is_said_what_to_install(tmp_path: Path) -> None:
+def test_without_jinja_it_is_said_what_to_install(tmp_path):
     """Verifying without a report needs none."""
     program = (
         "import sys; sys.modules['jinja2'] = None\n"
@@ -168,7 +165,7 @@ def test_without_jinja_it_is_said_what_to_install(tmp_path: Path) -> None:
 @pytest.mark.axe
 @pytest.mark.browser
 @pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_the_page_keeps_nobody_out(tmp_path: Path, scheme: Any) -> None:
+def test_the_page_keeps_nobody_out(tmp_path, scheme):
     """axe-core finds nothing serious, and a phone scrolls in one direction only."""
     # Here: most tests of this file need no browser.
     import shutil
@@ -189,7 +186,7 @@ def test_the_page_keeps_nobody_out(tmp_path: Path, scheme: Any) -> None:
         browser = playwright.chromium.launch(
             executable_path=found, args=["--no-sandbox"]
         )
-        size: Any = {"width": 360, "height": 800}
+        size = {"width": 360, "height": 800}
         with browser.new_context(viewport=size, color_scheme=scheme) as context:
             shown = context.new_page()
             shown.goto((tmp_path / "verify.html").as_uri())
