@@ -13,8 +13,6 @@ import pytest
 from mjrec.errors import ArchiveError
 from mjrec.formats.archive import MAX_VIDEOS, write_archive
 
-Pair = tuple[Path, Path]
-
 
 def make(directory, name, suffix=".mp4"):
     """Make a video and its metadata, with a content each."""
@@ -27,12 +25,10 @@ def make(directory, name, suffix=".mp4"):
 def refusal(videos):
     """Return the message with which `videos` are refused, with nothing written."""
     archive = io.BytesIO()
-    with pytest.raises(ArchiveError) as caught:
+    with pytest.raises(ArchiveError, match=r"^\[Hopper-v5\] ") as caught:
         write_archive(videos, archive, env_id="Hopper-v5")
     assert archive.getvalue() == b""
-    message = str(caught.value)
-    assert message.startswith("[Hopper-v5] ")
-    return message.removeprefix("[Hopper-v5] ")
+    return str(caught.value).removeprefix("[Hopper-v5] ")
 
 
 def test_it_holds_the_files_and_then_their_list(tmp_path):
@@ -41,24 +37,19 @@ def test_it_holds_the_files_and_then_their_list(tmp_path):
     archive = io.BytesIO()
     archive.write(b"before")
     # As `load_results` gives them, too.
-    write_archive([first, (str(second[0]), str(second[1]))], archive)
-    assert not archive.closed
+    write_archive([first, tuple(map(str, second))], archive)
     archive.seek(len(b"before"))
     contents = {}
     with tarfile.open(fileobj=archive, mode="r:gz") as tar:
         for member in tar:
-            file = tar.extractfile(member)
-            assert file is not None
-            contents[member.name] = file.read()
+            contents[member.name] = tar.extractfile(member).read()
             assert (member.mtime, member.uid, member.gid) == (0, 0, 0)
             assert (member.uname, member.gname, member.mode) == ("", "", 0o644)
-    names = ["b.mp4", "b.meta.json", "a.json", "a.meta.json", "manifest.json"]
-    assert list(contents) == names
+    names = ["b.mp4", "b.meta.json", "a.json", "a.meta.json"]
+    assert list(contents) == [*names, "manifest.json"]
     assert contents["a.json"] == b"video a"
-    assert json.loads(contents["manifest.json"]) == {
-        "version": 0,
-        "videos": [["b.mp4", "b.meta.json"], ["a.json", "a.meta.json"]],
-    }
+    videos = [names[:2], names[2:]]
+    assert json.loads(contents["manifest.json"]) == {"version": 0, "videos": videos}
 
 
 def test_the_same_videos_give_the_same_bytes(tmp_path):
@@ -87,36 +78,32 @@ def test_a_hundred_videos_fit_and_no_more(tmp_path):
     )
 
 
-# The names of videos and their metadata, of which the last is refused.
-NAMES = [
-    *((["a.mp4\n"], "'a.mp4\\n' is not a video's name"), (["a.mkv"], "'a.mkv' is no")),
-    (["ð.mp4"], "'ð.mp4' is not a video's name"),
-    (["a.mp4 a.json"], "'a.json' is not a metadata name"),
-    (["a.mp4 manifest.json"], "'manifest.json' is not a metadata name"),
-    (["b.meta.json a.meta.json"], "'b.meta.json' is a metadata file's name"),
-    (["manifest.json"], "the archive's manifest"),
-    (["Manifest.json"], "the archive's manifest"),
-    # In gym's order: pair by pair, and in each presence, doubles, names.
-    (["-"], "The video "),
-    (["a.mp4 -"], "the metadata of the video"),
-    (["b+c.mp4", "-"], "not a video's name"),
-    (["-", "b+c.mp4"], "The video "),
-    (["a.mp4", "other/a.mp4"], "'a.mp4' occurs twice (the second time as "),
-    (["a.mp4", "b.mp4 other/a.meta.json"], "'a.meta.json' occurs twice"),
-    (["b.meta.json b.meta.json"], "'b.meta.json' occurs twice"),
-]
-
-
-@pytest.mark.parametrize(("names", "reason"), NAMES)
+@pytest.mark.parametrize(
+    ("names", "reason"),
+    [
+        (["a.mp4\n"], "'a.mp4\\n' is not a video's name"),
+        (["a.mkv"], "'a.mkv' is no"),
+        (["ð.mp4"], "'ð.mp4' is not a video's name"),
+        (["a.mp4 a.json"], "'a.json' is not a metadata name"),
+        (["b.meta.json a.meta.json"], "'b.meta.json' is a metadata file's name"),
+        (["Manifest.json"], "the archive's manifest"),
+        # In gym's order: pair by pair, and in each presence, doubles, names.
+        (["a.mp4 -"], "the metadata of the video"),
+        (["b+c.mp4", "-"], "not a video's name"),
+        (["-", "b+c.mp4"], "The video "),
+        (["a.mp4", "other/a.mp4"], "'a.mp4' occurs twice (the second time as "),
+        (["a.mp4", "b.mp4 other/a.meta.json"], "'a.meta.json' occurs twice"),
+        (["b.meta.json b.meta.json"], "'b.meta.json' occurs twice"),
+    ],
+)
 def test_names_differ_are_plain_and_say_what_they_are(tmp_path, names, reason):
     """ASCII letters, digits and three signs; nothing after the ending."""
     (tmp_path / "other").mkdir()
     pairs = []
     for each in names:
         video, _, metadata = each.partition(" ")
-        pair = tmp_path / video, tmp_path / (metadata or "a.meta.json")
-        pairs.append(pair)
-        for path in pair:
+        pairs.append((tmp_path / video, tmp_path / (metadata or "a.meta.json")))
+        for path in pairs[-1]:
             if path.name != "-":
                 path.touch()
     assert reason in refusal(pairs)

@@ -1,5 +1,4 @@
 # SPDX-License-Identifier: Apache-2.0
-
 import json
 import shutil
 
@@ -66,8 +65,7 @@ def test_json_has_all(packed, capsys):
 
 def test_directory_that_was_not_packed_is_verified(pendulums, tmp_path, capsys):
     """Nothing is written into it."""
-    folder = tmp_path / "recordings"
-    shutil.copytree(pendulums(1), folder)
+    folder = shutil.copytree(pendulums(1), tmp_path / "recordings")
     before = {path: path.stat().st_mtime_ns for path in folder.rglob("*")}
     assert main(["verify", str(folder), "--level", "physics"]) == 3
     assert capsys.readouterr().out.startswith("PARTLY")
@@ -80,19 +78,14 @@ def test_directory_that_was_not_packed_is_verified(pendulums, tmp_path, capsys):
         (["--sample", "0"], "sample must be"),
         (["--allow", "gl"], "allow takes"),
         (["--report", "/no/such/place.html"], "no such directory"),
+        ([], "mjrec: Cannot verify {}: it is not a zip file"),
     ],
 )
-def test_options_are_checked_first(arguments, said, packed, capsys):
-    """Before anything is unpacked."""
-    assert main(["verify", str(packed), *arguments]) == 1
-    assert said in capsys.readouterr().err
-
-
-def test_what_cannot_be_read_is_one_message(tmp_path, capsys):
-    """And status 1."""
+def test_errors_are_one_message_and_status_1(arguments, said, tmp_path, capsys):
+    """Options are checked before anything is unpacked."""
     path = tmp_path / "run.zip"
     path.write_bytes(b"PK\x03\x04")
-    assert main(["verify", str(path)]) == 1
-    said = capsys.readouterr()
-    assert said.out == ""
-    assert said.err.startswith(f"mjrec: Cannot verify {path}: it is not a zip file")
+    assert main(["verify", str(path), *arguments]) == 1
+    printed = capsys.readouterr()
+    assert printed.out == ""
+    assert said.format(path) in printed.err

@@ -12,23 +12,16 @@ from packed_runs import record_pendulum, unpacked
 import mjrec
 
 
-@pytest.fixture(scope="session")
-def validator():
-    """Return the Python of an environment that holds the validator."""
+def issues(crate):
+    """Return what the validator says is wrong with a crate."""
     if "MJREC_TEST_CRATE" not in os.environ:
         pytest.skip("no environment with roc-validator: scripts/test --all makes one")
-    return Path(os.environ["MJREC_TEST_CRATE"])
-
-
-def issues(validator, crate):
-    """Return what the validator says is wrong with a crate."""
     script = Path(__file__).with_name("crate_validation.py")
-    environment = {k: v for k, v in os.environ.items() if k != "PYTHONWARNINGS"}
     done = subprocess.run(
-        [validator, script, crate],
+        [os.environ["MJREC_TEST_CRATE"], script, crate],
         capture_output=True,
         text=True,
-        env=environment,
+        env={k: v for k, v in os.environ.items() if k != "PYTHONWARNINGS"},
         check=False,
         timeout=240,
     )
@@ -39,19 +32,18 @@ def issues(validator, crate):
 
 @pytest.mark.crate_validator
 @pytest.mark.parametrize("stated", [True, False])
-def test_the_validator_takes_the_crate(stated, validator, tmp_path):
+def test_the_validator_takes_the_crate(stated, tmp_path):
     """All that is required, of our recordings and of gym's; and it can say no."""
+    said, directory = {}, Path(__file__).parent / "data/gym/0.21.0/two_monitors"
     if stated:
         said = {"authors": ["A B <a@b.org>"], "license": "MIT"}
         record_pendulum(directory := tmp_path / "runs", 2, longest=3)
-    else:
-        said, directory = {}, Path(__file__).parent / "data/gym/0.21.0/two_monitors"
-    packed = mjrec.pack(directory, tmp_path / "run.zip", **said)  # type: ignore[arg-type]  # of options
+    packed = mjrec.pack(directory, tmp_path / "run.zip", **said)
     crate = unpacked(packed, tmp_path / "x") / "data"
-    assert issues(validator, crate) == []
+    assert issues(crate) == []
     path = crate / "ro-crate-metadata.json"
     content = json.loads(path.read_text())
     for entity in content["@graph"]:
         entity.pop("instrument", None)
     path.write_text(json.dumps(content))
-    assert any("instrument" in issue for issue in issues(validator, crate))
+    assert any("instrument" in issue for issue in issues(crate))

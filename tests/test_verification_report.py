@@ -14,28 +14,23 @@ from mjrec.evidence.findings import Outcome, Topic
 from mjrec.evidence.verification_report import write_verification_report
 
 
-def page(tmp_path, *findings, **changes):
-    path = tmp_path / "verify.html"
-    write_verification_report(verification(*findings, **changes), path)
-    return path.read_text(encoding="utf-8")
+class Page(html.parser.HTMLParser):
+    """What a page about findings is made of."""
 
-
-class Elements(html.parser.HTMLParser):
-    """Collects what a page is made of."""
-
-    VOID = ("meta", "img", "br")
-
-    def __init__(self, text):
+    def __init__(self, tmp_path, *findings, **changes):
         super().__init__()
-        self.found = []
-        self.open = []
-        self.text = []
-        self.feed(text)
+        self.path = tmp_path / "verify.html"
+        write_verification_report(verification(*findings, **changes), self.path)
+        self.text = self.path.read_text(encoding="utf-8")
+        self.kinds, self.attributes, self.open, self.words = set(), set(), [], []
+        self.feed(self.text)
         self.close()
+        self.shown = " ".join(filter(None, self.words))
 
     def handle_starttag(self, tag, attrs):
-        self.found.append((tag, dict(attrs)))
-        if tag not in self.VOID:
+        self.kinds.add(tag)
+        self.attributes.update(name for name, _ in attrs)
+        if tag not in ("meta", "img", "br"):
             self.open.append(tag)
 
     def handle_endtag(self, tag):
@@ -43,25 +38,19 @@ class Elements(html.parser.HTMLParser):
 
     def handle_data(self, data):
         if self.open and self.open[-1] != "style":
-            self.text.append(" ".join(data.split()))
-
-
-def words(text):
-    return " ".join(filter(None, Elements(text).text))
+            self.words.append(" ".join(data.split()))
 
 
 def test_the_verdict_comes_first_and_then_what_differs(tmp_path):
     """With excuses, inputs, a line for each topic, and all findings."""
-    shown = words(
-        page(
-            tmp_path,
-            finding(reason="seven steps"),
-            finding(Outcome.DIFFERENT, reason="frame 3 is another"),
-            finding(Outcome.BELIEVED, reason="one is missing", is_headline=True),
-            excuses=(excuse(),),
-            inputs={"recording 0.u": {"max_episode_steps": 12}},
-            facts={"versions": {"mujoco": "3.17.0"}},
-        )
+    page = Page(
+        tmp_path,
+        finding(reason="seven steps"),
+        finding(Outcome.DIFFERENT, reason="frame 3 is another"),
+        finding(Outcome.BELIEVED, reason="one is missing", is_headline=True),
+        excuses=(excuse(),),
+        inputs={"recording 0.u": {"max_episode_steps": 12}},
+        facts={"versions": {"mujoco": "3.17.0"}},
     )
     order = [
         "FAIL run.zip: it does not match what its inputs produce",
@@ -74,45 +63,28 @@ def test_the_verdict_comes_first_and_then_what_differs(tmp_path):
         "seven steps",
         "versions: mujoco 3.17.0",
     ]
-    assert sorted(order, key=shown.index) == order
-    assert all(str(topic) in shown for topic in Topic)
+    assert sorted(order, key=page.shown.index) == order
+    assert all(str(topic) in page.shown for topic in Topic)
 
 
 def test_it_says_how_to_make_it_again(tmp_path):
     """With the options that it was made with."""
     facts = {"sample": 20, "seed": 7, "trust": ["A b-v0"], "allow": ["gl=H100"]}
-    shown = words(page(tmp_path, facts=facts))
+    shown = Page(tmp_path, facts=facts).shown
     assert (
         "mjrec verify run.zip --level pixels --sample 20 --seed 7 --trust 'A b-v0' "
         "--allow gl=H100"
     ) in shown
     assert "It runs the installed code of A b-v0, but no other code that" in shown
-    assert "It runs no code that the archive names" in words(page(tmp_path))
+    assert "It runs no code that the archive names" in Page(tmp_path).shown
 
 
-def test_the_page_is_whole_and_loads_nothing(tmp_path):
-    """Its elements close, and no attribute leads anywhere."""
-    text = page(tmp_path, *map(finding, Outcome), excuses=(excuse(),))
-    elements = Elements(text)
-    assert elements.open == []
-    names = {name for name, _ in elements.found}
-    assert names.isdisjoint({"script", "link", "iframe", "object", "form", "base"})
-    attributes = {key for _, a in elements.found for key in a}
-    assert attributes.isdisjoint({"src", "href"})
-    assert "default-src 'none'" in text
-    assert not re.search(r"url\(|@import|https?:", text)
-
-
-def test_hostile_text_stays_text(tmp_path):
-    """Wherever it comes from: nothing is marked up, nothing is hidden."""
-    given = {
-        "excuses": (excuse(),),
-        "inputs": {"a": {"b": "c"}},
-        "facts": {"a": {"b": "c"}},
-    }
-    outcomes = [finding(each) for each in Outcome]
-    clean = Elements(page(tmp_path, *outcomes, **given))
-    text = page(
+def test_the_page_is_whole_and_loads_nothing_whatever_is_in_it(tmp_path):
+    """Its elements close, no attribute leads anywhere, and hostile text stays text."""
+    inputs = {"a": {"b": "c"}}
+    given = {"excuses": (excuse(),), "inputs": inputs, "facts": inputs}
+    clean = Page(tmp_path, *map(finding, Outcome), **given)
+    hostile = Page(
         tmp_path,
         *(finding(each, item=HOSTILE, reason=HOSTILE) for each in Outcome),
         path=Path(f"somewhere/{HOSTILE.replace('/', '')}"),
@@ -120,23 +92,28 @@ def test_hostile_text_stays_text(tmp_path):
         inputs={HOSTILE: {HOSTILE: HOSTILE}},
         facts={HOSTILE: {"x": HOSTILE}, "sample": 2, "seed": 1, "trust": [HOSTILE]},
     )
-    dirty = Elements(text)
-    kinds = {name for name, _ in dirty.found}
-    assert kinds == {name for name, _ in clean.found}
-    assert all(not name.startswith("on") for _, a in dirty.found for name in a)
-    assert "\u202e" not in text
-    assert "\x00" not in text
-    assert "\\u202e" in text
-    assert "{{7*7}}" in text
+    assert hostile.kinds == clean.kinds
+    kinds = {"script", "link", "iframe", "object", "form", "base"}
+    assert clean.kinds.isdisjoint(kinds)
+    for page in (clean, hostile):
+        assert page.open == []
+        assert page.attributes.isdisjoint({"src", "href"})
+        assert not any(name.startswith("on") for name in page.attributes)
+        assert "default-src 'none'" in page.text
+    assert not re.search(r"url\(|@import|https?:", clean.text)
+    assert "\u202e" not in hostile.text
+    assert "\x00" not in hostile.text
+    assert "\\u202e" in hostile.text
+    assert "{{7*7}}" in hostile.text
 
 
 def test_many_findings_make_no_endless_page(tmp_path):
     """What is left out is counted."""
     many = [finding(Outcome.DIFFERENT, reason=f"{n} {'x' * 5000}") for n in range(1500)]
-    text = page(tmp_path, *many)
-    assert len(text) < 2_000_000
-    assert "And 1300 more" in words(text)
-    assert "1300 more are not listed" in words(text)
+    page = Page(tmp_path, *many)
+    assert len(page.text) < 2_000_000
+    assert "And 1300 more" in page.shown
+    assert "1300 more are not listed" in page.shown
 
 
 def test_without_jinja_it_is_said_what_to_install(tmp_path):
@@ -152,12 +129,8 @@ def test_without_jinja_it_is_said_what_to_install(tmp_path):
         "except report.MissingDependency as error:\n"
         "    print(error)\n"
     )
-    said = subprocess.run(
-        [sys.executable, "-c", program, str(tmp_path / "verify.html")],
-        capture_output=True,
-        text=True,
-        check=True,
-    ).stdout
+    command = [sys.executable, "-c", program, str(tmp_path / "verify.html")]
+    said = subprocess.run(command, capture_output=True, text=True, check=True).stdout
     assert "pip install 'mjrec[evidence]'" in said
     assert not (tmp_path / "verify.html").exists()
 
@@ -173,7 +146,7 @@ def test_the_page_keeps_nobody_out(tmp_path, scheme):
     from axe_playwright_python.sync_playwright import Axe
     from playwright.sync_api import sync_playwright
 
-    page(
+    page = Page(
         tmp_path,
         *(finding(each, reason="x" * 300, is_headline=False) for each in Outcome),
         finding(Outcome.BELIEVED, reason=HOSTILE, is_headline=True),
@@ -189,7 +162,7 @@ def test_the_page_keeps_nobody_out(tmp_path, scheme):
         size = {"width": 360, "height": 800}
         with browser.new_context(viewport=size, color_scheme=scheme) as context:
             shown = context.new_page()
-            shown.goto((tmp_path / "verify.html").as_uri())
+            shown.goto(page.path.as_uri())
             shown.evaluate("document.querySelector('details').open = true")
             assert shown.evaluate("document.scrollingElement.scrollWidth") <= 360
             violations = Axe().run(shown).response["violations"]

@@ -26,21 +26,12 @@ def finding(outcome=Outcome.RECREATED, **changes):
 
 def excuse(**changes):
     """Return the excuse of another renderer."""
-    usual = {
-        "kind": ExcuseKind.HARDWARE,
-        "name": "gl",
-        "claimed": "NVIDIA H100",
-        "here": "llvmpipe",
-        "costs": "frames are alike",
-    }
+    usual = {"kind": ExcuseKind.HARDWARE, "name": "gl", "costs": "frames are alike"}
+    usual |= {"claimed": "NVIDIA H100", "here": "llvmpipe"}
     return Excuse(**{**usual, **changes})
 
 
 def verification(*findings, **changes):
     """Return the result of verifying `run.zip`."""
-    usual = {
-        "path": Path("somewhere/run.zip"),
-        "level": Level.PIXELS,
-        "findings": findings,
-    }
-    return Verification(**{**usual, **changes})
+    usual = {"path": Path("somewhere/run.zip"), "level": Level.PIXELS}
+    return Verification(**{**usual, "findings": findings, **changes})
