@@ -18,41 +18,33 @@ SOURCE = ROOT / "src"
 
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory):
-    """Build the wheel from the working tree, without a network."""
+    """Build the wheel from the working tree, without a network; return its files."""
     pytest.importorskip("build", reason="the packages' tools are not here")
     folder = tmp_path_factory.mktemp("wheel")
-    subprocess.run(
-        [
-            *(sys.executable, "-m", "build", "--no-isolation", "--wheel"),
-            *("--outdir", str(folder), str(ROOT)),
-        ],
-        check=True,
-        capture_output=True,
-        timeout=280,
-    )
+    build = [sys.executable, "-m", "build", "--no-isolation", "--wheel"]
+    command = [*build, "--outdir", str(folder), str(ROOT)]
+    subprocess.run(command, check=True, capture_output=True, timeout=280)
     [path] = folder.glob("*.whl")
-    return path
+    with zipfile.ZipFile(path) as packed:
+        return {name: packed.read(name) for name in packed.namelist()}
 
 
 def test_wheel_holds_the_package_and_nothing_else(wheel):
     """Every file of the package, templates and tables too; no tests or benchmarks."""
-    with zipfile.ZipFile(wheel) as packed:
-        names = set(packed.namelist())
     package = {
         str(path.relative_to(SOURCE))
         for path in (SOURCE / "mjrec").rglob("*")
         if path.is_file() and "__pycache__" not in path.parts
     }
     assert any(name.endswith(".html.jinja") for name in package)
-    assert {name for name in names if ".dist-info/" not in name} == package
-    assert any(name.endswith("licenses/LICENSE") for name in names)
+    assert {name for name in wheel if ".dist-info/" not in name} == package
+    assert any(name.endswith("licenses/LICENSE") for name in wheel)
 
 
 def test_metadata_says_what_it_is_for(wheel):
     """README, licence, Pythons, and a typed package; no address that is made up."""
-    with zipfile.ZipFile(wheel) as packed:
-        [name] = [n for n in packed.namelist() if n.endswith("dist-info/METADATA")]
-        about = email.message_from_bytes(packed.read(name))
+    [name] = [n for n in wheel if n.endswith("dist-info/METADATA")]
+    about = email.message_from_bytes(wheel[name])
     assert about["Name"] == "mjrec"
     assert about["Version"] == mjrec.__version__
     assert about["License-Expression"] == "Apache-2.0"
