@@ -6,15 +6,12 @@ the validator fetches is the JSON-LD context of RO-Crate; `rocrate` ships that o
 later version, which has all the terms of 1.1.
 """
 
-from __future__ import annotations
-
 import json
 import sys
 from importlib import resources
-from typing import Any
 
 
-def main(folder: str) -> int:
+def main(folder):
     """Print what is wrong with the crate in a folder, and return how much it is."""
     context = json.loads(
         resources.files("rocrate").joinpath("data/ro-crate.jsonld").read_text()
@@ -26,10 +23,10 @@ def main(folder: str) -> int:
         content = text.encode()
         headers = {"Content-Type": "application/ld+json"}  # noqa: RUF012  as requests
 
-        def json(self) -> Any:
+        def json(self):
             return context
 
-        def raise_for_status(self) -> None: ...
+        def raise_for_status(self): ...
 
     from rocrate_validator.utils.http import HttpRequester
 

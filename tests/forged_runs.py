@@ -5,94 +5,90 @@ A liar has mjrec too. So statistics follow from the journal, hashes from the fil
 what one file says of another is true; `mjrec.pack` then computes the rest.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import subprocess
 import zipfile
-from collections.abc import Callable, Mapping, Sequence
 from fractions import Fraction
-from pathlib import Path
-from typing import Any
 
 import numpy as np
-from trajectory_contents import TrajectoryContent, content_of
+from trajectory_contents import content_of
 
 import mjrec
 from mjrec.formats.ffmpeg import ffmpeg_executable
-from mjrec.formats.trajectory import PARTS, TrajectoryReader, added_up, row_dtype
+from mjrec.formats.trajectory import PARTS, added_up, row_dtype
 from mjrec.formats.trajectory_file import open_trajectory
 from mjrec.formats.trajectory_hdf5 import write_hdf5
 from mjrec.formats.video_file import content_facts
 from mjrec.formats.video_writer import VideoWriter
 
-# Where facts of an episode stand in each kind of file.
 _OF_METADATA = ("length", "reward", "terminated", "truncated", "seed", "options")
 
 
 class ForgedRun:
-    """A monitor directory of one monitor, and edits of it.
+    """Edits of a monitor directory of one monitor."""
 
-    Args:
-        directory: the copy that is edited.
-    """
-
-    def __init__(self, directory: Path) -> None:
+    def __init__(self, directory):
         self.directory = directory
 
     # What files there are.
 
-    def the(self, pattern: str) -> Path:
-        """Return the one file that a pattern stands for."""
+    def the(self, pattern):
         [path] = self.directory.glob(pattern)
         return path
 
-    def trajectory(self, episode: int) -> Path:
-        """Return the trajectory of an episode."""
+    def trajectory(self, episode):
         return self.the(f"*.episode{episode:06d}.h5")
 
-    def video(self, episode: int) -> Path:
-        """Return the video of an episode."""
+    def video(self, episode):
         return self.the(f"*.video{episode:06d}.mp4")
 
-    def content(self, episode: int) -> TrajectoryContent:
-        """Return what a trajectory holds."""
+    def metadata(self, episode):
+        return self.video(episode).with_suffix(".meta.json")
+
+    def content(self, episode):
         with open_trajectory(self.trajectory(episode)) as reader:
             return content_of(reader)
 
-    def frames(self, episode: int) -> list[Any]:
+    def frames(self, episode):
         """Return the frames of an episode, drawn from its trajectory as it is."""
         return list(mjrec.render(self.trajectory(episode)))
 
+    def lines(self):
+        """Return what the journal says."""
+        return [json.loads(x) for x in self.the("*.jsonl").read_text().splitlines()]
+
     # Edits of one file.
 
-    def edit_json(self, pattern: str, edit: Callable[[Any], object]) -> None:
+    def edit_json(self, pattern, edit=None, **facts):
         """Change what files of JSON hold."""
         for path in self.directory.glob(pattern):
             content = json.loads(path.read_text())
-            edit(content)
-            path.write_text(json.dumps(content))
+            if edit is not None:
+                edit(content)
+            path.write_text(json.dumps({**content, **facts}))
 
-    def edit_journal(self, edit: Callable[[list[Any]], object]) -> None:
-        """Change the lines of the journal; statistics and manifest follow."""
-        path = self.the("*.jsonl")
-        lines = [json.loads(line) for line in path.read_text().splitlines()]
+    def edit_details(self, **facts):
+        """Change what the manifest says beside gym's own keys."""
+        self.edit_json("*.manifest.json", lambda said: said["mjrec"].update(facts))
+
+    def edit_journal(self, edit=lambda lines: None):
+        """Change the lines of the journal; statistics follow."""
+        lines = self.lines()
         edit(lines)
-        path.write_text("".join(f"{json.dumps(line)}\n" for line in lines))
+        text = "".join(f"{json.dumps(line)}\n" for line in lines)
+        self.the("*.jsonl").write_text(text)
         complete = [line for line in lines if "length" in line]
         self.edit_json(
             "*.stats.json",
-            lambda stats: stats.update(
-                initial_reset_timestamp=complete[0]["start_time"],
-                timestamps=[line["end_time"] for line in complete],
-                episode_lengths=[line["length"] for line in complete],
-                episode_rewards=[line["reward"] for line in complete],
-                episode_types=[line["type"] for line in complete],
-            ),
+            initial_reset_timestamp=complete[0]["start_time"],
+            timestamps=[line["end_time"] for line in complete],
+            episode_lengths=[line["length"] for line in complete],
+            episode_rewards=[line["reward"] for line in complete],
+            episode_types=[line["type"] for line in complete],
         )
 
-    def rewrite_zip(self, path: Path, change: Callable[[bytes], bytes]) -> None:
+    def rewrite_zip(self, path, change):
         """Change what the sources of a model hold."""
         with zipfile.ZipFile(path) as archive:
             members = {name: archive.read(name) for name in archive.namelist()}
@@ -100,114 +96,111 @@ class ForgedRun:
             for name, content in members.items():
                 archive.writestr(name, change(content))
 
-    def edit_rows(self, episode: int, **arrays: Any) -> None:
-        """Write a trajectory anew, with other arrays and facts.
+    def edit_rows(self, episode, *, facts=(), **arrays):
+        """Write a trajectory anew, with other facts, arrays and dtypes of `PARTS`.
 
-        Args:
-            episode: its number.
-            arrays: fields of `TrajectoryContent`, or functions that change a copy of
-                one in place; `facts`, which are added to its own or to
-                `all_facts`; and `action`,
-                `state`, `snapshot` and `observation`, their dtypes.
+        An array may be a function that changes a copy of the own one in place.
         """
-        path, content = self.trajectory(episode), self.content(episode)
-        facts = arrays.pop("all_facts", content.facts)
-        facts = {**facts, **arrays.pop("facts", {})}
-        kinds = {name: content.dtype[name] for name in content.dtype.names[4:]}
-        kinds |= {name: arrays.pop(name) for name in PARTS if name in arrays}
-        known = {name: kind for name, kind in kinds.items() if kind is not None}
-        for name, value in arrays.items():
-            if callable(value):
-                arrays[name] = np.array(getattr(content, name))
-                value(arrays[name])
-        forged = dataclasses.replace(
-            content, facts=facts, dtype=row_dtype(**known), **arrays
-        )
-        path.unlink()
-        write_hdf5(_in_memory(path, forged), path)
+        path = self.trajectory(episode)
+        with open_trajectory(path) as reader:
+            content = content_of(reader)
+            kinds = {part: arrays.pop(part, reader.kind(part)) for part in PARTS}
+            known = {part: kind for part, kind in kinds.items() if kind is not None}
+            for name, value in arrays.items():
+                if callable(value):
+                    arrays[name] = np.array(getattr(content, name))
+                    value(arrays[name])
+            content = dataclasses.replace(content, **arrays)
+
+            def read(part, start, stop):
+                rows = getattr(content, f"{part}s")[start:stop]
+                if part == "state":
+                    return np.ascontiguousarray(rows).view(known[part])[:, 0]
+                return rows
+
+            for name in ("rewards", "terminated", "truncated", "frame_steps"):
+                setattr(reader, name, getattr(content, name))
+            reader.facts = {**content.facts, **dict(facts)}
+            reader.dtype = row_dtype(**known)
+            reader.row_count = len(content.states)
+            reader.read = read
+            write_hdf5(reader, path)
 
     # Edits of what several files say.
 
-    def say(self, episode: int, **facts: Any) -> None:
+    def say(self, episode, **facts):
         """Say something of an episode wherever such a thing is said."""
 
-        def edit(lines: list[Any]) -> None:
+        def edit(lines):
             [line] = [each for each in lines if each.get("episode_id") == episode]
             line.update(facts)
 
         self.edit_journal(edit)
         self.edit_rows(episode, facts=facts)
         known = {name: facts[name] for name in _OF_METADATA if name in facts}
-        self.edit_json(
-            f"*.video{episode:06d}*.meta.json", lambda said: said.update(known)
-        )
+        self.edit_json(f"*.video{episode:06d}*.meta.json", **known)
 
-    def say_rewards(self, episode: int, change: Callable[[Any], Any]) -> None:
+    def say_rewards(self, episode, change):
         """Say other rewards of an episode, and the return that follows."""
         rewards = np.asarray(change(self.content(episode).rewards.copy()))
         self.edit_rows(episode, rewards=rewards)
         self.say(episode, reward=added_up(rewards))
 
-    def say_everywhere(self, edit: Callable[[dict[str, Any]], object]) -> None:
+    def say_everywhere(self, edit):
         """Edit every object of JSON: in the journal, manifest, metadata and facts."""
 
-        def walk(value: Any) -> None:
+        def walk(value):
             if isinstance(value, dict):
                 edit(value)
-            for item in value.values() if isinstance(value, dict) else ():
-                walk(item)
-            for item in value if isinstance(value, list) else ():
-                walk(item)
+                value = [*value.values()]
+            if isinstance(value, list):
+                for item in value:
+                    walk(item)
 
         self.edit_journal(walk)
         self.edit_json("*.manifest.json", walk)
         self.edit_json("*.meta.json", walk)
         for path in sorted(self.directory.glob("*.h5")):
             with open_trajectory(path) as reader:
-                facts = dict(reader.facts)
-                walk(facts)
-                reader.facts = facts
+                reader.facts = dict(reader.facts)
+                walk(reader.facts)
                 write_hdf5(reader, path)
+
+    def replace_everywhere(self, old, new, *, key=None):
+        """Replace a value, of one key or of any, in every object of JSON."""
+
+        def edit(facts):
+            for name, value in facts.items():
+                if value == old and key in (None, name):
+                    facts[name] = new
+
+        self.say_everywhere(edit)
 
     # Edits of a video.
 
-    def film(
-        self,
-        episode: int,
-        frames: list[Any] | None = None,
-        *,
-        encoder_arguments: Sequence[str] = (),
-        **metadata: Any,
-    ) -> None:
-        """Put frames into the video of an episode, with hashes and metadata.
+    def film(self, episode, frames=None, *, encoder_arguments=(), **said):
+        """Put frames, or those of its trajectory, into the video of an episode.
 
-        Args:
-            episode: its number.
-            frames: those of its trajectory as it is now, if None.
-            encoder_arguments: as of `VideoWriter`.
-            metadata: what else is said.
+        Hashes and metadata follow; what else is `said` is added to them.
         """
         frames = self.frames(episode) if frames is None else frames
-        path = self.video(episode)
-        said = json.loads(path.with_suffix(".meta.json").read_text())
-        said.update({"frame_count": len(frames), "frame_steps": [[0, len(frames) - 1]]})
-        fps = Fraction(metadata.get("fps", said["fps"]))
+        path, known = (
+            self.video(episode),
+            json.loads(self.metadata(episode).read_text()),
+        )
+        fps = Fraction(said.get("fps", known["fps"]))
         more = {"encoder_arguments": encoder_arguments}
         with VideoWriter(path, fps=fps, frame_hashes=True, **more) as writer:
             for frame in frames:
                 writer.write(frame)
         height, width = frames[0].shape[:2]
-        size = {"height": height, "width": width}
-        padded = {f"padded_{name}": side + side % 2 for name, side in size.items()}
-        self._note(path, {**said, **size, **padded, **metadata})
+        sides = {"height": height, "width": width}
+        sides |= {f"padded_{name}": side + side % 2 for name, side in sides.items()}
+        steps = [[0, len(frames) - 1]]
+        counts = {"frame_count": len(frames), "frame_steps": steps}
+        self.rehash(episode, **counts, **sides, **said)
 
-    def mux(
-        self,
-        episode: int,
-        *arguments: str,
-        inputs: tuple[Path, ...] = (),
-        metadata: str = "-1",
-    ) -> None:
+    def mux(self, episode, *arguments, inputs=(), metadata="-1"):
         """Pass a video through ffmpeg, whose frames stay what they are."""
         path = self.video(episode)
         changed = path.with_suffix(".changed.mp4")
@@ -219,57 +212,52 @@ class ForgedRun:
         changed.replace(path)
         self.rehash(episode)
 
-    def rehash(self, episode: int) -> None:
-        """Let the metadata of a video say the hashes of the file."""
-        path = self.video(episode)
-        self._note(path, json.loads(path.with_suffix(".meta.json").read_text()))
-
-    def _note(self, path: Path, said: Mapping[str, Any]) -> None:
-        """Write the metadata of a video with the hashes of the file."""
+    def rehash(self, episode, **facts):
+        """Let the metadata of a video say the hashes of the file, and facts."""
+        path = self.metadata(episode)
+        said = {**json.loads(path.read_text()), **facts}
         size = {side: said[f"padded_{side}"] for side in ("height", "width")}
-        facts = content_facts(path, **size, pixel_format="yuv420p")
+        found = content_facts(self.video(episode), **size, pixel_format="yuv420p")
         # How many frames there are was said.
-        hashes = {key: facts[key] for key in ("file_sha256", "decoded_sha256")}
-        path.with_suffix(".meta.json").write_text(json.dumps({**said, **hashes}))
+        hashes = {key: found[key] for key in ("file_sha256", "decoded_sha256")}
+        path.write_text(json.dumps({**said, **hashes}))
 
     # Edits of which episodes there are.
 
-    def remove_video(self, episode: int) -> None:
+    def remove_video(self, episode):
         """Remove a video, and what names it but the journal."""
         for path in self.directory.glob(f"*.video{episode:06d}.*"):
             path.unlink()
-        self.edit_json("*.manifest.json", lambda said: _without(said, episode))
+        self.list_no_video(f".video{episode:06d}.")
 
-    def remove_episode(self, episode: int) -> None:
+    def list_no_video(self, part):
+        """Remove from the manifest the videos with this in the names of their files."""
+
+        def edit(said):
+            said["videos"] = [pair for pair in said["videos"] if part not in pair[0]]
+
+        self.edit_json("*.manifest.json", edit)
+
+    def remove_episode(self, episode):
         """Remove an episode as if it had never been."""
         self.remove_video(episode)
         self.trajectory(episode).unlink(missing_ok=True)
-        self.edit_journal(
-            lambda lines: lines.__setitem__(
-                slice(None),
-                [each for each in lines if each.get("episode_id") != episode],
-            )
-        )
-        self.edit_json(
-            "*.manifest.json",
-            lambda said: said["mjrec"]["schedule"].update(
-                recorded=[
-                    n for n in said["mjrec"]["schedule"]["recorded"] if n != episode
-                ]
-            ),
-        )
 
-    def renumber(self, old: int, new: int) -> None:
+        def edit(lines):
+            lines[:] = [each for each in lines if each.get("episode_id") != episode]
+
+        self.edit_journal(edit)
+        self._edit_recorded(lambda numbers: [n for n in numbers if n != episode])
+
+    def renumber(self, old, new):
         """Give an episode another number, in all names and texts."""
-        texts = {f"video{old:06d}": f"video{new:06d}"}
-        texts[f"episode{old:06d}"] = f"episode{new:06d}"
 
-        def renamed(text: str) -> str:
-            for before, after in texts.items():
-                text = text.replace(before, after)
+        def renamed(text):
+            for kind in ("video", "episode"):
+                text = text.replace(f"{kind}{old:06d}", f"{kind}{new:06d}")
             return text
 
-        def walk(value: Any) -> Any:
+        def walk(value):
             if isinstance(value, dict):
                 number = {"episode_id": new} if value.get("episode_id") == old else {}
                 return {key: walk(item) for key, item in {**value, **number}.items()}
@@ -283,55 +271,22 @@ class ForgedRun:
         for pattern in ("*.meta.json", "*.manifest.json"):
             self.edit_json(pattern, lambda said: said.update(walk(said)))
         self.edit_journal(lambda lines: lines.__setitem__(slice(None), walk(lines)))
-        self.edit_json(
-            "*.manifest.json",
-            lambda said: said["mjrec"]["schedule"].update(
-                recorded=[
-                    new if n == old else n
-                    for n in said["mjrec"]["schedule"]["recorded"]
-                ]
-            ),
-        )
+        self._edit_recorded(lambda numbers: [new if n == old else n for n in numbers])
 
-    def say_numbers(self, following: int) -> None:
+    def _edit_recorded(self, change):
+        def edit(said):
+            schedule = said["mjrec"]["schedule"]
+            schedule["recorded"] = change(schedule["recorded"])
+
+        self.edit_json("*.manifest.json", edit)
+
+    def say_numbers(self, following):
         """Say how many episodes there were."""
-        self.edit_json(
-            "*.manifest.json",
-            lambda said: said["mjrec"].update(next_episode_id=following),
-        )
-        self.edit_journal(
-            lambda lines: [
-                line["closed"].update(next_episode_id=following)
-                for line in lines
-                if "closed" in line
-            ]
-        )
+        self.edit_details(next_episode_id=following)
 
+        def edit(lines):
+            for line in lines:
+                if "closed" in line:
+                    line["closed"]["next_episode_id"] = following
 
-def _without(manifest: dict[str, Any], episode: int) -> None:
-    stem = f".video{episode:06d}."
-    manifest["videos"] = [v for v in manifest["videos"] if stem not in v[0]]
-
-
-def _in_memory(path: Path, content: TrajectoryContent) -> TrajectoryReader:
-    def read(part: str, start: int, stop: int) -> Any:
-        rows = getattr(content, f"{part}s")[start:stop]
-        if part == "state":
-            return np.ascontiguousarray(rows).view(content.dtype[part])[:, 0]
-        return rows
-
-    return TrajectoryReader(
-        path=path,
-        facts=content.facts,
-        dtype=content.dtype,
-        row_count=len(content.states),
-        rewards=content.rewards,
-        terminated=content.terminated,
-        truncated=content.truncated,
-        frame_steps=content.frame_steps,
-        change_count=len(content.model_changes),
-        dropped=content.dropped,
-        read=read,
-        read_change=content.model_changes.__getitem__,
-        release=lambda: None,
-    )
+        self.edit_journal(edit)

@@ -5,8 +5,6 @@ It is copied into the home directory of that person and run there, with the dire
 of the recordings.
 """
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 from typing import Any
@@ -21,7 +19,7 @@ HERE = Path(__file__).parent
 
 
 class FailingTracker(Tracker):
-    def episode(self, run: Any, episode: Any) -> None:
+    def episode(self, run, episode):
         raise OSError(f"no key in {HERE}/wandb.key")
 
 
@@ -31,17 +29,17 @@ class Diary(gymnasium.Env[Any, Any]):
     observation_space = action_space = gymnasium.spaces.Discrete(2)
     spec = gymnasium.envs.registration.EnvSpec("Diary-v0")
 
-    def reset(self, **_: Any) -> Any:
+    def reset(self, **_):
         return 0, {}
 
-    def step(self, _: Any) -> Any:
+    def step(self, _):
         return 0, 1.0, True, False, {}
 
-    def render(self) -> str:
+    def render(self):
         return f"the diary is in {HERE}"
 
 
-def pendulum() -> Any:
+def pendulum():
     return gymnasium.make(
         "InvertedPendulum-v5",
         xml_file=str(HERE / "models" / "robot.xml"),
@@ -52,7 +50,7 @@ def pendulum() -> Any:
     )
 
 
-def record(directory: Path) -> None:
+def record(directory):
     environment = mjrec.Monitor(
         pendulum(),
         directory,
@@ -71,7 +69,7 @@ def record(directory: Path) -> None:
                 environment.step(np.zeros(1))
 
 
-def write_diary(directory: Path) -> None:
+def write_diary(directory):
     with mjrec.Monitor(Diary(), directory, uid="brunelli-ws7.diary") as environment:
         environment.reset()
         environment.step(0)

@@ -1,15 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Looks for words in files, however they are packed there; with nothing of mjrec."""
 
-from __future__ import annotations
-
 import gzip
 import io
 import zipfile
 import zlib
-from collections.abc import Iterable, Iterator
-from pathlib import Path
-from typing import Any
 
 import h5py
 import numpy as np
@@ -18,7 +13,7 @@ _ENCODINGS = ("utf-8", "utf-16-le", "utf-16-be")
 _PNG = b"\x89PNG\r\n\x1a\n"
 
 
-def find(path: Path, words: Iterable[str]) -> list[tuple[str, str]]:
+def find(path, words):
     """Return where below a file or directory which of the words are.
 
     Names of files count, and so do those inside of archives and HDF5 files.
@@ -35,7 +30,7 @@ def find(path: Path, words: Iterable[str]) -> list[tuple[str, str]]:
     ]
 
 
-def _everything(path: Path) -> Iterator[tuple[str, bytes]]:
+def _everything(path):
     paths = sorted(path.rglob("*")) if path.is_dir() else [path]
     for one in paths:
         where = one.relative_to(path).as_posix()
@@ -44,7 +39,7 @@ def _everything(path: Path) -> Iterator[tuple[str, bytes]]:
             yield from _inside(where, one.read_bytes())
 
 
-def _inside(where: str, content: bytes) -> Iterator[tuple[str, bytes]]:
+def _inside(where, content):
     yield where, content
     if content[:4] == b"PK\3\4":
         yield from _inside_zip(where, content)
@@ -56,7 +51,7 @@ def _inside(where: str, content: bytes) -> Iterator[tuple[str, bytes]]:
         yield from _inside_png(where, content)
 
 
-def _inside_zip(where: str, content: bytes) -> Iterator[tuple[str, bytes]]:
+def _inside_zip(where, content):
     with zipfile.ZipFile(io.BytesIO(content)) as archive:
         yield f"{where} (comment)", archive.comment
         for member in archive.infolist():
@@ -66,8 +61,8 @@ def _inside_zip(where: str, content: bytes) -> Iterator[tuple[str, bytes]]:
             yield from _inside(inside, archive.read(member))
 
 
-def _inside_hdf5(where: str, content: bytes) -> Iterator[tuple[str, bytes]]:
-    items: list[Any] = []
+def _inside_hdf5(where, content):
+    items = []
     with h5py.File(io.BytesIO(content), "r") as file:
         file.visit(items.append)
         for name in ["/", *items]:
@@ -81,7 +76,7 @@ def _inside_hdf5(where: str, content: bytes) -> Iterator[tuple[str, bytes]]:
                 yield f"{where} > {name}", _bytes(item[()])
 
 
-def _bytes(value: Any) -> bytes:
+def _bytes(value):
     array = np.asarray(value)
     if array.dtype.kind not in "OUS":
         return array.tobytes()
@@ -89,7 +84,7 @@ def _bytes(value: Any) -> bytes:
     return b"\0".join(i if isinstance(i, bytes) else str(i).encode() for i in items)
 
 
-def _inside_png(where: str, content: bytes) -> Iterator[tuple[str, bytes]]:
+def _inside_png(where, content):
     """Yield the texts in a frame that are compressed."""
     start = len(_PNG)
     while start < len(content):

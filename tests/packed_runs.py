@@ -1,30 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
 """Packed runs to verify, and to forge: unpacked, edited, and made to fit again."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import re
 import zipfile
-from collections.abc import Callable, Iterable, Iterator
-from pathlib import Path
-from typing import Any
 
 import gymnasium
-import h5py
-import numpy as np
 
 import mjrec
 from mjrec.evidence.compare_descriptions import written_again
-from mjrec.formats.trajectory_file import open_trajectory
-from mjrec.formats.trajectory_hdf5 import write_hdf5
 from mjrec.json_text import dumps
 
 
-def record_pendulum(
-    directory: Path, episodes: int = 3, *, longest: int = 8, **options: Any
-) -> None:
+def record_pendulum(directory, episodes=3, *, longest=8, **options):
     """Record short episodes with small frames."""
     env = gymnasium.make(
         "InvertedPendulum-v5",
@@ -43,7 +32,7 @@ def record_pendulum(
                 done = terminated or truncated
 
 
-def unpacked(archive: Path, into: Path) -> Path:
+def unpacked(archive, into):
     """Unpack a packed run of ours, and return its folder."""
     with zipfile.ZipFile(archive) as file:
         file.extractall(into)
@@ -51,23 +40,17 @@ def unpacked(archive: Path, into: Path) -> Path:
     return folder
 
 
-def zipped(bag: Path, archive: Path) -> Path:
-    """Pack a folder, as it is."""
-    with zipfile.ZipFile(archive, "w") as file:
-        for path in _files(bag):
-            file.write(path, f"{bag.name}/{path.relative_to(bag).as_posix()}")
-    return archive
-
-
-def make_bag_fit(bag: Path) -> None:
+def make_bag_fit(bag):
     """Let the lists of a packed run say what is there, whatever that is."""
     sizes = [path.stat().st_size for path in _files(bag / "data")]
     info, count = bag / "bag-info.txt", f"{sum(sizes)}.{len(sizes)}"
     info.write_text(re.sub(r"(?<=Oxum: )[\d.]+", count, info.read_text()))
-    make_manifests_fit(bag)
+    _write_manifest(bag, "manifest-sha512.txt", _files(bag / "data"))
+    tags = (p for p in bag.iterdir() if p.is_file() and p.name[:3] != "tag")
+    _write_manifest(bag, "tagmanifest-sha512.txt", sorted(tags))
 
 
-def describe_again(bag: Path) -> None:
+def describe_again(bag):
     """Let all descriptions of a packed run follow from its recordings."""
     # The second time with the sizes that the first has made.
     for _ in range(2):
@@ -76,24 +59,13 @@ def describe_again(bag: Path) -> None:
             (bag / name if is_tag else bag / "data" / name).write_text(text)
 
 
-def make_manifests_fit(bag: Path) -> None:
-    """Let the manifests alone say it."""
-    _write_manifest(bag, "manifest-sha512.txt", _files(bag / "data"))
-    tags = (
-        path
-        for path in _files(bag)
-        if path.parent == bag and not path.name.startswith("tagmanifest")
-    )
-    _write_manifest(bag, "tagmanifest-sha512.txt", tags)
-
-
-def the(folder: Path, pattern: str) -> Path:
+def the(folder, pattern):
     """Return the one file below a folder that a pattern stands for."""
     [path] = folder.rglob(pattern)
     return path
 
 
-def edit_json(path: Path, edit: Callable[[Any], object]) -> None:
+def edit_json(path, edit):
     """Change what a file of JSON holds, and write it as it was written."""
     text = path.read_text()
     content = json.loads(text)
@@ -102,33 +74,7 @@ def edit_json(path: Path, edit: Callable[[Any], object]) -> None:
     path.write_text(dumps(content, indent=indent) + "\n" * text.endswith("\n"))
 
 
-def edit_trajectory(
-    path: Path,
-    edit: Callable[[h5py.File], object] = lambda _: None,
-    **facts: Any,
-) -> None:
-    """Change a finished trajectory: its datasets, its facts; its checksum fits."""
-    if facts:
-        with open_trajectory(path) as reader:
-            reader.facts = {**reader.facts, **facts}
-            write_hdf5(reader, path)
-    with h5py.File(path, "r+") as file:
-        edit(file)
-
-
-def set_reward(path: Path, step: int, reward: float) -> None:
-    """Change one recorded reward, and the return that the trajectory says."""
-    with open_trajectory(path) as reader:
-        rewards = reader.rewards.copy()
-    rewards[step] = reward
-    edit_trajectory(
-        path,
-        lambda file: file["rewards"].__setitem__(slice(None), rewards),
-        reward=float(np.add.accumulate(rewards)[-1]),
-    )
-
-
-def _write_manifest(bag: Path, name: str, paths: Iterable[Path]) -> None:
+def _write_manifest(bag, name, paths):
     lines = (
         f"{hashlib.sha512(path.read_bytes()).hexdigest()}  "
         f"{path.relative_to(bag).as_posix()}\n"
@@ -137,5 +83,5 @@ def _write_manifest(bag: Path, name: str, paths: Iterable[Path]) -> None:
     (bag / name).write_text("".join(lines))
 
 
-def _files(folder: Path) -> Iterator[Path]:
+def _files(folder):
     return (path for path in sorted(folder.rglob("*")) if path.is_file())

@@ -9,12 +9,7 @@ import numpy as np
 from mjrec.evaluation.result_tables import ROW
 from mjrec.evaluation.statistics import Bootstrap
 from mjrec.evaluation.summaries import AcrossTasks, summarize_across, summarize_task
-from mjrec.reporting.contents import (
-    ReportContents,
-    ReportTask,
-    ReportVideo,
-    Verdict,
-)
+from mjrec.reporting.contents import ReportContents, ReportTask, ReportVideo, Verdict
 
 _FEW = Bootstrap(resamples=50)
 

@@ -8,20 +8,25 @@ from evaluations import write_evaluation
 from mjrec.commands import main
 
 WALK = "dm_control/walker-walk"
+SAME = {"Hopper-v5": [[5.0, 6, 7, 8]]}
+WORSE = {WALK: [[100.0, 200, 300, 400]], **SAME, "x": [[1.0] * 4]}
+BETTER = {WALK: [[500.0, 600, 700, 800]], **SAME}
 
 
 @pytest.fixture
-def two(tmp_path):
+def write(tmp_path):
+    """Return what writes an evaluation, and returns its path as a text."""
+    return lambda name, *arguments, **options: str(
+        write_evaluation(tmp_path / name, *arguments, **options)
+    )
+
+
+@pytest.fixture
+def two(write):
     """Return two evaluations; of the first task the second is better."""
-    a = {
-        WALK: [[100.0, 200, 300, 400]],
-        "Hopper-v5": [[5.0, 6, 7, 8]],
-        "x": [[1.0] * 4],
-    }
-    b = {WALK: [[500.0, 600, 700, 800]], "Hopper-v5": [[5.0, 6, 7, 8]]}
     return [
-        str(write_evaluation(tmp_path / "a", a, policy="mine:old")),
-        str(write_evaluation(tmp_path / "b", b, policy="mine:new")),
+        write("a", WORSE, policy="mine:old"),
+        write("b", BETTER, policy="mine:new"),
     ]
 
 
@@ -31,14 +36,13 @@ def told(arguments, capsys):
     return json.loads(capsys.readouterr().out)
 
 
-def test_a_table_and_a_sentence(two, tmp_path, capsys):
+def test_a_table_and_a_sentence(two, write, capsys):
     """What must be known first stands first, and what it comes to stands last."""
     assert main(["compare", *two]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert lines[0].endswith("a (policy mine:old)")
     (row,) = (line for line in map(str.strip, lines) if line.startswith(WALK))
-    figures = ["250", "650", "400", "400", "1"]
-    assert row.split()[1:-1] == ["4,", "4", *figures]
+    assert row.split()[1:-1] == ["4,", "4", "250", "650", "400", "400", "1"]
     assert any(line.rstrip().endswith("(1 to 1)") for line in lines)
     assert "Only in A: x" in lines
     assert lines[-1].startswith(
@@ -46,11 +50,10 @@ def test_a_table_and_a_sentence(two, tmp_path, capsys):
         "probability of improvement 0.75 ("
     )
     assert lines[-1].endswith(" (scores of 1 task).")
-    failed = write_evaluation(tmp_path / "c", {WALK: [[500.0, 600, None, 700]]})
-    assert main(["compare", two[0], str(failed)]) == 0
-    assert capsys.readouterr().out.startswith(
-        f"Caution: {WALK}: 1 of 4 episodes of B failed"
-    )
+    failed = write("c", {WALK: [[500.0, 600, None, 700]]})
+    assert main(["compare", two[0], failed]) == 0
+    caution = f"Caution: {WALK}: 1 of 4 episodes of B failed"
+    assert capsys.readouterr().out.startswith(caution)
 
 
 def test_the_same_figures_as_json(two, capsys):
@@ -65,27 +68,21 @@ def test_the_same_figures_as_json(two, capsys):
     assert fields["figures"]["probability of improvement"]["value"] == 0.75
 
 
-def test_sets_of_evaluations(tmp_path, capsys):
+def test_sets_of_evaluations(write, capsys):
     """As a shell writes out `runs/a* --against runs/b*`."""
-    paths = [
-        str(write_evaluation(tmp_path / f"{side}{k}", {WALK: [[k + add, k + add]]}))
-        for side, add in (("a", 0.0), ("b", 2.5))
-        for k in range(3)
-    ]
-    sets = [*paths[:3], "--against", *paths[3:]]
-    fields = told(sets, capsys)
-    assert (fields["a"], fields["b"]) == (paths[:3], paths[3:])
-    assert fields["unit"] == "evaluations"
+    a = [write(f"a{k}", {WALK: [[float(k)] * 2]}) for k in range(3)]
+    b = [write(f"b{k}", {WALK: [[k + 2.5] * 2]}) for k in range(3)]
+    fields = told([*a, "--against", *b], capsys)
+    assert (fields["a"], fields["b"], fields["unit"]) == (a, b, "evaluations")
     figures = fields["tasks"][0]["figures"]
     assert (figures["mean A"]["value"], figures["mean B"]["value"]) == (1, 3.5)
-    assert main(["compare", *sets]) == 0
+    assert main(["compare", *a, "--against", *b]) == 0
     assert "A: 3 evaluations: " in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
     ("required", "reason"),
     [
-        ("probability of improvement>=0.75", None),
         ("probability of improvement low > 0.5", None),
         (f"{WALK}: difference low > 100", None),
         ("paired difference > -1e-3", None),
@@ -141,36 +138,36 @@ def test_what_cannot_be_required(options, reason, two, capsys):
 def test_no_worse_than(two):
     """The interval decides: what is too wide is no evidence."""
     a, b = two
-    demand = ["--no-worse-than", "A", "--margin"]
-    assert main(["compare", a, b, *demand, "0.05"]) == 0
-    assert main(["compare", a, a, *demand, "0.05"]) == 1
-    assert main(["compare", a, a, *demand, "0.3"]) == 0
-    assert main(["compare", b, a, *demand, "0.3"]) == 1
-    assert main(["compare", b, a, "--no-worse-than", "B", "--margin", "0.3"]) == 0
+    for first, second, better, margin, status in (
+        (a, b, "A", "0.05", 0),
+        (a, a, "A", "0.05", 1),
+        (a, a, "A", "0.3", 0),
+        (b, a, "A", "0.3", 1),
+        (b, a, "B", "0.3", 0),
+    ):
+        demand = ["--no-worse-than", better, "--margin", margin]
+        assert main(["compare", first, second, *demand]) == status
 
 
 @pytest.mark.parametrize("returns", [[None, 900.0], [math.nan, 900.0], [None, None]])
-def test_failed_episodes_and_nan_meet_no_requirement(returns, tmp_path, capsys):
+def test_failed_episodes_and_nan_meet_no_requirement(returns, write, capsys):
     """However good the others are; and without figures the status is always 1."""
-    a = str(write_evaluation(tmp_path / "a", {WALK: [[1.0, 2.0]]}))
-    b = str(write_evaluation(tmp_path / "b", {WALK: [returns]}))
+    a, b = write("a", {WALK: [[1.0, 2.0]]}), write("b", {WALK: [returns]})
     assert main(["compare", a, b, "--require", "difference > 0"]) == 1
     capsys.readouterr()
-    has_figures = returns[0] is None and returns[1] is not None
+    has_figures, is_nan = returns == [None, 900.0], returns[0] is not None
     assert main(["compare", a, b]) == (0 if has_figures else 1)
     out = capsys.readouterr().out
     assert ("1 of 2" in out) or ("no episode of B was completed" in out)
     assert ("No task could be compared." in out) is not has_figures
-    is_nan = returns[0] is not None
     allowed = main(["compare", a, b, "--allow-nan"])
     assert allowed == (0 if has_figures or is_nan else 1)
 
 
-def test_text_of_files_is_no_order_to_the_terminal(tmp_path, capsys):
+def test_text_of_files_is_no_order_to_the_terminal(write, capsys):
     """Neither escape sequences nor rich's markup."""
-    task = "[red]\x1b[2Jx"
-    a = write_evaluation(tmp_path / "a", {task: [[1.0, 2.0]]}, policy="[bold]\x1b[2J")
-    assert main(["compare", str(a), str(a)]) == 0
+    a = write("a", {"[red]\x1b[2Jx": [[1.0, 2.0]]}, policy="[bold]\x1b[2J")
+    assert main(["compare", a, a]) == 0
     out = capsys.readouterr().out
     assert "\x1b" not in out
     assert "[red]\\x1b[2Jx" in out

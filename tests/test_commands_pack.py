@@ -1,12 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """`mjrec pack`: it says what it made, and how that is verified."""
 
-from __future__ import annotations
-
 import hashlib
 import json
-from collections.abc import Callable
-from pathlib import Path
 
 import pytest
 from packed_runs import the, unpacked
@@ -16,32 +12,29 @@ from mjrec.commands import main
 
 
 @pytest.fixture(scope="module")
-def recorded(pendulums: Callable[..., Path]) -> Path:
+def recorded(pendulums):
     """Return a directory with two episodes, each with a video."""
-    return pendulums(2, longest=3)
+    return str(pendulums(2, longest=3))
 
 
-def test_it_says_what_it_made(
-    recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_it_says_what_it_made(recorded, tmp_path, capsys):
     """Where, how much, its hash, and the command that verifies it."""
     path = tmp_path / "run.zip"
-    assert main(["pack", str(recorded), "-o", str(path)]) == 0
+    assert main(["pack", recorded, "-o", str(path), "--anonymous"]) == 0
     where, size, digest, advice = capsys.readouterr().out.splitlines()
     assert where == str(path)
     assert f"({path.stat().st_size} bytes)" in size
     assert digest == f"  sha256 {hashlib.sha256(path.read_bytes()).hexdigest()}"
     assert advice.endswith(f"mjrec verify {path}")
-    # Whole; nothing was recreated.
-    assert main(["verify", str(path), "--level", "files"]) == 3
+    assert "withheld" in the(unpacked(path, tmp_path / "x"), "README.md").read_text()
 
 
-def test_everything_can_be_stated(recorded: Path, tmp_path: Path) -> None:
+def test_everything_can_be_stated(recorded, tmp_path):
     """Several authors, and a choice of episodes."""
     path = tmp_path / "run.zip"
     arguments = ["--title", "T", "--author", "A B", "--author", "C D"]
     more = ["--license", "MIT", "--episodes", "1, 1", "--max-size", "5M"]
-    assert main(["pack", str(recorded), "--out", str(path), *arguments, *more]) == 0
+    assert main(["pack", recorded, "--out", str(path), *arguments, *more]) == 0
     folder = unpacked(path, tmp_path / "x")
     crate = json.loads(the(folder, "ro-crate-metadata.json").read_text())
     root = next(entity for entity in crate["@graph"] if entity["@id"] == "./")
@@ -49,14 +42,6 @@ def test_everything_can_be_stated(recorded: Path, tmp_path: Path) -> None:
     assert len(root["author"]) == 2
     assert root["license"]["@id"].endswith("/MIT")
     assert videos_in(folder / "data/recordings") == [1]
-
-
-def test_anonymous_is_a_flag(recorded: Path, tmp_path: Path) -> None:
-    """Without authors."""
-    path = tmp_path / "run.zip"
-    assert main(["pack", str(recorded), "-o", str(path), "--anonymous"]) == 0
-    readme = the(unpacked(path, tmp_path / "x"), "README.md").read_text()
-    assert "withheld" in readme
 
 
 @pytest.mark.parametrize(
@@ -67,16 +52,9 @@ def test_anonymous_is_a_flag(recorded: Path, tmp_path: Path) -> None:
         (["--max-size", "1k"], "The largest files"),
     ],
 )
-def test_errors_are_one_message(
-    arguments: list[str],
-    part: str,
-    recorded: Path,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_errors_are_one_message(arguments, part, recorded, tmp_path, capsys):
     """And nothing is made."""
-    path = tmp_path / "run.zip"
-    assert main(["pack", str(recorded), "-o", str(path), *arguments]) == 1
+    assert main(["pack", recorded, "-o", str(tmp_path / "run.zip"), *arguments]) == 1
     said = capsys.readouterr()
     assert said.out == ""
     assert part in said.err

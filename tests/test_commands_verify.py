@@ -1,10 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-from __future__ import annotations
-
 import json
 import shutil
-from collections.abc import Callable
-from pathlib import Path
 
 import pytest
 from packed_runs import make_bag_fit, the, unpacked
@@ -20,16 +16,12 @@ TOPICS = (
 
 
 @pytest.fixture(scope="module")
-def packed(
-    pendulums: Callable[..., Path], tmp_path_factory: pytest.TempPathFactory
-) -> Path:
+def packed(pendulums, tmp_path_factory):
     """A packed run of one episode."""
     return mjrec.pack(pendulums(1), tmp_path_factory.mktemp("packed") / "run.zip")
 
 
-def test_honest_run_passes_on_one_screen(
-    packed: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_honest_run_passes_on_one_screen(packed, tmp_path, capsys):
     """The verdict first, then a line for each topic; and a page about it."""
     page = tmp_path / "verify.html"
     assert main(["verify", str(packed), "--report", str(page)]) == 0
@@ -41,9 +33,7 @@ def test_honest_run_passes_on_one_screen(
     assert "<html" in page.read_text()
 
 
-def test_what_was_left_out_is_partly_and_status_3(
-    packed: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_was_left_out_is_partly_and_status_3(packed, capsys):
     """A sample is chosen at random, and its seed is printed."""
     assert main(["verify", str(packed), "--sample", "2", "--verbose"]) == 3
     said = capsys.readouterr().out
@@ -51,9 +41,7 @@ def test_what_was_left_out_is_partly_and_status_3(
     assert "--seed" in said
 
 
-def test_forged_run_fails_with_status_1(
-    packed: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_forged_run_fails_with_status_1(packed, tmp_path, capsys):
     """The difference is named; names cannot give orders to the terminal."""
     bag = unpacked(packed, tmp_path / "bag")
     the(bag, "README.md").write_text("new \x1b[31m[bold]words")
@@ -65,7 +53,7 @@ def test_forged_run_fails_with_status_1(
     assert "\x1b" not in said
 
 
-def test_json_has_all(packed: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_json_has_all(packed, capsys):
     """One object with stable fields, for scripts."""
     assert main(["verify", str(packed), "--level", "stats", "--json"]) == 3
     said = json.loads(capsys.readouterr().out)
@@ -75,12 +63,9 @@ def test_json_has_all(packed: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert set(said["facts"]) >= {"archive", "sample", "seed", "versions", "machine"}
 
 
-def test_directory_that_was_not_packed_is_verified(
-    pendulums: Callable[..., Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_directory_that_was_not_packed_is_verified(pendulums, tmp_path, capsys):
     """Nothing is written into it."""
-    folder = tmp_path / "recordings"
-    shutil.copytree(pendulums(1), folder)
+    folder = shutil.copytree(pendulums(1), tmp_path / "recordings")
     before = {path: path.stat().st_mtime_ns for path in folder.rglob("*")}
     assert main(["verify", str(folder), "--level", "physics"]) == 3
     assert capsys.readouterr().out.startswith("PARTLY")
@@ -93,26 +78,14 @@ def test_directory_that_was_not_packed_is_verified(
         (["--sample", "0"], "sample must be"),
         (["--allow", "gl"], "allow takes"),
         (["--report", "/no/such/place.html"], "no such directory"),
+        ([], "mjrec: Cannot verify {}: it is not a zip file"),
     ],
 )
-def test_options_are_checked_first(
-    arguments: list[str],
-    said: str,
-    packed: Path,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    """Before anything is unpacked."""
-    assert main(["verify", str(packed), *arguments]) == 1
-    assert said in capsys.readouterr().err
-
-
-def test_what_cannot_be_read_is_one_message(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """And status 1."""
+def test_errors_are_one_message_and_status_1(arguments, said, tmp_path, capsys):
+    """Options are checked before anything is unpacked."""
     path = tmp_path / "run.zip"
     path.write_bytes(b"PK\x03\x04")
-    assert main(["verify", str(path)]) == 1
-    said = capsys.readouterr()
-    assert said.out == ""
-    assert said.err.startswith(f"mjrec: Cannot verify {path}: it is not a zip file")
+    assert main(["verify", str(path), *arguments]) == 1
+    printed = capsys.readouterr()
+    assert printed.out == ""
+    assert said.format(path) in printed.err

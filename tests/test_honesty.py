@@ -1,183 +1,160 @@
 # SPDX-License-Identifier: Apache-2.0
 """What inputs say of their author."""
 
-from __future__ import annotations
-
-import dataclasses
-from collections.abc import Sequence
-from typing import Any
-
 import numpy as np
 import pytest
 
 from mjrec.environments.episode_seeds import episode_seeds
-from mjrec.evidence.findings import Finding, Outcome
+from mjrec.evidence.findings import Outcome
 from mjrec.evidence.honesty import remarks
 from mjrec.evidence.inputs import EpisodeInputs, Inputs, RecordingInputs
 
-
-def seed_of(run: int, episode: int) -> int:
-    """Return the seed that the stated rule gives."""
-    return episode_seeds(run, episode).environment
+NOTED, BELIEVED, DIFFERENT = Outcome.NOTED, Outcome.BELIEVED, Outcome.DIFFERENT
 
 
-def recording(
-    number: int, episodes: Sequence[EpisodeInputs], **inputs: Any
-) -> RecordingInputs:
+def recording(number, *episodes, **inputs):
     """Return a recording of these episodes."""
     usual = {"infix": f"{number}.1", "env_id": "A-v0", "environment": None}
     return RecordingInputs(**{**usual, **inputs}, episodes=episodes)
 
 
-def said(
-    *recordings: Sequence[EpisodeInputs], first: int = 0, **options: Any
-) -> list[Finding]:
-    """Return what is said of recordings of these episodes."""
-    more = {"options": options, "first_episode_id": first}
-    inputs = Inputs(
-        recordings=[
-            recording(number, episodes, **more)
-            for number, episodes in enumerate(recordings)
-        ]
-    )
-    names = [e.arrays for each in recordings for e in each if e.arrays]
-    # Of one name in the test is one content.
-    arrays = {name: np.full(3, ord(name[0])) for name in names}
-    return list(remarks(inputs, arrays))
-
-
-def episode(number: int, **inputs: Any) -> EpisodeInputs:
+def episode(number, **inputs):
     """Return an episode, with actions if it has arrays."""
     has_actions = "arrays" in inputs
     return EpisodeInputs(episode_id=number, steps=3, has_actions=has_actions, **inputs)
 
 
+def evaluated(number, of, **inputs):
+    """Return an episode of an evaluation with seed 2."""
+    return episode(number, evaluation={"seed": 2, "episode": of}, **inputs)
+
+
+def said(*recordings):
+    """Return what is said of them; of arrays of one first letter is one content."""
+    names = [e.arrays for each in recordings for e in each.episodes if e.arrays]
+    arrays = {name: np.full(3, ord(name[0])) for name in names}
+    return list(remarks(Inputs(recordings=recordings), arrays))
+
+
+def seed_of(run, number):
+    """Return the seed that the stated rule gives."""
+    return episode_seeds(run, number).environment
+
+
+CHOSEN = "seeds chosen by the author"
+
+
 @pytest.mark.parametrize(
-    ("episodes", "options", "rule"),
+    ("episodes", "rule"),
     [
-        ([episode(0, seed=7), episode(1)], {}, "one seed, 7, at the first reset"),
+        ([episode(0, seed=7), episode(1)], "one seed, 7, at the first reset"),
         (
             [episode(n, seed=seed_of(5, n)) for n in range(3)],
-            {"seed": 5},
             r"SeedSequence([5, i]) for episode i",
         ),
         (
-            [
-                episode(n, seed=seed_of(2, n), evaluation={"seed": 2, "episode": n})
-                for n in range(2)
-            ],
-            {},
+            [evaluated(n, n, seed=seed_of(2, n)) for n in range(2)],
             "SeedSequence([S, i]) for episode i, S in 2",
         ),
-        ([episode(0, seed=3), episode(1, seed=9)], {}, "seeds chosen by the author"),
-        (
-            [episode(n, seed=seed_of(5, n + 1)) for n in range(2)],
-            {"seed": 5},
-            "seeds chosen by the author",
-        ),
-        (
-            [episode(0, seed=1, evaluation={"seed": 2, "episode": 0})],
-            {},
-            "seeds chosen by the author",
-        ),
+        ([episode(0, seed=3), episode(1, seed=9)], CHOSEN),
+        ([episode(n, seed=seed_of(5, n + 1)) for n in range(2)], CHOSEN),
+        ([evaluated(0, 0, seed=1)], CHOSEN),
     ],
 )
-def test_seeds_follow_a_stated_rule_or_are_the_authors(
-    episodes: list[EpisodeInputs], options: dict[str, Any], rule: str
-) -> None:
+def test_seeds_follow_a_stated_rule_or_are_the_authors(episodes, rule):
     """From the first episode of the recording on."""
-    [finding] = said(episodes, **options)
+    [finding] = said(recording(0, *episodes, options={"seed": 5}))
     assert rule in finding.reason
-    assert finding.outcome is Outcome.NOTED
+    assert finding.outcome is NOTED
 
 
-def test_gaps_are_in_the_first_line() -> None:
-    """An episode that is not there is no episode of a whole recording."""
-    [finding] = said([episode(0), episode(1), episode(4)])
-    assert finding.is_headline
-    assert finding.outcome is Outcome.DIFFERENT
-    assert "missing: 2, 3" in finding.reason
-
-
-def test_a_missing_predecessor_is_in_the_first_line() -> None:
-    """Of a monitor that went on from others; where they are there, nothing is said."""
-    [finding] = said([episode(2)], first=2)
-    assert finding.is_headline
-    assert "0, 1 are missing" in finding.reason
-    chain = [recording(n, [episode(n)], first_episode_id=n) for n in (0, 1)]
-    assert list(remarks(Inputs(recordings=chain), {})) == []
-    # Those of another environment stand in for nothing.
-    chain[0] = dataclasses.replace(chain[0], environment={"id": "Easier-v0"})
-    found = list(remarks(Inputs(recordings=chain), {}))
-    assert any("0 are missing" in each.reason for each in found)
-
-
-def test_equal_episodes_count_once_and_are_named() -> None:
-    """Wherever they are; other actions, or another beginning, are another episode."""
-    first = [episode(0, seed=1, arrays="a"), episode(1, seed=2, arrays="a2")]
-    second = [episode(0, seed=1, arrays="a3"), episode(1, seed=1, arrays="b")]
-    found = [each for each in said(first, second) if each.is_headline]
-    [finding] = found
-    assert "episode 0 of 0.1, episode 0 of 1.1" in finding.reason
-    assert finding.outcome is Outcome.BELIEVED
-    assert finding.count == 1
-
-
-def test_cut_episodes_are_in_the_first_line() -> None:
-    """They are in no statistics."""
-    [finding] = said([episode(0), episode(1, cut="reset")])
-    assert finding.outcome is Outcome.NOTED
-    assert finding.is_headline
-    assert "cut off: 1" in finding.reason
-
-
-def test_closing_and_going_on_leaves_episodes_out() -> None:
-    """A run is closed once; whoever resumes can drop each episode that goes wrong."""
-    first = recording(0, [episode(0), episode(1, cut="close")])
-    second = recording(1, [episode(2)], first_episode_id=2)
-    [finding] = remarks(Inputs(recordings=[first, second]), {})
-    assert finding.outcome is Outcome.BELIEVED
-    assert "continues after them" in finding.reason
+FIRST = recording(0, episode(0))
+EASIER = {"environment": {"id": "Easier-v0"}}
+HOPPER = {"id": "Hopper-v5"}
 
 
 @pytest.mark.parametrize(
-    ("name", "environment", "outcome"),
+    ("recordings", "outcome", "reason"),
     [
-        ("Humanoid-v5", {"id": "Hopper-v5"}, Outcome.DIFFERENT),
-        ("our hopper", {"id": "Hopper-v5"}, Outcome.BELIEVED),
-        ("Hopper-v5", {"id": "Hopper-v5", "framework": "mjcf"}, Outcome.NOTED),
+        # An episode that is not there is no episode of a whole recording.
+        ([recording(0, episode(0), episode(1), episode(4))], DIFFERENT, "ing: 2, 3"),
+        # Nor are those of a monitor that this one went on from.
+        ([recording(0, episode(2), first_episode_id=2)], BELIEVED, "0, 1 are missing"),
+        # They are in no statistics.
+        ([recording(0, episode(0), episode(1, cut="reset"))], NOTED, "cut off: 1"),
+        # An author who resumes can drop each episode that goes wrong.
+        (
+            [
+                recording(0, episode(0), episode(1, cut="close")),
+                recording(1, episode(2), first_episode_id=2),
+            ],
+            BELIEVED,
+            "continues after them",
+        ),
+        # An average over the others would leave them out.
+        (
+            [recording(0, episode(0, type="t"), episode(1, type="e"))],
+            NOTED,
+            "1 of 2 episodes are labelled training",
+        ),
+        # The best of many would be a choice; chunks count together.
+        (
+            [
+                recording(0, evaluated(0, 0), evaluated(1, 1)),
+                recording(1, evaluated(0, 2), evaluated(1, 5)),
+            ],
+            BELIEVED,
+            "3, 4",
+        ),
+        # Other actions, or another beginning, are another episode.
+        (
+            [
+                recording(0, episode(0, seed=1, arrays="a"), episode(1, arrays="a2")),
+                recording(1, episode(0, seed=1, arrays="a3"), episode(1, arrays="b")),
+            ],
+            BELIEVED,
+            "episode 0 of 0.1, episode 0 of 1.1",
+        ),
+        # All files bear the name, and another environment was run.
+        ([recording(0, episode(0), env_id="ours", environment=HOPPER)], BELIEVED, ""),
+        (
+            [recording(0, episode(0), env_id="Humanoid-v5", environment=HOPPER)],
+            DIFFERENT,
+            "",
+        ),
+        (
+            [
+                recording(
+                    0,
+                    episode(0),
+                    env_id="Hopper-v5",
+                    environment={**HOPPER, "framework": "mjcf"},
+                )
+            ],
+            NOTED,
+            "",
+        ),
     ],
 )
-def test_an_environment_is_what_it_is_called(
-    name: str, environment: dict[str, Any], outcome: Outcome
-) -> None:
-    """All files bear the name, and another environment was run."""
-    run = recording(0, [episode(0)], env_id=name, environment=environment)
-    [finding] = remarks(Inputs(recordings=[run]), {})
-    assert finding.is_headline
+def test_what_makes_a_run_look_better_is_in_the_first_lines(
+    recordings, outcome, reason
+):
+    """One line for each thing that its author may have chosen."""
+    [finding] = [each for each in said(*recordings) if each.is_headline]
     assert finding.outcome is outcome
+    assert reason in finding.reason
 
 
-def test_training_episodes_among_evaluations_are_named() -> None:
-    """An average over the others would leave them out."""
-    [finding] = said([episode(0, type="t"), episode(1, type="e")])
-    assert finding.is_headline
-    assert "1 of 2 episodes are labelled training" in finding.reason
+def test_a_predecessor_that_is_there_is_none_that_is_missing():
+    """But for one of another environment, which stands in for nothing."""
+    second = recording(1, episode(1), first_episode_id=1)
+    assert said(FIRST, second) == []
+    found = said(recording(0, episode(0), **EASIER), second)
+    assert any("0 are missing" in each.reason for each in found)
 
 
-def test_episodes_of_an_evaluation_are_numbered_without_gaps() -> None:
-    """The best of many would be a choice; chunks of one evaluation count together."""
-    chunks = [
-        [episode(k, evaluation={"seed": 2, "episode": n}) for k, n in enumerate(each)]
-        for each in ((0, 1), (2, 5))
-    ]
-    [finding] = [each for each in said(*chunks) if each.is_headline]
-    assert finding.outcome is Outcome.BELIEVED
-    assert "3, 4" in finding.reason
-
-
-def test_huge_numbers_take_no_memory() -> None:
+def test_huge_numbers_take_no_memory():
     """A stranger's archive may have any."""
-    [gap, absent] = said([episode(10**15)], first=10**14)
+    [gap, absent] = said(recording(0, episode(10**15), first_episode_id=10**14))
     assert "and 899999999999995 more" in gap.reason
     assert absent.count == 10**14

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Archives that are made to do harm to whoever verifies them."""
 
-from __future__ import annotations
-
 import os
 import stat
 import struct
@@ -10,7 +8,6 @@ import tempfile
 import warnings
 import zipfile
 import zlib
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
@@ -21,147 +18,119 @@ from mjrec.evidence.archive import bring_in
 
 GOOD = "run/data/recordings/openaigym.episodes.0.7.jsonl"
 EVIL = Path("/tmp/evil-of-mjrec-tests")
+TABLE = b"PK\x01\x02"
 
-Make = Callable[[Path], object]
 
-
-def write(path: Path, *entries: tuple[str | zipfile.ZipInfo, bytes]) -> None:
+def write(path, *entries, comment=b"", **options):
     """Write a zip file as it would never come from us."""
-    with warnings.catch_warnings(), zipfile.ZipFile(path, "w") as file:
+    with warnings.catch_warnings(), zipfile.ZipFile(path, "w", **options) as file:
         warnings.simplefilter("ignore")  # of names that are there twice
         for name, content in entries:
             file.writestr(name, content)
+        file.comment = comment
 
 
-def write_called(name: str, path: Path, mode: int = 0) -> None:
-    """Write an entry whose name is taken as it is."""
+def writes(*entries, **options):
+    return lambda path: write(path, *entries, **options)
+
+
+def entry(name=GOOD, **facts):
+    """Return an entry whose name is taken as it is."""
     info = zipfile.ZipInfo("x")
-    info.filename = name
-    info.external_attr = mode << 16
-    write(path, (GOOD, b""), (info, b"/etc/passwd"))
+    for key, value in {"filename": name, **facts}.items():
+        setattr(info, key, value)
+    return info
 
 
-def write_both(first: str, second: str, path: Path) -> None:
-    write(path, (first, b"1"), (second, b"2"))
+def write_called(name, path, mode=0):
+    write(path, (GOOD, b""), (entry(name, external_attr=mode << 16), b"/etc/passwd"))
 
 
-def damage(change: Callable[[bytearray], object], path: Path) -> None:
+def damage(change, path):
     """Write a sound archive with other bytes in it."""
-    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as file:
-        file.writestr(GOOD, os.urandom(1000))
+    write(path, (GOOD, os.urandom(1000)), compression=zipfile.ZIP_DEFLATED)
     data = bytearray(path.read_bytes())
     changed = change(data)
-    path.write_bytes(changed if isinstance(changed, bytes | bytearray) else data)
+    path.write_bytes(data if changed is None else changed)
 
 
-def stating(size: int, data: bytearray) -> None:
+def stating(size, data):
     """What is said to be small is counted while it is unpacked."""
-    for place in (22, data.index(b"PK\x01\x02") + 24):
+    for place in (22, data.index(TABLE) + 24):
         struct.pack_into("<L", data, place, size)
 
 
-def encrypted(data: bytearray) -> None:
+def encrypted(data):
     data[6] |= 1
-    data[data.index(b"PK\x01\x02") + 8] |= 1
+    data[data.index(TABLE) + 8] |= 1
 
 
-def one_bit(data: bytearray) -> None:
+def one_bit(data):
     data[500] ^= 1
 
 
-def with_bytes_between(data: bytearray) -> bytearray:
-    table = data.index(b"PK\x01\x02")
+def with_bytes_between(data):
+    table = data.index(TABLE)
     moved = bytearray(data[:table] + b"evil" + data[table:])
     struct.pack_into("<L", moved, len(moved) - 6, table + 4)
     return moved
 
 
-def with_comment(path: Path) -> None:
-    write(path, (GOOD, b"1"))
-    with zipfile.ZipFile(path, "a") as file:
-        file.comment = b"evil"
+def bomb(path):
+    write(path, (GOOD, bytes(80 << 20)), compression=zipfile.ZIP_DEFLATED)
 
 
-def bomb(path: Path) -> None:
-    with (
-        zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as file,
-        file.open(GOOD, "w") as output,
-    ):
-        for _ in range(80):
-            output.write(bytes(1 << 20))
-
-
-def many_files(path: Path) -> None:
-    with zipfile.ZipFile(path, "w") as file:
-        for number in range(100_001):
-            file.writestr(f"r/{number}", b"")
-
-
-def two_entries_over_the_same_bytes(path: Path) -> None:
+def two_entries_over_the_same_bytes(path):
     """As in bombs that unpack one content any number of times."""
-    write_both("run/data/a", "run/data/b", path)
+    write(path, ("run/data/a", b"1"), ("run/data/b", b"2"))
     data = bytearray(path.read_bytes())
-    struct.pack_into("<L", data, data.rindex(b"PK\x01\x02") + 42, 0)
+    struct.pack_into("<L", data, data.rindex(TABLE) + 42, 0)
     path.write_bytes(data)
 
 
-def with_two_tables(path: Path) -> None:
+def with_two_tables(path):
     """Python follows a record of large archives; others see none, for it hides."""
     evil = "run/data/evil"
     begin = 30 + len(GOOD) + 1  # the second file, which holds the table that all see
     table = begin + 30 + len(evil)
     hidden_size = 46 + len(GOOD) + 46 + len(evil)
-    extra = struct.pack("<2H", 0x5455, hidden_size + 56 + 20)
-    seen = listing(GOOD, b"1", 0, len(extra) + hidden_size + 56 + 20) + extra
+    rest = hidden_size + 56 + 20
+    extra = struct.pack("<2H", 0x5455, rest)
+    seen = listing(GOOD, b"1", 0, len(extra) + rest) + extra
     hidden = listing(GOOD, b"1", 0) + listing(evil, seen, begin)
     place = table + len(seen)
+    large = (b"PK\6\6", 44, 45, 45, 0, 0, 2, 2, hidden_size, place)
+    end = (b"PK\5\6", 0, 0, 1, 1, len(seen) + rest, table, 0)
     path.write_bytes(
         stored(GOOD, b"1")
         + stored(evil, seen)
         + hidden
-        + struct.pack(
-            "<4sQ2H2L4Q", b"PK\6\6", 44, 45, 45, 0, 0, 2, 2, hidden_size, place
-        )
+        + struct.pack("<4sQ2H2L4Q", *large)
         + struct.pack("<4sLQL", b"PK\6\7", 0, place + hidden_size, 1)
-        + struct.pack(
-            "<4s4H2LH",
-            *(b"PK\5\6", 0, 0, 1, 1, len(seen) + hidden_size + 56 + 20, table, 0),
-        )
+        + struct.pack("<4s4H2LH", *end)
     )
 
 
-def stored(name: str, content: bytes) -> bytes:
+def stored(name, content):
     facts = (0, 0, 33, zlib.crc32(content), len(content), len(content), len(name), 0)
     head = struct.pack("<4s2H3H3L2H", b"PK\3\4", 20, 0, *facts)
     return head + name.encode() + content
 
 
-def listing(name: str, content: bytes, offset: int, extra: int = 0) -> bytes:
+def listing(name, content, offset, extra=0):
     sizes = (zlib.crc32(content), len(content), len(content), len(name), extra)
     facts = (20, 20, 0, 0, 0, 33, *sizes, 0, 0, 0, 0, offset)
-    return struct.pack("<4s6H3L5H2L", b"PK\1\2", *facts) + name.encode()
+    return struct.pack("<4s6H3L5H2L", TABLE, *facts) + name.encode()
 
 
-def rare_compression(path: Path) -> None:
-    with zipfile.ZipFile(path, "w", zipfile.ZIP_BZIP2) as file:
-        file.writestr(GOOD, b"1")
-
-
-def with_a_second_name(path: Path) -> None:
+def with_a_second_name(path):
     """Info-ZIP shows the name in this field, and Python the other one."""
-    info = zipfile.ZipInfo(GOOD)
     called = b"\x01" + struct.pack("<L", zlib.crc32(GOOD.encode())) + b"run/data/evil"
-    info.extra = struct.pack("<2H", 0x7075, len(called)) + called
-    write(path, (info, b"1"))
+    extra = struct.pack("<2H", 0x7075, len(called)) + called
+    write(path, (entry(extra=extra), b"1"))
 
 
-def with_a_comment_on_an_entry(path: Path) -> None:
-    info = zipfile.ZipInfo(GOOD)
-    info.comment = b"evil"
-    write(path, (info, b"1"))
-
-
-def linked_folder(path: Path) -> None:
+def linked_folder(path):
     """An unpacked run whose recordings lie elsewhere."""
     elsewhere = path.with_name("elsewhere")
     (elsewhere / "recordings").mkdir(parents=True)
@@ -170,85 +139,59 @@ def linked_folder(path: Path) -> None:
     (path / "data").symlink_to(elsewhere)
 
 
-HARMS: list[tuple[Make, str]] = [
-    # Names that lead elsewhere, whatever the system.
-    *(
-        (partial(write_called, name), reason)
-        for name, reason in [
-            *(("../evil", "leads out"), ("run/../../evil", "leads out")),
-            *(("run/..", "leads out"), (str(EVIL), "absolute")),
-            *(("C:/evil", "absolute"), ("run\\..\\..\\evil", "backslash")),
-            *(("run/a\0b", "invisible character"), ("run/a\nb", "invisible character")),
-            *(("run//evil", "empty part"), ("run/./evil", "empty part")),
-            *((f"run/{'e' * 300}", "too long"), (f"run/{'e/' * 600}e", "too long")),
-            (f"run/{'e/' * 20}e", "folders deep"),
-        ]
-    ),
-    # A link could be written through, and a device opened.
-    *(
-        (
-            partial(write_called, "run/data/link", mode=mode),
-            "neither a file nor a folder",
-        )
-        for mode in (stat.S_IFLNK | 0o777, stat.S_IFCHR | 0o666, stat.S_IFIFO)
-    ),
+NAMES = [
+    # They lead elsewhere, whatever the system.
+    *(("../evil", "leads out"), ("run/../../evil", "leads out")),
+    *(("run/..", "leads out"), (str(EVIL), "absolute")),
+    *(("C:/evil", "absolute"), ("run\\..\\..\\evil", "backslash")),
+    *(("run/a\0b", "invisible character"), ("run/a\nb", "invisible character")),
+    *(("run//evil", "empty part"), ("run/./evil", "empty part")),
+    *((f"run/{'e' * 300}", "too long"), (f"run/{'e/' * 600}e", "too long")),
+    (f"run/{'e/' * 20}e", "folders deep"),
+]
+PAIRS = [
     # Two files of one name, on any system, or more than one folder.
-    *(
-        (partial(write_both, first, second), reason)
-        for first, second, reason in [
-            ("run/data/a", "run/data/a", "same file"),
-            ("run/data/a", "run/data/A", "same file"),
-            ("run/data/\u00e4", "run/data/a\u0308", "same file"),
-            ("run/data/a", "run/data/a/b", "the folder"),
-            ("run/data/a", "other/a", "one folder"),
-            ("run/data/a", "a", "one folder"),
-        ]
-    ),
-    *(
-        (partial(damage, change), reason)
-        for change, reason in [
-            (partial(stating, 5), "CRC"),
-            (partial(stating, 5000), "the declared size"),
-            (encrypted, "encrypted"),
-            (one_bit, "CRC"),
-            # What some programs see and others do not.
-            (with_bytes_between, "hidden bytes"),
-            (lambda data: b"evil" + data, "before its first file"),
-            (lambda data: data + b"evil", "at its end"),
-            # A download that broke off.
-            *((lambda data, n=n: data[:n], "not a zip file") for n in (0, 10, 200)),
-        ]
-    ),
-    (with_comment, "has a comment"),
-    (with_a_comment_on_an_entry, "has a comment"),
+    *(("run/data/a", "run/data/a", "same file"), ("run/data/a", "run/data/A", "same")),
+    ("run/data/\u00e4", "run/data/a\u0308", "same file"),
+    *(("run/data/a", "run/data/a/b", "the folder"), ("run/data/a", "a", "one folder")),
+    ("run/data/a", "other/a", "one folder"),
+]
+DAMAGES = [
+    *((partial(stating, 5), "CRC"), (partial(stating, 5000), "the declared size")),
+    *((encrypted, "encrypted"), (one_bit, "CRC")),
+    # What some programs see and others do not.
+    (with_bytes_between, "hidden bytes"),
+    (lambda data: b"evil" + data, "before its first file"),
+    (lambda data: data + b"evil", "at its end"),
+    # A download that broke off.
+    *((lambda data, n=n: data[:n], "not a zip file") for n in (0, 10, 200)),
+]
+# A link could be written through, and a device opened.
+MODES = [stat.S_IFLNK | 0o777, stat.S_IFCHR | 0o666, stat.S_IFIFO]
+NO_FILE = "neither a file nor a folder"
+HARMS = [
+    *((partial(write_called, name), reason) for name, reason in NAMES),
+    *((partial(write_called, "run/data/link", mode=m), NO_FILE) for m in MODES),
+    *((writes((a, b"1"), (b, b"2")), reason) for a, b, reason in PAIRS),
+    *((partial(damage, change), reason) for change, reason in DAMAGES),
+    (writes((GOOD, b"1"), comment=b"evil"), "has a comment"),
+    (writes((entry(comment=b"evil"), b"1")), "has a comment"),
     (with_a_second_name, "not all programs read"),
-    (
-        lambda path: write(path, (GOOD, b"1"), ("run/All succeeded/", b"")),
-        "is an empty",
-    ),
+    (writes((GOOD, b"1"), ("run/All succeeded/", b"")), "is an empty"),
     (bomb, "zip bomb"),
-    (many_files, "more than the limit"),
+    (writes(*((f"r/{n}", b"") for n in range(100_001))), "more than the limit"),
     (two_entries_over_the_same_bytes, "overlaps"),
     (with_two_tables, "two tables"),
-    (rare_compression, "unsupported compression"),
-    (lambda path: write(path, ("run/readme.txt", b"1")), "data/recordings"),
-    (linked_folder, "neither a file nor a folder"),
+    (writes((GOOD, b"1"), compression=zipfile.ZIP_BZIP2), "unsupported compression"),
+    (writes(("run/readme.txt", b"1")), "data/recordings"),
+    (linked_folder, NO_FILE),
 ]
-
-
-@pytest.fixture
-def temporary(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Where temporary folders are made."""
-    folder = tmp_path / "temporary"
-    folder.mkdir()
-    monkeypatch.setattr(tempfile, "tempdir", str(folder))
-    return folder
 
 
 @pytest.mark.parametrize(
     ("make", "reason"), HARMS, ids=[f"{n} {why}" for n, (_, why) in enumerate(HARMS)]
 )
-def test_harm_is_refused(make: Make, reason: str, tmp_path: Path) -> None:
+def test_harm_is_refused(make, reason, tmp_path):
     """With its reason; nothing is written outside of the folder for it."""
     archive, place = tmp_path / "run.zip", tmp_path / "place"
     make(archive)
@@ -261,18 +204,24 @@ def test_harm_is_refused(make: Make, reason: str, tmp_path: Path) -> None:
     assert not EVIL.exists()
 
 
-def test_harm_in_a_verification_is_refused(tmp_path: Path, temporary: Path) -> None:
-    """By the process that unpacks, of which nothing is left."""
+def test_harm_in_a_verification_is_refused(tmp_path, monkeypatch):
+    """By the process that unpacks, of which nothing is left; it says what to do."""
+    temporary = tmp_path / "temporary"
+    temporary.mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(temporary))
     archive = tmp_path / "run.zip"
     write_called("../evil", archive)
     with pytest.raises(mjrec.UnreadableArchive, match="leads out"):
         mjrec.verify(archive, level="files")
     assert list(temporary.iterdir()) == []
+    archive.write_bytes(b"PK")
+    with pytest.raises(mjrec.UnreadableArchive, match="ask for the original file") as e:
+        mjrec.verify(archive)
+    assert str(e.value).startswith(f"Cannot verify {archive}: it is not a zip file.")
+    assert "directory" not in str(e.value)
 
 
-def test_archive_that_does_not_fit_on_the_disk_is_an_error(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_archive_that_does_not_fit_on_the_disk_is_an_error(tmp_path, monkeypatch):
     """Before anything is written, and with the room that it takes."""
     path = tmp_path / "run.zip"
     write(path, (GOOD, bytes(1000)))
@@ -281,16 +230,3 @@ def test_archive_that_does_not_fit_on_the_disk_is_an_error(
     with pytest.raises(mjrec.Error, match=r"takes 1000 bytes, but only 999 are free"):
         bring_in(path, tmp_path / "given")
     assert not (tmp_path / "given").exists()
-
-
-def test_words_about_a_bad_archive_say_what_to_do(tmp_path: Path) -> None:
-    """It is one file that somebody has sent."""
-    archive = tmp_path / "run.zip"
-    archive.write_bytes(b"PK")
-    with pytest.raises(mjrec.UnreadableArchive) as raised:
-        mjrec.verify(archive)
-    assert str(raised.value).startswith(
-        f"Cannot verify {archive}: it is not a zip file."
-    )
-    assert "ask for the original file" in str(raised.value)
-    assert "directory" not in str(raised.value)

@@ -1,10 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What names a person or a machine, and where it is found."""
 
-from __future__ import annotations
-
 import os
-from pathlib import Path
 
 import pytest
 
@@ -44,7 +41,7 @@ IDENTITY = Identity(
         ("Bob Green, green", "<user>, green"),
     ],
 )
-def test_what_names_somebody_is_replaced(text: str, expected: str) -> None:
+def test_what_names_somebody_is_replaced(text, expected):
     """Each kind of name has its placeholder, and is found where it is replaced."""
     matcher = IdentityMatcher(IDENTITY)
     assert matcher.replaced(text) == expected
@@ -55,19 +52,19 @@ def test_what_names_somebody_is_replaced(text: str, expected: str) -> None:
 @pytest.mark.parametrize(
     "text", ["rootx", "root", "vm", "adapt", "ada", "balance", "vmax", "Madagascar"]
 )
-def test_short_and_ordinary_names_stay_inside_other_words(text: str) -> None:
+def test_short_and_ordinary_names_stay_inside_other_words(text):
     """HalfCheetah's joint `rootx` is no account of anybody's."""
     assert IdentityMatcher(IDENTITY).replaced(text) == text
 
 
-def test_names_of_files_stay_portable() -> None:
+def test_names_of_files_stay_portable():
     """A short login counts as a part of a name, and no bracket gets into it."""
     matcher = IdentityMatcher(IDENTITY)
     assert matcher.replaced_in_name("0.ada-run.vm_2") == "0.user-run.host_2"
     assert matcher.replaced_in_name("0.rooty.mbrunelli") == "0.rooty.user"
 
 
-def test_few_letters_amid_numbers_are_chance() -> None:
+def test_few_letters_amid_numbers_are_chance():
     """Four letters in compressed bytes are nobody's name; a line of text is one."""
     matcher = IdentityMatcher(IDENTITY)
     assert matcher.found_in_bytes(b"\x00\xffAlan:/vm:\xfe\x01") == []
@@ -77,56 +74,42 @@ def test_few_letters_amid_numbers_are_chance() -> None:
     assert matcher.found_in_bytes(b"\xffmbrunelli\xff") == ["mbrunelli"]
 
 
-def test_letters_are_found_that_json_escapes() -> None:
-    """As they are in every JSON file here, and in the facts of a trajectory."""
-    matcher = IdentityMatcher(Identity(users={"joséphine"}))
+def test_names_of_other_alphabets_are_found_amid_bytes():
+    """As JSON escapes them, and where neither encoding can be read as a whole."""
+    matcher = IdentityMatcher(Identity(users={"joséphine"}, people={"Łukasz Wąs"}))
     assert matcher.found_in_bytes(b'{"by": "Jos\\u00e9phine"}') == ["Joséphine"]
-
-
-def test_names_of_other_alphabets_are_found_amid_bytes() -> None:
-    """Also where neither encoding can be read as a whole."""
-    matcher = IdentityMatcher(Identity(people={"Łukasz Wąs"}))
     for encoding in ("utf-8", "utf-16-le"):
         content = b"\xff\xfe\xff" + "Łukasz Wąs".encode(encoding) + b"\xff"
         assert matcher.found_in_bytes(content) == ["Łukasz Wąs"]
 
 
-def test_who_recorded_is_known_from_the_recording() -> None:
+def test_who_recorded_is_known_from_the_recording():
     """On another machine, paths, the repository and variables tell it."""
-    identity = identity_of_user(
-        [
-            {
-                "command": ["python", "/home/ada/gait/train.py"],
-                "working_directory": "/home/ada/gait",
-                "code": {
-                    "root": "/home/ada/gait",
-                    "remote": "https://git.example/lab7/gait",
-                },
-                "variables": {"LD_LIBRARY_PATH": "/home/charles/lib"},
-                "policy": {"file": "/scratch/p7/policy.pt"},
-            }
-        ]
-    )
+    remote, root = "https://git.example/lab7/gait", "/home/ada/gait"
+    provenance = {
+        "command": ["python", f"{root}/train.py"],
+        "working_directory": root,
+        "code": {"root": root, "remote": remote},
+        "variables": {"LD_LIBRARY_PATH": "/home/charles/lib"},
+        "policy": {"file": "/scratch/p7/policy.pt"},
+    }
+    identity = identity_of_user([provenance])
     assert {"ada", "charles", "lab7"} <= identity.users
     assert "/home/ada" in identity.homes
-    assert {"/home/ada/gait", "/scratch/p7"} <= identity.directories
-    assert "https://git.example/lab7/gait" in identity.remotes
+    assert {root, "/scratch/p7"} <= identity.directories
+    assert remote in identity.remotes
 
 
-def test_who_packs_is_known_from_the_system(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_who_packs_is_known_from_the_system(tmp_path, monkeypatch):
     """Variables, the machine's name, the working directory, and the authors given."""
     monkeypatch.setenv("USER", "mbrunelli")
     monkeypatch.setenv("HOME", str(tmp_path))
     monkeypatch.chdir(tmp_path)
     said = ["Margherita Brunelli (MIT) <mb@uni.example>", "C D <0000-0002-1825-0097>"]
-    identity = identity_of_user(
-        authors=state(title=None, authors=said, license=None).authors
-    )
+    stated = state(title=None, authors=said, license=None)
+    identity = identity_of_user(authors=stated.authors)
     assert "mbrunelli" in identity.users
-    assert str(tmp_path) in identity.homes
-    assert str(tmp_path) in identity.directories
+    assert str(tmp_path) in identity.homes & identity.directories
     assert os.uname().nodename in identity.hosts
     assert "Margherita Brunelli" in identity.people
     assert {"mb@uni.example", "0000-0002-1825-0097"} <= identity.addresses
@@ -146,6 +129,6 @@ def test_who_packs_is_known_from_the_system(
         {"code": {"root": "/\0", "remote": "::::"}, "variables": {"HOME": ["x"]}},
     ],
 )
-def test_provenance_may_say_anything(hostile: dict[str, object]) -> None:
+def test_provenance_may_say_anything(hostile):
     """What a file says of its provenance raises nothing."""
     assert identity_of_user([hostile]).hosts

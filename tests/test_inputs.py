@@ -1,17 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """The inputs of a run: read from what it recorded, and nothing more."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
+import shutil
 
 import gymnasium
 import numpy as np
 import pytest
+from packed_runs import the
 
 import mjrec
 from mjrec.errors import Error
@@ -37,19 +34,15 @@ OTHERS = {
 
 
 @pytest.fixture(scope="module")
-def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def data(tmp_path_factory):
     """What would be in a packed run: a recording with all that is unusual."""
     place = tmp_path_factory.mktemp("inputs")
     env = gymnasium.make("InvertedPendulum-v5", max_episode_steps=4, frame_skip=3)
+    options = {"mode": "evaluation", "fps": 29.97, "workers": 0}
     with mjrec.Monitor(
-        env,
-        place / "recordings",
-        lambda episode: episode == 1,
-        mode="evaluation",
-        fps=29.97,
-        workers=0,
+        env, place / "recordings", lambda episode: episode == 1, **options
     ) as monitor:
-        actions: list[Any] = [np.float32([0.1]), [0.25], np.zeros((2, 1)), np.ones(1)]
+        actions = [np.float32([0.1]), [0.25], np.zeros((2, 1)), np.ones(1)]
         monitor.reset(seed=3, options={"a": 1})
         for action in actions[:2]:
             monitor.step(action)
@@ -61,18 +54,28 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return place
 
 
-def test_inputs_are_what_was_asked_for_and_done(data: Path) -> None:
-    """Environment, options, seeds, actions and what cut an episode off."""
+def test_inputs_are_what_was_asked_for_and_done(data, tmp_path):
+    """Environment, options, seeds, actions and what cut an episode off.
+
+    They go through a folder unchanged, without pickles.
+    """
     inputs, arrays = read_inputs(data)
     [recording] = inputs.recordings
     assert recording.options == {"fps": "29.97"}
     first, second = recording.episodes
     assert (first.seed, first.options, first.cut) == (3, {"a": 1}, "exception")
     assert (second.seed, second.cut, second.is_chosen) == (None, None, True)
-    assert [a.tolist() for a in arrays[str(second.arrays)]][2:] == [[1.0], [1.0]]
+    assert [a.tolist() for a in arrays[second.arrays]][2:] == [[1.0], [1.0]]
+    inputs.write(tmp_path, arrays)
+    again = Inputs.read(tmp_path)
+    assert again.unusual() == inputs.unusual()
+    texts = [json.dumps(dataclasses.asdict(each)) for each in (again, inputs)]
+    assert texts[0] == texts[1]
+    with np.load(tmp_path / ARRAYS_FILE, allow_pickle=False) as read:
+        assert set(read) == set(arrays)
 
 
-def test_actions_are_played_in_the_dtype_that_was_given(data: Path) -> None:
+def test_actions_are_played_as_they_were_given(data):
     """Where float32 became float64 in mid-episode, and where one fits nowhere."""
     inputs, arrays = read_inputs(data)
     first, second = inputs.recordings[0].episodes
@@ -83,38 +86,20 @@ def test_actions_are_played_in_the_dtype_that_was_given(data: Path) -> None:
     odd = dataclasses.replace(first, irregular=(irregular,))
     whole = list(given_actions(odd, arrays))[1]
     assert (whole.dtype.name, whole.shape) == ("float32", (2, 1))
+    # Dictionaries are recorded as one vector.
+    parts = {"arrays": "a", "action_parts": [("x", [2]), ("y", [])]}
+    vector = {"a": np.array([[1.0, 2.0, 3.0]])}
+    [action] = given_actions(EpisodeInputs(episode_id=0, steps=1, **parts), vector)
+    assert (action["x"].tolist(), action["y"]) == ([1.0, 2.0], 3.0)
 
 
-def test_dictionaries_are_played_as_dictionaries() -> None:
-    """They are recorded as one vector."""
-    episode = EpisodeInputs(
-        episode_id=0, steps=1, arrays="a", action_parts=[("x", [2]), ("y", [])]
-    )
-    [action] = given_actions(episode, {"a": np.array([[1.0, 2.0, 3.0]])})
-    assert action["x"].tolist() == [1.0, 2.0]
-    assert action["y"] == 3.0
-
-
-def test_inputs_go_through_a_folder_unchanged(data: Path, tmp_path: Path) -> None:
-    """Without pickles."""
-    inputs, arrays = read_inputs(data)
-    inputs.write(tmp_path, arrays)
-    again = Inputs.read(tmp_path)
-    assert again.unusual() == inputs.unusual()
-    assert json.loads(json.dumps(dataclasses.asdict(again))) == json.loads(
-        json.dumps(dataclasses.asdict(inputs))
-    )
-    with np.load(tmp_path / ARRAYS_FILE, allow_pickle=False) as read:
-        assert set(read) == set(arrays)
-
-
-def test_unusual_inputs_are_listed(data: Path) -> None:
+def test_unusual_inputs_are_listed(data):
     """For the report: all that is not the default."""
     inputs, _ = read_inputs(data)
     packed = dataclasses.replace(inputs, packing={"anonymous": True, "name": "run"})
     said = packed.unusual()
-    assert said["pack"] == {"anonymous": True}
-    [(_, recording)] = [item for item in said.items() if item[0] != "pack"]
+    assert said.pop("pack") == {"anonymous": True}
+    [recording] = said.values()
     assert recording["environment: frame_skip"] == 3
     assert recording["max_episode_steps"] == 4
     assert recording["fps"] == "29.97"
@@ -123,7 +108,7 @@ def test_unusual_inputs_are_listed(data: Path) -> None:
     assert recording["environment"] == "InvertedPendulum-v5"
 
 
-def test_wrappers_are_listed_with_their_arguments() -> None:
+def test_wrappers_are_listed_with_their_arguments():
     """Gymnasium's own can give any reward."""
     environment = {
         "id": "A-v0",
@@ -134,10 +119,8 @@ def test_wrappers_are_listed_with_their_arguments() -> None:
     recording = RecordingInputs(infix="0.u", env_id="A-v0", environment=environment)
     [said] = Inputs(recordings=[recording]).unusual().values()
     assert said["environment"] == "A-v0, the author's own model (MJCF)"
-    assert said["wrappers"] == [
-        "gymnasium.ClipReward(min_reward=100.0)",
-        "mine.Wrapper(...)",
-    ]
+    listed = ["gymnasium.ClipReward(min_reward=100.0)", "mine.Wrapper(...)"]
+    assert said["wrappers"] == listed
 
 
 @pytest.mark.parametrize(
@@ -149,25 +132,19 @@ def test_wrappers_are_listed_with_their_arguments() -> None:
         lambda run: run.update(first_episode_id="0"),
     ],
 )
-def test_what_is_no_input_is_refused(
-    change: Callable[[dict[str, Any]], None], data: Path, tmp_path: Path
-) -> None:
+def test_what_is_no_input_is_refused(change, data, tmp_path):
     """The list is closed, and each has its type."""
-    folder = tmp_path / "recordings"
-    folder.mkdir()
-    for path in (data / "recordings").iterdir():
-        content = path.read_bytes()
-        if path.suffix == ".jsonl":
-            first, _, rest = content.partition(b"\n")
-            said = json.loads(first)
-            change(said["run"])
-            content = json.dumps(said).encode() + b"\n" + rest
-        (folder / path.name).write_bytes(content)
+    shutil.copytree(data / "recordings", tmp_path / "recordings")
+    journal = the(tmp_path, "*.jsonl")
+    first, *others = journal.read_text().splitlines()
+    said = json.loads(first)
+    change(said["run"])
+    journal.write_text("\n".join([json.dumps(said), *others, ""]))
     with pytest.raises(Error, match="inputs cannot be read"):
         read_inputs(tmp_path)
 
 
-def test_each_option_is_an_input_or_has_a_reason_not_to_be() -> None:
+def test_each_option_is_an_input_or_has_a_reason_not_to_be():
     """An option that changes files, and is not an input, would never verify."""
     fields = {field.name for field in dataclasses.fields(RecorderOptions)}
     others = {name for names in OTHERS.values() for name in names.split()}

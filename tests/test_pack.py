@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A packed run holds what was recorded, conforms, and is the same every time."""
 
-from __future__ import annotations
-
 import csv
 import json
 import os
@@ -13,9 +11,7 @@ import subprocess
 import sys
 import threading
 import zipfile
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import gymnasium
 import numpy as np
@@ -27,11 +23,9 @@ from recordings import frames_of, manifest_of, metadata_of, videos_in
 import honest_runs
 import mjrec
 from mjrec.evidence.layout import STATISTICS_COLUMNS
-from mjrec.evidence.pack import pack_folder
-from mjrec.evidence.packed_run import PackingOptions
 from mjrec.formats.journal import is_of_spans
 
-STATED: dict[str, Any] = {
+STATED = {
     "title": "Pendulums: «five» of them",
     "authors": ["Ada Lovelace <0000-0002-1825-0097>", "van Rossum, Guido <g@x.org>"],
     "license": "cc-by-4.0",
@@ -39,48 +33,69 @@ STATED: dict[str, Any] = {
 
 
 @pytest.fixture(scope="module")
-def recorded(pendulums: Callable[..., Path]) -> Path:
+def recorded(pendulums):
     """Return a directory with three episodes, of which two have a video."""
     return pendulums(3)
 
 
 @pytest.fixture(scope="module")
-def archive(recorded: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def archive(recorded, tmp_path_factory):
     """Return it packed."""
-    path = tmp_path_factory.mktemp("packed") / "run.zip"
-    return mjrec.pack(recorded, path, **STATED)
+    return mjrec.pack(recorded, tmp_path_factory.mktemp("packed") / "run.zip", **STATED)
 
 
 @pytest.fixture(scope="module")
-def bag(archive: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def bag(archive, tmp_path_factory):
     """Return that unpacked."""
     return unpacked(archive, tmp_path_factory.mktemp("unpacked"))
 
 
 @pytest.fixture(scope="module")
-def infix(recorded: Path) -> str:
+def infix(recorded):
     """Return what the names of its files have in common."""
     name = the(recorded, "*.jsonl").name
     return name.removeprefix("openaigym.episodes.").removesuffix(".jsonl")
 
 
-def packed_bytes(path: Path) -> bytes:
+def packed_bytes(path):
     """Return what is packed of a file: of a journal all but the lines about logs."""
     lines = path.read_bytes().splitlines(keepends=True)
     is_journal = path.suffix == ".jsonl"
     return b"".join(x for x in lines if not (is_journal and is_of_spans(x)))
 
 
-def test_it_holds_the_recordings_unchanged(recorded: Path, bag: Path) -> None:
-    """Every file of the directory, and not one byte of it is another."""
+def packed_and_unpacked(directory, place, **options):
+    return unpacked(mjrec.pack(directory, place / "a.zip", **options), place / "x")
+
+
+def readme_of(bag):
+    return (bag / "data/README.md").read_text()
+
+
+def entities_of(bag):
+    crate = json.loads((bag / "data/ro-crate-metadata.json").read_text())
+    assert crate["@context"] == "https://w3id.org/ro/crate/1.1/context"
+    entities = {entity["@id"]: entity for entity in crate["@graph"]}
+    assert len(entities) == len(crate["@graph"])
+    return entities
+
+
+def actions_of(entities):
+    return [e for e in entities.values() if e["@type"] == "CreateAction"]
+
+
+def test_it_holds_the_recordings_unchanged(recorded, bag, tmp_path):
+    """Every file, byte for byte, also under a limit that is kept anyway."""
     assert bag.name == "run"
-    packed = {path.name: path for path in (bag / "data/recordings").iterdir()}
-    assert sorted(packed) == sorted(path.name for path in recorded.iterdir())
-    for name, path in packed.items():
-        assert path.read_bytes() == packed_bytes(recorded / name)
+    limited = packed_and_unpacked(recorded, tmp_path, max_size="5M")
+    for folder in (bag, limited):
+        packed = {path.name: path for path in (folder / "data/recordings").iterdir()}
+        assert sorted(packed) == sorted(path.name for path in recorded.iterdir())
+        for name, path in packed.items():
+            assert path.read_bytes() == packed_bytes(recorded / name)
 
 
-def test_other_programs_take_the_bag(bag: Path) -> None:
+def test_other_programs_take_the_bag(bag):
     """The `bagit` package, and sha512sum, as the README says."""
     assert (bag / "bagit.txt").read_text().startswith("BagIt-Version: 1.0\n")
     for command in (
@@ -90,7 +105,7 @@ def test_other_programs_take_the_bag(bag: Path) -> None:
         subprocess.run(command, cwd=bag, check=True, capture_output=True)
 
 
-def test_names_in_the_zip_are_plain(archive: Path) -> None:
+def test_names_in_the_zip_are_plain(archive):
     """One folder, sorted, no times, no owners, what is compressed already stored."""
     with zipfile.ZipFile(archive) as packed:
         infos = packed.infolist()
@@ -103,18 +118,20 @@ def test_names_in_the_zip_are_plain(archive: Path) -> None:
     assert stored == {n for n in names if n.endswith((".mp4", ".h5", ".gz", ".zip"))}
 
 
-def test_the_same_input_gives_the_same_bytes(
-    recorded: Path,
-    archive: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """From a copy with other times, in another order, elsewhere, with another umask."""
-    copy = tmp_path / "copy"
-    copy.mkdir()
+def test_the_same_input_gives_the_same_bytes(recorded, archive, tmp_path, monkeypatch):
+    """From a copy with other times, in another order, elsewhere, with another umask.
+
+    Also where files cannot be linked, as from another file system.
+    """
+    (tmp_path / "copy").mkdir()
     for path in sorted(recorded.iterdir(), reverse=True):
-        shutil.copyfile(path, copy / path.name)
-        os.utime(copy / path.name, (1, 1))
+        shutil.copyfile(path, tmp_path / "copy" / path.name)
+        os.utime(tmp_path / "copy" / path.name, (1, 1))
+
+    def refuse(*_, **__):
+        raise OSError(18, "Invalid cross-device link")
+
+    monkeypatch.setattr(os, "link", refuse)
     monkeypatch.chdir(tmp_path)
     before = os.umask(0o077)
     try:
@@ -124,11 +141,15 @@ def test_the_same_input_gives_the_same_bytes(
     assert again.read_bytes() == archive.read_bytes()
 
 
-def test_packing_changes_nothing_else(recorded: Path, tmp_path: Path) -> None:
+def test_packing_changes_nothing_else(recorded, tmp_path):
     """Neither the recordings, nor the working directory, also from a thread."""
-    before = {path: path.stat() for path in recorded.iterdir()}
-    place = Path.cwd()
-    seen: set[Path] = set()
+
+    def status():
+        found = {path: path.stat() for path in recorded.iterdir()}
+        return {p: (s.st_mtime_ns, s.st_nlink, s.st_mode) for p, s in found.items()}
+
+    before, place = status(), Path.cwd()
+    seen = set()
     packing = threading.Thread(target=mjrec.pack, args=(recorded, tmp_path / "a.zip"))
     packing.start()
     while packing.is_alive():
@@ -136,41 +157,20 @@ def test_packing_changes_nothing_else(recorded: Path, tmp_path: Path) -> None:
         packing.join(0.001)
     assert seen | {Path.cwd()} == {place}
     assert [path.name for path in tmp_path.iterdir()] == ["a.zip"]
-    after = {path: path.stat() for path in recorded.iterdir()}
-    assert after.keys() == before.keys()
-    for path, status in after.items():
-        # The links that were made of it are gone.
-        assert (status.st_mtime_ns, status.st_nlink, status.st_mode) == (
-            before[path].st_mtime_ns,
-            1,
-            before[path].st_mode,
-        )
+    # The links that were made of it are gone.
+    assert {links for _, links, _ in before.values()} == {1}
+    assert status() == before
 
 
-def test_files_are_copied_where_there_are_no_links(
-    recorded: Path, archive: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Another file system, say; the archive is the same."""
-
-    def refuse(*_: object, **__: object) -> None:
-        raise OSError(18, "Invalid cross-device link")
-
-    monkeypatch.setattr(os, "link", refuse)
-    again = mjrec.pack(recorded, tmp_path / "run.zip", **STATED)
-    assert again.read_bytes() == archive.read_bytes()
-
-
-def test_the_table_says_what_the_journal_says(
-    recorded: Path, infix: str, bag: Path
-) -> None:
+def test_the_table_says_what_the_journal_says(recorded, infix, bag):
     """A row an episode, in order, with the same bits in every number."""
     with (bag / "data/statistics.csv").open(newline="") as file:
-        head, *rows = csv.reader(file)
-    assert tuple(head) == STATISTICS_COLUMNS
+        table = csv.DictReader(file)
+        rows = list(table)
+    assert tuple(table.fieldnames) == STATISTICS_COLUMNS
     episodes = list(mjrec.iter_episodes(recorded))
     assert len(rows) == len(episodes) == 3
-    for cells, episode in zip(rows, episodes, strict=True):
-        row = dict(zip(head, cells, strict=True))
+    for row, episode in zip(rows, episodes, strict=True):
         assert (row["monitor"], int(row["episode_id"])) == (infix, episode.episode_id)
         assert float(row["reward"]) == episode.reward
         assert float(row["end_time"]) == episode.end_time
@@ -178,21 +178,12 @@ def test_the_table_says_what_the_journal_says(
         assert row["truncated"] == str(episode.truncated).lower()
         assert row["video"] == (episode.video.name if episode.video else "")
         assert bool(row["video_sha256"]) == bool(episode.video)
-    digest = metadata_of(recorded, 0)["file_sha256"]
-    assert dict(zip(head, rows[0], strict=True))["video_sha256"] == digest
+    assert rows[0]["video_sha256"] == metadata_of(recorded, 0)["file_sha256"]
 
 
-def _entities(bag: Path) -> dict[str, Any]:
-    crate = json.loads((bag / "data/ro-crate-metadata.json").read_text())
-    assert crate["@context"] == "https://w3id.org/ro/crate/1.1/context"
-    entities = {entity["@id"]: entity for entity in crate["@graph"]}
-    assert len(entities) == len(crate["@graph"])
-    return entities
-
-
-def test_the_crate_has_what_its_specification_wants(bag: Path) -> None:
+def test_the_crate_has_what_its_specification_wants(bag):
     """What RO-Crate 1.1 and Process Run Crate 0.5 call MUST."""
-    entities = _entities(bag)
+    entities = entities_of(bag)
     descriptor = entities["ro-crate-metadata.json"]
     assert descriptor["about"] == {"@id": "./"}
     assert descriptor["conformsTo"] == {"@id": "https://w3id.org/ro/crate/1.1"}
@@ -208,74 +199,60 @@ def test_the_crate_has_what_its_specification_wants(bag: Path) -> None:
     assert "https://orcid.org/0000-0002-1825-0097" in entities
     action = entities[root["mentions"]["@id"]]
     assert action["@type"] == "CreateAction"
+    assert action["startTime"] < action["endTime"]
     tools = [entities[tool["@id"]] for tool in action["instrument"]]
     assert {tool["@type"] for tool in tools} == {"SoftwareApplication"}
-    assert tools[0]["name"] == "mjrec"
     versions = {tool["name"]: tool["softwareVersion"] for tool in tools}
+    assert next(iter(versions)) == "mjrec"
     assert versions["mjrec"] == mjrec.__version__
     assert versions.keys() >= {"mujoco", "gymnasium", "python"}
-    assert action["startTime"] < action["endTime"]
 
 
-def test_the_crate_describes_every_file_and_nothing_else(bag: Path) -> None:
+def references_in(value):
+    if isinstance(value, dict):
+        return [value["@id"]] if set(value) == {"@id"} else []
+    items = value if isinstance(value, list) else []
+    return [reference for item in items for reference in references_in(item)]
+
+
+def test_the_crate_describes_every_file_and_nothing_else(bag):
     """Every reference leads to an entity, and every entity of a file to a file."""
-    entities = _entities(bag)
-    files = {
-        path.relative_to(bag / "data").as_posix()
+    entities = entities_of(bag)
+    sizes = {
+        path.relative_to(bag / "data").as_posix(): str(path.stat().st_size)
         for path in (bag / "data").rglob("*")
         if path.is_file() and path.name != "ro-crate-metadata.json"
     }
-    described = {i for i, entity in entities.items() if entity["@type"] == "File"}
-    assert described == files
-    for name in described:
-        size = (bag / "data" / name).stat().st_size
-        assert entities[name]["contentSize"] == str(size)
-
-    def references(value: Any) -> Any:
-        if isinstance(value, dict):
-            return [value["@id"]] if set(value) == {"@id"} else []
-        return (
-            [i for item in value for i in references(item)]
-            if (isinstance(value, list))
-            else []
-        )
-
-    known = {i for entity in entities.values() for i in map(str, [entity["@id"]])}
+    files = {i: e["contentSize"] for i, e in entities.items() if e["@type"] == "File"}
+    assert files == sizes
+    known = ("http://schema.org/", "https://w3id.org/ro/crate/")
     for entity in entities.values():
-        for value in entity.values():
-            for reference in references(value):
-                assert reference in known or reference.startswith(
-                    ("http://schema.org/", "https://w3id.org/ro/crate/")
-                )
-    [action] = [e for e in entities.values() if e["@type"] == "CreateAction"]
+        for reference in references_in(list(entity.values())):
+            assert reference in entities or reference.startswith(known)
+    [action] = actions_of(entities)
     results = {result["@id"] for result in action["result"]}
     objects = {one["@id"] for one in action["object"]}
     recordings = {name for name in files if name.startswith("recordings/")}
+    models = {name for name in recordings if ".model." in name}
     assert results | (objects & recordings) == recordings
-    assert {one for one in objects if "model" in one} == {
-        name for name in recordings if ".model." in name
-    }
+    assert {one for one in objects if "model" in one} == models
 
 
-def test_the_citation_is_valid(bag: Path) -> None:
+def test_the_citation_is_valid(bag):
     """YAML, with what the format demands."""
     cited = yaml.safe_load((bag / "data/CITATION.cff").read_text())
+    ada = {"family-names": "Lovelace", "given-names": "Ada"}
+    guido = {"family-names": "van Rossum", "given-names": "Guido", "email": "g@x.org"}
     assert cited["cff-version"] == "1.2.0"
     assert cited["title"] == STATED["title"]
     assert cited["license"] == "CC-BY-4.0"
     assert cited["authors"] == [
-        {
-            "family-names": "Lovelace",
-            "given-names": "Ada",
-            "orcid": "https://orcid.org/0000-0002-1825-0097",
-        },
-        {"family-names": "van Rossum", "given-names": "Guido", "email": "g@x.org"},
+        {**ada, "orcid": "https://orcid.org/0000-0002-1825-0097"},
+        guido,
     ]
 
 
-def test_the_environment_says_what_drew_and_encoded(
-    recorded: Path, infix: str, bag: Path
-) -> None:
+def test_the_environment_says_what_drew_encoded_and_packed(recorded, infix, bag):
     """Beside what the recording says of its own provenance."""
     content = json.loads((bag / "data/environment.json").read_text())
     said, metadata = content["recordings"][infix], metadata_of(recorded, 0)
@@ -286,13 +263,21 @@ def test_the_environment_says_what_drew_and_encoded(
     [frames], [encoder] = said["pictures"], said["encoders"]
     assert frames["gl_renderer"] == metadata["gl_renderer"]
     assert encoder["ffmpeg_sha256"] == metadata["ffmpeg_sha256"]
-    assert content["packed_with"]["mjrec"] == mjrec.__version__
+    packed_with = content["packed_with"]
+    assert packed_with["mjrec"] == mjrec.__version__
+    usual = dict.fromkeys(("episodes", "max_size", "planned"))
+    assert packed_with["options"] == {
+        **usual,
+        **STATED,
+        "name": "run",
+        "anonymous": False,
+    }
 
 
-def test_the_readme_leads_a_stranger(infix: str, recorded: Path, bag: Path) -> None:
+def test_the_readme_leads_a_stranger(infix, recorded, bag):
     """What it is, how to verify it, what was shown, by which rule."""
     returns = mjrec.load_results(recorded)["episode_rewards"]
-    text = (bag / "data/README.md").read_text()
+    text = readme_of(bag)
     for part in (
         f"# {STATED['title']}",
         "mjrec verify run.zip",
@@ -308,26 +293,23 @@ def test_the_readme_leads_a_stranger(infix: str, recorded: Path, bag: Path) -> N
     assert "has chosen" not in text
 
 
-def test_the_readme_says_what_environments_were_made_with(tmp_path: Path) -> None:
+def test_the_readme_says_what_environments_were_made_with(tmp_path):
     """Which makes another environment of one with a name that everybody knows."""
     env = gymnasium.make("HalfCheetah-v5", forward_reward_weight=100.0)
     env = gymnasium.wrappers.ClipReward(env, 1.0)
-    directory = tmp_path / "run"
-    kept: dict[str, Any] = {"video_callable": False, "trajectory_callable": True}
-    honest_runs.play(mjrec.Monitor(env, directory, **kept), 1, most=2)
-    folder = unpacked(mjrec.pack(directory, tmp_path / "a.zip"), tmp_path / "x")
-    text = (folder / "data/README.md").read_text()
-    said = (
+    kept = {"video_callable": False, "trajectory_callable": True}
+    honest_runs.play(mjrec.Monitor(env, tmp_path / "run", **kept), 1, most=2)
+    text = readme_of(packed_and_unpacked(tmp_path / "run", tmp_path))
+    assert (
         "| environment | HalfCheetah-v5, made with forward_reward_weight=100.0, in the"
-    )
-    assert said in text
+    ) in text
     assert "ClipReward(min_reward=1.0" in text
 
 
-def test_nothing_need_be_stated(recorded: Path, tmp_path: Path) -> None:
+def test_nothing_need_be_stated(recorded, tmp_path):
     """Then that is said, where something has to be."""
-    folder = unpacked(mjrec.pack(recorded, tmp_path / "a.zip"), tmp_path / "x")
-    root = _entities(folder)["./"]
+    folder = packed_and_unpacked(recorded, tmp_path)
+    root = entities_of(folder)["./"]
     assert root["name"] == "Recordings of InvertedPendulum-v5"
     assert root["license"].startswith("No licence was stated")
     assert "author" not in root
@@ -337,56 +319,46 @@ def test_nothing_need_be_stated(recorded: Path, tmp_path: Path) -> None:
 
 
 @pytest.fixture(scope="module")
-def one_chosen(recorded: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def one_chosen(recorded, tmp_path_factory):
     """Return the folder of an archive of episode 1 alone, chosen by a NumPy integer."""
-    path = tmp_path_factory.mktemp("chosen") / "one.zip"
-    mjrec.pack(recorded, path, episodes=np.array([1]))
-    return unpacked(path, path.parent / "x")
+    place = tmp_path_factory.mktemp("chosen")
+    return packed_and_unpacked(recorded, place, episodes=np.array([1]))
 
 
-def test_some_episodes_can_be_chosen(
-    recorded: Path, infix: str, one_chosen: Path, names: Callable[[Path], list[str]]
-) -> None:
-    """Statistics stay whole, and everything says that a choice was made."""
+def test_some_episodes_can_be_chosen(recorded, infix, one_chosen, names):
+    """Statistics stay whole, nothing is promised, and all say that it is a choice."""
     packed = one_chosen / "data/recordings"
     assert videos_in(packed) == [1]
     left_out = set(names(recorded)) - set(names(packed))
     assert left_out == {n for n in names(recorded) if ".video000000." in n}
     manifest = manifest_of(packed)
-    assert [video for video, _ in manifest["videos"]] == [
-        f"openaigym.video.{infix}.video000001.mp4"
-    ]
+    [[video, _]] = manifest["videos"]
+    assert video == f"openaigym.video.{infix}.video000001.mp4"
     assert manifest["mjrec"].pop("packed_episodes") == [1]
     assert manifest["mjrec"] == manifest_of(recorded)["mjrec"]
     assert len((one_chosen / "data/statistics.csv").read_text().splitlines()) == 4
+    assert not [each for each in mjrec.iter_episodes(packed) if each.pending]
+    said = json.loads((one_chosen / "data/environment.json").read_text())
+    assert said["packed_with"]["options"]["episodes"] == [1]
     # In the original it is as it was.
     assert videos_in(recorded) == [0, 1]
 
 
-def test_actions_of_all_episodes_stay(
-    recorded: Path, infix: str, one_chosen: Path
-) -> None:
-    """Anyone can make the others again, from their seeds; only states are left out."""
+def test_actions_of_all_episodes_stay(recorded, infix, one_chosen):
+    """Anyone can make the others again; only states are left out, as is said."""
     name = f"openaigym.trajectory.{infix}.episode000000.h5"
-    before, after = (
-        mjrec.load_trajectory(folder / name)
-        for folder in (recorded, one_chosen / "data/recordings")
-    )
+    folders = (recorded, one_chosen / "data/recordings")
+    before, after = (mjrec.load_trajectory(folder / name) for folder in folders)
     np.testing.assert_array_equal(after.actions, before.actions)
     np.testing.assert_array_equal(after.rewards, before.rewards)
     assert after.facts["seed"] == before.facts["seed"]
     assert after.states.size == 0 < before.states.size
     assert not after.frame_steps.size
-
-
-def test_descriptions_claim_what_is_in_the_archive(one_chosen: Path) -> None:
-    """Of episodes that were not chosen there are neither videos nor states."""
     held = (
         "statistics of 3 episodes of InvertedPendulum-v5, 1 video, actions of 2 "
         "episodes and physics states of 1 episode"
     )
-    text = (one_chosen / "data/README.md").read_text()
-    entities = _entities(one_chosen)
+    text, entities = readme_of(one_chosen), entities_of(one_chosen)
     assert held in text
     assert held in entities["./"]["description"]
     assert held in entities["recordings/"]["description"]
@@ -394,24 +366,16 @@ def test_descriptions_claim_what_is_in_the_archive(one_chosen: Path) -> None:
     assert "as it was recorded" not in text
 
 
-def test_what_was_left_out_is_not_pending(one_chosen: Path) -> None:
-    """Nothing promises a video of an episode that was not chosen."""
-    episodes = mjrec.iter_episodes(one_chosen / "data/recordings")
-    assert not [episode for episode in episodes if episode.pending]
-
-
-def test_commands_in_the_readme_can_be_pasted(recorded: Path, tmp_path: Path) -> None:
+def test_commands_in_the_readme_can_be_pasted(recorded, tmp_path):
     """A shell takes the archive's name as one argument, whatever is in it."""
     name = "it's $(here); a `run` & more.zip"
     folder = unpacked(mjrec.pack(recorded, tmp_path / name), tmp_path / "x")
-    lines = (folder / "data/README.md").read_text().splitlines()
+    lines = readme_of(folder).splitlines()
     [command] = [line for line in lines if line.startswith("    mjrec verify ")]
     assert shlex.split(command) == ["mjrec", "verify", name]
 
 
-def test_more_files_than_verify_takes_are_refused(
-    recorded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_more_files_than_verify_takes_are_refused(recorded, tmp_path, monkeypatch):
     """Before any work, and with the way out."""
     monkeypatch.setattr("mjrec.evidence.pack.MOST_ENTRIES", 20)
     with pytest.raises(mjrec.PackError, match=r"at most 20 files.*--episodes"):
@@ -419,38 +383,8 @@ def test_more_files_than_verify_takes_are_refused(
     assert not list(tmp_path.iterdir())
 
 
-def test_the_options_of_packing_are_said(bag: Path, one_chosen: Path) -> None:
-    """Who makes the archive again packs in the same way."""
-    said = [
-        json.loads((folder / "data/environment.json").read_text())["packed_with"]
-        for folder in (bag, one_chosen)
-    ]
-    assert said[0]["options"] == {
-        **STATED,
-        "name": "run",
-        "episodes": None,
-        "anonymous": False,
-        "max_size": None,
-        "planned": None,
-    }
-    assert said[1]["options"]["episodes"] == [1]
-
-
-def test_the_same_folder_comes_of_the_same_options(
-    recorded: Path, bag: Path, tmp_path: Path
-) -> None:
-    """Without a zip file, for who compares with it."""
-    authors = tuple(STATED["authors"])
-    options = PackingOptions(name="run", **{**STATED, "authors": authors})
-    pack_folder(recorded, tmp_path / "again", options)
-    files = {p.relative_to(bag) for p in bag.rglob("*") if p.is_file()}
-    assert len(files) > 20
-    for file in files:
-        assert (tmp_path / "again" / file).read_bytes() == (bag / file).read_bytes()
-
-
 @pytest.mark.thorough
-def test_models_of_other_episodes_are_left_out(tmp_path: Path) -> None:
+def test_models_of_other_episodes_are_left_out(tmp_path):
     """What nothing in the archive refers to would be called an extra file."""
     directory = tmp_path / "runs"
     record_pendulum(directory, 1)
@@ -459,65 +393,44 @@ def test_models_of_other_episodes_are_left_out(tmp_path: Path) -> None:
     again = the(directory, "*.mp4").with_suffix(".side.mp4")
     again.write_bytes(b"rendered again")
     (directory / "notes.txt").write_text("mine")
-    packed = unpacked(mjrec.pack(directory, tmp_path / "a.zip"), tmp_path / "x")
-    held = {path.name for path in (packed / "data/recordings").iterdir()}
-    assert held == {path.name for path in directory.iterdir()} - {
-        *(stray.name, again.name, "notes.txt")
+    packed = packed_and_unpacked(directory, tmp_path) / "data/recordings"
+    left_out = {stray.name, again.name, "notes.txt"}
+    assert {p.name for p in directory.iterdir()} - left_out == {
+        p.name for p in packed.iterdir()
     }
 
 
-def test_two_monitors_are_two_actions(recorded: Path, tmp_path: Path) -> None:
+def test_two_monitors_are_two_actions(recorded, tmp_path):
     """Each with its own files; a choice of episodes is of both."""
-    directory = tmp_path / "runs"
-    shutil.copytree(recorded, directory)
+    directory = shutil.copytree(recorded, tmp_path / "runs")
     record_pendulum(directory, 1, uid="other", resume=True)
-    folder = unpacked(
-        mjrec.pack(directory, tmp_path / "a.zip", episodes=[0]), tmp_path / "x"
-    )
-    actions = [e for e in _entities(folder).values() if e["@type"] == "CreateAction"]
-    assert len(actions) == 2
-    results = [{one["@id"] for one in action["result"]} for action in actions]
+    entities = entities_of(packed_and_unpacked(directory, tmp_path, episodes=[0]))
+    first, second = actions_of(entities)
+    results = [{one["@id"] for one in each["result"]} for each in (first, second)]
     assert not results[0] & results[1]
-    assert len(_entities(folder)["./"]["mentions"]) == 2
+    assert len(entities["./"]["mentions"]) == 2
 
 
-def _record(directory: Path, episodes: int, size: tuple[int, int], **rest: Any) -> None:
-    """Record episodes of four steps with frames of that height and width."""
-    env = gymnasium.make(
-        "HalfCheetah-v5",
-        render_mode="rgb_array",
-        height=size[0],
-        width=size[1],
-        max_episode_steps=4,
-    )
-    with mjrec.Monitor(env, directory, workers=1, **rest) as env:
-        for _ in range(episodes):
-            env.reset(seed=3)
-            done = False
-            while not done:
-                _, _, terminated, truncated, _ = env.step(env.action_space.sample())
-                done = terminated or truncated
-
-
-def _largest_video(archive: Path) -> int:
+def largest_video(archive):
     with zipfile.ZipFile(archive) as packed:
         return max(i.file_size for i in packed.infolist() if i.filename[-4:] == ".mp4")
 
 
 @pytest.mark.thorough
-def test_videos_are_drawn_smaller_for_a_limit(tmp_path: Path) -> None:
+def test_videos_are_drawn_smaller_for_a_limit(tmp_path):
     """All frames of them, with hashes of their own; the recording stays as it was."""
     directory = tmp_path / "runs"
-    _record(directory, 2, size=(240, 320))
+    small = {"render_mode": "rgb_array", "height": 240, "width": 320}
+    env = gymnasium.make("HalfCheetah-v5", max_episode_steps=4, **small)
+    honest_runs.play(mjrec.Monitor(env, directory, workers=1), 2)
     whole = mjrec.pack(directory, tmp_path / "whole.zip")
-    told: list[Any] = []
-    limit = whole.stat().st_size - _largest_video(whole) // 4
-    small = mjrec.pack(
-        directory, tmp_path / "small.zip", max_size=limit, on_progress=told.append
-    )
-    assert small.stat().st_size <= limit
-    assert _largest_video(small) < _largest_video(whole)
-    folder = unpacked(small, tmp_path / "x")
+    told = []
+    limit = whole.stat().st_size - largest_video(whole) // 4
+    options = {"max_size": limit, "on_progress": told.append}
+    smaller = mjrec.pack(directory, tmp_path / "small.zip", **options)
+    assert smaller.stat().st_size <= limit
+    assert largest_video(smaller) < largest_video(whole)
+    folder = unpacked(smaller, tmp_path / "x")
     packed = folder / "data/recordings"
     for episode in videos_in(packed):
         before, after = metadata_of(directory, episode), metadata_of(packed, episode)
@@ -532,16 +445,7 @@ def test_videos_are_drawn_smaller_for_a_limit(tmp_path: Path) -> None:
             assert after[key] != before[key]
         for key in ("camera", "reward", "seed", "fps", "frame_steps"):
             assert after[key] == before[key]
-    assert "smaller than 320x240" in (folder / "data/README.md").read_text()
+    assert "smaller than 320x240" in readme_of(folder)
     assert told[-1].frames_done == told[-1].frames > 0
     assert told[-1].videos_done == 2
     assert "packed_smaller" not in metadata_of(directory, 0)
-
-
-def test_a_limit_that_is_kept_anyway_changes_no_recording(
-    recorded: Path, tmp_path: Path
-) -> None:
-    """No video is drawn again."""
-    packed = mjrec.pack(recorded, tmp_path / "run.zip", max_size="5M")
-    for path in (unpacked(packed, tmp_path / "x") / "data/recordings").iterdir():
-        assert path.read_bytes() == packed_bytes(recorded / path.name)

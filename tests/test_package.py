@@ -1,14 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """The wheel: what is in it, what it says of itself, and that it works alone."""
 
-from __future__ import annotations
-
 import email
 import os
 import subprocess
 import sys
 import zipfile
-from email.message import Message
 from pathlib import Path
 
 import pytest
@@ -20,42 +17,34 @@ SOURCE = ROOT / "src"
 
 
 @pytest.fixture(scope="module")
-def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Build the wheel from the working tree, without a network."""
+def wheel(tmp_path_factory):
+    """Build the wheel from the working tree, without a network; return its files."""
     pytest.importorskip("build", reason="the packages' tools are not here")
     folder = tmp_path_factory.mktemp("wheel")
-    subprocess.run(
-        [
-            *(sys.executable, "-m", "build", "--no-isolation", "--wheel"),
-            *("--outdir", str(folder), str(ROOT)),
-        ],
-        check=True,
-        capture_output=True,
-        timeout=280,
-    )
+    build = [sys.executable, "-m", "build", "--no-isolation", "--wheel"]
+    command = [*build, "--outdir", str(folder), str(ROOT)]
+    subprocess.run(command, check=True, capture_output=True, timeout=280)
     [path] = folder.glob("*.whl")
-    return path
+    with zipfile.ZipFile(path) as packed:
+        return {name: packed.read(name) for name in packed.namelist()}
 
 
-def test_wheel_holds_the_package_and_nothing_else(wheel: Path) -> None:
+def test_wheel_holds_the_package_and_nothing_else(wheel):
     """Every file of the package, templates and tables too; no tests or benchmarks."""
-    with zipfile.ZipFile(wheel) as packed:
-        names = set(packed.namelist())
     package = {
         str(path.relative_to(SOURCE))
         for path in (SOURCE / "mjrec").rglob("*")
         if path.is_file() and "__pycache__" not in path.parts
     }
     assert any(name.endswith(".html.jinja") for name in package)
-    assert {name for name in names if ".dist-info/" not in name} == package
-    assert any(name.endswith("licenses/LICENSE") for name in names)
+    assert {name for name in wheel if ".dist-info/" not in name} == package
+    assert any(name.endswith("licenses/LICENSE") for name in wheel)
 
 
-def test_metadata_says_what_it_is_for(wheel: Path) -> None:
+def test_metadata_says_what_it_is_for(wheel):
     """README, licence, Pythons, and a typed package; no address that is made up."""
-    with zipfile.ZipFile(wheel) as packed:
-        [name] = [n for n in packed.namelist() if n.endswith("dist-info/METADATA")]
-        about: Message = email.message_from_bytes(packed.read(name))
+    [name] = [n for n in wheel if n.endswith("dist-info/METADATA")]
+    about = email.message_from_bytes(wheel[name])
     assert about["Name"] == "mjrec"
     assert about["Version"] == mjrec.__version__
     assert about["License-Expression"] == "Apache-2.0"
@@ -65,13 +54,13 @@ def test_metadata_says_what_it_is_for(wheel: Path) -> None:
 
 
 @pytest.mark.wheel
-def test_wheel_alone_records_renders_evaluates_and_reports(tmp_path: Path) -> None:
+def test_wheel_alone_records_renders_evaluates_and_reports(tmp_path):
     """In an environment that holds it and what it depends on, far from the sources."""
     python = os.environ.get("MJREC_TEST_WHEEL")
     if python is None:
         pytest.fail("scripts/test --all names an environment with the wheel.")
 
-    def run(*arguments: str) -> str:
+    def run(*arguments):
         done = subprocess.run(
             [python, *arguments],
             cwd=tmp_path,

@@ -77,45 +77,44 @@ def test_no_module_is_imported_for_an_id(tmp_path, monkeypatch):
     assert not (tmp_path / "ran").exists()
 
 
-@pytest.fixture
-def registered(monkeypatch):
-    """Return the id of an environment that a user has registered."""
-    monkeypatch.setattr(gymnasium.envs.registration, "registry", {**gymnasium.registry})
-    gymnasium.register("Mine-v0", entry_point=f"{__name__}:mine")
-    return "Mine-v0"
-
-
 def mine(**kwargs):
-    """Return an environment."""
+    """Return an environment that a user has registered."""
     return gymnasium.make(PENDULUM, **kwargs).unwrapped
 
 
-def test_a_registered_id_is_made_where_the_reader_trusts_it(registered):
+def test_a_registered_id_is_made_where_the_reader_trusts_it(monkeypatch):
     """With its exact name, or that of the module before it."""
-    for trust in (registered, f"gymnasium:{registered}"):
-        recreate(facts(registered), trust=frozenset([trust]))
-    assert "--trust" in refusal(facts(registered))
-    assert "--trust" in refusal(facts(registered), registered[:-1])
+    monkeypatch.setattr(gymnasium.envs.registration, "registry", {**gymnasium.registry})
+    gymnasium.register("Mine-v0", entry_point=f"{__name__}:mine")
+    for trust in ("Mine-v0", "gymnasium:Mine-v0"):
+        recreate(facts("Mine-v0"), trust=frozenset([trust]))
+    assert "--trust" in refusal(facts("Mine-v0"))
+    assert "--trust" in refusal(facts("Mine-v0"), "Mine-v")
 
 
 CARTPOLE = {"framework": "dm_control", "env_id": "dm_control/cartpole-balance"}
 REFUSED = [
     # Arguments name no files, hold no objects, and take no more than there is.
-    {"kwargs": {"xml_file": "/etc/passwd"}},
-    {"kwargs": {"xml_file": "ant.xml"}},
-    {"kwargs": {"frame_skip": "../x"}},
-    {"kwargs": {"reward": "a.b"}},
-    {"kwargs": {"max_episode_steps": 7}},
-    {"kwargs": {"disable_env_checker": False}},
-    {"kwargs": {"frame_skip": [0] * 20_000}},
-    {"kwargs": {"frame_skip": 10**6}},
-    {"kwargs": {"reset_noise_scale": 1e300}},
-    {"kwargs": {"width": 10**6}},
-    {"kwargs": {"default_camera_config": {"path": 1}}},
-    {"kwargs": {"render_mode": "human"}},
-    {"kwargs": {"no_such": 1}},
-    {"kwargs": None},
-    {"kwargs": [1]},
+    *(
+        {"kwargs": kwargs}
+        for kwargs in (
+            {"xml_file": "/etc/passwd"},
+            {"xml_file": "ant.xml"},
+            {"frame_skip": "../x"},
+            {"reward": "a.b"},
+            {"max_episode_steps": 7},
+            {"disable_env_checker": False},
+            {"frame_skip": [0] * 20_000},
+            {"frame_skip": 10**6},
+            {"reset_noise_scale": 1e300},
+            {"width": 10**6},
+            {"default_camera_config": {"path": 1}},
+            {"render_mode": "human"},
+            {"no_such": 1},
+            None,
+            [1],
+        )
+    ),
     {"env_id": 7},
     {"framework": "pickle"},
     {"framework": "mjcf"},
@@ -134,25 +133,20 @@ REFUSED = [
 
 @pytest.mark.parametrize("said", REFUSED)
 def test_what_cannot_be_made_is_refused(said):
-    """With a reason, and no other error."""
+    """With a reason, and no other error; what says nothing, too."""
     refusal(facts(**{"env_id": PENDULUM, **said}))
-
-
-def test_what_says_nothing_is_refused():
-    """With a reason, too."""
     refusal({})
 
 
 def test_gymnasiums_own_wrappers_are_made_again():
     """With their arguments, in their order."""
     env = ClipAction(RescaleAction(gymnasium.make("HalfCheetah-v5"), -2, 2))
-    said = facts("HalfCheetah-v5", **around_gymnasium(env))
-    again = recreate(said).environment
+    again = recreate(facts("HalfCheetah-v5", **around_gymnasium(env))).environment
     assert isinstance(again, ClipAction)
     assert around_gymnasium(again) == around_gymnasium(env)
-    action = np.full(6, 1.5, np.float32)
     for each in (env, again):
         each.reset(seed=1)
+    action = np.full(6, 1.5, np.float32)
     assert np.array_equal(env.step(action)[0], again.step(action)[0])
 
 
@@ -161,19 +155,19 @@ def test_of_other_wrappers_there_are_stand_ins():
     recreated = recreate(facts("HalfCheetah-v5", wrappers=["a.B", "c.D"]))
     env, stand_in = recreated.environment, recreated.stand_in
     assert around_gymnasium(env)["wrappers"] == ["a.B", "c.D"]
-    bare = gymnasium.make("HalfCheetah-v5")
-    controls = np.full((2, 6), 0.5)
+    bare, controls = gymnasium.make("HalfCheetah-v5"), np.full((2, 6), 0.5)
     bare.reset(seed=1)
-    rewards = [float(bare.step(each)[1]) for each in controls]
+    reward = float(bare.step(controls[0])[1])
+    ends = np.zeros(2, bool)
     recorded = RecordedSteps(
         controls=controls,
-        rewards=np.array([rewards[0], 7.0]),
-        terminated=np.zeros(2, bool),
-        truncated=np.zeros(2, bool),
+        rewards=np.array([reward, 7.0]),
+        terminated=ends,
+        truncated=ends,
     )
     env.reset(seed=1)
     stand_in.begin(recorded)
-    assert [env.step("anything")[1] for _ in range(2)] == [rewards[0], 7.0]
+    assert [env.step("anything")[1] for _ in range(2)] == [reward, 7.0]
     assert stand_in.differing == 1
 
 
@@ -194,20 +188,21 @@ def test_a_random_state_that_is_none_is_a_reason(state, pendulum):
 
 
 def test_a_random_state_leads_to_the_same_beginning(pendulum):
-    """As it was just before the reset."""
+    """As it was just before the reset. It has no seed, but dm_control's unused has."""
     pendulum.environment.reset(seed=3)
     before = pendulum.random_state()
     first = pendulum.environment.reset()[0]
     pendulum.set_random_state(before)
     assert np.array_equal(pendulum.environment.reset()[0], first)
+    assert pendulum.seed_behind(pendulum.random_state()) is None
+    legacy = generator_state(np.random.RandomState(4))
+    assert Recreated(environment=None, is_dm_env=True).seed_behind(legacy) == 4
 
 
 def test_steps_from_recorded_states_are_the_recorded_steps(pendulum, tmp_path):
     """Bit for bit here; on another machine differences then do not grow."""
-    env = gymnasium.make("InvertedPendulum-v5")
-    with mjrec.Monitor(
-        env, tmp_path, video_callable=False, trajectory_callable=True
-    ) as monitor:
+    kept = {"video_callable": False, "trajectory_callable": True}
+    with mjrec.Monitor(gymnasium.make(PENDULUM), tmp_path, **kept) as monitor:
         monitor.reset(seed=3)
         monitor.action_space.seed(3)
         for _ in range(3):
@@ -252,11 +247,3 @@ def test_a_task_of_the_suite_is_made_again():
     env.reset()
     assert recreated.seed_behind(recreated.random_state()) is None
     assert [env.step(np.zeros(1)).last() for _ in range(5)] == [False] * 4 + [True]
-
-
-def test_a_generator_that_drew_numbers_has_no_seed(pendulum):
-    """And none of Gymnasium's has one that shows."""
-    pendulum.environment.reset(seed=1)
-    assert pendulum.seed_behind(pendulum.random_state()) is None
-    legacy = generator_state(np.random.RandomState(4))
-    assert Recreated(environment=None, is_dm_env=True).seed_behind(legacy) == 4

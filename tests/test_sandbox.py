@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What is said by a process with limits, and how it ends."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import select
@@ -24,27 +22,18 @@ _FOR_EVER = (
 )
 
 
-def sources(directory: Path, xml: str = "<mujoco/>") -> Path:
-    """Write what a model is compiled from."""
-    path = directory / "openaigym.model.0123456789abcdef.zip"
-    with zipfile.ZipFile(path, "w") as archive:
-        archive.writestr("contents.json", '{"format": 1, "main": "main.xml"}')
-        archive.writestr("source/main.xml", xml)
-    return path
-
-
-def compiling(parent: int) -> list[int]:
+def compiling(parent):
     """Return the process that compiles; importing mujoco starts others."""
     return [pid for pid in children(parent) if f"-m\0{_COMPILER}" in command_of(pid)]
 
 
-def command_of(pid: int) -> str:
+def command_of(pid):
     with contextlib.suppress(OSError):
         return Path(f"/proc/{pid}/cmdline").read_text()
     return ""
 
 
-def test_a_death_is_told_with_its_last_words(tmp_path: Path) -> None:
+def test_a_death_is_told_with_its_last_words(tmp_path):
     """Of a request that it does not understand, it dies."""
     with Sandbox(_COMPILER, {}, place=tmp_path) as sandbox:
         assert list(sandbox.answers(60)) == []
@@ -53,9 +42,12 @@ def test_a_death_is_told_with_its_last_words(tmp_path: Path) -> None:
     assert "KeyError: 'task'" in said
 
 
-def test_it_ends_with_its_parent_whatever_it_is_at(tmp_path: Path) -> None:
+def test_it_ends_with_its_parent_whatever_it_is_at(tmp_path):
     """Nobody would wait for it, or stop it, for days."""
-    path = sources(tmp_path, _FOR_EVER)
+    path = tmp_path / "openaigym.model.0123456789abcdef.zip"
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("contents.json", '{"format": 1, "main": "main.xml"}')
+        archive.writestr("source/main.xml", _FOR_EVER)
     program = (
         "from pathlib import Path\n"
         "from mjrec.simulation.foreign_files import compile_sources\n"

@@ -17,7 +17,9 @@ from mjrec.formats.second_names import (
 from mjrec.formats.video_metadata import finished_videos
 
 STEM = "openaigym.video.0.7.video000027"
+SIDE = f"{STEM}.side.mp4"
 SECOND = "rl-video-episode-27"
+ALL = [f"{SECOND}.{end}" for end in ("meta.json", "mp4", "side.meta.json", "side.mp4")]
 
 
 @pytest.fixture
@@ -27,23 +29,16 @@ def video(tmp_path):
 
 
 def write_episode(directory, **metadata):
-    for name in (f"{STEM}.mp4", f"{STEM}.side.mp4"):
+    for name in (f"{STEM}.mp4", SIDE):
         (directory / name).write_bytes(name.encode())
     (directory / f"{STEM}.side.meta.json").write_text("{}")
-    said = {
-        "also_named": f"{SECOND}.mp4",
-        "further_videos": [f"{STEM}.side.mp4"],
-        **metadata,
-    }
+    said = {"also_named": f"{SECOND}.mp4", "further_videos": [SIDE], **metadata}
     (directory / f"{STEM}.meta.json").write_text(json.dumps(said))
     return directory / f"{STEM}.mp4"
 
 
 def seconds(directory):
     return sorted(p.name for p in directory.iterdir() if "openaigym" not in p.name)
-
-
-ALL = [f"{SECOND}.{end}" for end in ("meta.json", "mp4", "side.meta.json", "side.mp4")]
 
 
 @pytest.mark.parametrize("has_hard_links", [True, False])
@@ -105,11 +100,9 @@ def test_clearing_removes_links_to_the_files(way, video):
 @pytest.mark.parametrize("name", ["../x-episode-1.mp4", "openaigym.x-episode-1.mp4", 5])
 def test_a_name_that_is_none_is_passed_over(name, tmp_path, names):
     """Metadata may be anybody's."""
-    directory = tmp_path / "recordings"
-    directory.mkdir()
-    video = write_episode(directory, also_named=name)
-    give_second_names(video)
-    assert seconds(directory) == []
+    (tmp_path / "recordings").mkdir()
+    give_second_names(write_episode(tmp_path / "recordings", also_named=name))
+    assert seconds(tmp_path / "recordings") == []
     assert names(tmp_path) == ["recordings"]
 
 
@@ -120,8 +113,7 @@ def test_a_name_that_is_none_is_passed_over(name, tmp_path, names):
 def test_only_files_of_the_episode_are_its_videos(name, tmp_path):
     """And only those that are there."""
     (tmp_path / "x.mp4").write_text("")
-    video = write_episode(tmp_path, further_videos=[name, f"{STEM}.side.mp4"])
-    assert finished_videos(video) == [
+    assert finished_videos(write_episode(tmp_path, further_videos=[name, SIDE])) == [
         (f"{STEM}.mp4", f"{STEM}.meta.json"),
-        (f"{STEM}.side.mp4", f"{STEM}.side.meta.json"),
+        (SIDE, f"{STEM}.side.meta.json"),
     ]

@@ -1,70 +1,56 @@
 # SPDX-License-Identifier: Apache-2.0
 """The page of a verification: what it says, and that nothing can be slipped into it."""
 
-from __future__ import annotations
-
 import html.parser
 import re
-import subprocess
 import sys
 from pathlib import Path
-from typing import Any
 
 import pytest
 from verifications import HOSTILE, excuse, finding, verification
 
-from mjrec.evidence.findings import Finding, Outcome, Topic
+from mjrec import MissingDependency
+from mjrec.evidence.findings import Outcome, Topic
 from mjrec.evidence.verification_report import write_verification_report
 
 
-def page(tmp_path: Path, *findings: Finding, **changes: Any) -> str:
-    path = tmp_path / "verify.html"
-    write_verification_report(verification(*findings, **changes), path)
-    return path.read_text(encoding="utf-8")
+class Page(html.parser.HTMLParser):
+    """What a page about findings is made of."""
 
-
-class Elements(html.parser.HTMLParser):
-    """Collects what a page is made of."""
-
-    VOID = ("meta", "img", "br")
-
-    def __init__(self, text: str) -> None:
+    def __init__(self, tmp_path, *findings, **changes):
         super().__init__()
-        self.found: list[tuple[str, dict[str, str | None]]] = []
-        self.open: list[str] = []
-        self.text: list[str] = []
-        self.feed(text)
+        self.path = tmp_path / "verify.html"
+        write_verification_report(verification(*findings, **changes), self.path)
+        self.text = self.path.read_text(encoding="utf-8")
+        self.kinds, self.attributes, self.open, self.words = set(), set(), [], []
+        self.feed(self.text)
         self.close()
+        self.shown = " ".join(filter(None, self.words))
 
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.found.append((tag, dict(attrs)))
-        if tag not in self.VOID:
+    def handle_starttag(self, tag, attrs):
+        self.kinds.add(tag)
+        self.attributes.update(name for name, _ in attrs)
+        if tag not in ("meta", "img", "br"):
             self.open.append(tag)
 
-    def handle_endtag(self, tag: str) -> None:
+    def handle_endtag(self, tag):
         assert self.open.pop() == tag
 
-    def handle_data(self, data: str) -> None:
+    def handle_data(self, data):
         if self.open and self.open[-1] != "style":
-            self.text.append(" ".join(data.split()))
+            self.words.append(" ".join(data.split()))
 
 
-def words(text: str) -> str:
-    return " ".join(filter(None, Elements(text).text))
-
-
-def test_the_verdict_comes_first_and_then_what_differs(tmp_path: Path) -> None:
+def test_the_verdict_comes_first_and_then_what_differs(tmp_path):
     """With excuses, inputs, a line for each topic, and all findings."""
-    shown = words(
-        page(
-            tmp_path,
-            finding(reason="seven steps"),
-            finding(Outcome.DIFFERENT, reason="frame 3 is another"),
-            finding(Outcome.BELIEVED, reason="one is missing", is_headline=True),
-            excuses=(excuse(),),
-            inputs={"recording 0.u": {"max_episode_steps": 12}},
-            facts={"versions": {"mujoco": "3.17.0"}},
-        )
+    page = Page(
+        tmp_path,
+        finding(reason="seven steps"),
+        finding(Outcome.DIFFERENT, reason="frame 3 is another"),
+        finding(Outcome.BELIEVED, reason="one is missing", is_headline=True),
+        excuses=(excuse(),),
+        inputs={"recording 0.u": {"max_episode_steps": 12}},
+        facts={"versions": {"mujoco": "3.17.0"}},
     )
     order = [
         "FAIL run.zip: it does not match what its inputs produce",
@@ -77,45 +63,28 @@ def test_the_verdict_comes_first_and_then_what_differs(tmp_path: Path) -> None:
         "seven steps",
         "versions: mujoco 3.17.0",
     ]
-    assert sorted(order, key=shown.index) == order
-    assert all(str(topic) in shown for topic in Topic)
+    assert sorted(order, key=page.shown.index) == order
+    assert all(str(topic) in page.shown for topic in Topic)
 
 
-def test_it_says_how_to_make_it_again(tmp_path: Path) -> None:
+def test_it_says_how_to_make_it_again(tmp_path):
     """With the options that it was made with."""
     facts = {"sample": 20, "seed": 7, "trust": ["A b-v0"], "allow": ["gl=H100"]}
-    shown = words(page(tmp_path, facts=facts))
+    shown = Page(tmp_path, facts=facts).shown
     assert (
         "mjrec verify run.zip --level pixels --sample 20 --seed 7 --trust 'A b-v0' "
         "--allow gl=H100"
     ) in shown
     assert "It runs the installed code of A b-v0, but no other code that" in shown
-    assert "It runs no code that the archive names" in words(page(tmp_path))
+    assert "It runs no code that the archive names" in Page(tmp_path).shown
 
 
-def test_the_page_is_whole_and_loads_nothing(tmp_path: Path) -> None:
-    """Its elements close, and no attribute leads anywhere."""
-    text = page(tmp_path, *map(finding, Outcome), excuses=(excuse(),))
-    elements = Elements(text)
-    assert elements.open == []
-    names = {name for name, _ in elements.found}
-    assert names.isdisjoint({"script", "link", "iframe", "object", "form", "base"})
-    attributes = {key for _, a in elements.found for key in a}
-    assert attributes.isdisjoint({"src", "href"})
-    assert "default-src 'none'" in text
-    assert not re.search(r"url\(|@import|https?:", text)
-
-
-def test_hostile_text_stays_text(tmp_path: Path) -> None:
-    """Wherever it comes from: nothing is marked up, nothing is hidden."""
-    given: dict[str, Any] = {
-        "excuses": (excuse(),),
-        "inputs": {"a": {"b": "c"}},
-        "facts": {"a": {"b": "c"}},
-    }
-    outcomes = [finding(each) for each in Outcome]
-    clean = Elements(page(tmp_path, *outcomes, **given))
-    text = page(
+def test_the_page_is_whole_and_loads_nothing_whatever_is_in_it(tmp_path):
+    """Its elements close, no attribute leads anywhere, and hostile text stays text."""
+    inputs = {"a": {"b": "c"}}
+    given = {"excuses": (excuse(),), "inputs": inputs, "facts": inputs}
+    clean = Page(tmp_path, *map(finding, Outcome), **given)
+    hostile = Page(
         tmp_path,
         *(finding(each, item=HOSTILE, reason=HOSTILE) for each in Outcome),
         path=Path(f"somewhere/{HOSTILE.replace('/', '')}"),
@@ -123,52 +92,42 @@ def test_hostile_text_stays_text(tmp_path: Path) -> None:
         inputs={HOSTILE: {HOSTILE: HOSTILE}},
         facts={HOSTILE: {"x": HOSTILE}, "sample": 2, "seed": 1, "trust": [HOSTILE]},
     )
-    dirty = Elements(text)
-    kinds = {name for name, _ in dirty.found}
-    assert kinds == {name for name, _ in clean.found}
-    assert all(not name.startswith("on") for _, a in dirty.found for name in a)
-    assert "\u202e" not in text
-    assert "\x00" not in text
-    assert "\\u202e" in text
-    assert "{{7*7}}" in text
+    assert hostile.kinds == clean.kinds
+    kinds = {"script", "link", "iframe", "object", "form", "base"}
+    assert clean.kinds.isdisjoint(kinds)
+    for page in (clean, hostile):
+        assert page.open == []
+        assert page.attributes.isdisjoint({"src", "href"})
+        assert not any(name.startswith("on") for name in page.attributes)
+        assert "default-src 'none'" in page.text
+    assert not re.search(r"url\(|@import|https?:", clean.text)
+    assert "\u202e" not in hostile.text
+    assert "\x00" not in hostile.text
+    assert "\\u202e" in hostile.text
+    assert "{{7*7}}" in hostile.text
 
 
-def test_many_findings_make_no_endless_page(tmp_path: Path) -> None:
+def test_many_findings_make_no_endless_page(tmp_path):
     """What is left out is counted."""
     many = [finding(Outcome.DIFFERENT, reason=f"{n} {'x' * 5000}") for n in range(1500)]
-    text = page(tmp_path, *many)
-    assert len(text) < 2_000_000
-    assert "And 1300 more" in words(text)
-    assert "1300 more are not listed" in words(text)
+    page = Page(tmp_path, *many)
+    assert len(page.text) < 2_000_000
+    assert "And 1300 more" in page.shown
+    assert "1300 more are not listed" in page.shown
 
 
-def test_without_jinja_it_is_said_what_to_install(tmp_path: Path) -> None:
+def test_without_jinja_it_is_said_what_to_install(tmp_path, monkeypatch):
     """Verifying without a report needs none."""
-    program = (
-        "import sys; sys.modules['jinja2'] = None\n"
-        "from pathlib import Path\n"
-        "from mjrec.evidence.findings import Level, Verification\n"
-        "from mjrec.evidence import verification_report as report\n"
-        "found = Verification(path=Path('x'), level=Level.FILES, findings=())\n"
-        "try:\n"
-        "    report.write_verification_report(found, Path(sys.argv[1]))\n"
-        "except report.MissingDependency as error:\n"
-        "    print(error)\n"
-    )
-    said = subprocess.run(
-        [sys.executable, "-c", program, str(tmp_path / "verify.html")],
-        capture_output=True,
-        text=True,
-        check=True,
-    ).stdout
-    assert "pip install 'mjrec[evidence]'" in said
+    monkeypatch.setitem(sys.modules, "jinja2", None)
+    with pytest.raises(MissingDependency, match=r"pip install 'mjrec\[evidence\]'"):
+        Page(tmp_path)
     assert not (tmp_path / "verify.html").exists()
 
 
 @pytest.mark.axe
 @pytest.mark.browser
 @pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_the_page_keeps_nobody_out(tmp_path: Path, scheme: Any) -> None:
+def test_the_page_keeps_nobody_out(tmp_path, scheme):
     """axe-core finds nothing serious, and a phone scrolls in one direction only."""
     # Here: most tests of this file need no browser.
     import shutil
@@ -176,7 +135,7 @@ def test_the_page_keeps_nobody_out(tmp_path: Path, scheme: Any) -> None:
     from axe_playwright_python.sync_playwright import Axe
     from playwright.sync_api import sync_playwright
 
-    page(
+    page = Page(
         tmp_path,
         *(finding(each, reason="x" * 300, is_headline=False) for each in Outcome),
         finding(Outcome.BELIEVED, reason=HOSTILE, is_headline=True),
@@ -189,10 +148,10 @@ def test_the_page_keeps_nobody_out(tmp_path: Path, scheme: Any) -> None:
         browser = playwright.chromium.launch(
             executable_path=found, args=["--no-sandbox"]
         )
-        size: Any = {"width": 360, "height": 800}
+        size = {"width": 360, "height": 800}
         with browser.new_context(viewport=size, color_scheme=scheme) as context:
             shown = context.new_page()
-            shown.goto((tmp_path / "verify.html").as_uri())
+            shown.goto(page.path.as_uri())
             shown.evaluate("document.querySelector('details').open = true")
             assert shown.evaluate("document.scrollingElement.scrollWidth") <= 360
             violations = Axe().run(shown).response["violations"]

@@ -1,12 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """All of a trajectory as arrays, to be compared."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 
-from mjrec.formats.trajectory import ModelChange, TrajectoryReader
+from mjrec.formats.trajectory import ModelChange
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -25,7 +23,7 @@ class TrajectoryContent:
     dropped: int = 0
 
 
-def content_of(reader: TrajectoryReader) -> TrajectoryContent:
+def content_of(reader):
     return TrajectoryContent(
         facts=dict(reader.facts),
         dtype=reader.dtype,

@@ -1,10 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Results of verifications, by hand: to be shown, summed up and judged."""
 
-from __future__ import annotations
-
 from pathlib import Path
-from typing import Any
 
 from mjrec.evidence.findings import (
     Excuse,
@@ -21,29 +18,20 @@ HOSTILE = (
 )
 
 
-def finding(outcome: Outcome = Outcome.RECREATED, **changes: Any) -> Finding:
+def finding(outcome=Outcome.RECREATED, **changes):
     """Return a finding about physics."""
     usual = {"topic": Topic.PHYSICS, "item": "a.h5", "count": 12, "unit": "step"}
     return Finding(**{**usual, "outcome": outcome, **changes})
 
 
-def excuse(**changes: Any) -> Excuse:
+def excuse(**changes):
     """Return the excuse of another renderer."""
-    usual: dict[str, Any] = {
-        "kind": ExcuseKind.HARDWARE,
-        "name": "gl",
-        "claimed": "NVIDIA H100",
-        "here": "llvmpipe",
-        "costs": "frames are alike",
-    }
+    usual = {"kind": ExcuseKind.HARDWARE, "name": "gl", "costs": "frames are alike"}
+    usual |= {"claimed": "NVIDIA H100", "here": "llvmpipe"}
     return Excuse(**{**usual, **changes})
 
 
-def verification(*findings: Finding, **changes: Any) -> Verification:
+def verification(*findings, **changes):
     """Return the result of verifying `run.zip`."""
-    usual: dict[str, Any] = {
-        "path": Path("somewhere/run.zip"),
-        "level": Level.PIXELS,
-        "findings": findings,
-    }
-    return Verification(**{**usual, **changes})
+    usual = {"path": Path("somewhere/run.zip"), "level": Level.PIXELS}
+    return Verification(**{**usual, "findings": findings, **changes})
