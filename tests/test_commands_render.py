@@ -2,14 +2,12 @@
 """`mjrec render`: what it says, and how it ends. `test_render_videos` has the rest."""
 
 import json
-import os
-import pty
 import subprocess
 import sys
 
 import gymnasium
 import pytest
-from recordings import frames_of
+from recordings import frames_of, manifest_of
 from trajectories_by_hand import (
     INFIX,
     write_finished,
@@ -22,6 +20,7 @@ from mjrec.commands import main
 from mjrec.rendering.jobs import RecordingKey, Variant, View
 from mjrec.rendering.recordings import claim
 from mjrec.rendering.render_videos import name_of_variant
+from terminals import on_terminal
 
 VIDEO = "openaigym.video.0.7.video000000"
 
@@ -29,12 +28,7 @@ VIDEO = "openaigym.video.0.7.video000000"
 @pytest.fixture
 def mjrec(capsys):
     """Run the command; returns the exit status and what it printed."""
-
-    def run(*arguments):
-        status = main(["render", *(str(argument) for argument in arguments)])
-        return status, *capsys.readouterr()
-
-    return run
+    return lambda *rest: (main(["render", *map(str, rest)]), *capsys.readouterr())
 
 
 def content_of(directory):
@@ -129,11 +123,10 @@ def test_another_view_is_a_new_file_beside_the_original(tmp_path, mjrec, painter
 
 def test_every_variant_has_a_name_of_its_own():
     """Also where a camera is called as a quality, a size or a rate would be."""
-    cameras = ["side", 0]
-    cameras += ["draft", "full", "64x32", "x32", "max10fps", "10fps", "camera-draft"]
+    cameras = ["side", 0, "draft", "64x32", "x32", "max10fps", "10fps", "camera-draft"]
     variants = [
         *(Variant(view=View(camera=camera)) for camera in cameras),
-        *(Variant(view=View(quality=quality)) for quality in ("draft", "full")),
+        Variant(view=View(quality="draft")),
         Variant(view=View(width=64, height=32)),
         Variant(view=View(height=32)),
         Variant(max_fps=10),
@@ -210,14 +203,13 @@ def test_strict_fails_where_nothing_is_to_be_seen(again_at, tmp_path, mjrec, pai
     """The videos are there, also in the manifest, and none is pending any more."""
     painter.plain = True
     write_finished(tmp_path, 0)
-    manifest = write_pending_manifest(tmp_path, 0)
+    write_pending_manifest(tmp_path, 0)
     status, out, _ = mjrec(tmp_path, "--strict", *again_at)
     assert status == 1
     assert "1 video rendered, but blank:" in out
     assert "all 5 frames are a single colour" in out
     assert len(list(tmp_path.glob("*.mp4"))) == 1
-    content = json.loads(manifest.read_text())
-    assert len(content["mjrec"]["pending"]) == bool(again_at)
+    assert len(manifest_of(tmp_path)["mjrec"]["pending"]) == bool(again_at)
 
 
 def test_an_engine_says_what_this_process_would(tmp_path, mjrec):
@@ -233,52 +225,25 @@ def test_an_engine_says_what_this_process_would(tmp_path, mjrec):
 
 
 @pytest.mark.thorough
-def test_a_terminal_shows_a_bar_and_a_recording_becomes_a_video(tmp_path):
+def test_a_terminal_shows_a_bar_and_a_recording_becomes_a_video(tmp_path, play):
     """With workers and OpenGL; two commands at once share the work."""
-    env = gymnasium.make(
-        "InvertedPendulum-v5", width=40, height=32, max_episode_steps=3
-    )
+    env = gymnasium.make("InvertedPendulum-v5", max_episode_steps=3)
     directory = tmp_path / "run"
-    with Monitor(env, directory, lambda _: True, workers=0, quality="draft") as monitor:
-        for _ in range(3):
-            monitor.reset(seed=0)
-            for _ in range(3):
-                monitor.step(env.action_space.sample())
-    reader, terminal = pty.openpty()
+    small = {"width": 40, "height": 32, "workers": 0, "quality": "draft"}
+    with Monitor(env, directory, lambda _: True, **small) as monitor:
+        play(monitor, 3, seed=0)
     command = [sys.executable, "-m", "mjrec", "render", str(directory)]
-    environ = {**os.environ, "COLUMNS": "100", "TERM": "xterm"}
-    with (
-        subprocess.Popen(
-            command, stdout=terminal, stderr=terminal, env=environ
-        ) as first,
-        subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as second,
-    ):
-        os.close(terminal)
-        shown = _read_all(reader)
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as second:
+        status, shown = on_terminal(command)
         other, _ = second.communicate()
-    assert (first.returncode, second.returncode) == (0, 0)
+    assert (status, second.returncode) == (0, 0)
     assert "/12 frames" in shown
     videos = sorted(directory.glob("*.mp4"))
     assert [len(frames_of(video)) for video in videos] == [4, 4, 4]
     # Each by one of the two.
     rendered = [line for line in (shown + other).splitlines() if ".mp4: 4 fra" in line]
     assert len(rendered) == 3
-    [manifest] = directory.glob("*.manifest.json")
-    content = json.loads(manifest.read_text())
-    assert len(content["videos"]) == 3
-    assert content["mjrec"]["pending"] == []
+    manifest = manifest_of(directory)
+    assert len(manifest["videos"]) == 3
+    assert manifest["mjrec"]["pending"] == []
     assert not list(directory.glob(".*"))
-
-
-def _read_all(descriptor):
-    said = b""
-    while True:
-        try:
-            block = os.read(descriptor, 1 << 16)
-        except OSError:
-            # Linux's way to say that nobody writes any more.
-            block = b""
-        if not block:
-            os.close(descriptor)
-            return said.decode()
-        said += block
