@@ -44,16 +44,10 @@ def register():
 
 def plan_of(task=PENDULUM, **changes):
     """Return a plan for one task, with short episodes and small frames."""
-    options = {
-        "policy": "random",
-        "seeds": (0,),
-        "episodes": 3,
-        "max_steps": 8,
-        "height": 32,
-        "width": 32,
-    }
+    few = {"policy": "random", "seeds": (0,), "episodes": 3}
+    small = {"max_steps": 8, "height": 32, "width": 32}
     tasks = (EvaluatedTask(task, "task"),)
-    return EvaluationPlan(tasks=tasks, **{**options, **changes})
+    return EvaluationPlan(tasks=tasks, **{**few, **small, **changes})
 
 
 def run_chunk(directory, plan, chunk=None, policy=None):
@@ -73,11 +67,6 @@ def run_chunk(directory, plan, chunk=None, policy=None):
     with closing(EvaluationWorker(sent[0])) as worker:
         worker(sent[1])
     return read_chunk(directory / folder, task).results
-
-
-def outcome(result):
-    """Return what does not depend on where and when an episode ran."""
-    return (result.total_reward, result.length, result.terminated, result.failure)
 
 
 def states_of(folder, result):
@@ -116,18 +105,6 @@ def test_an_episode_is_the_one_that_a_session_records(tmp_path, task):
         assert result.total_reward == expected[episode].reward
 
 
-def test_what_is_done_is_not_repeated(tmp_path, names):
-    """A chunk that is begun again is completed, and nothing is done where all is."""
-    plan, folder = plan_of(), tmp_path / "task" / "chunk"
-    first = run_chunk(tmp_path, plan, Chunk("chunk", (0,), 1, 2))[0, 1]
-    results = run_chunk(tmp_path, plan)
-    assert sorted(results) == [(0, 0), (0, 1), (0, 2)]
-    assert results[0, 1] == first
-    before = names(folder)
-    assert run_chunk(tmp_path, plan) == results
-    assert names(folder) == before
-
-
 class Stumbling:
     """Pushes gently; does something else in the third step of some episodes."""
 
@@ -145,23 +122,15 @@ class Stumbling:
         return np.full(1, 0.01)
 
 
-def raising():
-    raise RuntimeError("out of\nideas")
-
-
-def told_to_end():
-    raise KeyboardInterrupt
-
-
-def leaving():
-    raise SystemExit(3)
+def raised(error):
+    raise error
 
 
 @pytest.mark.parametrize(
     ("wrong", "failure"),
     [
-        (raising, "out of ideas"),
-        (leaving, "SystemExit: 3"),
+        (lambda: raised(RuntimeError("out of\nideas")), "out of ideas"),
+        (lambda: raised(SystemExit(3)), "SystemExit: 3"),
         (lambda: np.full(1, np.nan), "NaN"),
         (lambda: np.zeros(7), "action in Box"),
     ],
@@ -189,20 +158,18 @@ def test_a_policy_that_fails_loses_its_episode_only(tmp_path, wrong, failure):
 def test_a_random_stream_goes_on_where_it_was(tmp_path, fails_first):
     """Episodes that are done are run again unrecorded; a signal is no failure."""
     plan = plan_of(protocol="suite", episodes=4)
-    wrong = {0: raising} if fails_first else {}
-    before = Stumbling(wrong)
-    whole = run_chunk(tmp_path / "whole", plan, policy=before)
-    stopped = Stumbling({**wrong, 2: told_to_end})
+    wrong = {0: lambda: raised(RuntimeError)} if fails_first else {}
+    whole = run_chunk(tmp_path / "whole", plan, policy=Stumbling(wrong))
+    stopped = Stumbling({**wrong, 2: lambda: raised(KeyboardInterrupt)})
     with pytest.raises(KeyboardInterrupt):
         run_chunk(tmp_path / "cut", plan, policy=stopped)
-    results = run_chunk(tmp_path / "cut", plan, policy=before)
+    results = run_chunk(tmp_path / "cut", plan, policy=Stumbling(wrong))
     folders = [tmp_path / name / "task" / "chunk" for name in ("whole", "cut")]
     for unit in whole:
-        assert outcome(results[unit]) == outcome(whole[unit])
-        states = [
-            states_of(folder, found[unit])
-            for folder, found in zip(folders, (whole, results), strict=True)
-        ]
+        one, other = whole[unit], results[unit]
+        for fact in ("total_reward", "length", "terminated", "failure"):
+            assert getattr(one, fact) == getattr(other, fact)
+        states = map(states_of, folders, (one, other))
         assert np.array_equal(*states)
     assert len(list(finished_trajectories(folders[1]))) == 5
 

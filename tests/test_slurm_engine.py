@@ -166,13 +166,6 @@ def test_the_next_driver_ends_what_a_killed_one_has_left(tmp_path):
     assert not list((tmp_path / "shared").iterdir())
 
 
-def test_how_many_workers():
-    """What Slurm grants is not known; what this machine has is."""
-    assert SlurmEngine(cluster="local").workers == usable_cpus()
-    assert DEFAULT_WORKERS == 4
-    assert repr(engine(3)) == "SlurmEngine(workers=3, cluster='local')"
-
-
 @pytest.mark.parametrize(
     ("options", "said"),
     [
@@ -186,28 +179,34 @@ def test_how_many_workers():
         ({"gpus": -1}, "gpus must be the number"),
     ],
 )
-def test_what_cannot_be(options, said):
-    """It is refused before anything starts."""
+def test_what_cannot_be_is_refused_before_anything_starts(options, said):
+    """By default there are four workers, or on this machine one for each CPU."""
     with pytest.raises(InvalidArgument, match=said):
         SlurmEngine(**{"cluster": "local", **options})
+    assert engine(None).workers == usable_cpus()
+    assert DEFAULT_WORKERS == 4
+    assert repr(engine(3)) == "SlurmEngine(workers=3, cluster='local')"
+    # Outcomes of jobs are files, which other functions would not write.
+    with pytest.raises(InvalidArgument, match="submitit executor"):
+        engine().submit(len, "abc")
 
 
-def test_a_machine_without_slurm(tmp_path, monkeypatch):
-    """The error says what is missing, and what to do."""
-    monkeypatch.setenv("PATH", str(tmp_path))
-    with pytest.raises(Error, match=r"no sbatch, squeue, .* login node"):
-        SlurmEngine()
-
-
-def test_without_submitit(monkeypatch):
-    """The error says how to get it."""
+def test_what_is_missing_is_named(tmp_path, monkeypatch):
+    """Slurm's programs, or submitit, and what to do."""
+    with monkeypatch.context() as patch:
+        patch.setenv("PATH", str(tmp_path))
+        with pytest.raises(Error, match=r"no sbatch, squeue, .* login node"):
+            SlurmEngine()
     monkeypatch.setitem(sys.modules, "submitit", None)
     with pytest.raises(MissingDependency, match=r"pip install \"mjrec\[slurm\]\""):
-        SlurmEngine(cluster="local")
+        engine()
 
 
 def test_options_as_texts():
-    """Of the command line; those of a GPU may be in the cluster's own words."""
+    """Of the command line; those of a GPU may be in the cluster's own words.
+
+    A slip is told with what there is.
+    """
     texts = {
         "partition": "gpu",
         "time_min": "30",
@@ -232,6 +231,10 @@ def test_options_as_texts():
     script = sbatch_script({"sbatch.gres": "gpu:a100:1"}, workers=8, gpus=1)
     assert "#SBATCH --gres=gpu:a100:1\n" in script
     assert "gpus-per-node" not in script
+    with pytest.raises(mjrec.UnknownName, match=r"'partitoin'.*partition.*sbatch.NAME"):
+        slurm_options({"partitoin": "gpu"})
+    with pytest.raises(InvalidArgument, match="time_min must be a number"):
+        slurm_options({"time_min": "an hour"})
 
 
 def sbatch_script(texts, **options):
@@ -248,14 +251,6 @@ def sbatch_script(texts, **options):
     return str(slurm._make_submission_file_text("command", "uid"))
 
 
-def test_texts_that_cannot_be():
-    """A slip is told with what there is."""
-    with pytest.raises(mjrec.UnknownName, match=r"'partitoin'.*partition.*sbatch.NAME"):
-        slurm_options({"partitoin": "gpu"})
-    with pytest.raises(InvalidArgument, match="time_min must be a number"):
-        slurm_options({"time_min": "an hour"})
-
-
 def test_import_is_inert():
     """An engine needs submitit, which is to leave logging as it is."""
     script = """
@@ -270,9 +265,3 @@ assert handler in [reference() for reference in logging._handlerList]
 assert "SUBMITIT_LOG_LEVEL" not in os.environ
 """
     subprocess.run([sys.executable, "-W", "error", "-c", script], check=True)
-
-
-def test_it_does_jobs_only():
-    """Their outcomes are files, which other functions would not write."""
-    with pytest.raises(InvalidArgument, match="submitit executor"):
-        engine().submit(len, "abc")
