@@ -1,12 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
+import contextlib
 import json
 import logging
 import os
+import pty
 import signal
 import subprocess
 import sys
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 from parts import parametrize
@@ -16,9 +17,7 @@ from trajectories_by_hand import write_log
 from evaluations import write_recorded
 from mjrec import load_results
 from mjrec.commands import main
-from mjrec.commands.terminal import print_rows
 from report_recordings import entry, write_journal
-from terminals import on_terminal
 
 PENDULUM = """
 <mujoco>
@@ -94,19 +93,14 @@ def test_keep_names_only_what_was_chosen(mjrec, tmp_path):
     [
         (["Nope-v1"], ["Nope-v1", "Hopper-v5"]),
         (["HalfCheetah-v5", "--schedule", "some"], ["some", "every:N"]),
-        (["HalfCheetah-v5", "--keep", "some"], ["some", "worst:N"]),
-        (["HalfCheetah-v5", "--keep", "best:1", "--render", "off"], ["keep", "off"]),
         (
             ["HalfCheetah-v5", "--keep", "best:1", "--schedule", "cubic"],
             ["--keep best:1", "--schedule cubic"],
         ),
         (["HalfCheetah-v5", "--policy", "greedy"], ["greedy", "random"]),
-        (["HalfCheetah-v5", "--size", "0x48"], ["width", "0"]),
         (["HalfCheetah-v5", "--size", "-4x4"], ["-4x4", "640x480"]),
         (["HalfCheetah-v5", "--fps", "nan"], ["fps", "nan"]),
-        (["HalfCheetah-v5", "--episodes", "0"], ["episodes", "0"]),
         (["HalfCheetah-v5", "--seed", "-1"], ["seed", "-1"]),
-        (["HalfCheetah-v5", "--env-kwargs", "[1]"], ["JSON object", "[1]"]),
         (["HalfCheetah-v5", "--env-kwargs", "{"], ["JSON object"]),
         (["HalfCheetah-v5", "--env-kwargs", '{"no": 1, "no": 2}'], ["'no'", "twice"]),
         (["HalfCheetah-v5", "--env-kwargs", '{"no": [NaN]}'], ["'no'", "NaN"]),
@@ -279,20 +273,6 @@ def test_list_shows_an_evaluation_as_one(mjrec, tmp_path):
     ]
 
 
-def test_a_long_list_is_printed_as_it_is_read(monkeypatch):
-    """The first rows are there before the last are read."""
-    printed = []
-    monkeypatch.setattr(sys, "stdout", SimpleNamespace(write=printed.append))
-
-    def rows():
-        for number in range(3000):
-            assert len(printed) >= number - 1000
-            yield str(number), "a" * (number % 7)
-
-    assert print_rows(("number", "text"), rows(), left=("text",))
-    assert printed[-1] == f"  2999  {'a' * 3}\n"
-
-
 def test_list_says_that_there_is_nothing(mjrec, tmp_path):
     """Not an empty table, and no error: a run may not have come to an end yet."""
     handlers = logging.getLogger("mjrec").handlers[:]
@@ -318,6 +298,50 @@ def test_reader_may_leave_early(tmp_path):
     )
     os.close(writer)
     assert (done.returncode, done.stderr) == (1, "")
+
+
+LOG = "openaigym.trajectory.0.7.episode00000"
+
+
+def test_recover_lists_what_was_done(mjrec, tmp_path):
+    """A line a file, and nothing the second time; or one JSON object."""
+    for name in ("text", "json"):
+        write_log(tmp_path / name, 0)
+        write_log(tmp_path / name, 1, ended=False)
+    status, out, _ = mjrec("recover", tmp_path / "text")
+    assert status == 0
+    assert out.splitlines() == [
+        f"Recovered in {tmp_path / 'text'}:",
+        f"  {LOG}0.h5: 4 steps",
+        f"  {LOG}1.h5: 4 steps, incomplete: killed",
+        "  openaigym.episode_batch.0.7.stats.json: 0 episodes",
+        "  openaigym.manifest.0.7.manifest.json: 0 videos, 2 pending: mjrec render",
+    ]
+    again = mjrec("recover", tmp_path / "text")
+    assert again[:2] == (0, f"Nothing to recover in {tmp_path / 'text'}.\n")
+    _, out, _ = mjrec("recover", tmp_path / "json", "--timeout", 0, "--json")
+    said = json.loads(out)
+    assert said["directory"] == str(tmp_path / "json")
+    assert said["files"][0] == {"name": f"{LOG}0.h5", "what": "4 steps"}
+    assert (said["failures"], said["open_monitors"]) == ([], [])
+
+
+def test_recover_lists_failures(mjrec, tmp_path):
+    """The exit status says so too. A newer version's log is left as it is."""
+    write_log(tmp_path, 0)
+    [log] = tmp_path.glob("*.log")
+    [journal] = tmp_path.glob("*.jsonl")
+    spoilt = journal.read_bytes().replace(b'"version": 1', b'"version": 9', 1)
+    journal.write_bytes(spoilt)
+    content = log.read_bytes()
+    status, out, _ = mjrec("recover", tmp_path)
+    assert status == 1
+    assert "Not recovered:\n" in out
+    assert f"  {log.name}: " in out
+    assert log.read_bytes() == content
+    status, _, err = mjrec("recover", tmp_path / "missing")
+    assert status == 1
+    assert err.startswith("mjrec: Cannot recover")
 
 
 def test_what_is_said_by_mujoco_and_of_a_policy_is_said_once(
@@ -385,7 +409,18 @@ def test_being_told_to_end_keeps_everything_so_far(signum, status, tmp_path):
 @pytest.mark.usefixtures("default_signals")
 def test_terminal_shows_a_bar(tmp_path):
     """On a terminal there is a progress bar with episodes and steps."""
-    status, shown = on_terminal(endless(tmp_path), stop_at="1/10000 episodes")
-    assert status == 130
-    assert "steps" in shown
-    assert "HalfCheetah-v5" in shown
+    reader, terminal = pty.openpty()
+    process = subprocess.Popen(endless(tmp_path), stdout=terminal, stderr=terminal)
+    os.close(terminal)
+    shown = b""
+    while b"1/10000 episodes" not in shown:
+        shown += os.read(reader, 65536)
+    process.send_signal(signal.SIGINT)
+    # Linux's way to say that the other end is closed.
+    with contextlib.suppress(OSError):
+        while True:
+            shown += os.read(reader, 65536)
+    assert process.wait(60) == 130
+    os.close(reader)
+    assert b"steps" in shown
+    assert b"HalfCheetah-v5" in shown

@@ -147,9 +147,7 @@ def test_an_evaluation_is_recovered_and_rendered_as_one(
         ([TASK, "--fail-under", "Ant-v5=3"], "'Ant-v5'"),
         ([TASK, "--fail-under", f"{TASK}=nan"], "TASK=VALUE"),
         ([TASK, "--score-range", f"{TASK}=3"], "TASK=LOW:HIGH"),
-        ([TASK, "--score-range", f"{TASK}=3:nan"], "for a score of 0"),
         ([TASK, "--seeds", "0,x"], "0,1,2"),
-        ([TASK, "--env-kwargs", "[]"], "JSON object"),
     ],
 )
 def test_a_wrong_command_line_is_one_line(run, tmp_path, arguments, words):

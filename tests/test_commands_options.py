@@ -33,11 +33,9 @@ def test_an_engine_is_meant_by_its_name(options, kind, gpus, required):
 WRONG = [
     ({"address": "auto"}, "--engine ray"),
     ({"address": "auto", "engine": "slurm"}, "the engine is slurm"),
-    ({"address": "auto", "gpus": 0.5}, "--engine ray"),
     ({"engine": "ray", "engine_option": ("partition=gpu",)}, "partition"),
     ({"engine_option": ("partition=gpu",)}, "--engine slurm"),
     ({"engine_option": ("partition",), "engine": "slurm"}, "KEY=VALUE"),
-    ({"engine_option": ("=gpu",), "engine": "slurm"}, "KEY=VALUE"),
     ({"engine_option": ("a=1", "a=2"), "engine": "slurm"}, "given twice"),
     ({"gpus": -1.0}, "gpus"),
     ({"engine": "slrum"}, "(?s)slrum.*slurm.*dask:ADDRESS"),

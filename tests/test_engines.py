@@ -4,14 +4,12 @@
 `docs/howto/clusters.md` lists these guarantees.
 """
 
-import contextlib
-import functools
 import os
 import signal
-from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 from engine_runs import (
+    each_engine,
     lines,
     odd_work,
     outcomes,
@@ -23,11 +21,7 @@ from engine_runs import (
 from parts import parametrize
 
 import mjrec
-from mjrec.engines.choice import engine_from
 from mjrec.engines.jobs import JobOutcome, Run
-from mjrec.engines.local import LocalEngine
-from mjrec.engines.ray import RayEngine
-from mjrec.engines.slurm import SlurmEngine
 from mjrec.errors import Error, InvalidArgument
 
 pytestmark = [
@@ -39,50 +33,19 @@ on_each = parametrize("engine", ["local", "own", "slurm", "ray", "dask"], defaul
 
 
 @pytest.fixture(scope="module")
-def ray(tmp_path_factory):
-    """A Ray that this process has started, with room for two workers."""
-    from ray_clusters import home_for_ray, own_ray
-
-    with home_for_ray(tmp_path_factory.mktemp("home")), own_ray(cpus=2):
-        yield
-
-
-@pytest.fixture(scope="module")
-def dask():
-    """The address of a Dask cluster with a number of workers."""
-    import distributed
-
-    with contextlib.ExitStack() as clusters:
-
-        @functools.cache
-        def address(workers):
-            cluster = distributed.LocalCluster(
-                n_workers=workers, threads_per_worker=1, dashboard_address=":0"
-            )
-            return str(clusters.enter_context(cluster).scheduler_address)
-
-        yield address
+def engines(tmp_path_factory):
+    with each_engine(tmp_path_factory.mktemp("home")) as made:
+        yield made
 
 
 @pytest.fixture
-def begin(engine, request, tmp_path):
+def begin(engine, engines, tmp_path):
     """Return what begins a run of `odd_jobs` on an engine."""
     made = []
     (tmp_path / "shared").mkdir()
-    if engine == "slurm":
-        pytest.importorskip("submitit")
-    if engine in ("ray", "dask"):
-        cluster = request.getfixturevalue(engine)
-    engines = {
-        "local": LocalEngine,
-        "own": ThreadPoolExecutor,
-        "slurm": functools.partial(SlurmEngine, cluster="local"),
-        "ray": RayEngine,
-        "dask": lambda workers: engine_from(f"dask:{cluster(workers)}"),
-    }
 
     def begun(workers=1, make="make", **settings):
-        made.append(engines[engine](workers))
+        made.append(engines(engine, workers))
         return Run(made[-1], odd_work(make, shared=tmp_path / "shared", **settings))
 
     yield begun

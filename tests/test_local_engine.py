@@ -3,13 +3,12 @@
 
 import os
 import signal
-import subprocess
 import sys
 import threading
-from pathlib import Path
 
 import pytest
 from engine_runs import (
+    driver,
     lines,
     odd_work,
     outcomes,
@@ -23,7 +22,7 @@ from interruption import ctrl_c_soon
 from waiting import wait_until
 
 from mjrec.engines.gpu_shares import GpuShare
-from mjrec.engines.jobs import Run, Work
+from mjrec.engines.jobs import Run
 from mjrec.engines.local import LocalEngine
 from mjrec.errors import ClosedError, Error, GLError, InvalidArgument
 from mjrec.machine import usable_cpus
@@ -58,16 +57,6 @@ def test_an_engine_that_was_shut_down_or_forgotten():
         engine.submit(len, "abc")
     assert LocalEngine(3).submit(len, "abc").result() == 3
     wait_until(lambda: "mjrec-worker" not in str(threading.enumerate()))
-
-
-def test_children_have_more_environment():
-    """And bytes that are the same for all, in a file."""
-    environ = {"OMP_NUM_THREADS": "3"}
-    work = Work(entry="odd_jobs:make", environ=environ, payload=b"weights")
-    with Run(LocalEngine(1), work) as run:
-        submit(run, "a", do="where")
-        [value] = values(run)
-    assert (value["threads"], value["payload"]) == ("3", "weights")
 
 
 @pytest.mark.thorough
@@ -117,11 +106,6 @@ def test_processes_that_a_child_leaves_are_not_waited_for(tmp_path):
 
 def test_what_cannot_be_started(monkeypatch):
     """The error names it."""
-    for entry in ("no_such_module:make", "odd_jobs:no_such_name"):
-        with Run(LocalEngine(1), Work(entry=entry)) as run:
-            submit(run, "a", do="echo")
-            with pytest.raises(Error, match="no_such_"):
-                outcomes(run)
     monkeypatch.setattr(sys, "executable", "/no/such/python")
     with Run(LocalEngine(1), odd_work()) as run:
         submit(run, "a", do="echo")
@@ -191,28 +175,21 @@ if __name__ == "__main__":
 
 
 LEAVING = """
-import os, signal, sys
+import sys
 from pathlib import Path
-from mjrec.engines.jobs import Run, Work
+from engine_runs import odd_work, submit, wait_for
+from mjrec.engines.jobs import Run
 from mjrec.engines.local import LocalEngine
-begun = Path(sys.argv[1])
-run = Run(LocalEngine(1), Work(entry="odd_jobs:make"))
-run.submit("a", do="hold", begun=str(begun))
-for _ in run.results(timeout_s=0.02):
-    if begun.exists() and begun.read_text():
-        break
-if sys.argv[2] == "killed":
-    os.kill(os.getpid(), signal.SIGKILL)
+run = Run(LocalEngine(1), odd_work())
+submit(run, "a", do="hold", begun=sys.argv[1])
+wait_for(Path(sys.argv[1]), run)
 """
 
 
-@pytest.mark.parametrize("how", ["killed", "left"])
-def test_children_end_with_their_driver(tmp_path, how):
+def test_children_end_with_their_driver(tmp_path):
     """In mid-job; at interpreter exit nothing waits for them."""
-    subprocess.run(
-        [sys.executable, "-c", LEAVING, str(tmp_path / "begun"), how],
-        env={**os.environ, "PYTHONPATH": str(Path(__file__).parent)},
-        timeout=60,
-        check=False,
-    )
-    wait_for_end(int((tmp_path / "begun").read_text()))
+    with driver(tmp_path, "LocalEngine(1)") as process:
+        process.kill()
+    wait_for_end(*map(int, lines(tmp_path / "begun")))
+    run_python("-c", LEAVING, str(tmp_path / "again"))
+    wait_for_end(*map(int, lines(tmp_path / "again")))

@@ -128,30 +128,6 @@ def test_frameworks_stay_in_their_rows():
     ] == []
 
 
-def test_no_import_cycles():
-    """No module imports itself by way of others."""
-    # A package's own modules are loaded by it.
-    graph = {
-        name: {
-            each
-            for each in OURS[name] & {*MODULES}
-            if each != name and not each.startswith(f"{name}.")
-        }
-        for name in MODULES
-    }
-
-    def visit(name, trail):
-        assert name not in trail, " -> ".join([*trail, name])
-        if name not in done:
-            for imported in graph[name]:
-                visit(imported, (*trail, name))
-            done.add(name)
-
-    done = set()
-    for name in graph:
-        visit(name, ())
-
-
 def test_all_names_exist_and_are_sorted():
     """`__all__` is the public surface, and each name can be had; so can the version."""
     assert mjrec.__all__ == sorted(mjrec.__all__)

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Work on Ray clusters of several nodes."""
 
-import logging
 from pathlib import Path
 
 import pytest
@@ -103,23 +102,3 @@ def test_a_node_that_dies_takes_no_job_with_it(cluster, work, tmp_path, caplog):
     assert {outcome.failure for outcome in found.values()} == {None}
     assert sum(len(lines(tmp_path / key)) for key in "abcd") == 5
     assert caplog.text.count("will be retried") == 1
-
-
-def test_workers_without_mjrec(cluster, work, tmp_path):
-    """The error says what to install, and where."""
-    (tmp_path / "mjrec").mkdir()
-    (tmp_path / "mjrec" / "__init__.py").write_text(
-        "raise ModuleNotFoundError(\"No module named 'mjrec'\", name='mjrec')"
-    )
-    ray.init(
-        address=str(cluster.address),
-        logging_level=logging.ERROR,
-        runtime_env={"env_vars": {"PYTHONPATH": str(tmp_path)}},
-    )
-    try:
-        with Run(RayEngine(1), work) as run:
-            submit(run, "a", do="echo")
-            with pytest.raises(mjrec.Error, match="No module named 'mjrec'"):
-                outcomes(run)
-    finally:
-        ray.shutdown()

@@ -3,13 +3,12 @@
 
 import os
 import signal
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 from engine_runs import (
     MARK,
+    driver,
     lines,
     marked,
     odd_work,
@@ -116,30 +115,15 @@ except GLError as error:
     wait_until(lambda: not marked(tmp_path), seconds=10)
 
 
-HOLDING = f"""{BEGIN}
-from mjrec.signals import exiting_on_signals
-with exiting_on_signals():
-    work = odd_work(shared=place / "shared", left=str(place / "left"))
-    run = Run(RayEngine(1), work)
-    submit(run, "a", do="hold", begun=str(place / "begun"))
-    with run:
-        list(run.results())
-"""
-
-
 @pytest.mark.thorough
 @pytest.mark.parametrize(
     ("signum", "status"), [(signal.SIGTERM, 128 + 15), (signal.SIGKILL, -9)]
 )
 def test_a_driver_that_is_ended(tmp_path, signum, status):
     """Says so by its exit status, and leaves no process."""
-    environ = {"PYTHONPATH": str(Path(__file__).parent), MARK: str(tmp_path)}
-    with subprocess.Popen(
-        [sys.executable, "-c", HOLDING, str(tmp_path)], env={**os.environ, **environ}
-    ) as driver:
-        wait_until(lambda: lines(tmp_path / "begun"), seconds=60)
-        driver.send_signal(signum)
-    assert driver.returncode == status
+    with driver(tmp_path, "RayEngine(1)", **{MARK: str(tmp_path)}) as process:
+        process.send_signal(signum)
+    assert process.returncode == status
     wait_until(lambda: not marked(tmp_path), seconds=30)
     assert lines(tmp_path / "left") == lines(tmp_path / "begun")
 

@@ -92,16 +92,6 @@ def test_episode_info_is_what_stable_baselines3_logs(tmp_path):
     assert rewards_in(tmp_path) == pytest.approx(seen)
 
 
-def test_learning_again_begins_a_new_episode(tmp_path):
-    """`learn` resets in mid-episode, and what was cut off is an episode too."""
-    with make_env(tmp_path, video_callable=False, allow_early_reset=True) as env:
-        model = make_ppo(env)
-        model.learn(64)
-        model.learn(64)
-    assert sum(entry["length"] for entry in journal_of(tmp_path)) <= 128
-    assert len(journal_of(tmp_path)) > 2
-
-
 # From Python 3.12 on, `fork` beside any thread is warned of: torch's, for instance.
 @pytest.mark.filterwarnings("ignore:.*multi-threaded.*fork:DeprecationWarning")
 @pytest.mark.parametrize("kind", ["dummy", "spawn", "forkserver", "fork"])

@@ -54,19 +54,6 @@ def ends(interval):
     return [interval.low, interval.high]
 
 
-@pytest.mark.parametrize(
-    ("values", "expected"),
-    [
-        ([1, 2, 9], 4),  # one is more than a quarter: none is cut off
-        ([1, 2, 3, 4, 100], 3),
-        ([0, 0, 0, 0, 1, 1, 1, 1], 0.5),
-    ],
-)
-def test_interquartile_mean_by_hand(values, expected):
-    """A quarter, rounded down, is cut off at each end."""
-    assert interquartile_mean([array(*values)]).value == expected
-
-
 def test_figures_across_tasks_are_rliables():
     """To the last digit but rounding."""
     assert interquartile_mean(X).value == pytest.approx(0.37966666666666665)
@@ -126,20 +113,19 @@ def test_bootstrap_of_two_values_by_hand():
     assert figure.interval(Bootstrap(confidence=0.4)) == Interval(0.5, 0.5)
 
 
-# Of two samples; with its true value where both are drawn around 500.
 FIGURES = {
-    "mean": (lambda x, _: mean(x), 500),
-    "difference": (lambda x, y: mean(x) - mean(y), 0),
-    "iqm": (lambda x, y: interquartile_mean([x, y]), 500),
-    "improvement": (improvement, 0.5),
-    "gap": (lambda x, y: optimality_gap([x / 600, y / 600]), None),
+    "mean": lambda x, _: mean(x),
+    "difference": lambda x, y: mean(x) - mean(y),
+    "iqm": lambda x, y: interquartile_mean([x, y]),
+    "improvement": improvement,
+    "gap": lambda x, y: optimality_gap([x / 600, y / 600]),
 }
 
 
 @pytest.mark.parametrize("name", FIGURES)
 def test_both_kinds_of_intervals_agree(name, monkeypatch):
     """That of large samples is the bootstrap's, to a tenth of its width."""
-    figure = FIGURES[name][0](normal(60), normal(90, 550, seed=1))
+    figure = FIGURES[name](normal(60), normal(90, 550, seed=1))
     low, high = ends(figure.interval(USUAL))
     assert figure.interval_method == PERCENTILE_BOOTSTRAP
     monkeypatch.setattr(statistics, "MOST_RESAMPLED", 0)
@@ -156,23 +142,6 @@ def test_large_sample_band_of_a_profile(monkeypatch):
     monkeypatch.setattr(statistics, "MOST_RESAMPLED", 0)
     width = float(np.ptp(resampled))
     assert np.array(profile.ends(USUAL)) == pytest.approx(resampled, abs=0.1 * width)
-
-
-@pytest.mark.thorough
-@pytest.mark.parametrize("name", [name for name in FIGURES if name != "gap"])
-@pytest.mark.parametrize("is_large", [False, True])
-def test_coverage(name, is_large, monkeypatch):
-    """Of 2000 intervals of 95 %, so many hold the true value, by both methods."""
-    # Takes more than five seconds: resamples each of them a thousand times.
-    if is_large:
-        monkeypatch.setattr(statistics, "MOST_RESAMPLED", 0)
-    figure, true = FIGURES[name]
-    inside = 0
-    for k in range(2000):
-        found = figure(normal(30, seed=k), normal(30, seed=9000 + k))
-        low, high = ends(found.interval(Bootstrap(resamples=1000, seed=k)))
-        inside += low <= true <= high
-    assert 0.92 <= inside / 2000 <= 0.965
 
 
 def test_same_seed_same_interval():

@@ -84,13 +84,13 @@ def test_video_is_played_as_a_gif_of_the_file(finished):
 
 def test_runs_are_told_apart(finished, tmp_path):
     """Sub-environments, and two directories with one infix, in one `log_dir`."""
-    first = finished.run
-    runs = [
-        dataclasses.replace(first, env_index=0),
-        dataclasses.replace(first, env_index=1, infix="1.4711"),
-        dataclasses.replace(first, directory=tmp_path / "evaluation"),
-        dataclasses.replace(first, directory=tmp_path / "b" / "evaluation"),
+    changes = [
+        {"env_index": 0},
+        {"env_index": 1, "infix": "1.4711"},
+        {"directory": tmp_path / "evaluation"},
+        {"directory": tmp_path / "b" / "evaluation"},
     ]
+    runs = [dataclasses.replace(finished.run, **each) for each in changes]
     tracker = TensorBoardTracker(tmp_path / "logs")
     for run in runs:
         tracker.begin(run)
