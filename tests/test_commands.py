@@ -202,7 +202,7 @@ def test_cameras_are_a_video_each_or_one_side_by_side(mjrec, tmp_path):
 
 def test_list_says_which_videos_are_pending_and_which_episode_is_best(mjrec, tmp_path):
     """In place of the name that there is not yet; clips are listed for themselves."""
-    entries = [entry(0), entry(1, recording="deferred")]
+    entries = [entry(0, reward=float("nan")), entry(1, recording="deferred")]
     write_journal(tmp_path, "0.7", "X-v0", entries)
     trajectory = write_log(tmp_path, 1, steps=2)
     clip = tmp_path / "openaigym.video.0.7.video000000.step000001.mp4"
@@ -218,8 +218,7 @@ def test_list_says_which_videos_are_pending_and_which_episode_is_best(mjrec, tmp
     assert (second["pending"], second["trajectory"]) == (True, trajectory.name)
     assert second["video"] is None
     # Sub-environments count their episodes separately; a NaN is not the best.
-    entries = [entry(0, reward=float("nan")), entry(1, reward=9.0)]
-    write_journal(tmp_path, "1.7", "X-v0", entries)
+    write_journal(tmp_path, "1.7", "X-v0", [entry(0), entry(1, reward=9.0)])
     _, out, _ = mjrec("list", tmp_path)
     lines = out.splitlines()
     assert lines[0].split()[:2] == ["monitor", "episode"]
@@ -306,6 +305,7 @@ LOG = "openaigym.trajectory.0.7.episode00000"
 def test_recover_lists_what_was_done(mjrec, tmp_path):
     """A line a file, and nothing the second time; or one JSON object."""
     for name in ("text", "json"):
+        (tmp_path / name).mkdir()
         write_log(tmp_path / name, 0)
         write_log(tmp_path / name, 1, ended=False)
     status, out, _ = mjrec("recover", tmp_path / "text")

@@ -167,7 +167,7 @@ def by_one_worker(large, tmp_path_factory):
     return large(tmp_path_factory.mktemp("one") / "e", workers=1)
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def engines(tmp_path_factory):
     with each_engine(tmp_path_factory.mktemp("home")) as made:
         yield made
@@ -229,7 +229,7 @@ def test_machines_with_other_homes_draw_what_others_recorded(tmp_path):
     evaluation = run(tmp_path / "out", tasks=["dm_control/swimmer-swimmer6"], **far)
     assert not list(evaluation.directory.rglob("*.model.*.zip"))
     assert len(list(evaluation.directory.rglob("*.mp4"))) == 1
-    [folder] = {path.parent for path in evaluation.directory.glob("*/*/*.h5")}
+    folder, *_ = (path.parent for path in evaluation.directory.glob("*/*/*.h5"))
     for path in finished_trajectories(folder):
         assert mjrec.load_trajectory(path).model().nv == 8
 
