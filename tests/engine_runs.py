@@ -2,17 +2,61 @@
 """What tests do with a run, on whichever engine."""
 
 import contextlib
+import functools
 import os
 import re
 import select
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+import pytest
+from waiting import wait_until
+
+from mjrec.engines.choice import engine_from
 from mjrec.engines.jobs import Work
+from mjrec.engines.local import LocalEngine
+from mjrec.engines.ray import RayEngine
+from mjrec.engines.slurm import SlurmEngine
 
 # An environment variable, by which a test finds what it has started.
 MARK = "MJREC_TEST_MARK"
+
+
+@contextlib.contextmanager
+def each_engine(home):
+    """Have what makes engines by kind and number of workers; clusters start once."""
+    from ray_clusters import home_for_ray, own_ray
+
+    with contextlib.ExitStack() as clusters:
+
+        @functools.cache
+        def dask(workers):
+            import distributed
+
+            cluster = distributed.LocalCluster(
+                n_workers=workers, threads_per_worker=1, dashboard_address=":0"
+            )
+            return clusters.enter_context(cluster).scheduler_address
+
+        @functools.cache
+        def ray():
+            clusters.enter_context(home_for_ray(home))
+            clusters.enter_context(own_ray(cpus=2))
+
+        def engine(kind, workers):
+            if kind == "slurm":
+                pytest.importorskip("submitit")
+                return SlurmEngine(workers, cluster="local")
+            if kind == "dask":
+                return engine_from(f"dask:{dask(workers)}")
+            if kind == "ray":
+                ray()
+            kinds = {"local": LocalEngine, "own": ThreadPoolExecutor, "ray": RayEngine}
+            return kinds[kind](workers)
+
+        yield engine
 
 
 def odd_work(make="make", *, shared=None, **settings):
@@ -58,6 +102,34 @@ def marked(mark):
             if wanted in (process / "environ").read_bytes().split(b"\0"):
                 found.append((process / "cmdline").read_text().replace("\0", " "))
     return [c for c in found if not re.match(r"ray::\w+Agent|.*resource_tracker", c)]
+
+
+DRIVER = """
+import sys
+from pathlib import Path
+import mjrec
+from engine_runs import odd_work, submit
+from mjrec.engines.jobs import Run
+from mjrec.signals import exiting_on_signals
+place = Path(sys.argv[1])
+work = odd_work(shared=place / "shared", left=str(place / "left"))
+with exiting_on_signals(), Run(eval(f"mjrec.{sys.argv[2]}"), work) as run:
+    submit(run, "held", do="hold", begun=str(place / "begun"))
+    submit(run, *map(str, range(20)), do="echo")
+    list(run.results())
+"""
+
+
+@contextlib.contextmanager
+def driver(place, engine, **environ):
+    """Have a driver, in a session of its own, of whose jobs one is being done."""
+    with subprocess.Popen(
+        [sys.executable, "-c", DRIVER, str(place), engine],
+        env={**os.environ, "PYTHONPATH": str(Path(__file__).parent), **environ},
+        start_new_session=True,
+    ) as process:
+        wait_until(lambda: lines(place / "begun"), seconds=60)
+        yield process
 
 
 def wait_for_end(pid):

@@ -26,7 +26,8 @@ def recorded_in(evaluation):
         found[*of, "trajectory"] = (datasets_in(folder / row["trajectory"]), promised)
         if row["video"]:
             video = folder / row["video"]
-            found[*of, "video"] = (video.read_bytes(), hashes_of(video))
+            hashes = video.with_suffix(".framehash").read_text()
+            found[*of, "video"] = (video.read_bytes(), hashes)
     return found
 
 
@@ -43,8 +44,3 @@ def datasets_in(path):
         (file if holder == path else file[group_of(path)]).visititems(note)
     assert "states" in found
     return found
-
-
-def hashes_of(video):
-    """Return the hashes of a video's frames, as its file has them."""
-    return video.with_suffix(".framehash").read_text()

@@ -33,17 +33,9 @@ def write_evaluation(
 ):
     """Write the results of an evaluation, and return its directory.
 
-    Args:
-        directory: is made.
-        returns: for each task and seed those of its episodes; None is a failed one.
-        score_ranges: of tasks that have none of their own.
-        across: its figures across tasks.
-        bootstrap: of the intervals.
-        versions: of what ran.
-        monitor: the infix of those that recorded; they have left a journal each.
-        videos: by task, the video of its first episode.
-        finished: whether there are results.
-        plan: further fields of the plan.
+    `returns` has those of each task, seed and episode; None is a failed one. `monitor`
+    is the infix of those that recorded, which have left a journal each. `videos` has
+    each task's video of its first episode, and `plan` further fields of the plan.
     """
     folders = {task: re.sub(r"[^\w.-]", "-", task) for task in returns}
     asked = EvaluationPlan(
@@ -67,12 +59,16 @@ def write_evaluation(
     }
     directory.mkdir(parents=True, exist_ok=True)
     for task, of in results.items() if monitor else ():
-        write_journal(directory / folders[task], monitor, task, _entries(of))
+        entries = [_entry(each) for each in of if each.total_reward is not None]
+        write_journal(directory / folders[task], monitor, task, entries)
     if not finished:
         content = {"format_version": 1, "plan": to_json(asked)}
         (directory / "evaluation.json").write_text(dumps(content))
         return directory
     ranges, videos = score_ranges or {}, videos or {}
+
+    def scale(task):
+        return ranges.get(task, default_score_range(task, asked.max_steps))
 
     def files(result):
         is_first = result is results[result.task][0]
@@ -83,14 +79,7 @@ def write_evaluation(
         directory=directory,
         plan=asked,
         summaries=[
-            summarize_results(
-                task,
-                each,
-                score_range=ranges.get(
-                    task, default_score_range(task, asked.max_steps)
-                ),
-                bootstrap=bootstrap,
-            )
+            summarize_results(task, each, score_range=scale(task), bootstrap=bootstrap)
             for task, each in results.items()
         ],
         across=across,
@@ -100,6 +89,12 @@ def write_evaluation(
     )
     write_results(evaluation, [r for each in results.values() for r in each], files)
     return directory
+
+
+def _entry(result):
+    of = {"seed": result.seed, "episode": result.episode}
+    reward = result.total_reward
+    return entry(result.episode_id, reward=reward, seed=result.seed, evaluation=of)
 
 
 def _result(task, seed, number, total, monitor, episode_id):
@@ -122,19 +117,6 @@ def _result(task, seed, number, total, monitor, episode_id):
         failure="PolicyError: it gave <b>NaN</b>" if has_failed else None,
         **(recorded if monitor else {}),
     )
-
-
-def _entries(results):
-    return [
-        entry(
-            each.episode_id,
-            reward=each.total_reward,
-            seed=each.seed,
-            evaluation={"seed": each.seed, "episode": each.episode},
-        )
-        for each in results
-        if each.total_reward is not None
-    ]
 
 
 def write_recorded(directory, tasks, *, rewards=(3.0, 1.0, None, 2.0), **options):

@@ -32,14 +32,11 @@ class OddJobs:
         return {"arguments": dict(arguments), "settings": self._settings}
 
     def where(self, arguments):
-        payload = self._settings.get("payload")
         return {
             "pid": os.getpid(),
             "directory": str(Path.cwd()),
             "session": os.getsid(0),
-            "threads": os.environ.get("OMP_NUM_THREADS"),
             "gpus": os.environ.get("CUDA_VISIBLE_DEVICES"),
-            "payload": payload and Path(payload).read_text(),
         }
 
     def die(self, arguments):

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The benchmarks at a toy size: what they give, not how fast anything is."""
 
+import importlib
 import importlib.util
 import json
 import subprocess
@@ -8,41 +9,16 @@ import sys
 from pathlib import Path
 
 import pytest
-from benchmarks import (
-    disk,
-    encoding,
-    engines,
-    evaluating,
-    memory,
-    rendering,
-    reporting,
-    scaling,
-    stepping,
-    time_to_video,
-    verifying,
-    video_phases,
-)
+from benchmarks import stepping, time_to_video
 from benchmarks.children import ChildFailed, call
 from benchmarks.results import Reference, Result, at_least, at_most
 from benchmarks.tables import table_of
+from parts import parametrize
 from rich.console import Console
-
-ROOT = Path(__file__).parents[1]
-TINY = (16, 16)
-SMALL = {"rounds": 1, "size": TINY}
-MANY = {"rounds": 1, "monitors": (2, 4)}
 
 pytestmark = pytest.mark.skipif(
     importlib.util.find_spec("moviepy") is None, reason="moviepy is not installed"
 )
-
-
-def silently(words):
-    """Say nothing of the progress."""
-    del words
-
-
-# --- what is done with numbers -------------------------------------------------------
 
 
 def result(*samples, **others):
@@ -69,7 +45,10 @@ def test_what_was_not_measured_keeps_and_breaks_nothing():
     missing = result(promise=at_least(1), note="moviepy is not installed")
     assert missing.is_kept is None
     assert json.dumps(missing.as_json(), allow_nan=False)
-    assert "moviepy is not installed" in shown([missing])
+    console = Console(width=200)
+    with console.capture() as captured:
+        console.print(table_of("title", [missing]))
+    assert "moviepy is not installed" in captured.get()
 
 
 def test_failing_child_says_what_it_printed():
@@ -79,121 +58,73 @@ def test_failing_child_says_what_it_printed():
         call(stepping.run_episodes, setup=setup, steps=1)
 
 
-def shown(results):
-    console = Console(width=200)
-    with console.capture() as captured:
-        console.print(table_of("title", results))
-    return captured.get()
+CHEETAH = {"environments": ("HalfCheetah-v5",)}
+TINY = {"size": (16, 16)}
+SHORT = {"make": {"max_episode_steps": 10, "height": 16, "width": 16}}
+ONE_CASE = {"cases": time_to_video.CASES[1:]}
+RECORDERS = {"recorders": ("bare", "workers=0")}
+EPISODES = {"episodes": 2, "short": 3, "long_episodes": 1, "long": 5}
+ONE_VIDEO = {"videos": 1, "frames": 3, "size": 32, "workers": 1}
 
-
-# --- the measurements ----------------------------------------------------------------
-
-thorough, dm_control = pytest.mark.thorough, pytest.mark.dm_control
-SHORT = {"max_episode_steps": 10, "height": 16, "width": 16}
-ONE_CHEETAH = {"environments": ("HalfCheetah-v5",), "rounds": 1}
-
-# What is measured, how little of it, what each number is called, and what is promised.
-MEASURED = [
-    pytest.param(
-        stepping,
-        {**ONE_CHEETAH, "steps": 30, "drawn_steps": 2, "make": SHORT},
-        6,
-        {"≥ 0.95", "≥ 0.8"},
-        marks=thorough,
+# How little is measured, how many numbers there are or what each is called, and what is
+# promised of them.
+MEASURED = {
+    "engines": ({"workers": (2,), "jobs": 20}, 3, ()),
+    "stepping": (
+        {**CHEETAH, **SHORT, "steps": 30, "drawn_steps": 2},
+        *(6, ("≥ 0.95", "≥ 0.8")),
     ),
-    pytest.param(
-        time_to_video,
-        {**SMALL, "steps": (2,), "workers": 1, "cases": time_to_video.CASES[1:]},
-        ["RecordVideo", "max_fps=30, full quality"],
-        {"≤ 0.3"},
-        marks=thorough,
+    "time_to_video": (
+        {**TINY, **ONE_CASE, "steps": (2,), "workers": 1},
+        *(["RecordVideo", "max_fps=30, full quality"], ("≤ 0.3",)),
     ),
-    pytest.param(
-        video_phases,
-        {**SMALL, "steps": (2,), "workers": 1},
-        None,
-        set(),
-        marks=thorough,
-    ),
-    pytest.param(
-        memory,
-        {**SMALL, "short": 2, "long": 4, "recorders": ("bare", "workers=0")},
-        None,
-        {"≤ 64", "≤ 4"},
-        marks=thorough,
-    ),
-    pytest.param(
-        rendering,
-        {**ONE_CHEETAH, "frames": 3, "size": TINY},
+    "video_phases": ({**TINY, "steps": (2,), "workers": 1}, None, ()),
+    "memory": ({**TINY, **RECORDERS, "short": 2, "long": 4}, None, ("≤ 64", "≤ 4")),
+    "rendering": (
+        {**CHEETAH, **TINY, "frames": 3},
         ["mujoco.Renderer", "mjrec.render(workers=1)", "worker alone"],
-        {"≥ 0.9"},
-        marks=thorough,
+        ("≥ 0.9",),
     ),
-    pytest.param(
-        verifying,
-        {
-            "rounds": 1,
-            "episodes": 2,
-            "short": 3,
-            "long_episodes": 1,
-            "long": 5,
-            "videos": 1,
-            "frames": 3,
-            "size": 32,
-            "workers": 1,
-        },
-        None,
-        {"≤ 20", "≤ 4.2", "≤ 0.0025", "≤ 1.5"},
-        marks=thorough,
+    "verifying": (
+        {**EPISODES, **ONE_VIDEO},
+        *(None, ("≤ 20", "≤ 4.2", "≤ 0.0025", "≤ 1.5")),
     ),
-    pytest.param(
-        evaluating,
-        {"rounds": 1, "tasks": 1, "episodes": 1, "steps": 2, "bare": (4,)},
+    "evaluating": (
+        {"tasks": 1, "episodes": 1, "steps": 2, "bare": (4,)},
         ["1 worker", "2 workers", "2 bare processes", "2 workers"],
-        {"≤ 0.588235"},
-        marks=(thorough, dm_control),
+        ("≤ 0.588235",),
     ),
-    pytest.param(
-        reporting,
-        {"rounds": 1, "episodes": 20, "videos": 2, "many_episodes": 100},
-        None,
-        {"≤ 3", "≤ 500"},
-        marks=thorough,
+    "reporting": (
+        {"episodes": 20, "videos": 2, "many_episodes": 100},
+        *(None, ("≤ 3", "≤ 500")),
     ),
-    pytest.param(
-        scaling,
-        {**MANY, "episodes": 2, "tasks": 2, "results": (10, 20)},
-        None,
-        {"≤ 3", "≤ 30.048"},
-        marks=thorough,
+    "scaling": (
+        {"monitors": (2, 4), "episodes": 2, "tasks": 2, "results": (10, 20)},
+        *(None, ("≤ 3", "≤ 30.048")),
     ),
-    pytest.param(engines, {"rounds": 1, "workers": (2,), "jobs": 20}, 3, set()),
-    pytest.param(disk, {**ONE_CHEETAH, "steps": 10}, 5, set(), marks=thorough),
-    pytest.param(encoding, {**SMALL, "frames": 2}, 4, set(), marks=thorough),
-]
+    "disk": ({**CHEETAH, "steps": 10}, 5, ()),
+    "encoding": ({**TINY, "frames": 2}, 4, ()),
+}
 
 
-@pytest.mark.parametrize(("module", "settings", "given", "promises"), MEASURED)
-def test_each_measurement_gives_its_numbers(module, settings, given, promises):
+@parametrize("name", MEASURED)
+def test_each_measurement_gives_its_numbers(name):
     """As many as it is to, beside what it promises."""
-    results = module.measure(module.Settings(**settings), silently)
+    if name == "evaluating":
+        pytest.importorskip("dm_control")
+    settings, given, promises = MEASURED[name]
+    module = importlib.import_module(f"benchmarks.{name}")
+    results = module.measure(module.Settings(rounds=1, **settings), lambda words: None)
     variants = [r.variant for r in results]
     assert given in (None, len(variants), variants)
     assert all(r.median > 0 for r in results if r.samples)
-    assert promises <= {str(r.promise) for r in results if r.promise}
-
-
-# --- the command ---------------------------------------------------------------------
+    assert {*promises} <= {str(r.promise) for r in results if r.promise}
 
 
 def test_command_names_what_can_be_measured():
     """An unknown name is refused before anything is measured."""
-    done = subprocess.run(
-        [sys.executable, "-m", "benchmarks", "--only", "speed"],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    command = [sys.executable, "-m", "benchmarks", "--only", "speed"]
+    root = Path(__file__).parents[1]
+    done = subprocess.run(command, cwd=root, capture_output=True, text=True)
     assert done.returncode == 2
     assert "stepping" in done.stderr

@@ -1,16 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 import json
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from parts import parametrize
 
 import mjrec
 from mjrec import commands
-
-Run = Callable[..., tuple[int, str, str]]
 
 TASK = "InvertedPendulum-v5"
 POLICIES = """
@@ -34,23 +30,18 @@ def run(tmp_path, monkeypatch, capsys):
         small = ["--episodes", "2", "--num-seeds", "1", "--max-steps", "5"]
         rest = ["--size", "32x32", "--workers", "1", "--out", "e"]
         status = commands.main(["evaluate", *arguments, *small, *rest])
-        said = capsys.readouterr()
-        return status, said.out, said.err
+        return status, *capsys.readouterr()
 
     return run
 
 
 def test_a_table_says_what_came_of_it(run, tmp_path):
     """Each task has a row, and the videos and the directory are named."""
-    status, out, err = run(
-        *(TASK, "--policy", "few_policies:zero"),
-        *("--keep", "best", "--confidence", "0.9"),
-    )
+    policy = ("--policy", "few_policies:zero", "--keep", "best")
+    status, out, err = run(TASK, *policy, "--confidence", "0.9")
     assert status == 0
-    header, row = (
-        line for line in out.splitlines() if line.lstrip().startswith(("task ", TASK))
-    )
-    assert header.split()[0] == "task"
+    [header] = [line for line in out.splitlines() if line.lstrip().startswith("task ")]
+    [row] = [line for line in out.splitlines() if line.lstrip().startswith(TASK)]
     assert " 90 % " in header
     assert row.split()[:3] == [TASK, "2", "5"]
     assert "1 video:" in out
@@ -74,35 +65,22 @@ def test_tasks_with_a_scale_are_summarized_together(run):
 
 
 def test_json_is_one_object_and_nothing_else(run):
-    """For programs; over tasks too."""
-    status, out, err = run(
-        *(TASK, "--policy", "zero", "--keep", "none", "--json"),
-        *("--score-range", f"{TASK}=0:10"),
-    )
+    """For programs; over tasks too. A mean that is just high enough is no failure."""
+    policy = ("--policy", "zero", "--keep", "none", "--json")
+    least = ("--score-range", f"{TASK}=0:10", "--fail-under", f"{TASK}=5")
+    status, out, err = run(TASK, *policy, *least)
     said = json.loads(out)
     assert (status, err) == (0, "")
-    (task,) = said["tasks"]
+    [task] = said["tasks"]
     assert task["mean"] == 5.0
     assert said["across"]["iqm"] == 0.5
     assert (said["episodes"], said["failed"]) == (2, 0)
 
 
-@parametrize(("least", "status"), [("5", 0), ("5.5", 1)])
-def test_fail_under_fails_below_a_mean(run, least, status):
-    """The mean itself is enough."""
-    found, out, _ = run(
-        TASK, "--policy", "zero", "--keep", "none", "--fail-under", f"{TASK}={least}"
-    )
-    assert found == status
-    assert ("its mean return 5 is below 5.5" in out) is bool(status)
-
-
 def test_failed_episodes_fail_the_command(run, tmp_path):
     """The results are there, and foreign text moves no cursor and paints nothing."""
-    status, out, _ = run(
-        *(TASK, "--policy", "few_policies:raising", "--keep", "none"),
-        *("--fail-under", f"{TASK}=-1000"),
-    )
+    policy = ("--policy", "few_policies:raising", "--keep", "none")
+    status, out, _ = run(TASK, *policy, "--fail-under", f"{TASK}=-1000")
     assert status == 1
     assert "2 of 2 episodes failed:" in out
     assert "[red]no idea[/]" in out
@@ -111,16 +89,18 @@ def test_failed_episodes_fail_the_command(run, tmp_path):
     assert (tmp_path / "e" / "results.json").exists()
 
 
-def test_a_directory_is_enough_to_go_on(run, tmp_path, capsys):
+def test_a_directory_is_enough_to_go_on(run, capsys):
     """Its best, median and worst episodes are named, each with a file."""
-    assert run(TASK, "--policy", "zero", "--keep", "none")[0] == 0
+    low = ("--fail-under", f"{TASK}=5.5")
+    status, out, _ = run(TASK, "--policy", "zero", "--keep", "none", *low)
+    assert status == 1
+    assert "its mean return 5 is below 5.5" in out
     more = ["--seeds", "0-2", "--workers", "1", "--fail-under", "Inverted*=5"]
     assert commands.main(["evaluate", "--resume", "e", *more]) == 0
     out = capsys.readouterr().out
     assert out.split()[out.split().index(TASK) + 1] == "6"
     [worst] = [line for line in out.splitlines() if line.startswith("  worst")]
-    path = Path(worst.split()[-1])
-    assert len(mjrec.load_trajectory(path)) > 0
+    assert len(mjrec.load_trajectory(Path(worst.split()[-1]))) > 0
     assert commands.main(["evaluate", "--resume", "e", "--seeds", "0-1"]) == 1
     assert "seeds was [0, 1, 2]" in capsys.readouterr().err
 
@@ -128,31 +108,35 @@ def test_a_directory_is_enough_to_go_on(run, tmp_path, capsys):
 def test_an_evaluation_is_recovered_and_rendered_as_one(
     run, tmp_path, monkeypatch, capsys
 ):
-    """All folders in it; its table of files is right before and after."""
+    """All folders in it; its table of files is right before and after.
+
+    Where nothing can be drawn that is said, and how to draw elsewhere.
+    """
     monkeypatch.setenv("MUJOCO_GL", "glfw")
     monkeypatch.delenv("DISPLAY", raising=False)
-    assert run(TASK, "--policy", "zero", "--keep", "all")[0] == 0
+    status, out, err = run(TASK, "--policy", "zero", "--keep", "all")
+    assert status == 0
+    place = tmp_path / "e"
+    assert "Videos cannot be drawn on this machine" in err
+    assert f"mjrec render e/{TASK}" in out
     monkeypatch.setenv("MUJOCO_GL", "egl")
-    table = (tmp_path / "e" / "timing.csv").read_text()
-    videos = [row.split(",") for row in table.splitlines()[1:]]
-    assert not list(tmp_path.rglob("*.mp4"))
+    table = (place / "timing.csv").read_text()
+    rows = [row.split(",") for row in table.splitlines()[1:]]
+    paths = [place / row[5] / row[-1] for row in rows]
+    assert not list(place.rglob("*.mp4"))
     # One of them by its number, as `mjrec list` has it; then all.
     assert commands.main(["render", "e", "--episode", "1"]) == 0
-    paths = [tmp_path / "e" / row[5] / row[-1] for row in videos]
     assert [path.is_file() for path in paths] == [False, True]
-    again = ["--size", "48x32", "--out", "again.mp4"]
-    assert commands.main(["render", "e", "--episode", "1", *again]) == 0
-    assert (tmp_path / "again.mp4").is_file()
     assert commands.main(["render", "e", "--episode", "9"]) == 1
     assert "No episode 9 is recorded" in capsys.readouterr().err
     assert commands.main(["render", "e"]) == 0
     assert all(path.is_file() for path in paths)
-    assert (tmp_path / "e" / "timing.csv").read_text() == table
+    assert (place / "timing.csv").read_text() == table
     capsys.readouterr()
-    [manifest, *_] = (tmp_path / "e").rglob("*.manifest.json")
+    [manifest, *_] = place.rglob("*.manifest.json")
     manifest.unlink()
     assert commands.main(["recover", "e"]) == 0
-    assert f"{manifest.parent.relative_to(tmp_path / 'e')}" in capsys.readouterr().out
+    assert f"{manifest.parent.relative_to(place)}" in capsys.readouterr().out
     assert manifest.is_file()
 
 
@@ -161,19 +145,14 @@ def test_an_evaluation_is_recovered_and_rendered_as_one(
     [
         (["NoSuch-v0"], "no Gymnasium environment 'NoSuch-v0'"),
         ([TASK, "--fail-under", "Ant-v5=3"], "'Ant-v5'"),
-        ([TASK, "--fail-under", TASK], "TASK=VALUE"),
         ([TASK, "--fail-under", f"{TASK}=nan"], "TASK=VALUE"),
         ([TASK, "--score-range", f"{TASK}=3"], "TASK=LOW:HIGH"),
-        ([TASK, "--score-range", f"{TASK}=3:nan"], "for a score of 0"),
         ([TASK, "--seeds", "0,x"], "0,1,2"),
-        ([TASK, "--env-kwargs", "[]"], "JSON object"),
     ],
 )
 def test_a_wrong_command_line_is_one_line(run, tmp_path, arguments, words):
     """It says what there is, and nothing is run."""
-    if "--policy" not in arguments:
-        arguments = [*arguments, "--policy", "zero"]
-    status, out, err = run(*arguments)
+    status, out, err = run(*arguments, "--policy", "zero")
     lines = [line for line in err.splitlines() if line.startswith("mjrec: ")]
     assert (status, out, len(lines)) == (1, "", 1)
     assert words in err

@@ -9,7 +9,6 @@ import os
 import platform
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 from rich.console import Console
@@ -51,7 +50,7 @@ def test_a_machine_that_renders():
     facts = json.loads(healthy.stdout)
     assert (facts["can_render"], facts["backend"]) == (True, "egl")
     assert facts["reason"] == "the first that works"
-    (note,) = facts["problems"]
+    [note] = facts["problems"]
     assert "MUJOCO_GL is not set" in note["cause"]
     assert "export MUJOCO_GL=egl" in note["fix"]
     by_name = {tried["backend"]: tried for tried in facts["backends"]}
@@ -61,7 +60,6 @@ def test_a_machine_that_renders():
     assert "DISPLAY is not set" in by_name["glfw"]["cause"]
     assert by_name["glfw"]["fix"]
     assert facts["ffmpeg"]["encodes"] is True
-    assert Path(facts["ffmpeg"]["path"]).is_file()
     assert facts["ffmpeg"]["version"].startswith("ffmpeg version")
     assert facts["python"] == platform.python_version()
     packages = {package["name"]: package for package in facts["packages"]}
@@ -69,20 +67,12 @@ def test_a_machine_that_renders():
     assert packages["gymnasium"]["works"] is True, packages["gymnasium"]
     extras = {extra["name"]: extra for extra in facts["extras"]}
     assert extras["SciPy"]["version"] == importlib.metadata.version("scipy")
-    assert extras["Slurm"]["version"] or "login node" in extras["Slurm"]["fix"]
-    assert {"Ray", "submitit", "Dask", "report", "GPU"} < extras.keys()
+    assert {"Slurm", "Ray", "submitit", "Dask", "report", "GPU"} < extras.keys()
     # A new key is added here, none is renamed.
     assert list(facts) == [
         *("can_render", "backend", "reason", "backends", "problems"),
-        *(
-            "gpu_device_files",
-            "ffmpeg",
-            "packages",
-            "extras",
-            "cpus",
-            "python",
-            "platform",
-        ),
+        *("gpu_device_files", "ffmpeg", "packages", "extras", "cpus"),
+        *("python", "platform"),
     ]
     assert list(by_name["egl"]) == [
         *("backend", "renders", "gl_renderer", "gl_vendor", "gl_version"),
@@ -104,45 +94,39 @@ def test_status_1_where_nothing_may_render():
     assert "Traceback" not in done.stderr
 
 
-def report_of(**changed):
-    """Return a report of a machine with a bit of everything."""
-    report = MachineReport(
-        can_render=True,
-        backend="egl",
-        reason="the first that works",
-        backends=(
-            Probe(
-                "egl",
-                renders=True,
-                gl_renderer="llvmpipe (LLVM 15.0.6, 256 bits)",
-                gl_version="4.5 Mesa [22.3.6]",
-                frames_per_second=12.345,
-                devices=(EglDevice(0, "/dev/dri/renderD128", 3, True, True),),
-            ),
-            Probe(
-                "osmesa",
-                renders=False,
-                cause="[bold]It[/bold] is missing.",
-                fix=f"As root:\n  {_APT}",
-            ),
+# Of a machine with a bit of everything.
+REPORT = MachineReport(
+    can_render=True,
+    backend="egl",
+    reason="the first that works",
+    backends=(
+        Probe(
+            "egl",
+            renders=True,
+            gl_renderer="llvmpipe (LLVM 15.0.6, 256 bits)",
+            gl_version="4.5 Mesa [22.3.6]",
+            frames_per_second=12.345,
+            devices=(EglDevice(0, "/dev/dri/renderD128", 3, True, True),),
         ),
-        problems=(Diagnosis("Something is odd.", "Do:\n  export X=1"),),
-        gpu_device_files=("/dev/nvidia0",),
-        ffmpeg=Ffmpeg(_PATH, "ffmpeg version 9 Copyright (c) 2000", encodes=True),
-        packages=(
-            Package("gymnasium", "1.4.0", works=True),
-            Package("dm_control", None, fix="To install it:\n  pip install x"),
-            Package("mujoco", "9", works=False, cause="It is too new.", fix="Wait."),
+        Probe(
+            "osmesa", False, cause="[bold]It[/bold] is missing.", fix=f"Do:\n  {_APT}"
         ),
-        extras=(
-            Package("SciPy", "1.14"),
-            Package("Ray", None, fix='python -m pip install "mjrec[ray]"'),
-        ),
-        cpus=Cpus(usable=2, present=64, allowed=4, quota=2.5),
-        python="3.11.7",
-        platform="Linux",
-    )
-    return dataclasses.replace(report, **changed)
+    ),
+    problems=(Diagnosis("Something is odd.", "Do:\n  export X=1"),),
+    gpu_device_files=("/dev/nvidia0",),
+    ffmpeg=Ffmpeg(_PATH, "ffmpeg version 9 Copyright (c) 2000", encodes=True),
+    packages=(
+        Package("dm_control", None, fix="To install it:\n  pip install x"),
+        Package("mujoco", "9", works=False, cause="It is too new.", fix="Wait."),
+    ),
+    extras=(
+        Package("SciPy", "1.14"),
+        Package("Ray", None, fix='python -m pip install "mjrec[ray]"'),
+    ),
+    cpus=Cpus(usable=2, present=64, allowed=4, quota=2.5),
+    python="3.11.7",
+    platform="Linux",
+)
 
 
 def shown(report):
@@ -153,12 +137,13 @@ def shown(report):
 
 def test_what_people_see():
     """Every fact once, brackets no markup, commands never broken."""
-    text = shown(report_of())
+    text = shown(REPORT)
     lines = [line.rstrip() for line in text.splitlines()]
     assert f"    {_APT}" in lines
     assert [line for line in lines if len(line) > 80 and _PATH not in line] == []
     reason = "Nothing renders.\negl: why"
-    assert "egl: why" not in shown(report_of(backend=None, reason=reason))
+    none = dataclasses.replace(REPORT, backend=None, reason=reason)
+    assert "egl: why" not in shown(none)
     for said in (
         "12.3 frames per second",
         "llvmpipe (LLVM 15.0.6, 256 bits), on the CPU",
@@ -186,7 +171,7 @@ def test_what_people_see():
     ],
 )
 def test_ffmpeg_that_cannot_encode(refused, said, tmp_path, monkeypatch):
-    """It is found out, in its own words."""
+    """It is found out, in its own words; what is no ffmpeg is named."""
     good = examine_ffmpeg()
     assert good.encodes
     fake = tmp_path / "ffmpeg"
@@ -198,10 +183,6 @@ def test_ffmpeg_that_cannot_encode(refused, said, tmp_path, monkeypatch):
     monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", str(fake))
     found = examine_ffmpeg()
     assert (found.version, found.encodes, found.cause) == (good.version, False, said)
-
-
-def test_what_is_no_ffmpeg(monkeypatch):
-    """It is named, with a way out."""
     monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", "/bin/false")
     found = examine_ffmpeg()
     assert (found.path, found.encodes) == ("/bin/false", False)

@@ -21,17 +21,9 @@ TASKS = ("InvertedPendulum-v5", "InvertedDoublePendulum-v5")
 def evaluation(tmp_path_factory):
     """Two tasks with two seeds each, one of which is drawn."""
     directory = tmp_path_factory.mktemp("evaluations") / "e"
-    small = {"max_steps": 3, "height": 32, "width": 32}
-    mjrec.evaluate(
-        TASKS,
-        policy="random",
-        directory=directory,
-        num_seeds=2,
-        episodes=1,
-        keep="best",
-        workers=1,
-        **small,
-    )
+    few = {"policy": "random", "num_seeds": 2, "episodes": 1, "keep": "best"}
+    small = {"max_steps": 3, "height": 32, "width": 32, "workers": 1}
+    mjrec.evaluate(TASKS, directory=directory, **few, **small)
     return directory
 
 

@@ -52,11 +52,17 @@ def load(name, environment=BOX, **kwargs):
     return load_policy(f"mjrec_test_policy:{name}", environment, kwargs)
 
 
+BOUNDS = np.array([[-1, 0.3, -7], [1, 0.30001, 1e6]], np.float32)
+
+
 @pytest.mark.parametrize(
-    "space", [spaces.Box(-np.inf, np.inf, (2,), np.float64), MIXED]
+    "space", [spaces.Box(-np.inf, np.inf, (2,), np.float64), MIXED, spaces.Box(*BOUNDS)]
 )
 def test_random_actions_are_the_episodes(space):
-    """They lie in the space, the same for a seed, and leave others' draws alone."""
+    """They lie in the space, the same for a seed, and leave others' draws alone.
+
+    Bounded boxes are drawn in another way than by `sample`, which gives the same.
+    """
 
     def drawn(policy, episode):
         policy.reset(episode_seeds(0, episode))
@@ -71,19 +77,8 @@ def test_random_actions_are_the_episodes(space):
     assert repr(drawn(policy, 4)) != repr(first)
     assert repr(drawn(load_policy("random", acting_in(space)), 3)) == repr(first)
     assert repr(space.sample()) == own
-
-
-def test_random_actions_are_those_that_gymnasium_draws():
-    """A policy draws bounded boxes in its own way, and gives what `sample` gives."""
-    bounds = np.array([[-1, 0.3, -7], [1, 0.30001, 1e6]], np.float32)
-    space = spaces.Box(*bounds)
-    policy = load_policy("random", acting_in(space))
-    policy.reset(SEEDS)
-    space.seed(SEEDS.actions)
-    for _ in range(100):
-        action, expected = policy(None), space.sample()
-        assert action.dtype == expected.dtype
-        assert np.array_equal(action, expected)
+    space.seed(episode_seeds(0, 3).actions)
+    assert repr([space.sample() for _ in range(20)]) == repr(first)
 
 
 @pytest.mark.parametrize(
@@ -91,7 +86,6 @@ def test_random_actions_are_those_that_gymnasium_draws():
     [
         (spaces.Box(np.array([0.5, -3]), np.array([2, -1.0]), dtype=float), [0.5, -1]),
         (spaces.Discrete(3, start=4), 4),
-        (spaces.Discrete(3, start=-1), 0),
         (spaces.MultiDiscrete([2, 2], start=[1, -1]), [1, 0]),
         (spaces.MultiBinary(2), [0, 0]),
     ],
@@ -111,22 +105,16 @@ def test_zero_is_the_action_nearest_to_zero(space, zero):
 def test_dm_envs_actions_are_drawn_within_their_bounds():
     """Nested ones too; a number without bounds is drawn around zero."""
     specs = pytest.importorskip("dm_env").specs
-    endless = 1e10
     spec = {
         "bounded": specs.BoundedArray((2,), np.float32, [-1, 2.1], [0, 3]),
-        "endless": specs.BoundedArray((2,), float, -endless, endless),
+        "endless": specs.BoundedArray((2,), float, -1e10, 1e10),
         "half": specs.BoundedArray((), float, 5, np.inf),
         "parts": [specs.DiscreteArray(4), specs.Array((3,), np.float64)],
     }
     environment = SimpleNamespace(action_spec=lambda: spec)
     policy = load_policy("random", environment)
-
-    def drawn():
-        policy.reset(SEEDS)
-        return [policy(None) for _ in range(300)]
-
-    actions = drawn()
-    assert repr(drawn()) == repr(actions)
+    policy.reset(SEEDS)
+    actions = [policy(None) for _ in range(300)]
     for action in actions:
         spec["bounded"].validate(action["bounded"])
         assert action["parts"][0] in range(4)
@@ -135,59 +123,50 @@ def test_dm_envs_actions_are_drawn_within_their_bounds():
     assert bounded.mean(axis=0) == pytest.approx([-0.5, 2.55], abs=0.1)
     free = np.array([action["endless"] for action in actions])
     assert [free.mean(), free.std()] == pytest.approx([0, 1], abs=0.2)
+    policy.reset(SEEDS)
+    assert repr([policy(None) for _ in range(300)]) == repr(actions)
     zero = load_policy("zero", environment)(None)
     assert zero["bounded"].tolist() == [0, np.float32(2.1)]
     assert (zero["half"], zero["parts"][0]) == (5, 0)
-    assert zero["endless"].tolist() == [0, 0]
     strings = SimpleNamespace(action_spec=lambda: specs.StringArray(()))
     with pytest.raises(mjrec.PolicyError, match="numeric actions"):
         load_policy("random", strings)
 
 
 @pytest.mark.parametrize(
-    ("space", "action"),
+    ("space", "action", "taken"),
     [
-        (BOX.action_space, np.array([3.0, 0])),
-        (BOX.action_space, [0, 1]),
-        (spaces.Discrete(3), np.array(2)),
-        (spaces.Discrete(3), np.array([1])),
-        (spaces.MultiBinary(2), np.array([0, 1], np.int8)),
-        (spaces.Dict(a=spaces.Discrete(3), b=BOX.action_space), {"a": 2, "b": [0, 9]}),
+        (BOX.action_space, np.array([3.0, 0]), [3, 0]),
+        (BOX.action_space, [0, 1], [0, 1]),
+        (spaces.Discrete(3), np.array([1]), 1),
+        (spaces.Dict(a=BOX.action_space), {"a": [0, 9]}, {"a": [0, 9]}),
     ],
 )
-def test_actions_of_other_types_are_taken(space, action):
+def test_actions_of_other_types_are_taken(space, action, taken):
     """Policies give float64, lists, and arrays of one number."""
-    taken = checked(space, action)
-    if isinstance(action, dict):
-        assert taken == action
-    else:
-        assert np.array_equal(np.ravel(taken), np.ravel(action))
-    if isinstance(space, spaces.Discrete):
-        assert type(taken) is int
+    found = checked(space, action)
+    assert taken == (found.tolist() if isinstance(found, np.ndarray) else found)
+    assert type(taken) is not int or type(found) is int
 
 
 @pytest.mark.parametrize(
     ("space", "action"),
     [
-        (spaces.Box(-1, 1, (2,)), None),
-        (spaces.Box(-1, 1, (2,)), np.zeros((1, 2))),
-        (spaces.Box(-1, 1, (2,)), np.array([0, np.nan])),
-        (spaces.Box(-1, 1, (2,)), ["a", "b"]),
-        (spaces.Box(-1, 1, (2,)), [[1], [1, 2]]),
+        (BOX.action_space, None),
+        (BOX.action_space, np.zeros((1, 2))),
+        (BOX.action_space, np.array([0, np.nan])),
+        (BOX.action_space, ["a", "b"]),
+        (BOX.action_space, [[1], [1, 2]]),
         (spaces.Discrete(3), 3),
         (spaces.Discrete(3), 1.0),
         (spaces.Discrete(3), np.array([1, 2])),
-        (spaces.MultiDiscrete([2, 2]), None),
         (MIXED, {"arm": 1}),
-        (MIXED, None),
         (spaces.Tuple([spaces.Discrete(2)]), (1, 1)),
     ],
 )
-def test_what_is_no_action_is_refused(write, space, action):
+def test_what_is_no_action_is_refused(space, action):
     """The message says what the space is and what came."""
-    write("action = None\ndef policy(observation):\n    return action\n")
-    policy = load("policy", acting_in(space))
-    sys.modules["mjrec_test_policy"].action = action
+    policy = policy_from(lambda _: action, "mine", acting_in(space))
     with pytest.raises(mjrec.PolicyError, match="must return an action in ") as caught:
         policy(None)
     assert str(space) in str(caught.value)
@@ -199,7 +178,7 @@ def test_functions_classes_and_calls_are_policies(write):
     write(
         "import mjrec_test_neighbour\n"
         "def double(observation): return observation * 2\n"
-        "def make(environment, scale=1):\n"
+        "def make(environment, scale):\n"
         "    return lambda _: [environment.action_space.shape[0] * scale] * 2\n"
         "class Policy:\n"
         "    def __init__(self, environment, last=2): self.last = last\n"
@@ -211,13 +190,11 @@ def test_functions_classes_and_calls_are_policies(write):
     write("value = [0.5, 0.5]\n", name="mjrec_test_neighbour")
     path = list(sys.path)
     assert load("double")(np.array([0.1, 0.2])).tolist() == [0.2, 0.4]
-    assert load("make()")(None) == [2, 2]
     assert load("make()", scale=3)(None) == [6, 6]
     assert load("Policy.still")(None) == [0.5, 0.5]
-    for kwargs, last in (({}, 2), ({"last": 7}, 7)):
-        policy = load("Policy", **kwargs)
-        policy.reset(SEEDS)
-        assert policy(None) == [3, last]
+    policy = load("Policy", last=7)
+    policy.reset(SEEDS)
+    assert policy(None) == [3, 7]
     # The working directory was importable, and is no more.
     assert sys.path == path
     with pytest.raises(mjrec.PolicyError, match="unexpected keyword argument 'scale'"):
@@ -227,41 +204,37 @@ def test_functions_classes_and_calls_are_policies(write):
             load_policy(name, BOX, {"scale": 3})
 
 
-def test_predict_is_understood(write):
+def test_predict_is_understood():
     """Stable-Baselines3's: deterministic, with state and start of the episode."""
-    write(
-        "import numpy as np\n"
-        "class Model:\n"
-        "    def __init__(self, environment=None): self.calls = []\n"
-        "    def predict(self, observation, state=None, episode_start=None,\n"
-        "                deterministic=False):\n"
-        "        self.calls.append((observation, state, episode_start.tolist(),\n"
-        "                           deterministic))\n"
-        "        return np.zeros(2), (0 if state is None else state) + 1\n"
-        "    def __call__(self, observation): raise AssertionError('not this one')\n"
-        "model = Model()\n"
-        "class Short:\n"
-        "    def __init__(self, environment): pass\n"
-        "    def predict(self, state): return [state, 0]\n"
-    )
-    policy = load("model")
-    calls = sys.modules["mjrec_test_policy"].model.calls
+
+    class Model:
+        calls = []  # noqa: RUF012  one object
+
+        def predict(self, observation, state=None, episode_start=None, deterministic=0):
+            self.calls.append((observation, state, *episode_start, deterministic))
+            return np.zeros(2), (0 if state is None else state) + 1
+
+        def __call__(self, observation):
+            raise AssertionError("not this one")
+
+    class Short:
+        def predict(self, state):
+            return [state, 0]
+
+    policy = policy_from(Model(), "model", BOX)
     for _ in range(2):
         policy.reset(SEEDS)
         policy("a")
         policy("b")
-    once = [("a", None, [True], True), ("b", 1, [False], True)]
-    assert calls == once * 2
+    assert Model.calls == [("a", None, True, True), ("b", 1, False, True)] * 2
     # One of fewer arguments that gives just the action.
-    assert load("Short")(1) == [1, 0]
+    assert policy_from(Short(), "short", BOX)(1) == [1, 0]
 
 
 REFUSED = [
     # Built-in names, modules nearby, names in the module, files nearby.
     ("", "rnd", mjrec.UnknownName, "'rnd'.*random, zero.*module:name"),
     ("", ":act", mjrec.UnknownName, "module:name"),
-    ("", "mjrec_test_policy:", mjrec.UnknownName, "module:name"),
-    ("", "mjrec_test_policy:()", mjrec.UnknownName, "module:name"),
     ("", "mjrec_test_plicy:act", mjrec.UnknownName, "'mjrec_test_plicy'.*test_policy"),
     ("", "bst.zip", mjrec.UnknownName, r"'bst.zip'.*best.zip"),
     (
@@ -273,10 +246,8 @@ REFUSED = [
         *("def f(o): pass\n1 / 0\n", "f", mjrec.PolicyError),
         r"ZeroDivisionError.*mjrec_test_policy.py, line 2",
     ),
-    ("import no_such_module\n", "f", mjrec.PolicyError, "no_such_module"),
     ("def f(o:\n", "f", mjrec.PolicyError, r"SyntaxError.*line 1\)\.$"),
     ("number = 3\n", "number", mjrec.PolicyError, "3, which is neither"),
-    ("number = 3\n", "number()", mjrec.PolicyError, "Remove the parentheses"),
     ("def f(env): return 3\n", "f()", mjrec.PolicyError, "3, which is neither"),
 ]
 
@@ -315,17 +286,16 @@ def test_what_a_policy_raises_is_named(write):
 
 
 def test_an_object_is_a_policy_as_what_a_name_names():
-    """Functions, objects with `predict` and classes need no module to be found in."""
+    """Functions and classes need no module to be found in."""
 
     class Still:
         def __init__(self, environment, value=0):
             self.action = np.full(environment.action_space.shape, value)
 
-        def predict(self, observation):
-            return self.action, None
+        def __call__(self, observation):
+            return self.action
 
     assert policy_from(lambda _: [0.5, 0], "half", BOX)(None) == [0.5, 0]
     assert policy_from(Still, "Still", BOX, {"value": 1})(None).tolist() == [1, 1]
-    assert policy_from(Still(BOX), "Still", BOX)(None).tolist() == [0, 0]
     with pytest.raises(mjrec.PolicyError, match="mine is 3"):
         policy_from(3, "mine", BOX)

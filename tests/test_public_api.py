@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 import ast
+import importlib.metadata
 from pathlib import Path
 
 import pytest
@@ -60,16 +61,13 @@ HEAVY = (
 )
 
 
-def modules():
-    """Yield each module's dotted name below the package, and its file."""
-    for path in sorted(PACKAGE.rglob("*.py")):
-        parts = path.relative_to(PACKAGE).with_suffix("").parts
-        name = ".".join(part for part in parts if part != "__init__")
-        if name not in ("", "__main__"):
-            yield name, path
-
-
-MODULES = list(modules())
+# Each module's dotted name below the package, and its file.
+MODULES = {
+    ".".join(part for part in parts if part != "__init__"): path
+    for path in sorted(PACKAGE.rglob("*.py"))
+    if (parts := path.relative_to(PACKAGE).with_suffix("").parts)
+    not in (("__init__",), ("__main__",))
+}
 
 
 def imports(name, path):
@@ -104,14 +102,18 @@ def row(name):
     return next(i for i, names in enumerate(ROWS) if name.split(".")[0] in names)
 
 
+# What each module imports, ours without `mjrec.`.
+IMPORTED = {name: {*imports(name, path)} for name, path in MODULES.items()}
+OURS = {
+    name: {each.removeprefix("mjrec.") for each in all_ if each.startswith("mjrec.")}
+    for name, all_ in IMPORTED.items()
+}
+
+
 def test_modules_import_only_from_rows_below():
     """The layers of the design hold; every module has a row."""
     assert [
-        (name, imported)
-        for name, path in MODULES
-        for imported in imports(name, path)
-        if imported.startswith("mjrec.")
-        and row(imported.removeprefix("mjrec.")) > row(name)
+        (name, each) for name in OURS for each in OURS[name] if row(each) > row(name)
     ] == []
 
 
@@ -119,45 +121,22 @@ def test_frameworks_stay_in_their_rows():
     """Only the row that is for a framework imports it."""
     assert [
         (name, imported)
-        for name, path in MODULES
-        for imported in imports(name, path)
+        for name in IMPORTED
+        for imported in IMPORTED[name]
         if (allowed := CONFINED.get(imported.split(".")[0])) is not None
         and allowed.isdisjoint({name, name.split(".")[0]})
     ] == []
 
 
-def test_no_import_cycles():
-    """No module imports itself by way of others."""
-    known = dict(modules())
-    graph = {
-        name: {
-            imported.removeprefix("mjrec.")
-            for imported in imports(name, path)
-            if imported.removeprefix("mjrec.") in known
-            # A package's own modules are loaded by it.
-            and not imported.removeprefix("mjrec.").startswith(f"{name}.")
-        }
-        - {name}
-        for name, path in known.items()
-    }
-
-    def visit(name, trail):
-        assert name not in trail, " -> ".join([*trail, name])
-        if name not in done:
-            for imported in graph[name]:
-                visit(imported, (*trail, name))
-            done.add(name)
-
-    done = set()
-    for name in graph:
-        visit(name, ())
-
-
 def test_all_names_exist_and_are_sorted():
-    """`__all__` is the public surface, and each name can be had."""
+    """`__all__` is the public surface, and each name can be had; so can the version."""
     assert mjrec.__all__ == sorted(mjrec.__all__)
     for name in mjrec.__all__:
         assert getattr(mjrec, name) is not None
+    assert mjrec.__version__ == importlib.metadata.version("mjrec")
+    assert "__version__" in dir(mjrec)
+    with pytest.raises(AttributeError, match="no_such_name"):
+        _ = mjrec.no_such_name
 
 
 def test_every_error_is_public_and_an_error():
@@ -170,37 +149,33 @@ def test_every_error_is_public_and_an_error():
         assert name in drawn
 
 
-def _run(code):
-    return run_python(code).stdout
-
-
 def test_import_is_inert():
     """No simulator, no OpenGL, no ffmpeg, and the environment stays as it is.
 
     Nor does a monitor load HDF5: trajectories are logs while an environment runs.
     """
-    assert _run(
+    assert run_python(
         "import os, sys; before = dict(os.environ); import mjrec; "
         f"print([m for m in {HEAVY} if m in sys.modules], before == os.environ); "
         "import mjrec.monitors.gymnasium_monitor; print('h5py' in sys.modules)"
-    ).split() == ["[]", "True", "False"]
+    ).stdout.split() == ["[]", "True", "False"]
 
 
 def test_read_half_needs_no_simulator():
     """Results are read on a machine without mujoco, OpenGL or ffmpeg."""
-    assert _run(
+    assert run_python(
         "import sys; "
         f"sys.modules.update(dict.fromkeys({HEAVY})); "
         "import mjrec; mjrec.load_results, mjrec.iter_episodes, mjrec.write_archive; "
         "mjrec.StatsRecorder, mjrec.capped_cubic_video_schedule; print('read')"
-    ).split() == ["read"]
+    ).stdout.split() == ["read"]
 
 
 def test_no_module_hides_a_public_name():
     """After every submodule was imported, every public name is still what it was."""
     # In a process of its own: here, anything may have been imported before. Modules
     # first, because a name that was used once stays.
-    assert _run(
+    assert run_python(
         "import contextlib, importlib, importlib.util, pkgutil, types, mjrec\n"
         "lacks = not importlib.util.find_spec('dm_control')\n"
         "missing = (ModuleNotFoundError, mjrec.MissingDependency) * lacks\n"
@@ -213,14 +188,4 @@ def test_no_module_hides_a_public_name():
         "print([n for n, v in names.items() if isinstance(v, types.ModuleType)])\n"
         "print([n for n, where in mjrec._LAZY.items() if n in names and names[n] "
         "is not getattr(importlib.import_module('mjrec.' + where), n)])"
-    ).split() == ["[]", "[]"]
-
-
-def test_version_is_the_packages():
-    """The one in pyproject.toml."""
-    from importlib.metadata import version
-
-    assert mjrec.__version__ == version("mjrec")
-    assert "__version__" in dir(mjrec)
-    with pytest.raises(AttributeError, match="no_such_name"):
-        _ = mjrec.no_such_name
+    ).stdout.split() == ["[]", "[]"]

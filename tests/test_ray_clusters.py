@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Work on Ray clusters of several nodes."""
 
-import logging
 from pathlib import Path
 
 import pytest
@@ -32,16 +31,13 @@ def home(tmp_path_factory):
 @pytest.fixture(scope="module")
 def cluster(home):
     """A cluster of which one node has two GPUs, as Ray believes."""
+    small = {"object_store_memory": SMALL_STORE}
     # Nothing runs on its head.
-    head = {
-        "num_cpus": 0,
-        "include_dashboard": False,
-        "object_store_memory": SMALL_STORE,
-    }
+    head = {"num_cpus": 0, "include_dashboard": False, **small}
     cluster = Cluster(initialize_head=True, head_node_args=head)
     try:
-        for node in ({"num_cpus": 1, "num_gpus": 2}, {"num_cpus": 2}):
-            cluster.add_node(object_store_memory=SMALL_STORE, **node)
+        cluster.add_node(num_cpus=1, num_gpus=2, **small)
+        cluster.add_node(num_cpus=2, **small)
         yield cluster
     finally:
         cluster.shutdown()
@@ -62,7 +58,7 @@ def test_a_cluster_that_there_is(how, cluster, work, monkeypatch):
     engine = RayEngine(address=address if how == "argument" else None)
     with Run(engine, work) as run:
         submit(run, *"abc", do="where")
-        assert len({value["pid"] for value in values(run)}) >= 1
+        assert len(values(run)) == 3
     engine.shutdown()
     assert not ray.is_initialized()
 
@@ -106,23 +102,3 @@ def test_a_node_that_dies_takes_no_job_with_it(cluster, work, tmp_path, caplog):
     assert {outcome.failure for outcome in found.values()} == {None}
     assert sum(len(lines(tmp_path / key)) for key in "abcd") == 5
     assert caplog.text.count("will be retried") == 1
-
-
-def test_workers_without_mjrec(cluster, work, tmp_path):
-    """The error says what to install, and where."""
-    (tmp_path / "mjrec").mkdir()
-    (tmp_path / "mjrec" / "__init__.py").write_text(
-        "raise ModuleNotFoundError(\"No module named 'mjrec'\", name='mjrec')"
-    )
-    ray.init(
-        address=str(cluster.address),
-        logging_level=logging.ERROR,
-        runtime_env={"env_vars": {"PYTHONPATH": str(tmp_path)}},
-    )
-    try:
-        with Run(RayEngine(1), work) as run:
-            submit(run, "a", do="echo")
-            with pytest.raises(mjrec.Error, match="No module named 'mjrec'"):
-                outcomes(run)
-    finally:
-        ray.shutdown()

@@ -10,13 +10,12 @@ import socket
 import subprocess
 import sys
 import time
-from pathlib import Path
 
 import pytest
-from engine_runs import lines, wait_for
+from engine_runs import driver, lines, odd_work, submit, wait_for
 from waiting import wait_until
 
-from mjrec.engines.jobs import WORK_FOLDER, Run, Work
+from mjrec.engines.jobs import WORK_FOLDER, Run
 from mjrec.engines.slurm import SlurmEngine
 from mjrec.errors import Error
 
@@ -149,15 +148,11 @@ def asked(*command):
 
 
 def work(place):
-    return Work(
-        entry="odd_jobs:make",
-        settings={"left": str(place / "left")},
-        shared_directory=place / "shared",
-    )
+    return odd_work(shared=place / "shared", left=str(place / "left"))
 
 
 def hold(run, place):
-    run.submit("held", do="hold", begun=str(place / "begun"))
+    submit(run, "held", do="hold", begun=str(place / "begun"))
 
 
 def slurm_job():
@@ -226,28 +221,10 @@ def test_what_slurm_refuses(tmp_path):
             next(run.results())
 
 
-DRIVER = """
-import sys
-from pathlib import Path
-import test_slurm_cluster
-from mjrec.engines.jobs import Run
-from mjrec.engines.slurm import SlurmEngine
-place = Path(sys.argv[1])
-run = Run(SlurmEngine(2), test_slurm_cluster.work(place))
-test_slurm_cluster.hold(run, place)
-next(run.results())
-"""
-
-
 def test_the_next_driver_ends_what_a_killed_one_has_left(tmp_path):
     """Those that wait in the queue too."""
-    driver = subprocess.Popen(
-        [sys.executable, "-c", DRIVER, str(tmp_path)],
-        env={**os.environ, "PYTHONPATH": str(Path(__file__).parent)},
-    )
-    with driver:
-        until(lambda: lines(tmp_path / "begun"))
-        driver.kill()
+    with driver(tmp_path, "SlurmEngine(2)") as process:
+        process.kill()
     [pid] = lines(tmp_path / "begun")
     with Run(SlurmEngine(1), work(tmp_path)) as run:
         run.submit("a", do="echo")

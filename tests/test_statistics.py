@@ -54,20 +54,6 @@ def ends(interval):
     return [interval.low, interval.high]
 
 
-@pytest.mark.parametrize(
-    ("values", "expected"),
-    [
-        ([1, 2, 9], 4),  # one is more than a quarter: none is cut off
-        ([100, 2, 4, -50], 3),
-        ([1, 2, 3, 4, 100], 3),
-        ([0, 0, 0, 0, 1, 1, 1, 1], 0.5),
-    ],
-)
-def test_interquartile_mean_by_hand(values, expected):
-    """A quarter, rounded down, is cut off at each end."""
-    assert interquartile_mean([array(*values)]).value == expected
-
-
 def test_figures_across_tasks_are_rliables():
     """To the last digit but rounding."""
     assert interquartile_mean(X).value == pytest.approx(0.37966666666666665)
@@ -94,15 +80,14 @@ def test_intervals_across_tasks_are_rliables():
 
 
 def test_tasks_count_alike_however_many_episodes_they_have():
-    """Gap and profile are means over tasks; the interquartile mean is of episodes."""
+    """Gap and profile are means over tasks; the interquartile mean is of episodes.
+
+    A score at a threshold is not above it, and more than 1 makes up for nothing.
+    """
     scores = [array(1.0, 1.0), np.zeros(98)]
     assert optimality_gap(scores).value == 0.5
     assert performance_profile(scores, array(0.5)).values == [0.5]
     assert interquartile_mean(scores).value == 0
-
-
-def test_scores_at_a_threshold_and_above_one():
-    """Equal is not above; more than 1 makes up for nothing."""
     profile = performance_profile([array(0.0, 0.5, 1.0, 1.0)], array(0, 0.5, 1))
     assert profile.values.tolist() == [0.75, 0.5, 0]
     assert optimality_gap([array(0, 1, 3)]).value == pytest.approx(1 / 3)
@@ -132,8 +117,8 @@ FIGURES = {
     "mean": lambda x, _: mean(x),
     "difference": lambda x, y: mean(x) - mean(y),
     "iqm": lambda x, y: interquartile_mean([x, y]),
-    "gap": lambda x, y: optimality_gap([x / 600, y / 600]),
     "improvement": improvement,
+    "gap": lambda x, y: optimality_gap([x / 600, y / 600]),
 }
 
 
@@ -155,8 +140,8 @@ def test_large_sample_band_of_a_profile(monkeypatch):
     profile = performance_profile([normal(200) / 1000, normal(300) / 1000], array(0.5))
     resampled = np.array(profile.ends(USUAL))
     monkeypatch.setattr(statistics, "MOST_RESAMPLED", 0)
-    found = np.array(profile.ends(USUAL))
-    assert found == pytest.approx(resampled, abs=0.1 * float(np.ptp(resampled)))
+    width = float(np.ptp(resampled))
+    assert np.array(profile.ends(USUAL)) == pytest.approx(resampled, abs=0.1 * width)
 
 
 def test_same_seed_same_interval():
@@ -174,48 +159,7 @@ def test_a_single_value_has_no_interval():
         assert (figure.interval(QUICK), figure.interval_method) == (None, None)
 
 
-def covered(figure, true, *, times):
-    """Return how often an interval of 95 % holds the true value."""
-    inside = 0
-    for k in range(times):
-        low, high = ends(figure(k).interval(Bootstrap(resamples=1000, seed=k)))
-        inside += low <= true <= high
-    return inside / times
-
-
-SIMULATED = {
-    "mean": (lambda k: mean(normal(30, seed=k)), 500),
-    "iqm": (lambda k: interquartile_mean([normal(50, seed=k)]), 500),
-    "difference": (
-        lambda k: mean(normal(30, seed=k)) - mean(normal(40, 450, seed=9000 + k)),
-        50,
-    ),
-    "improvement": (
-        lambda k: improvement(normal(30, seed=k), normal(30, seed=9000 + k)),
-        0.5,
-    ),
-    # Ten trainings of each of five tasks, as rliable has it.
-    "runs": (
-        lambda k: interquartile_mean(normal(10, seed=100 * k + t) for t in range(5)),
-        500,
-    ),
-}
-
-
-@pytest.mark.thorough
-@pytest.mark.parametrize("name", SIMULATED)
-@pytest.mark.parametrize("is_large", [False, True])
-def test_coverage(name, is_large, monkeypatch):
-    """Of 2000 samples, by both methods."""
-    # Takes more than five seconds: resamples each of them a thousand times.
-    if is_large:
-        monkeypatch.setattr(statistics, "MOST_RESAMPLED", 0)
-    assert 0.92 <= covered(*SIMULATED[name], times=2000) <= 0.965
-
-
-@pytest.mark.parametrize(
-    "wrong", [{"resamples": 0}, {"resamples": 10**7}, {"confidence": 1.0}, {"seed": -1}]
-)
+@pytest.mark.parametrize("wrong", [{"resamples": 10**7}, {"confidence": 1.0}])
 def test_impossible_bootstraps_are_refused(wrong):
     """Before anything is read or run."""
     with pytest.raises(InvalidArgument, match="but it is"):

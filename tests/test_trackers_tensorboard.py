@@ -29,12 +29,6 @@ def read(directory):
     return events
 
 
-def frame(gif, index):
-    with Image.open(io.BytesIO(gif)) as image:
-        image.seek(index)
-        return image.convert("RGB")
-
-
 def test_scalars_stand_over_the_steps_of_the_run(finished):
     """Success only where it is known, evaluation apart, NaN as it is."""
     tracker, run = TensorBoardTracker(), finished.run
@@ -73,12 +67,12 @@ def test_video_is_played_as_a_gif_of_the_file(finished):
         assert opened.n_frames == 11
         assert opened.info["duration"] == 100
         assert opened.info["loop"] == 0
-    # The bar grows by four pixels a step.
-    for step in (0, 5, 10):
-        shown = frame(gif, step)
-        inside, outside = (4 * step + 1, 16), (min(4 * step + 7, 47), 16)
-        assert shown.getpixel(inside)[0] > 150
-        assert shown.getpixel(outside)[0] < 60
+        # The bar grows by four pixels a step.
+        for step in (0, 5, 10):
+            opened.seek(step)
+            shown = opened.convert("RGB")
+            assert shown.getpixel((4 * step + 1, 16))[0] > 150
+            assert shown.getpixel((min(4 * step + 7, 47), 16))[0] < 60
     # A long one lasts as long, with fewer frames.
     long = animated_gif(finished.video.path, frame_count=11, fps=Fraction(1, 25))
     with Image.open(io.BytesIO(long)) as opened:
@@ -90,13 +84,13 @@ def test_video_is_played_as_a_gif_of_the_file(finished):
 
 def test_runs_are_told_apart(finished, tmp_path):
     """Sub-environments, and two directories with one infix, in one `log_dir`."""
-    first = finished.run
-    runs = [
-        dataclasses.replace(first, env_index=0),
-        dataclasses.replace(first, env_index=1, infix="1.4711"),
-        dataclasses.replace(first, directory=tmp_path / "evaluation"),
-        dataclasses.replace(first, directory=tmp_path / "b" / "evaluation"),
+    changes = [
+        {"env_index": 0},
+        {"env_index": 1, "infix": "1.4711"},
+        {"directory": tmp_path / "evaluation"},
+        {"directory": tmp_path / "b" / "evaluation"},
     ]
+    runs = [dataclasses.replace(finished.run, **each) for each in changes]
     tracker = TensorBoardTracker(tmp_path / "logs")
     for run in runs:
         tracker.begin(run)
