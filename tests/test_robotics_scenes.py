@@ -22,7 +22,7 @@ def _robots():
         yield
 
 
-def make(env_id, **kwargs):
+def begun(env_id, **kwargs):
     env = gymnasium.make(env_id, **kwargs)
     env.reset(seed=0)
     for _ in range(3):
@@ -59,51 +59,46 @@ def test_what_is_shown(env_id, inside):
     scenes = gymnasium_scenes(env)
     assert scenes.obstacle is None
     env.reset(seed=1)
-    assert bool(scenes.random_state())
-
-
-def test_overriding_inside_a_maze_is_an_obstacle():
-    """What the maze shows is not what it simulates."""
-    env = gymnasium.make("PointMaze_UMaze-v3")
-    env.unwrapped.point_env.render = lambda: None
-    assert "PointEnv overrides render()" in str(gymnasium_scenes(env).obstacle)
+    assert scenes.random_state()
+    if inside:
+        # What the maze shows is not what it simulates.
+        drawn_part(base).render = lambda: None
+        assert "overrides render()" in gymnasium_scenes(env).obstacle
 
 
 @pytest.mark.parametrize("mode", [None, "rgb_array"])
 def test_goal_is_shown_and_nothing_is_changed(mode):
-    """In the moment the marker is at the goal; afterwards all is bit for bit as was."""
-    env = make("FetchPickAndPlace-v4", render_mode=mode)
+    """In the moment the marker is at the goal; afterwards all is bit for bit as was.
+
+    So it is after an error in the moment.
+    """
+    env = begun("FetchPickAndPlace-v4", render_mode=mode)
     base = env.unwrapped
     moment = frame_moment(base)
     site = mujoco.mj_name2id(base.model, int(mujoco.mjtObj.mjOBJ_SITE), "target0")
     before, seen = everything(env), []
-    moment(lambda: seen.append(base.data.site_xpos[site].copy()))
-    np.testing.assert_allclose(seen[0], base.goal, atol=1e-6)
-    assert not np.allclose(base.data.site_xpos[site], base.goal)
-    for now, then in zip(everything(env), before, strict=True):
-        np.testing.assert_array_equal(now, then)
-    assert "render" not in vars(base.mujoco_renderer)
-    assert base.mujoco_renderer.viewer is None
 
+    def capture():
+        seen.append(base.data.site_xpos[site].copy())
+        if len(seen) == 2:
+            raise OSError("full")
 
-def test_an_error_in_the_moment_leaves_all_as_it_was():
-    """A full disk, for example."""
-    env = make("HandReach-v3")
-    moment = frame_moment(env.unwrapped)
-    before = everything(env)
-
-    def fail():
-        raise OSError("full")
-
-    with pytest.raises(OSError, match="full"):
-        moment(fail)
-    for now, then in zip(everything(env), before, strict=True):
-        np.testing.assert_array_equal(now, then)
-    assert "render" not in vars(env.unwrapped.mujoco_renderer)
+    for is_full in (False, True):
+        if is_full:
+            with pytest.raises(OSError, match="full"):
+                moment(capture)
+        else:
+            moment(capture)
+        np.testing.assert_allclose(seen[-1], base.goal, atol=1e-6)
+        assert not np.allclose(base.data.site_xpos[site], base.goal)
+        for now, then in zip(everything(env), before, strict=True):
+            np.testing.assert_array_equal(now, then)
+        assert "render" not in vars(base.mujoco_renderer)
+        assert base.mujoco_renderer.viewer is None
 
 
 def test_a_render_that_is_not_known_is_not_called():
-    """What it does, nobody knows."""
+    """Nor one that changes nothing: nothing has to be put back."""
     from gymnasium_robotics.envs.fetch.reach import MujocoFetchReachEnv
 
     class Robot(MujocoFetchReachEnv):
@@ -112,7 +107,6 @@ def test_a_render_that_is_not_known_is_not_called():
 
     env = Robot()
     assert frame_moment(env) is None
-    # Nor where drawing changes nothing: nothing has to be put back.
+    assert "Robot overrides render()" in gymnasium_scenes(env).obstacle
     maze = gymnasium.make("PointMaze_UMaze-v3")
     assert frame_moment(drawn_part(maze.unwrapped)) is None
-    assert "Robot overrides render()" in str(gymnasium_scenes(env).obstacle)
