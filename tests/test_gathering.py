@@ -6,7 +6,6 @@ import os
 import re
 import shlex
 import shutil
-import tracemalloc
 from pathlib import Path
 
 import gymnasium
@@ -318,19 +317,3 @@ def test_a_directory_without_recordings_is_an_error(tmp_path):
     ):
         with pytest.raises(InvalidArgument, match=words):
             gather(given)
-
-
-@pytest.mark.thorough
-def test_many_episodes_take_little_memory(tmp_path):
-    """A hundred bytes each: a million take a fifth of what is promised."""
-    count = 10_000
-    write_journal(tmp_path, "0.a", "X-v0", [entry(i) for i in range(count)])
-    gather(tmp_path)
-    tracemalloc.start()
-    try:
-        gather(tmp_path)
-        peak = tracemalloc.get_traced_memory()[1]
-    finally:
-        tracemalloc.stop()
-    # Besides, the bootstrap takes what it takes, for any number.
-    assert peak < 150 * count + (24 << 20)
