@@ -124,6 +124,7 @@ def test_usual_columns(video, frames, columns):
     ("kind", "options", "said"),
     [
         ("mp4", {"frames": 12}, "has only 11 frames, not 12"),
+        ("h5", {"frames": 12}, "has only 11 frames, not 12"),
         ("mp4", {"frames": 0}, "frames"),
         ("mp4", {"columns": -1}, "columns"),
         ("mp4", {"camera": "track"}, "trajectory"),

@@ -25,8 +25,6 @@ WIREFRAME = int(mujoco.mjtRndFlag.mjRND_WIREFRAME)
 def make(env_id="InvertedPendulum-v5", **kwargs):
     kwargs = {"render_mode": "rgb_array", "width": 64, "height": 48, **kwargs}
     env = gymnasium.make(env_id, **kwargs)
-    quality = env.get_wrapper_attr("model").vis.quality
-    quality.shadowsize, quality.offsamples = 64, 0
     env.reset(seed=1)
     return env
 
@@ -38,9 +36,7 @@ def scene_of(env, **asked):
 
 class Overlay(gymnasium.Wrapper):
     def render(self):
-        frame = super().render()
-        frame[:8] = 255
-        return frame
+        return super().render() // 2
 
 
 class OverlayBelow(Overlay):
@@ -50,11 +46,6 @@ class OverlayBelow(Overlay):
 class DrawsMore(HalfCheetahEnv):
     def render(self):
         return super().render() // 2
-
-
-class PassesOn(gymnasium.Wrapper):
-    def step(self, action):
-        return super().step(action * 0.5)
 
 
 class Renderer(MujocoRenderer):
@@ -69,8 +60,8 @@ def changed(env, part, **values):
 
 
 def test_wrappers_that_show_what_is_inside_are_no_obstacle():
-    """gymnasium.make's own, a user's, and most of Gymnasium's."""
-    env = wrappers.RecordEpisodeStatistics(PassesOn(make()))
+    """Those of gymnasium.make, and most of Gymnasium's others."""
+    env = wrappers.RecordEpisodeStatistics(wrappers.ClipAction(make()))
     env = wrappers.NormalizeReward(wrappers.Autoreset(env))
     assert gymnasium_scenes(env).obstacle is None
     assert gymnasium_scenes(make(render_mode=None)).obstacle is None
@@ -78,9 +69,12 @@ def test_wrappers_that_show_what_is_inside_are_no_obstacle():
 
 OBSTACLES = [
     # Wherever they are in the chain; the class that overrides is what is named.
-    (lambda: PassesOn(OverlayBelow(make())), f"wrapper {__name__}.Overlay overrides"),
+    (
+        lambda: gymnasium.Wrapper(OverlayBelow(make())),
+        f"wrapper {__name__}.Overlay overrides",
+    ),
     (lambda: wrappers.RenderCollection(make()), "rendering.RenderCollection overrides"),
-    (lambda: changed(PassesOn(make()), "", render=print), "PassesOn overrides"),
+    (lambda: changed(make(), "", render=print), "TimeLimit overrides"),
     # It shows another.
     (lambda: changed(make(), "", render=make().render), "TimeLimit overrides"),
     (

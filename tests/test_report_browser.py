@@ -4,7 +4,6 @@
 import contextlib
 import re
 import shutil
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -20,8 +19,8 @@ from mjrec.reporting.report_folder import write_report
 
 pytestmark = pytest.mark.browser
 
-_FPS = 25
-_FRAMES = 50
+FPS = 25
+FRAMES = 50
 
 
 @pytest.fixture(scope="module")
@@ -52,14 +51,12 @@ def page_of_width(browser, width, **options):
 
 @pytest.fixture(scope="module")
 def videos(tmp_path_factory):
-    """Make a folder of short videos: a bar that goes from left to right."""
+    """Make a folder of two short videos."""
     folder = tmp_path_factory.mktemp("report #1")
-    frames = np.zeros((_FRAMES, 48, 64, 3), np.uint8)
-    for i, frame in enumerate(frames):
-        frame[:, : i + 2] = (200, 120, 40)
+    frames = np.tile(np.arange(64, dtype=np.uint8)[:, None], (FRAMES, 48, 1, 3))
     for name in ("best", "worst"):
         mjrec.save_video(
-            frames, folder, name_prefix=name, fps=_FPS, episode_trigger=lambda _: True
+            frames, folder, name_prefix=name, fps=FPS, episode_trigger=lambda _: True
         )
     return folder
 
@@ -112,7 +109,7 @@ def test_videos_play(usual):
             "i => document.querySelectorAll('video')[i].currentTime > 0.1", arg=i
         )
         told = player.evaluate("v => [v.videoWidth, v.videoHeight, v.duration]")
-        assert told == [64, 48, pytest.approx(_FRAMES / _FPS, abs=1 / _FPS)]
+        assert told == [64, 48, pytest.approx(FRAMES / FPS, abs=1 / FPS)]
     playing = "[...document.querySelectorAll('video')].filter(v => !v.paused).length"
     assert usual.evaluate(playing) <= 1
 
@@ -143,12 +140,9 @@ def test_a_recordings_report_plays(page, tmp_path, make_corridor, play, single_f
 @pytest.mark.thorough
 def test_tables_sort_by_mouse_and_by_keyboard(page, tmp_path):
     """Either way, and say which; what is not known comes last whichever way."""
-    tasks = [
-        task("a", [3.0, 3.0]),
-        task("b", [1.0]),
-        task("c", [2.0], failures={0: "x"}),
-    ]
-    open_report(page, tmp_path, contents(*tasks))
+    unknown = task("c", [2.0], failures={0: "x"})
+    known = task("a", [3.0, 3.0]), task("b", [1.0])
+    open_report(page, tmp_path, contents(*known, unknown))
     mean = page.locator("#summary-table th", has_text="Mean")
     names = page.locator("#summary-table tbody th")
     mean.get_by_role("button").click()
@@ -159,11 +153,6 @@ def test_tables_sort_by_mouse_and_by_keyboard(page, tmp_path):
     assert names.all_inner_texts() == ["b", "a", "c"]
     expect(page.locator("#said")).to_have_text("Sorted by Mean, ascending")
     assert page.locator("[aria-sort]").count() == 1
-    rewards = page.locator("#episodes-table").get_by_role("button", name="Return")
-    for shown in (["3.000", "3.000", "1.000"], ["1.000", "3.000", "3.000"]):
-        rewards.click()
-        cells = page.locator("#episodes-table tbody td:nth-child(5)").all_inner_texts()
-        assert cells == [*shown, "\N{EN DASH}"]
 
 
 @pytest.mark.thorough
@@ -193,28 +182,28 @@ def test_a_command_is_copied_or_selected(usual):
     """Whatever the browser allows to a page from the disk."""
     card = usual.locator("#video-0")
     card.get_by_text("File, hash and command").click()
-    button = card.get_by_role("button", name="Copy the command")
-    button.click()
-    expect(button).to_have_text("Copied")
+    command, of_hash = (
+        card.get_by_role("button", name=f"Copy the {what}")
+        for what in ("command", "hash")
+    )
+    command.click()
+    expect(command).to_have_text("Copied")
     usual.evaluate(
         """() => {
             navigator.clipboard.writeText = () => Promise.reject(new Error("no"));
             document.execCommand = () => false;
         }"""
     )
-    card.get_by_role("button", name="Copy the hash").click()
-    expect(card.get_by_role("button", name="Copy the hash")).to_have_text("Selected")
+    of_hash.click()
+    expect(of_hash).to_have_text("Selected")
     assert usual.evaluate("getSelection().toString()") == "0123456789abcdef" * 4
 
 
 @pytest.mark.thorough
 def test_of_ten_thousand_episodes_a_hundred_are_laid_out(page, tmp_path):
     """Opening, sorting, filtering and turning pages cost no more than what is shown."""
-    shown = [video(i, file=f"{i}.mp4", poster=_PIXEL) for i in range(20)]
-    returns = np.arange(2000.0)
-    tasks = [
-        task(f"dm_control/task-{i}", returns, seeds=5, videos=shown) for i in range(5)
-    ]
+    shown = [video(i, file=f"{i}.mp4", poster="") for i in range(20)]
+    tasks = [task(name, np.arange(2000.0), videos=shown) for name in "abcde"]
     open_report(page, tmp_path, contents(*tasks, task("short", np.arange(152.0))))
     count = page.locator("#episodes-count")
     rows = page.locator("#episodes tbody tr")
@@ -254,13 +243,9 @@ def test_nothing_keeps_people_out(browser, videos, width, scheme, report):
 @pytest.mark.thorough
 def test_paper_has_the_whole_summary_frames_and_no_buttons(browser, videos):
     """On A4 with margins of a centimetre."""
-    known = {"success_known": 50, "success_rate": 0.5, "warnings": {"BADQACC": 12}}
-    made = usual_report()
-    for each in made.tasks:
-        each.summary = replace(each.summary, **known)
     with page_of_width(browser, 718) as page:
         page.emulate_media(media="print")
-        open_report(page, videos, made)
+        open_report(page, videos, usual_report())
         assert page.evaluate("document.scrollingElement.scrollWidth") <= 718
         expect(page.locator("#gallery-filter")).to_be_hidden()
         expect(page.locator("nav")).to_be_hidden()
@@ -285,11 +270,8 @@ def test_what_a_stranger_wrote_stays_text(page, browser, videos):
         page = context.new_page()
         open_report(page, videos, usual_report())
         page.evaluate(
-            """() => {
-                const script = document.createElement("script");
-                script.textContent = "window.hasRun = true";
-                document.body.append(script);
-            }"""
+            """document.body.append(Object.assign(
+                document.createElement("script"), {textContent: "hasRun = true"}))"""
         )
         assert page.evaluate("window.hasRun") is None
 
@@ -307,9 +289,3 @@ def test_without_scripts_everything_but_the_tools_is_there(browser, videos):
         expect(page.locator("noscript")).to_be_visible()
         expect(page.locator("#gallery-filter")).to_be_hidden()
         expect(page.locator("#episodes-tools")).to_be_hidden()
-
-
-_PIXEL = (
-    "data:image/png;base64,iVBORw0KGgoAAAANSUhEUgAAAAEAAAABCAYAAAAfFcSJAAAADUlEQVR42mNk"
-    "YPhfDwAChwGA60e6kgAAAABJRU5ErkJggg=="
-)
