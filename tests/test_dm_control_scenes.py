@@ -72,18 +72,26 @@ def test_a_physics_that_overrides_is_named():
     assert "Physics overrides render()" in dm_control_scenes(env).obstacle
 
 
-def test_name_and_random_state():
-    """The name is what the user says; a generator with that state draws the same."""
-    env = load()
-    scenes = dm_control_scenes(env, env_id="dm_control/cheetah-run")
+def test_what_makes_the_environment_again():
+    """Its name, wrappers and least limit; a generator with the state draws the same."""
+
+    class Opaque:
+        __slots__ = ()
+
+    env = load(time_limit=0.5)
+    name = "dm_control/cheetah-run"
+    scenes = dm_control_scenes(action_noise.Wrapper(env), env_id=name)
     assert scenes.environment == {
         "framework": "dm_control",
-        "id": "dm_control/cheetah-run",
+        "id": name,
         "kwargs": None,
-        "wrappers": [],
-        "max_episode_steps": 1000,
+        "wrappers": ["dm_control.suite.wrappers.action_noise.Wrapper"],
+        "max_episode_steps": 50,
     }
+    assert dm_control_scenes(env, env_id=name).environment["wrappers"] == []
     assert dm_control_scenes(env, env_id="mine").environment is None
+    [hidden] = around_dm_env(Opaque())["wrappers"]
+    assert hidden.endswith("Opaque")
     again = np.random.RandomState()
     again.set_state(json.loads(json.dumps(scenes.random_state())))
     assert again.rand() == env.task.random.rand()
@@ -152,19 +160,3 @@ def test_a_reset_leaves_the_contexts_as_they_were():
         assert env.physics._contexts is own
     assert env.physics._contexts is own
     env.physics.free()
-
-
-def test_wrappers_that_change_something_are_named():
-    """Also what hides its environment; the least limit counts."""
-
-    class Opaque:
-        __slots__ = ()
-
-    env = load(time_limit=0.5)
-    assert around_dm_env(env) == {"wrappers": [], "max_episode_steps": 50}
-    assert around_dm_env(action_noise.Wrapper(env)) == {
-        "wrappers": ["dm_control.suite.wrappers.action_noise.Wrapper"],
-        "max_episode_steps": 50,
-    }
-    [name] = around_dm_env(Opaque())["wrappers"]
-    assert name.endswith("Opaque")

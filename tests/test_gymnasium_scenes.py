@@ -16,7 +16,6 @@ from gymnasium.envs.mujoco.mujoco_rendering import MujocoRenderer
 
 from mjrec.environments.gymnasium_scenes import gymnasium_scenes
 from mjrec.environments.viewer_scene import ViewerScene
-from mjrec.environments.wrapping import around_gymnasium
 from mjrec.errors import InvalidArgument, UnknownName
 
 WIREFRAME = int(mujoco.mjtRndFlag.mjRND_WIREFRAME)
@@ -169,31 +168,24 @@ def test_camera_that_was_asked_for():
 
 
 def test_what_makes_the_environment_again():
-    """Its id and arguments, as far as JSON can hold them."""
+    """Id, arguments that JSON can hold, the least limit, wrappers that do something."""
     env = make("Hopper-v5", healthy_z_range=(0.5, np.float32(2.5)))
     environment = gymnasium_scenes(env).environment
     assert environment["kwargs"]["healthy_z_range"] == [0.5, 2.5]
     assert json.loads(json.dumps(environment)) == environment
-    odd = make(default_camera_config={"lookat": np.zeros(3)})
-    assert gymnasium_scenes(odd).environment == {
+    env = make(default_camera_config={"lookat": np.zeros(3)}, max_episode_steps=7)
+    for steps in (9, 5, 8):
+        env = wrappers.TimeLimit(env, steps)
+    env = wrappers.RecordEpisodeStatistics(wrappers.ClipAction(env))
+    assert gymnasium_scenes(wrappers.TransformReward(env, abs)).environment == {
         "framework": "gymnasium",
         "id": "InvertedPendulum-v5",
         "kwargs": None,
-        "wrappers": [],
-        "max_episode_steps": 1000,
+        "wrappers": [
+            "gymnasium.wrappers.transform_reward.TransformReward",
+            "gymnasium.wrappers.transform_action.ClipAction",
+        ],
+        "wrapper_arguments": [None, {}],
+        "max_episode_steps": 5,
     }
     assert gymnasium_scenes(HalfCheetahEnv()).environment is None
-
-
-def test_wrappers_that_change_something_are_named():
-    """Outermost first; what only looks on is not among them; the least limit counts."""
-    env = gymnasium.make("InvertedPendulum-v5", max_episode_steps=7)
-    for steps in (9, 5, 8):
-        env = wrappers.TimeLimit(env, steps)
-    assert around_gymnasium(env) == {"wrappers": [], "max_episode_steps": 5}
-    env = wrappers.RecordEpisodeStatistics(wrappers.ClipAction(env))
-    env = wrappers.TransformReward(env, abs)
-    assert around_gymnasium(env)["wrappers"] == [
-        "gymnasium.wrappers.transform_reward.TransformReward",
-        "gymnasium.wrappers.transform_action.ClipAction",
-    ]

@@ -5,7 +5,6 @@ import base64
 import re
 
 import pytest
-from browsers import chromium
 
 import mjrec
 from mjrec.formats import notebook
@@ -62,7 +61,7 @@ def test_a_recording_shows_numbers_and_a_player(kind, said, recorded):
     if kind == "rendered":
         [path] = [path.parent / name for name in shown[kind].videos]
     assert videos_in(text) == [path.read_bytes()]
-    for words in (*said, path.name):
+    for words in (*said, path.name, "<video "):
         assert words in text
 
 
@@ -86,15 +85,3 @@ def test_large_and_missing_videos_are_named(tmp_path, monkeypatch):
     text = notebook.shown("x", videos=paths)
     assert videos_in(text) == [b"a" * 6, b"c" * 4]
     assert all(path.name in text for path in paths)
-
-
-@pytest.mark.browser
-def test_a_browser_plays_it(recorded, tmp_path):
-    """Chromium decodes the video of the output, in its size."""
-    page = tmp_path / "page.html"
-    page.write_text(recorded[1]["trajectory"]._repr_html_())
-    with chromium() as start:
-        shown = start().new_page()
-        shown.goto(page.as_uri())
-        shown.wait_for_function("document.querySelector('video').readyState >= 2")
-        assert shown.evaluate("document.querySelector('video').videoWidth") == 32

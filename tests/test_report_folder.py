@@ -191,27 +191,23 @@ IMAGE = "<img[^>]* src=.data:image/jpeg;base64,"
 VIDEO = "<a[^>]* href=.data:video/mp4;base64,"
 
 
-def test_a_single_file_has_everything_in_it(recordings, tmp_path):
-    """Byte for byte; it is replaced as a folder is, and may be in one."""
-    for target in (tmp_path / "one.html", tmp_path / "one.html", tmp_path / "folder"):
-        page = write_report(recordings, target, single_file=True)
-        text = page.read_text()
+def test_a_single_file_has_as_much_in_it_as_is_allowed(recordings, tmp_path):
+    """Byte for byte; posters come first, then the videos; what is missing is told."""
+
+    def written(name, **options):
+        page = write_report(recordings, tmp_path / name, single_file=True, **options)
+        return page, page.read_text()
+
+    # It is replaced as a folder is, and may be in one.
+    for name in ("one.html", "one.html", "folder"):
+        page, text = written(name)
         for path in recordings.glob("*.mp4"):
             assert base64.b64encode(path.read_bytes()).decode() in text
         assert len(re.findall(VIDEO, text)) == len(re.findall(IMAGE, text)) == 2
     assert names(tmp_path / "folder") == ["index.html"]
-
-
-def test_a_single_file_is_no_larger_than_allowed(recordings, tmp_path):
-    """Posters come first, then the videos in their order; what is missing is told."""
-
-    def written(name, **options):
-        return write_report(recordings, tmp_path / name, single_file=True, **options)
-
-    most = written("whole.html").stat().st_size - 100
-    part = written("part.html", max_single_file_bytes=most)
+    most = page.stat().st_size - 100
+    part, text = written("part.html", max_single_file_bytes=most)
     assert part.stat().st_size <= most
-    text = part.read_text()
     assert (len(re.findall(IMAGE, text)), len(re.findall(VIDEO, text))) == (2, 1)
     assert "1 of 2 videos are not embedded" in text
     with pytest.raises(InvalidArgument, match="without any image or video"):
