@@ -26,9 +26,9 @@ from mjrec.viewing.geometry import mesh_of
 from mjrec.viewing.live import LiveView
 from mjrec.viewing.motion import Shape
 
-STEPS = 12
+_STEPS = 12
 # Meshes, skins, height fields, tendons, mocap bodies; hundreds of geoms.
-ENVIRONMENTS = (
+_ENVIRONMENTS = (
     *("Humanoid-v5", "Ant-v5", "Pusher-v5", "FetchPickAndPlace-v4"),
     *("AdroitHandDoor-v1", "HandManipulateBlock-v1"),
     *("dm_control/dog-run", "dm_control/quadruped-escape"),
@@ -36,7 +36,7 @@ ENVIRONMENTS = (
 )
 
 # All shapes that are not geoms of one size: tendons around a cylinder, a cloth.
-SOFT = """
+_SOFT = """
 <mujoco>
   <worldbody>
     <geom type="plane" size="2 2 .1"/>
@@ -56,7 +56,7 @@ SOFT = """
 </mujoco>
 """
 
-BOX = """
+_BOX = """
 <mujoco>
   <asset>
     <texture name="side" type="cube" file="side.png"/>
@@ -67,35 +67,35 @@ BOX = """
 """
 
 # Where nodes of the scene are, in the frame of the model.
-POSES = """() => {
+_POSES = """() => {
   const nodes = window.__viserMutable.nodeRefFromName;
   const shown = Object.entries(nodes).filter(([name]) => name.startsWith("/"));
   return Object.fromEntries(
     shown.map(([name, node]) => [name, [...node.position.toArray(),
       node.quaternion.w, node.quaternion.x, node.quaternion.y, node.quaternion.z]]));
 }"""
-VERTICES = """(name, kind = "position") => {
+_VERTICES = """(name, kind = "position") => {
   let found = null;
   window.__viserMutable.nodeRefFromName[name].traverse((part) => {
     if (part.isMesh) found ??= [...part.geometry.attributes[kind].array];
   });
   return found;
 }"""
-NORMALS = f"(name) => ({VERTICES})(name, 'normal')"
-SIZES = """(names) => names.map((name) => {
+_NORMALS = f"(name) => ({_VERTICES})(name, 'normal')"
+_SIZES = """(names) => names.map((name) => {
   return window.__viserMutable.nodeRefFromName[name].scale.toArray();
 })"""
-CAMERA = """() => {
+_CAMERA = """() => {
   const viewer = window.__viserMutable;
   const inverse = viewer.nodeRefFromName[""].quaternion.clone().invert();
   return [viewer.camera.position.clone().applyQuaternion(inverse).toArray(),
     viewer.camera.fov];
 }"""
-STEP = "Number(document.getElementById('replay-where').textContent.split(' ')[1])"
-STEP_SHOWN = f"(step) => {STEP} >= step"
+_STEP = "Number(document.getElementById('replay-where').textContent.split(' ')[1])"
+_STEP_SHOWN = f"(step) => {_STEP} >= step"
 
 # An episode that goes on until the process is killed.
-RUN = """
+_RUN = """
 import sys, time, gymnasium, mjrec
 env = gymnasium.make("HalfCheetah-v5", max_episode_steps=10**6)
 env = mjrec.Monitor(env, sys.argv[1], workers=0, video_callable=lambda _: True)
@@ -106,7 +106,7 @@ while True:
 """
 
 
-def record(name, directory, steps=STEPS, change=lambda env, step: None, **options):
+def record(name, directory, steps=_STEPS, change=lambda env, step: None, **options):
     """Record an episode without drawing it, and return its trajectory's path."""
     if name.startswith("dm_control/"):
         suite = pytest.importorskip("dm_control.suite")
@@ -130,7 +130,7 @@ def record(name, directory, steps=STEPS, change=lambda env, step: None, **option
 def cheetah(tmp_path_factory):
     """Record a short episode that is cut by its time limit."""
     directory = tmp_path_factory.mktemp("cheetah")
-    return record("HalfCheetah-v5", directory, max_episode_steps=STEPS)
+    return record("HalfCheetah-v5", directory, max_episode_steps=_STEPS)
 
 
 @pytest.fixture(scope="module")
@@ -172,7 +172,7 @@ def data_at(trajectory, step):
 def check_geoms(page, data):
     """Check that the page has the geoms that MuJoCo draws, where MuJoCo has them."""
     page.wait_for_timeout(500)
-    poses = {k: v for k, v in page.evaluate(POSES).items() if k.startswith("/geom/")}
+    poses = {k: v for k, v in page.evaluate(_POSES).items() if k.startswith("/geom/")}
     scene = mujoco.MjvScene(data.model, maxgeom=10_000)
     view = (mujoco.MjvOption(), None, mujoco.MjvCamera(), mujoco.mjtCatBit.mjCAT_ALL)
     mujoco.mjv_updateScene(data.model, data, *view, scene)
@@ -188,7 +188,7 @@ def check_geoms(page, data):
     for skin in range(data.model.nskin):
         first, count = scene.skinvertadr[skin], scene.skinvertnum[skin]
         expected = np.reshape(scene.skinvert, (-1, 3))[first : first + count]
-        shown = np.reshape(page.evaluate(VERTICES, f"/skin/{skin}"), (-1, 3))
+        shown = np.reshape(page.evaluate(_VERTICES, f"/skin/{skin}"), (-1, 3))
         assert shown == pytest.approx(expected, abs=1e-5)
 
 
@@ -196,7 +196,7 @@ def check_geoms(page, data):
 
 
 @pytest.mark.browser
-@parametrize("name", ENVIRONMENTS, default=0, part=pytest.mark.environments)
+@parametrize("name", _ENVIRONMENTS, default=0, part=pytest.mark.environments)
 def test_all_kinds_of_scenes_stand_where_mujoco_has_them(name, pages, tmp_path):
     """So do meshes, skins, height fields, and bodies that the simulation moves."""
     with robots_that_reset():
@@ -205,8 +205,8 @@ def test_all_kinds_of_scenes_stand_where_mujoco_has_them(name, pages, tmp_path):
         path = record(name, tmp_path / "run")
     trajectory = mjrec.load_trajectory(path)
     mjrec.write_replay(trajectory, tmp_path / "page.html")
-    page = pages(f"{(tmp_path / 'page.html').as_uri()}#step={STEPS}")
-    check_geoms(page, data_at(trajectory, STEPS))
+    page = pages(f"{(tmp_path / 'page.html').as_uri()}#step={_STEPS}")
+    check_geoms(page, data_at(trajectory, _STEPS))
 
 
 @pytest.mark.browser
@@ -229,11 +229,11 @@ def test_keys_go_through_the_states(page, cheetah):
     page.keyboard.press("End")
     assert page.inner_text("#replay-ending") == "Episode truncated"
     assert page.evaluate("location.hash") == "#step=12&camera=track&speed=2"
-    data = data_at(trajectory, STEPS)
+    data = data_at(trajectory, _STEPS)
     check_geoms(page, data)
     # The model's cameras can be chosen, and move as they do in the videos.
     page.select_option("#replay-camera", label="track")
-    position, fovy = page.evaluate(CAMERA)
+    position, fovy = page.evaluate(_CAMERA)
     assert position == pytest.approx(data.cam_xpos[0], abs=1e-4)
     assert fovy == pytest.approx(data.model.cam_fovy[0])
 
@@ -268,7 +268,7 @@ def test_nothing_keeps_people_out_of_a_replay(page):
 @pytest.mark.thorough
 def test_the_live_view_follows_a_run_until_it_is_killed(pages, tmp_path):
     """A page shows the newest states of another process, and all that a kill leaves."""
-    run = subprocess.Popen([sys.executable, "-c", RUN, str(tmp_path)])
+    run = subprocess.Popen([sys.executable, "-c", _RUN, str(tmp_path)])
     thread = None
     try:
         wait_until(lambda: len(list(tmp_path.glob("*.log"))) > 0)
@@ -276,13 +276,13 @@ def test_the_live_view_follows_a_run_until_it_is_killed(pages, tmp_path):
         thread = threading.Thread(target=view.serve)
         thread.start()
         page = pages(view.url)
-        page.wait_for_function(STEP_SHOWN, arg=1)
-        page.wait_for_function(STEP_SHOWN, arg=page.evaluate(STEP) + 1)
+        page.wait_for_function(_STEP_SHOWN, arg=1)
+        page.wait_for_function(_STEP_SHOWN, arg=page.evaluate(_STEP) + 1)
         run.kill()
         run.wait()
         [path] = recorded_episodes(tmp_path)
         last = len(mjrec.load_trajectory(path))
-        page.wait_for_function(STEP_SHOWN, arg=last)
+        page.wait_for_function(_STEP_SHOWN, arg=last)
     finally:
         run.kill()
         run.wait()
@@ -296,7 +296,7 @@ def test_the_live_view_follows_a_run_until_it_is_killed(pages, tmp_path):
 def test_tendons_and_cloth_move(pages, tmp_path):
     """What changes its shape has the vertices and the segments that MuJoCo computes."""
     model = tmp_path / "soft.xml"
-    model.write_text(SOFT)
+    model.write_text(_SOFT)
     out = tmp_path / "run"
     arguments = ["--out", str(out), "--max-steps", "8", "--workers", "0"]
     assert main(["record", str(model), "--policy", "zero", *arguments]) == 0
@@ -306,14 +306,14 @@ def test_tendons_and_cloth_move(pages, tmp_path):
     assert mjrec.write_replay(trajectory, file).notes == ()
     page = pages(f"{file.as_uri()}#step=8")
     # The page draws the cloth with vertices at zero until its motion is loaded.
-    page.wait_for_function(f"({VERTICES})('/flex/0')?.some(Boolean)", polling=50)
+    page.wait_for_function(f"({_VERTICES})('/flex/0')?.some(Boolean)", polling=50)
     data = data_at(trajectory, 8)
-    shown = np.reshape(page.evaluate(VERTICES, "/flex/0"), (-1, 3))
+    shown = np.reshape(page.evaluate(_VERTICES, "/flex/0"), (-1, 3))
     assert shown == pytest.approx(data.flexvert_xpos, abs=1e-5)
-    normals = np.reshape(page.evaluate(NORMALS, "/flex/0"), (-1, 3))
+    normals = np.reshape(page.evaluate(_NORMALS, "/flex/0"), (-1, 3))
     assert normals == pytest.approx(np.tile([0, 0, 1], (16, 1)), abs=1e-5)
-    segments = [n for n in page.evaluate(POSES) if n.startswith("/tendon/")]
-    sizes = np.array(page.evaluate(SIZES, segments))
+    segments = [n for n in page.evaluate(_POSES) if n.startswith("/tendon/")]
+    sizes = np.array(page.evaluate(_SIZES, segments))
     is_there = sizes[:, 2] > 1e-6
     # The tendon has fewer segments here than in another state.
     assert 2 <= is_there.sum() < len(segments)
@@ -327,8 +327,8 @@ def test_tendons_and_cloth_move(pages, tmp_path):
 @parametrize(
     ("name", "steps", "largest"),
     [
-        ("Hopper-v5", STEPS, 2_000_000),
-        ("dm_control/cartpole-balance", STEPS, 2_000_000),
+        ("Hopper-v5", _STEPS, 2_000_000),
+        ("dm_control/cartpole-balance", _STEPS, 2_000_000),
         ("Humanoid-v5", 999, 5_000_000),
     ],
     default=2,
@@ -359,7 +359,7 @@ def test_what_cannot_be_shown_is_left_out(cheetah, tmp_path):
     trajectory.facts = {**trajectory.facts, "env_id": "</script><script>alert(1)"}
     trajectory.states[-1] = np.nan
     made = mjrec.write_replay(trajectory, tmp_path / "page.html")
-    assert made.states == STEPS
+    assert made.states == _STEPS
     assert "<script>alert" not in made.path.read_text()
 
 
@@ -385,7 +385,7 @@ def test_sides_have_the_whole_texture_and_normals(tmp_path):
     """One image for all sides is not cut into six; round shapes look smooth."""
     Image.new("RGB", (8, 8), "red").save(tmp_path / "side.png")
     path = tmp_path / "box.xml"
-    path.write_text(BOX)
+    path.write_text(_BOX)
     model = mujoco.MjModel.from_xml_path(str(path))
     kinds = (mujoco.mjtObj.mjOBJ_GEOM, 0, mujoco.mjtGeom.mjGEOM_BOX)
     mesh = mesh_of(model, Shape("/geom/0", *map(int, kinds), (1.0, 1.0, 1.0, 1.0)))

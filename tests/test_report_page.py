@@ -80,27 +80,6 @@ def test_texts_of_strangers_stay_text():
     assert data_of(page)["tasks"][1]["name"] == HOSTILE[1]
 
 
-@pytest.mark.parametrize(
-    ("path", "address"),
-    [
-        ("videos/a b#?.mp4", "./videos/a%20b%23%3F.mp4"),
-        ("javascript:alert(1)", "./javascript%3Aalert%281%29"),
-        ("//host/x.mp4", ".///host/x.mp4"),
-        ("data:text/html;base64,PGI+", "./data%3Atext/html%3Bbase64%2CPGI%2B"),
-        ("data:video/mp4;base64,AAAA", "data:video/mp4;base64,AAAA"),
-    ],
-)
-def test_a_path_becomes_an_address(path, address):
-    """Of a file beside the page, whatever it looks like, or a video's bytes, once."""
-    page = page_with(video(file=path))
-    (link,) = Elements(page).players()
-    assert link["href"] == address
-    is_embedded = address.startswith("data:")
-    # A link saves it, for no browser opens a page that is such an address.
-    assert ("download" in link) == is_embedded
-    assert not is_embedded or page.count(path) == 1
-
-
 # --- What it shows ----------------------------------------------------------------
 
 
@@ -163,35 +142,29 @@ def test_what_the_figures_do_not_say_is_said_beside_them():
     assert page.count("<dt>Seeds</dt>") == 4
 
 
-def test_more_episodes_than_a_page_opens_with_are_left_to_the_files():
-    """Those with videos, those that failed, the best and the worst stay."""
+def test_a_page_opens_with_a_part_of_many_episodes():
+    """Those with videos, failures, the best and the worst; players for some videos."""
     returns = np.arange(30_000.0)
     # Those of any size are told; one that is no number is not.
     returns[:3] = (-1e307, 0.123456789, 1e307)
     made = task("a", returns, failures={17_000: "boom"}, score_range=None)
-    made.videos = [video(15_000)]
+    made.videos = [
+        video(15_000 + i, file=f"{i}.mp4", roles=("best",) if i == 599 else ())
+        for i in range(600)
+    ]
     page = page_of(contents(made, across={}))
     (shown,) = data_of(page)["tasks"]
     assert len(shown["run"]) < 20_000
     rewards = dict(zip(shown["episode"], shown["total_reward"], strict=True))
     assert (rewards[0], rewards[2], rewards[17_000]) == (-1e307, 1e307, None)
-    row = shown["episode"].index(15_000)
-    assert shown["videos"] == {str(row): ["#video-0"]}
     assert "evaluation/results.csv" in page
     assert "30\u202f000" in page
-
-
-def test_not_every_video_of_thousands_has_a_player():
-    """Those that are best or worst first; the table of episodes links to the others."""
-    made = task("a", [1.0] * 600)
-    made.videos = [
-        video(i, file=f"{i}.mp4", roles=("best",) if i == 599 else ())
-        for i in range(600)
-    ]
-    page = page_of(contents(made))
+    # The table of episodes links to the videos that have no player.
     assert len(Elements(page).players()) == 300
-    places = data_of(page)["tasks"][0]["videos"]
-    assert (places["599"], places["598"]) == (["#video-599"], ["./598.mp4"])
+    places = [
+        shown["videos"][str(shown["episode"].index(15_000 + i))] for i in (599, 598)
+    ]
+    assert places == [["#video-599"], ["./598.mp4"]]
 
 
 def test_a_report_of_nothing_is_a_page():
