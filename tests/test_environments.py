@@ -160,6 +160,7 @@ def registered(monkeypatch):
         "NoCamera-v0": NoCamera,
         # Its render modes are known only when it has been called.
         "Made-v0": lambda render_mode=None: Corridor(render_mode=render_mode),
+        "Blind-v0": lambda render_mode=None: Corridor(render_mode=None),
         "Missing-v0": missing,
     }.items():
         gymnasium.register(env_id, entry_point)
@@ -250,6 +251,7 @@ WRONG = [
     ("Corridor-v0", {"height": 9, "width": 9}, mjrec.InvalidArgument, "takes no size"),
     # The modes there are, the modes it takes, and the way out.
     ("OnlyWindow-v0", {}, mjrec.NoPictures, r"\['human'\].*rgb_array.*none"),
+    ("Blind-v0", {}, mjrec.NoPictures, "ignored render_mode"),
     (CHEETAH, {"kwargs": {"render_mode": None}}, mjrec.NoPictures, "was requested"),
     (CHEETAH, {"kwargs": {"render_mode": "rgb"}}, mjrec.UnknownName, "'rgb'.*rgb_arr"),
     *(

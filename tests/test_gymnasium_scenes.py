@@ -147,6 +147,21 @@ def test_a_view_that_was_asked_for_is_of_the_scene(asked):
     assert gymnasium_scenes(Overlay(make()), **asked).obstacle is None
 
 
+def test_another_renderer_has_another_camera():
+    """It is shown as if the environment were new, at once."""
+    env = make("HalfCheetah-v5")
+    scene = scene_of(env)
+    view = scene()
+    scene.at_frame(lambda: None)
+    base = env.unwrapped
+    base.mujoco_renderer = MujocoRenderer(
+        base.model, base.data, {"azimuth": 11.0}, 64, 48, visual_options={0: True}
+    )
+    scene.at_frame(lambda: None)
+    assert view.camera.azimuth == 11
+    assert view.option.flags[0] == 1
+
+
 def test_camera_that_was_asked_for():
     """A name, the free camera where the model has it, or an MjvCamera; checked soon."""
     env = make("HalfCheetah-v5")

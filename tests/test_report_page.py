@@ -16,6 +16,7 @@ from mjrec.evaluation.summaries import AcrossTasks, TaskSummary
 from mjrec.reporting.contents import ReportContents
 from mjrec.reporting.curves import evaluation_curve, learning_curve
 from mjrec.reporting.page import page_of
+from mjrec.reporting.page_text import number
 
 
 class Elements(HTMLParser):
@@ -204,3 +205,17 @@ def test_a_learning_curve_is_in_the_order_of_time():
     order = np.random.default_rng(0).permutation(100)
     mixed = replace(rising, episodes=rising.episodes[order])
     assert learning_curve(mixed, key="k") == learning_curve(rising, key="k")
+
+
+@pytest.mark.parametrize(
+    ("value", "decimals", "shown"),
+    [
+        (float("nan"), 1, "\N{EN DASH}"),
+        (-0.04, 1, "0.0"),
+        (-12345.678, 2, "-12\u202f345.68"),
+        (1.5e300, 0, "1.5e+300"),
+    ],
+)
+def test_a_number_is_shown_as_people_read_it(value, decimals, shown):
+    """With thousands apart where there are many."""
+    assert number(value, decimals) == shown
