@@ -15,7 +15,7 @@ _FEW = Bootstrap(resamples=50)
 
 # Markup, quotes, what ends a script, a comment and a template, a mark that turns the
 # direction of writing, line ends that JSON allows and JavaScript did not, a formula,
-# and a name that never ends.
+# addresses, and a name that never ends.
 HOSTILE = (
     "<script>alert(1)</script>",
     "</script><script>alert(2)</script>",
@@ -25,6 +25,8 @@ HOSTILE = (
     "abc\u202edef\u2028ghi\x00\x1b[31m",
     "$\\frac{1}{0$ &amp; &lt;",
     "javascript:alert(4)",
+    "data:text/html;base64,PGI+",
+    "//host/x.mp4",
     "שלום مرحبا",
     "x" * 10_000,
     "a b/" * 2_500,

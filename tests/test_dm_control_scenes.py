@@ -2,9 +2,6 @@
 """What is known of dm_control's environments, and their resets without OpenGL."""
 
 import json
-import os
-import subprocess
-import sys
 
 import mujoco
 import numpy as np
@@ -12,7 +9,10 @@ import pytest
 
 pytest.importorskip("dm_control")
 
-from dm_control import suite
+from dm_control import _render, composer, manipulation, suite
+from dm_control.locomotion.arenas import bowl
+from dm_control.locomotion.tasks import escape
+from dm_control.locomotion.walkers import rodent
 from dm_control.mujoco import Physics
 from dm_control.suite.wrappers import action_noise, pixels
 
@@ -23,7 +23,7 @@ pytestmark = pytest.mark.dm_control
 
 
 def load(domain="cheetah", task="run", **kwargs):
-    env = suite.load(domain, task, task_kwargs={"random": 0}, **kwargs)
+    env = suite.load(domain, task, task_kwargs={"random": 0, **kwargs})
     quality = env.physics.model.vis.quality
     quality.shadowsize, quality.offsamples = 64, 0
     return env
@@ -31,32 +31,26 @@ def load(domain="cheetah", task="run", **kwargs):
 
 def begun(env, directory, **asked):
     """Return the facts of the scene of an episode that begins now."""
-    scenes = dm_control_scenes(env, **asked)
-    scenes.states.open(directory)
-    with scenes.states.resetting():
+    states = dm_control_scenes(env, **asked).states
+    states.open(directory)
+    with states.resetting():
         env.reset()
-    start = scenes.states.begin_episode()
+    start = states.begin_episode()
     assert start.refusal is None
-    scenes.states.finish()
-    scenes.states.close()
+    states.finish()
+    states.close()
     return dict(start.scene)
 
 
-def test_shown_as_by_physics(tmp_path):
-    """dm_control's size, number of geoms and option, and a new scene each time."""
+def test_a_scene_is_that_of_physics_where_physics_can_draw_it(tmp_path):
+    """Its size, geoms and option, anew each time; not too large, no own camera."""
     scene = begun(load(), tmp_path)
     assert (scene["height"], scene["width"], scene["label"]) == (240, 320, -1)
-    assert scene["fresh"] is True
-    assert scene["max_geom"] == 1000
+    assert (scene["fresh"], scene["max_geom"]) == (True, 1000)
     assert scene["option"]["flags"][int(mujoco.mjtVisFlag.mjVIS_RANGEFINDER)] == 0
     named = begun(load(), tmp_path, camera="side", height=32)
     assert (named["camera"]["fixedcamid"], named["label"]) == (0, "side")
-
-
-def test_what_physics_cannot_draw_is_shown_as_it_is_live(tmp_path):
-    """Larger frames than its buffer, and cameras of one's own."""
-    camera = mujoco.MjvCamera()
-    for asked in ({"width": 4000}, {"camera": camera}):
+    for asked in ({"width": 4000}, {"camera": mujoco.MjvCamera()}):
         scene = begun(load(), tmp_path, **asked)
         assert (scene["fresh"], scene["max_geom"]) == (False, 10000)
 
@@ -71,35 +65,40 @@ def test_a_physics_that_overrides_is_named():
     env = load()
     assert dm_control_scenes(env).obstacle is None
     env._physics = Drawing.from_model(env.physics.model)
-    assert "Drawing overrides render()" in str(dm_control_scenes(env).obstacle)
+    assert "Drawing overrides render()" in dm_control_scenes(env).obstacle
     assert dm_control_scenes(env, camera=mujoco.MjvCamera()).obstacle is None
     env = load()
     env.physics.render = lambda: None
-    assert "Physics overrides render()" in str(dm_control_scenes(env).obstacle)
+    assert "Physics overrides render()" in dm_control_scenes(env).obstacle
 
 
-def test_name_and_random_state():
-    """The name is what the user says; a generator with that state draws the same."""
-    env = load()
-    scenes = dm_control_scenes(env, env_id="dm_control/cheetah-run")
+def test_what_makes_the_environment_again():
+    """Its name, wrappers and least limit; a generator with the state draws the same."""
+
+    class Opaque:
+        __slots__ = ()
+
+    env = load(time_limit=0.5)
+    name = "dm_control/cheetah-run"
+    scenes = dm_control_scenes(action_noise.Wrapper(env), env_id=name)
     assert scenes.environment == {
         "framework": "dm_control",
-        "id": "dm_control/cheetah-run",
+        "id": name,
         "kwargs": None,
-        "wrappers": [],
-        "max_episode_steps": 1000,
+        "wrappers": ["dm_control.suite.wrappers.action_noise.Wrapper"],
+        "max_episode_steps": 50,
     }
+    assert dm_control_scenes(env, env_id=name).environment["wrappers"] == []
     assert dm_control_scenes(env, env_id="mine").environment is None
-    state = json.loads(json.dumps(scenes.random_state()))
+    [hidden] = around_dm_env(Opaque())["wrappers"]
+    assert hidden.endswith("Opaque")
     again = np.random.RandomState()
-    again.set_state(state)
+    again.set_state(json.loads(json.dumps(scenes.random_state())))
     assert again.rand() == env.task.random.rand()
 
 
 def test_composers_model_is_stored_as_it_was_written(tmp_path):
     """With what makes it again in any version of MuJoCo."""
-    from dm_control import manipulation
-
     env = manipulation.load("reach_site_features", seed=1)
     scenes = dm_control_scenes(env)
     assert scenes.obstacle is None
@@ -109,105 +108,55 @@ def test_composers_model_is_stored_as_it_was_written(tmp_path):
     assert len(list(tmp_path.glob("*.zip"))) == 1
 
 
-WITHOUT_GL = """
-import numpy as np
-from dm_control import composer, suite
-from dm_control.locomotion.arenas import bowl
-from dm_control.locomotion.tasks import escape
-from dm_control.locomotion.walkers import rodent
-from mjrec.environments.dm_control_scenes import ContextsOnDemand
-
-def quadruped():
-    return suite.load("quadruped", "escape", task_kwargs={"random": 0})
-
-def rat():
+def rat_in_a_bowl():
     walker = rodent.Rat()
     task = escape.Escape(walker=walker, arena=bowl.Bowl(size=(4.0, 4.0)))
     walker.observables.egocentric_camera.enabled = False
     return composer.Environment(task, random_state=np.random.RandomState(0))
 
-for make in (quadruped, rat):
+
+@pytest.mark.parametrize("make", [lambda: load("quadruped", "escape"), rat_in_a_bowl])
+def test_terrain_is_made_without_gl(make, monkeypatch):
+    """Where a reset asks for the context, and only inside a recorded reset."""
+    # As with MUJOCO_GL=disable.
+    monkeypatch.setattr(_render, "Renderer", _render._no_renderer())
     env = make()
     contexts = ContextsOnDemand(env)
     for _ in range(2):
         with contexts.resetting():
             env.reset()
-        print(env.physics._contexts, env.physics.model.hfield_data.std() > 0.1)
-    try:
+        assert env.physics._contexts is None
+        assert env.physics.model.hfield_data.std() > 0.1
+    with pytest.raises(RuntimeError, match="No OpenGL rendering backend"):
         env.reset()
-    except RuntimeError as error:
-        print(error)
-"""
-
-
-def test_terrain_is_made_without_gl():
-    """Where a reset asks for the context, and only inside a recorded reset."""
-    run = subprocess.run(
-        [sys.executable, "-c", WITHOUT_GL],
-        capture_output=True,
-        text=True,
-        check=True,
-        env={**os.environ, "MUJOCO_GL": "disable"},
-    )
-    each = ["None True", "None True", "No OpenGL rendering backend is available."]
-    assert run.stdout.splitlines() == 2 * each
 
 
 def test_a_reset_that_draws_gets_its_frames():
     """Pixel observations are the same, and the contexts are real ones by then."""
-    seen = []
-    for recorded in (False, True):
-        kwargs = {"height": 24, "width": 32, "camera_id": 0}
-        env = pixels.Wrapper(load("quadruped", "escape"), render_kwargs=kwargs)
-        contexts = ContextsOnDemand(env)
-        if recorded:
-            with contexts.resetting():
-                timestep = env.reset()
-        else:
-            timestep = env.reset()
-        assert type(env.physics._contexts).__name__ == "Contexts"
-        seen.append(timestep.observation["pixels"].copy())
+    kwargs = {"height": 24, "width": 32, "camera_id": 0}
+    plain, recorded = (
+        pixels.Wrapper(load("quadruped", "escape"), render_kwargs=kwargs)
+        for _ in range(2)
+    )
+    expected = plain.reset().observation["pixels"].copy()
+    with ContextsOnDemand(recorded).resetting():
+        seen = recorded.reset().observation["pixels"].copy()
+    assert type(recorded.physics._contexts).__name__ == "Contexts"
+    np.testing.assert_array_equal(seen, expected)
+    assert seen.std() > 5
+    for env in (plain, recorded):
         env.physics.free()
-    np.testing.assert_array_equal(*seen)
-    assert seen[0].std() > 5
 
 
-def test_an_error_in_a_reset_leaves_the_physics_as_it_was():
-    """No stand-in stays behind."""
+def test_a_reset_leaves_the_contexts_as_they_were():
+    """After an error no stand-in stays behind; real ones are the user's."""
     env = load()
-
-    def fail():
-        with ContextsOnDemand(env).resetting():
-            assert env.physics._contexts is not None
-            raise ZeroDivisionError
-
-    with pytest.raises(ZeroDivisionError):
-        fail()
+    with pytest.raises(ZeroDivisionError), ContextsOnDemand(env).resetting():
+        env.physics.render(1 / 0)
     assert env.physics._contexts is None
-
-
-def test_contexts_that_are_there_are_left_alone():
-    """The user's own frames need the terrain too."""
-    env = load()
     env.physics.render(8, 8)
     own = env.physics._contexts
     with ContextsOnDemand(env).resetting():
         assert env.physics._contexts is own
     assert env.physics._contexts is own
     env.physics.free()
-
-
-def test_wrappers_that_change_something_are_named():
-    """Also what hides its environment; the least limit counts."""
-
-    class Opaque:
-        __slots__ = ()
-
-    env = suite.load("cheetah", "run", task_kwargs={"time_limit": 0.5})
-    assert around_dm_env(env) == {"wrappers": [], "max_episode_steps": 50}
-    assert around_dm_env(action_noise.Wrapper(env)) == {
-        "wrappers": ["dm_control.suite.wrappers.action_noise.Wrapper"],
-        "max_episode_steps": 50,
-    }
-    [name] = around_dm_env(Opaque())["wrappers"]
-    assert name.endswith("Opaque")

@@ -1,82 +1,169 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The documentation's pages agree with the program, and its site builds."""
+"""README, tutorial, pages and examples agree with the program, and the site builds."""
 
-from __future__ import annotations
-
-import importlib.util
+import os
 import re
+import runpy
+import shlex
+import shutil
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
-from types import ModuleType
 
 import pytest
+import yaml
 
 import mjrec
 from mjrec.commands import COMMANDS
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
+EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
+README = (ROOT / "README.md").read_text()
+TUTORIAL = (DOCS / "tutorial.md").read_text()
 SETUP = (ROOT / "scripts" / "setup").read_text()
 
 
-@pytest.fixture(scope="module")
-def pages() -> ModuleType:
-    """Return the hook that generates pages."""
-    pytest.importorskip("mkdocs", reason="the documentation's tools are not here")
-    spec = importlib.util.spec_from_file_location(
-        "docs_pages", ROOT / "scripts" / "docs_pages.py"
-    )
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+def blocks(text, language):
+    return re.findall(rf"```{language}\n(.*?)```", text, re.DOTALL)
+
+
+def run(*command, cwd):
+    """Run a command that finds `mjrec` where this Python has it."""
+    path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+    env = {**os.environ, "PATH": path}
+    done = subprocess.run(command, cwd=cwd, env=env, capture_output=True, text=True)
+    assert done.returncode == 0, f"{command}\n{done.stdout}{done.stderr}"
+    return done.stdout
+
+
+def needs_extras(text):
+    if "dm_control" in text:
+        pytest.importorskip("dm_control", reason="dm_control is not installed here")
+
+
+def test_texts_stay_short():
+    """README and pages have at most 12,000 words, as `wc -w` counts; some less."""
+    words = {path: len(path.read_text().split()) for path in DOCS.rglob("*.md")}
+    assert sum(words.values()) + len(README.split()) <= 12_000
+    assert words[DOCS / "decisions.md"] <= 1_500
+    assert len((ROOT / "CHANGELOG.md").read_text().split()) <= 900
+    assert len(README.split()) <= 450
+    assert README.count("![") == 1
+
+
+# --- README -----------------------------------------------------------------------
+
+
+# Takes more than five seconds: the README's own size, 480x480, drawn in software.
+def test_python_block_leaves_what_is_shown(tmp_path):
+    """The program runs as it stands, and its directory holds the files below it."""
+    [code], [tree] = blocks(README, "python"), blocks(README, "text")
+    run(sys.executable, "-c", code, cwd=tmp_path)
+    there = (tmp_path / "recordings" / "halfcheetah").iterdir()
+    shown = set(re.findall(r"openaigym\.\S+", tree))
+    assert len(shown) == 4
+    assert shown <= {re.sub(r"\.0\.\d+\.", ".0.4711.", path.name) for path in there}
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize(
+    "line", re.findall(r"^mjrec [^#\n]*", "".join(blocks(README, "sh")), re.MULTILINE)
+)
+def test_command_runs(line, tmp_path):
+    """As it stands, and it says which videos it made."""
+    needs_extras(line)
+    out = run(sys.executable, "-m", *shlex.split(line), cwd=tmp_path)
+    assert ".mp4" in out
+
+
+@pytest.mark.thorough
+@pytest.mark.dm_control
+def test_scripts_demo_runs(tmp_path):
+    """The first command: twenty episodes, six videos, two tables."""
+    assert "\nscripts/demo " in README
+    out = run(str(ROOT / "scripts" / "demo"), str(tmp_path / "demo"), cwd=ROOT)
+    assert len(list((tmp_path / "demo").glob("*/*.mp4"))) == 6
+    assert out.count("truncated") == 20
+
+
+def test_links_lead_somewhere():
+    """Images and pages of the README are there."""
+    targets = re.findall(r"\]\((?!https?:)([^)#]+)", README)
+    assert targets
+    assert [target for target in targets if not (ROOT / target).exists()] == []
+
+
+# --- The tutorial -----------------------------------------------------------------
+
+
+def tutorial_commands():
+    """Yield each command of the tutorial and the output it shows."""
+    for block in blocks(TUTORIAL, "console"):
+        for part in re.split(r"^\$ ", block, flags=re.MULTILINE)[1:]:
+            command, _, output = part.partition("\n")
+            yield command, output
+
+
+def normalized(text):
+    """Return the lines without what differs from machine to machine."""
+    text = re.sub(r"\.0\.\d+\.video", ".0.4711.video", text)
+    text = re.sub(r"-?\d+\.\d+(e-\d+)?", "#", text)
+    text = re.sub(r"sha256 [0-9a-f]{64}", "sha256 #", text)
+    text = re.sub(r"\d+ kB \(\d+ bytes\)", "# kB", text)
+    lines = [" ".join(line.split()) for line in text.splitlines()]
+    return [line for line in lines if line]
+
+
+# Takes minutes: it records, draws, evaluates twice, packs and verifies.
+@pytest.mark.thorough
+@pytest.mark.timeout(1500)
+def test_tutorial_shows_what_its_commands_print(tmp_path):
+    """Each command prints what stands below it, and the whole ends in an archive."""
+    for name, text in re.findall(
+        r'```python title="(\S+)"\n(.*?)```', TUTORIAL, re.DOTALL
+    ):
+        (tmp_path / name).write_text(text)
+    for command, output in tutorial_commands():
+        printed = run("bash", "-c", command, cwd=tmp_path)
+        found = normalized(printed.replace(str(tmp_path), "/home/ada"))
+        # `...` stands for any lines.
+        shown = "".join(
+            r"(?:.*\n)*" if line == "..." else re.escape(line) + "\n"
+            for line in normalized(output)
+        )
+        text = "".join(f"{line}\n" for line in found)
+        assert re.fullmatch(shown, text), f"{command}\n{printed}"
+    assert (tmp_path / "run.zip").is_file()
+
+
+# --- The site ---------------------------------------------------------------------
 
 
 # Takes more than five seconds: every page, and every docstring behind the names.
-def test_site_builds_without_a_warning(pages: ModuleType, tmp_path: Path) -> None:
+def test_site_builds_without_a_warning(tmp_path):
     """No dead link or anchor, no page outside the navigation, no broken docstring."""
-    done = subprocess.run(
-        [
-            *(sys.executable, "-m", "mkdocs", "build", "--strict"),
-            *("--site-dir", str(tmp_path / "site")),
-        ],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        timeout=280,
-    )
-    assert done.returncode == 0, done.stderr
+    pytest.importorskip("mkdocs", reason="the documentation's tools are not here")
+    build = (sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir")
+    run(*build, str(tmp_path / "site"), cwd=ROOT)
     commands = (tmp_path / "site" / "reference" / "commands" / "index.html").read_text()
     assert all(f"mjrec {name}" in commands for name in COMMANDS)
 
 
-def test_every_public_name_has_its_place(pages: ModuleType) -> None:
-    """Each name of the package is in one group of the reference; errors have theirs."""
-    listed = [name for names in pages.GROUPS.values() for name in names.split()]
+def test_generated_pages_are_complete():
+    """Each public name is in one group, and each known OpenGL message is explained."""
+    pytest.importorskip("mkdocs", reason="the documentation's tools are not here")
+    pages = runpy.run_path(str(ROOT / "scripts" / "docs_pages.py"))
+    listed = [name for names in pages["GROUPS"].values() for name in names.split()]
     errors = set(mjrec.errors.KINDS)
     of_extras = {"DmEnvMonitor", "Replay", "write_replay"}
     assert sorted(listed) == sorted({*mjrec.__all__, *of_extras} - errors)
+    text = pages["gl_page"]()
+    assert all(f"`{message}`" in text for _, message in pages["GL_MESSAGES"])
 
 
-def test_every_known_message_of_opengl_is_explained(pages: ModuleType) -> None:
-    """Each has a cause and a fix on the page."""
-    text = pages.gl_page()
-    for _, message in pages.GL_MESSAGES:
-        assert f"`{message}`" in text
-
-
-def test_pages_stay_short() -> None:
-    """README and pages have at most 12,000 words, as `wc -w` counts; some less."""
-    pages = [ROOT / "README.md", *DOCS.rglob("*.md")]
-    words = {path: len(path.read_text().split()) for path in pages}
-    assert sum(words.values()) <= 12_000
-    assert words[DOCS / "decisions.md"] <= 1_500
-    assert len((ROOT / "CHANGELOG.md").read_text().split()) <= 900
-
-
-def test_system_packages_are_those_that_setup_installs() -> None:
+def test_system_packages_are_those_that_setup_installs():
     """The apt line of the headless page names what scripts/setup looks for."""
     text = (DOCS / "howto" / "headless.md").read_text()
     [line] = [x for x in text.splitlines() if x.startswith("apt-get install -y libegl")]
@@ -87,13 +174,65 @@ def test_system_packages_are_those_that_setup_installs() -> None:
 
 @pytest.mark.thorough
 @pytest.mark.dm_control
-def test_dm_control_page_runs(tmp_path: Path) -> None:
+def test_dm_control_page_runs(tmp_path):
     """Its program runs as it stands, and leaves a video of a named environment."""
-    pytest.importorskip("dm_control", reason="dm_control is not installed here")
-    text = (DOCS / "howto" / "dm-control.md").read_text()
-    [code] = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
-    subprocess.run([sys.executable, "-c", code], cwd=tmp_path, check=True, timeout=280)
+    needs_extras("dm_control")
+    [code] = blocks((DOCS / "howto" / "dm-control.md").read_text(), "python")
+    run(sys.executable, "-c", code, cwd=tmp_path)
     results = mjrec.load_results(tmp_path / "recordings" / "cheetah")
-    assert results is not None
     assert len(results["videos"]) == 1
     assert results["env_info"]["env_id"] == "dm_control/cheetah-run"
+
+
+# --- Examples ---------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "example",
+    [
+        pytest.param(
+            path,
+            id=path.stem,
+            marks=pytest.mark.stable_baselines3
+            if path.stem == "stable_baselines3_training"
+            else pytest.mark.thorough,
+        )
+        for path in EXAMPLES
+    ],
+)
+def test_example_runs(example, tmp_path):
+    """By itself, in an empty directory, and is listed on the examples' page."""
+    needs_extras(example.read_text())
+    run(sys.executable, shutil.copy(example, tmp_path), cwd=tmp_path)
+    assert list((tmp_path / "recordings").iterdir())
+    assert example.name in (ROOT / "examples" / "README.md").read_text()
+
+
+@pytest.mark.thorough
+def test_command_line_example_runs(tmp_path):
+    """It keeps as many videos as it says, and lists its episodes."""
+    script = ROOT / "examples" / "command_line" / "evaluate.sh"
+    out = run(str(script), str(tmp_path / "out"), cwd=tmp_path)
+    assert len(list((tmp_path / "out").glob("*.mp4"))) == 2
+    assert out.count("truncated") == 6
+    assert "command_line/" in (ROOT / "examples" / "README.md").read_text()
+
+
+@pytest.mark.thorough
+@pytest.mark.dm_control
+def test_workflow_records_and_uploads(tmp_path):
+    """Its own commands leave what it uploads; the rest is what setup installs too."""
+    workflow = yaml.safe_load((ROOT / "examples" / "ci" / "record.yml").read_text())
+    [job] = workflow["jobs"].values()
+    commands = [step["run"] for step in job["steps"] if "run" in step]
+    for command in commands:
+        if command.startswith("mjrec"):
+            run("sh", "-ec", command, cwd=tmp_path)
+    [upload] = [s for s in job["steps"] if "upload-artifact" in s.get("uses", "")]
+    assert len(list((tmp_path / upload["with"]["path"]).rglob("*.mp4"))) == 1
+    [packages] = [text.split() for text in commands if "apt-get" in text]
+    assert all(name in SETUP for name in packages if name.startswith("lib"))
+    [extras] = [text for text in commands if text.startswith("pip")]
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    for extra in re.findall(r"mjrec\[([^]]+)\]", extras)[0].split(","):
+        assert extra in project["optional-dependencies"]

@@ -157,7 +157,7 @@ def test_ways_of_ending_a_program(code, status, reason, tmp_path):
 def test_a_full_disk_at_exit_is_one_line(tmp_path):
     """No traceback of the interpreter's exit hooks, in which the reason would drown."""
     code = "import resource\nresource.setrlimit(resource.RLIMIT_FSIZE, (0, 0))\n"
-    done = run(code, tmp_path, 0)
+    done = run_python(PROGRAM + code, tmp_path, status=0)
     assert "File too large" in done.stderr
     assert "Traceback" not in done.stderr
 

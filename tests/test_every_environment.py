@@ -2,13 +2,12 @@
 """Monitors of every environment there is."""
 
 import importlib.util
-import json
 from fractions import Fraction
 
-import av
 import gymnasium
 import pytest
 from parts import parametrize
+from recordings import frames_in, metadata_of
 
 from mjrec.environments.named_environment import EnvironmentOptions
 from mjrec.sessions import Session, record_session
@@ -28,28 +27,19 @@ def suite_tasks():
     return [f"dm_control/{domain}-{task}" for domain, task in suite.ALL_TASKS]
 
 
-def record(name, directory, *, steps=3):
-    """Record an episode; returns its metadata."""
-    session = Session(
-        environment=name,
-        directory=directory,
-        seed=0,
-        made=EnvironmentOptions(max_steps=steps, height=48, width=64),
-    )
+def check(name, directory, timestep):
+    """Record an episode, which plays in real time and has something to see."""
+    made = EnvironmentOptions(max_steps=3, height=48, width=64)
+    session = Session(environment=name, directory=directory, seed=0, made=made)
     [episode] = record_session(session)
-    assert episode.length <= steps
-    [path] = directory.glob("*.meta.json")
-    metadata = json.loads(path.read_text())
+    assert episode.length <= 3
+    metadata = metadata_of(directory, 0)
     assert metadata["frame_count"] == episode.length + 1
-    return metadata
-
-
-def check_frames(directory):
-    """Frames have content: neither black nor of one colour."""
-    [path] = directory.glob("*.mp4")
-    with av.open(str(path)) as container:
-        for frame in container.decode(video=0):
-            assert frame.to_ndarray(format="rgb24").std() > 5
+    expected = Fraction(timestep).limit_denominator(10**6)
+    assert Fraction(metadata["timestep"]) == expected
+    assert metadata["playback_speed"] == 1.0
+    # Neither black nor of one colour.
+    assert all(frame.std() > 5 for frame in frames_in(directory, 0))
 
 
 def test_all_of_gymnasiums_are_known():
@@ -58,18 +48,11 @@ def test_all_of_gymnasiums_are_known():
 
 
 @parametrize(
-    "env_id", GYMNASIUM, default=("HalfCheetah-v5",), part=pytest.mark.environments
+    "name", GYMNASIUM, default=("HalfCheetah-v5",), part=pytest.mark.environments
 )
-def test_gymnasium(env_id, tmp_path):
+def test_gymnasium(name, tmp_path):
     """Recorded in real time, with something to see."""
-    metadata = record(env_id, tmp_path)
-    check_frames(tmp_path)
-    env = gymnasium.make(env_id)
-    assert Fraction(metadata["timestep"]) == Fraction(
-        env.unwrapped.dt
-    ).limit_denominator(10**6)
-    assert metadata["playback_speed"] == 1.0
-    env.close()
+    check(name, tmp_path, gymnasium.make(name).unwrapped.dt)
 
 
 @pytest.mark.dm_control
@@ -83,11 +66,5 @@ def test_dm_control(name, tmp_path):
     """Recorded in real time, with something to see."""
     from dm_control import suite
 
-    metadata = record(name, tmp_path)
-    check_frames(tmp_path)
     env = suite.load(*name.removeprefix("dm_control/").split("-"))
-    assert Fraction(metadata["timestep"]) == Fraction(
-        env.control_timestep()
-    ).limit_denominator(10**6)
-    assert metadata["playback_speed"] == 1.0
-    env.close()
+    check(name, tmp_path, env.control_timestep())

@@ -3,16 +3,14 @@
 
 import json
 import os
+import re
 import shlex
 import shutil
-import tracemalloc
 from pathlib import Path
 
 import gymnasium
 import numpy as np
 import pytest
-import report_contents
-from engine_runs import run_python
 from parts import parametrize
 
 import mjrec
@@ -31,13 +29,8 @@ from report_recordings import GYM, entry, record, write_journal
 def recorded(tmp_path_factory):
     """Two recorded episodes of six steps, with two cameras, whose states are there."""
     directory = tmp_path_factory.mktemp("my recordings")
-    env = gymnasium.make(
-        "HalfCheetah-v5",
-        render_mode="rgb_array",
-        width=64,
-        height=48,
-        max_episode_steps=6,
-    )
+    size = {"width": 64, "height": 48, "max_episode_steps": 6}
+    env = gymnasium.make("HalfCheetah-v5", render_mode="rgb_array", **size)
     record(env, directory, 2, camera=[None, "track"])
     return directory
 
@@ -78,14 +71,6 @@ def test_the_command_renders_a_video_again(recorded, number, tmp_path, monkeypat
     assert decoded == json.loads(metadata.read_text())["decoded_sha256"]
 
 
-def test_live_videos_have_no_command(corridor, tmp_path):
-    """There is nothing that they could be rendered from, and that is said."""
-    record(corridor, tmp_path, 1)
-    [video] = gather(tmp_path).videos
-    assert video.command is None
-    assert any("live" in note for note in video.notes)
-
-
 @pytest.mark.parametrize("version", sorted(p.name for p in GYM.iterdir() if p.is_dir()))
 def test_recordings_of_every_gym_are_gathered(version):
     """Each directory is found one level below, with all episodes and text videos."""
@@ -101,18 +86,13 @@ def test_recordings_of_every_gym_are_gathered(version):
 
 def test_episodes_of_several_monitors_are_in_the_order_of_time(tmp_path):
     """What has no time comes last; what is not known of success stays unknown."""
-    write_journal(
-        tmp_path, "0.a", "X-v0", [entry(0, end_time=3.0e9, success=True), entry(1)]
-    )
+    early = [entry(0, end_time=3.0e9, success=True), entry(1)]
     late = [entry(0, end_time=2.0e9, success=False), entry(1, end_time=np.nan)]
+    write_journal(tmp_path, "0.a", "X-v0", early)
     write_journal(tmp_path, "1.b", "X-v0", late)
     [task] = gather(tmp_path).tasks
-    assert task.episodes[["seed", "episode", "success"]].tolist() == [
-        (0, 1, -1),
-        (1, 0, 0),
-        (0, 0, 1),
-        (1, 1, -1),
-    ]
+    shown = task.episodes[["seed", "episode", "success"]].tolist()
+    assert shown == [(0, 1, -1), (1, 0, 0), (0, 0, 1), (1, 1, -1)]
     assert task.runs == ["0.a", "1.b"]
     summary = task.summary
     assert (summary.runs, summary.success_known, summary.success_rate) == (2, 2, 0.5)
@@ -120,16 +100,14 @@ def test_episodes_of_several_monitors_are_in_the_order_of_time(tmp_path):
 
 def test_several_environments_are_tasks_of_their_own(tmp_path):
     """In one directory, which is told, and in several, by the directory's name."""
-    write_journal(tmp_path / "a", "0.a", "X-v0", [entry(0)])
-    write_journal(tmp_path / "a", "1.a", "Y-v0", [entry(0), entry(1)])
-    write_journal(tmp_path / "b", "0.x", "X-v0", [entry(0)])
+    a, b = tmp_path / "a", tmp_path / "b"
+    write_journal(a, "0.a", "X-v0", [entry(0)])
+    write_journal(a, "1.a", "Y-v0", [entry(0), entry(1)])
+    write_journal(b, "0.x", "X-v0", [entry(0)])
     # One that is given twice counts once.
-    contents = gather([tmp_path / "a", tmp_path / "b", tmp_path / "b" / "."])
-    assert [(task.name, task.summary.episodes) for task in contents.tasks] == [
-        (f"X-v0 ({tmp_path / 'a'})", 1),
-        ("Y-v0", 2),
-        (f"X-v0 ({tmp_path / 'b'})", 1),
-    ]
+    contents = gather([a, b, b / "."])
+    tasks = [(task.name, task.summary.episodes) for task in contents.tasks]
+    assert tasks == [(f"X-v0 ({a})", 1), ("Y-v0", 2), (f"X-v0 ({b})", 1)]
     [problem] = contents.problems
     assert "2 environments, X-v0, Y-v0" in problem
     assert contents.title == "Recordings: 3 tasks"
@@ -153,6 +131,10 @@ def test_what_stands_in_the_place_of_a_video_is_left_out(corridor, tmp_path, the
     """A link could put any file of the reader into a report; a pipe never ends."""
     directory = tmp_path / "run"
     record(corridor, directory, 1)
+    # What was drawn live cannot be rendered again, and that is said.
+    [shown] = gather(directory).videos
+    assert shown.command is None
+    assert any("live" in note for note in shown.notes)
     [video] = directory.glob("*.mp4")
     shutil.move(video, tmp_path / "secret.mp4")
     if there == "link":
@@ -206,18 +188,8 @@ def test_an_evaluation_has_its_results(tmp_path):
     assert ("Versions", "mjrec 9.9, MuJoCo 8.8") in task.provenance
     # One sentence about intervals is true of the whole page.
     assert (contents.bootstrap.seed, contents.bootstrap.resamples) == (3, 100)
-    beside = [
-        c.tasks[-1].summary.mean_interval for c in (contents, gather(tmp_path / "m"))
-    ]
-    assert beside[0] != beside[1]
-
-
-def test_intervals_made_in_another_way_are_told(tmp_path):
-    """One sentence about them is true of all but these."""
-    write_recorded(tmp_path / "a", ["a/x"])
-    write_evaluation(tmp_path / "b", {"b/y": [[1.0, 2.0]]}, monitor="0.batch")
-    [problem] = gather([tmp_path / "a", tmp_path / "b"]).problems
-    assert "computed differently: 10 resamples with seed 0, confidence 0.95." in problem
+    [alone] = gather(tmp_path / "m").tasks
+    assert contents.tasks[-1].summary.mean_interval != alone.summary.mean_interval
 
 
 def test_videos_of_an_evaluation_know_their_episode(corridor, tmp_path):
@@ -234,13 +206,15 @@ def test_videos_of_an_evaluation_know_their_episode(corridor, tmp_path):
     assert contents.problems == []
 
 
-def test_pending_videos_of_an_evaluation_are_told(tmp_path):
-    """With the command that makes them."""
+def test_problems_of_evaluations_are_told(tmp_path):
+    """Pending videos with the command for them, and intervals made in another way."""
     name = "openaigym.video.0.batch.video000000.mp4"
-    write_recorded(tmp_path, ["a/x"], videos={"a/x": name})
-    [problem] = gather(tmp_path).problems
-    assert "1 of 1 videos of a/x are missing" in problem
-    assert f"mjrec render {tmp_path / 'a-x'}" in problem
+    write_recorded(tmp_path / "a", ["a/x"], videos={"a/x": name})
+    write_evaluation(tmp_path / "b", {"b/y": [[1.0, 2.0]]}, monitor="0.batch")
+    pending, computed = gather([tmp_path / "a", tmp_path / "b"]).problems
+    assert "1 of 1 videos of a/x are missing" in pending
+    assert f"mjrec render {tmp_path / 'a' / 'a-x'}" in pending
+    assert "differently: 10 resamples with seed 0, confidence 0.95." in computed
 
 
 @pytest.mark.parametrize(
@@ -256,13 +230,11 @@ def test_an_evaluation_without_results_is_shown_by_its_monitors(
 ):
     """Whether it is not finished or a file is damaged, which is said."""
     write_recorded(tmp_path, ["a/x", "b/y"], finished=broken is not None)
-    if broken is not None and content is not None:
+    if broken:
         (tmp_path / broken).write_text(content)
     contents = gather(tmp_path)
-    assert [(t.name, t.is_evaluation) for t in contents.tasks] == [
-        ("a/x", False),
-        ("b/y", False),
-    ]
+    tasks = [(task.name, task.is_evaluation) for task in contents.tasks]
+    assert tasks == [("a/x", False), ("b/y", False)]
     assert contents.tasks[0].episodes["total_reward"].tolist() == [3.0, 1.0, 2.0]
     [problem] = contents.problems
     assert told in problem
@@ -273,45 +245,38 @@ def test_an_evaluation_without_results_is_shown_by_its_monitors(
 
 
 @pytest.mark.parametrize(
-    ("rewards", "failed", "roles"),
+    "rewards",
     [
-        ((1.0, 3.0, 2.0), [], {1: ("best",), 2: ("median",), 0: ("worst",)}),
-        ((5.0, 5.0, 5.0), [], {0: ("best", "median", "worst")}),
-        ((4.0, 1.0, 3.0, 2.0), [], {0: ("best",), 3: ("median",), 1: ("worst",)}),
-        ((np.nan, -np.inf, 0.0), [], {2: ("best",), 1: ("median",), 0: ("worst",)}),
-        ((9.0, 1.0, 2.0), [0], {2: ("best",), 1: ("median", "worst")}),
-        ((1.0,), [0], {}),
+        (2.0, 5.0, 5.0, 1.0, 1.0, 2.0),
+        *((5.0, 5.0), (9.0, None, 1.0, 2.0), (np.nan, -np.inf, 0.0, 1.0)),
     ],
 )
-def test_roles(rewards, failed, roles):
-    """Of equals the earlier, of an even number the lower, no number is the worst."""
-    given = report_contents.task("X", rewards, failures=dict.fromkeys(failed, "broke"))
-    given.episodes["total_reward"] = rewards
-    assert episodes_with_roles(given) == roles
-
-
-def test_roles_are_those_of_an_evaluation(tmp_path):
+def test_roles_are_those_of_an_evaluation(tmp_path, rewards):
     """The rule that chose the videos and the page call the same episodes the best."""
-    rewards = (2.0, 5.0, 5.0, 1.0, 1.0, 2.0)
     write_recorded(tmp_path, ["a/x"], rewards=rewards)
     results = list(read_results(tmp_path))
     expected = {}
     for result, role in keep_rule("best,median,worst").choose(results):
         index = results.index(result)
         expected[index] = (*expected.get(index, ()), role)
+    assert expected
     assert episodes_with_roles(gather(tmp_path).tasks[0]) == expected
 
 
+def verdict(outcome, **said):
+    """Return the text of a verification with one finding."""
+    known = {"path": "run", "level": "physics", "findings": [{"outcome": outcome}]}
+    return json.dumps({**known, **said})
+
+
 def test_verdicts_are_found_and_given(tmp_path):
-    """In the directory, and as a file."""
+    """In the directory, and as a file; what is only noted does not count."""
     write_journal(tmp_path / "run", "0.a", "X-v0", [entry(0)])
-    findings = [{"outcome": each} for each in ("recreated", "believed", "noted")]
-    said = {"path": "run", "level": "physics", "verdict": "PARTLY"}
-    said["findings"] = findings
-    (tmp_path / "run" / "verification.json").write_text(json.dumps(said))
-    bad = {**said, "verdict": "FAIL", "findings": [{"outcome": "different"}]}
-    (tmp_path / "other.json").write_text(json.dumps(bad))
-    contents = gather(tmp_path / "run", verifications=[tmp_path / "other.json"])
+    found, given = tmp_path / "run" / "verification.json", tmp_path / "other.json"
+    outcomes = [{"outcome": each} for each in ("recreated", "believed", "noted")]
+    found.write_text(verdict("", verdict="PARTLY", findings=outcomes))
+    given.write_text(verdict("different", verdict="FAIL"))
+    contents = gather(tmp_path / "run", verifications=[given])
     assert [each.verdict for each in contents.verdicts] == ["PARTLY", "FAIL"]
     assert contents.verdicts[0].counts == {"recreated": 1, "believed": 1}
     assert contents.verdicts[0].level == "physics"
@@ -320,11 +285,9 @@ def test_verdicts_are_found_and_given(tmp_path):
 @pytest.mark.parametrize(
     "text",
     [
-        "no JSON",
-        "{}",
-        '{"path": "x", "level": "pixels", "verdict": "PASS", '
-        '"findings": [{"outcome": "different"}]}',
-        '{"path": "x", "level": "all", "verdict": "PASS", "findings": []}',
+        *("no JSON", "{}"),
+        verdict("different", verdict="PASS"),
+        verdict("recreated", verdict="PASS", level="all"),
     ],
 )
 def test_a_verdict_that_is_none_is_not_shown(tmp_path, text):
@@ -343,49 +306,14 @@ def test_a_directory_without_recordings_is_an_error(tmp_path):
     """It is named, with what to do; so is one that is not there, or a file."""
     (tmp_path / "deep" / "deeper").mkdir(parents=True)
     write_journal(tmp_path / "deep" / "deeper", "0.a", "X-v0", [entry(0)])
-    with pytest.raises(InvalidArgument, match="contains no recordings"):
-        gather(tmp_path)
     named = tmp_path / "my runs; $(x)"
     named.mkdir()
-    with pytest.raises(InvalidArgument, match="--out") as error:
-        gather(named)
-    assert f"--out {shlex.quote(str(named))}`" in str(error.value)
-    with pytest.raises(InvalidArgument, match="does not exist"):
-        gather(tmp_path / "nowhere")
-    with pytest.raises(InvalidArgument, match="is a file"):
-        gather(GYM.parent.parent / "conftest.py")
-    with pytest.raises(InvalidArgument, match="at least one directory"):
-        gather([])
-
-
-def test_gathering_needs_no_simulator_no_opengl_and_no_ffmpeg(recorded):
-    """Where these cannot be imported, everything is there all the same."""
-    code = (
-        "import sys\n"
-        "blocked = {'mujoco', 'OpenGL', 'gymnasium', 'dm_control', 'imageio_ffmpeg'}\n"
-        "class Finder:\n"
-        "    def find_spec(self, name, path=None, target=None):\n"
-        "        if name.split('.')[0] in blocked:\n"
-        "            raise ImportError(name)\n"
-        "sys.meta_path.insert(0, Finder())\n"
-        "from mjrec.reporting.gathering import gather\n"
-        "contents = gather(sys.argv[1])\n"
-        "print(contents.tasks[0].summary.episodes, len(contents.videos))"
-    )
-    assert run_python("-c", code, str(recorded)).split() == ["2", "4"]
-
-
-@pytest.mark.thorough
-def test_many_episodes_take_little_memory(tmp_path):
-    """A hundred bytes each: a million take a fifth of what is promised."""
-    count = 10_000
-    write_journal(tmp_path, "0.a", "X-v0", [entry(i) for i in range(count)])
-    gather(tmp_path)
-    tracemalloc.start()
-    try:
-        gather(tmp_path)
-        peak = tracemalloc.get_traced_memory()[1]
-    finally:
-        tracemalloc.stop()
-    # Besides, the bootstrap takes what it takes, for any number.
-    assert peak < 150 * count + (24 << 20)
+    for given, words in (
+        (tmp_path, "contains no recordings"),
+        (named, re.escape(f"--out {shlex.quote(str(named))}`")),
+        (tmp_path / "nowhere", "does not exist"),
+        (__file__, "is a file"),
+        ([], "at least one directory"),
+    ):
+        with pytest.raises(InvalidArgument, match=words):
+            gather(given)

@@ -1,9 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """MJCF files, simulated and as an environment."""
 
-from fractions import Fraction
-
-import gymnasium
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
@@ -29,7 +26,7 @@ MODEL = """
     </body>
   </worldbody>
   <actuator>
-    <motor joint="rail" gear="5" ctrllimited="true" ctrlrange="-2 3"/>
+    <motor joint="rail" gear="{gear}" ctrllimited="true" ctrlrange="-2 3"/>
     <position joint="rail" kp="0.1"/>
   </actuator>
 </mujoco>
@@ -40,38 +37,33 @@ FOLLOWER = '<camera name="follow" mode="trackcom" pos="0 -2 0" xyaxes="1 0 0 0 0
 
 @pytest.fixture
 def write(tmp_path):
-    def write_model(*, timestep=0.002, cameras="", follower=""):
+    def write_model(**values):
         path = tmp_path / "my rail (2).xml"
-        options = {"timestep": timestep, "cameras": cameras, "follower": follower}
-        path.write_text(MODEL.format(**options))
+        usual = {"timestep": 0.002, "cameras": "", "follower": "", "gear": 5}
+        path.write_text(MODEL.format(**{**usual, **values}))
         return path
 
     return write_model
 
 
-@pytest.mark.parametrize("timestep", [0.0033, 0.0166667])
-def test_there_are_sixty_frames_to_the_second(write, timestep):
-    """No frame is more than half a timestep off, and nothing adds up; each episode."""
+@pytest.mark.parametrize(
+    ("timestep", "fps"), [(0.0033, 60), (0.0166667, 60), (0.025, 40)]
+)
+def test_there_are_sixty_frames_to_the_second(write, timestep, fps):
+    """No frame is more than half a timestep off, and nothing adds up; each episode.
+
+    A simulation slower than 60 steps a second plays at its own rate.
+    """
     env = MjcfEnvironment(write(timestep=timestep))
-    assert env.metadata["render_fps"] == 60
-    assert env.control_timestep() == pytest.approx(1 / 60)
+    assert env.metadata["render_fps"] == fps
+    assert env.control_timestep() == pytest.approx(1 / fps)
     for _ in range(2):
         env.reset()
         for frame in range(1, 301):
             env.step(np.zeros(2))
             # A hundred-thousandth is the rounding of 1/60 and 1/240 to these digits.
-            off = abs(env.simulation.data.time - frame / 60)
-            assert off <= timestep / 2 + 1e-5 * frame / 60
-
-
-def test_a_long_timestep_makes_one_frame_a_step(write):
-    """A simulation slower than 60 steps a second plays at its own rate."""
-    env = MjcfEnvironment(write(timestep=0.025))
-    assert env.simulation.frame_rate == Fraction(40)
-    assert (env.metadata["render_fps"], env.control_timestep()) == (40, 0.025)
-    env.reset()
-    env.step(np.zeros(2))
-    assert env.simulation.data.time == 0.025
+            off = abs(env.simulation.data.time - frame / fps)
+            assert off <= timestep / 2 + 1e-5 * frame / fps
 
 
 # States have no bounds, and the actuators' ranges are the author's.
@@ -102,30 +94,24 @@ def test_a_model_without_actuators_is_simulated(tmp_path):
     assert env.step(env.action_space.sample())[0][2] < 0
 
 
-def test_an_unstable_simulation_ends_where_it_was_sound(tmp_path, monkeypatch):
+def test_an_unstable_simulation_ends_where_it_was_sound(write, tmp_path, monkeypatch):
     """MuJoCo starts over by itself; the episode must not go on from there."""
     # MuJoCo writes MUJOCO_LOG.TXT where it is.
     monkeypatch.chdir(tmp_path)
-    path = tmp_path / "unstable.xml"
-    path.write_text(
-        '<mujoco><worldbody><body><joint name="j" type="slide"/><geom size=".1"/>'
-        '</body></worldbody><actuator><motor joint="j" gear="1e12"/></actuator>'
-        "</mujoco>"
-    )
-    env = MjcfEnvironment(path)
+    env = MjcfEnvironment(write(gear=1e12))
     env.reset()
-    sound, *_ = env.step(np.array([0.0]))
+    sound, *_ = env.step(np.zeros(2))
     time = env.simulation.data.time
-    observation, _, terminated, truncated, info = env.step(np.array([1.0]))
+    observation, _, terminated, truncated, info = env.step(np.array([1.0, 0.0]))
     assert (terminated, truncated) == (True, False)
     assert "unstable" in info["unstable"]
     assert observation.tolist() == sound.tolist()
     assert env.simulation.data.time == time > 0
     env.reset()
-    assert env.step(np.array([0.0]))[2] is False
+    assert env.step(np.zeros(2))[2] is False
 
 
-@pytest.mark.parametrize("action", [[0.0], [0, np.nan], [0, np.inf], np.zeros((2, 1))])
+@pytest.mark.parametrize("action", [[0.0], [0, np.nan], np.zeros((2, 1))])
 def test_what_is_no_control_is_refused(write, action):
     """MuJoCo would go on with other controls, or raise something obscure."""
     env = MjcfEnvironment(write())
@@ -134,37 +120,22 @@ def test_what_is_no_control_is_refused(write, action):
         env.step(action)
 
 
-@pytest.mark.parametrize(("asked", "expected"), [(None, 1000), (7, 7)])
-def test_episodes_end_after_max_steps(write, asked, expected):
-    """A model has no end of its own; its id in recordings is the file's name."""
-    env = make_mjcf(write(), EnvironmentOptions(max_steps=asked, frames=False))
-    env.reset()
-    ends = [env.step(np.zeros(2))[2:4] for _ in range(expected)]
-    assert ends == [(False, False)] * (expected - 1) + [(False, True)]
-    assert env.spec.id == "mjcf/my_rail__2_"
-
-
-class Draws(MjcfEnvironment):
-    def render(self):
-        return super().render()
-
-
 def test_frames_follow_from_states(write):
-    """Wrapped or not, unless something overrides; cameras are checked at once."""
+    """Wrapped or not, unless something overrides; a model has no end of its own."""
     path = write(cameras=FIXED)
-    limited = gymnasium.wrappers.TimeLimit(MjcfEnvironment(path), 3)
-    scenes = gymnasium_scenes(limited)
+    scenes = gymnasium_scenes(make_mjcf(path, EnvironmentOptions()))
     assert scenes.obstacle is None
-    assert scenes.environment == {
+    limited = make_mjcf(path, EnvironmentOptions(max_steps=3))
+    assert gymnasium_scenes(limited).environment == {
         "framework": "mjcf",
         "id": "mjcf/my_rail__2_",
         "kwargs": {},
         "wrappers": [],
         "max_episode_steps": 3,
     }
-    assert "Draws overrides render()" in str(gymnasium_scenes(Draws(path)).obstacle)
-    with pytest.raises(mjrec.UnknownName, match="fixed"):
-        gymnasium_scenes(limited, camera="forward")
+    assert scenes.environment["max_episode_steps"] == 1000
+    limited.unwrapped.render = lambda: None
+    assert "overrides render()" in gymnasium_scenes(limited).obstacle
 
 
 def test_frames_show_the_camera_that_follows_or_the_first(write):
@@ -181,30 +152,27 @@ def test_frames_show_the_camera_that_follows_or_the_first(write):
     assert frame[16, 24, 0] > 100 > frame[16, 24, 1]
     env.close()
     env.close()
-    with pytest.raises(mjrec.UnknownName, match=r"'nose'.*fixed, follow"):
-        MjcfEnvironment(env.path, camera="nose")
 
     path = write(cameras=FIXED)
-    env = MjcfEnvironment(path, **size)
-    env.reset()
-    frame = env.render()
-    assert frame[16, 24, 1] > 100 > frame[16, 24, 0]
-    env.close()
-    cameras = [env, MjcfEnvironment(path, camera=-1), MjcfEnvironment(write())]
-    assert [each.camera for each in cameras] == ["fixed", -1, -1]
-    assert (cameras[1].height, cameras[1].width) == (480, 480)
+    first, free = MjcfEnvironment(path), MjcfEnvironment(path, camera=-1)
+    cameras = [each.camera for each in (first, free, MjcfEnvironment(write()))]
+    assert cameras == ["fixed", -1, -1]
+    assert (free.height, free.width) == (480, 480)
 
 
-def test_without_a_render_mode_nothing_is_rendered(write):
-    """Rendering is an error that says how to make the environment."""
-    env = MjcfEnvironment(write())
-    env.reset()
+def test_wrong_arguments_are_refused_at_once(write):
+    """A camera that is not there, a window, and more than a file can take."""
+    path = write(cameras=FIXED)
+    with pytest.raises(mjrec.UnknownName, match=r"'nose'.*fixed"):
+        MjcfEnvironment(path, camera="nose")
+    with pytest.raises(mjrec.UnknownName, match="fixed"):
+        gymnasium_scenes(MjcfEnvironment(path), camera="forward")
     with pytest.raises(mjrec.NoPictures, match='render_mode="rgb_array"'):
-        env.render()
+        MjcfEnvironment(path).render()
     with pytest.raises(mjrec.InvalidArgument, match="render_mode"):
-        MjcfEnvironment(write(), render_mode="human")
+        MjcfEnvironment(path, render_mode="human")
     with pytest.raises(mjrec.InvalidArgument, match=r"no more arguments.*frame_skip"):
-        make_mjcf(write(), EnvironmentOptions(kwargs={"frame_skip": 2}))
+        make_mjcf(path, EnvironmentOptions(kwargs={"frame_skip": 2}))
 
 
 @pytest.mark.parametrize(

@@ -48,24 +48,20 @@ def test_a_report_is_a_page_with_copies_beside_it(recordings, tmp_path):
         recordings, tmp_path / "report", title="Mine", on_progress=told.append
     )
     assert page == tmp_path / "report" / "index.html"
-    assert told == [
-        ReportProgress(what, done, 2)
-        for what in ("posters", "videos")
-        for done in (1, 2)
-    ]
+    steps = [("posters", 1), ("posters", 2), ("videos", 1), ("videos", 2)]
+    assert told == [ReportProgress(what, done, 2) for what, done in steps]
     shutil.rmtree(recordings)
-    assert names(page.parent) == [
-        "index.html",
-        "posters/0000-unknown-corridor.jpg",
-        "posters/0001-unknown-corridor.jpg",
-        "videos/0000-unknown-corridor.mp4",
-        "videos/0001-unknown-corridor.mp4",
+    files = [
+        f"{kind}/000{number}-unknown-corridor.{ending}"
+        for kind, ending in (("posters", "jpg"), ("videos", "mp4"))
+        for number in (0, 1)
     ]
+    assert names(page.parent) == ["index.html", *files]
     copies = sorted((page.parent / "videos").iterdir())
     assert [sha256(path) for path in copies] == hashes
     assert all(path.stat().st_nlink == 1 for path in copies)
     text = page.read_text()
-    for words in (*names(page.parent)[1:], *hashes, "<title>Mine</title>"):
+    for words in (*files, *hashes, "<title>Mine</title>"):
         assert words in text
 
 
@@ -86,63 +82,50 @@ def test_the_command_writes_a_folder_and_prints_its_page(tmp_path, capsys, monke
     assert report((run,), as_json=True) == 0
     said = json.loads(capsys.readouterr().out)
     assert said == {"page": str(tmp_path / "report" / "index.html")}
-    one = {"out": tmp_path / "one.html", "single_file": True}
-    assert report((run,), **one) == 0
     with pytest.raises(InvalidArgument, match="max_single_file_bytes"):
-        report((run,), **one, max_single_file_bytes=10)
+        report((run,), out=page, single_file=True, max_single_file_bytes=10)
 
 
 def test_posters_show_the_middle(recordings):
     """At most 640 pixels wide, with the colours of the video."""
-    first, second = sorted(recordings.glob("*.mp4"))
-    for video, size in ((first, (400, 800)), (second, (48, 64))):
+    sizes = [(400, 800), (48, 64)]
+    for video, size in zip(sorted(recordings.glob("*.mp4")), sizes, strict=True):
         with mjrec.VideoWriter(video, fps=10) as writer:
             for colour in ((255, 0, 0), (20, 160, 90), (0, 0, 255)):
                 writer.write(np.full((*size, 3), colour, np.uint8))
     contents = gather(recordings)
-    sizes = []
     add_images(contents, lambda progress: None)
-    for video in contents.videos:
-        with Image.open(io.BytesIO(video.image)) as image:
-            assert image.format == "JPEG"
-            sizes.append(image.size)
-            pixel = np.asarray(image)[20, 20]
-            np.testing.assert_allclose(pixel, (20, 160, 90), atol=4)
-    assert sizes == [(640, 320), (64, 48)]
+    shown = [Image.open(io.BytesIO(video.image)) for video in contents.videos]
+    assert [image.size for image in shown] == [(640, 320), (64, 48)]
+    for image in shown:
+        assert image.format == "JPEG"
+        np.testing.assert_allclose(image.getpixel((20, 20)), (20, 160, 90), atol=4)
 
 
 def test_a_video_that_is_none_is_named_and_the_rest_is_there(recordings, tmp_path):
     """One that was cut off is copied; a page, which a browser would open, is not."""
     first, second = sorted(recordings.glob("*.mp4"))
     first.write_bytes(first.read_bytes()[:200])
+    second.write_text("<html><script>alert(1)</script></html>")
     page = write_report(recordings, tmp_path / "report")
-    assert "posters/0000-unknown-corridor.jpg" not in names(page.parent)
-    assert "posters/0001-unknown-corridor.jpg" in names(page.parent)
+    assert names(page.parent) == ["index.html", "videos/0000-unknown-corridor.mp4"]
     text = page.read_text()
     assert "A video has no poster" in text
     assert "does not match its metadata" in text
     assert sha256(first) in text
-    second.write_text("<html><script>alert(1)</script></html>")
-    page = write_report(recordings, tmp_path / "report")
-    assert [n for n in names(page.parent) if n.startswith("videos")] == [
-        "videos/0000-unknown-corridor.mp4"
-    ]
-    assert f"The video {second} is left out" in page.read_text()
+    assert f"The video {second} is left out" in text
 
 
 def test_hostile_names_are_text_on_the_page_and_no_names_of_files(tmp_path):
     """Whatever an environment is called."""
     env_id = "../<script>alert(1)</script>\u202e"
     write_journal(tmp_path / "run", "0.a", env_id, [entry(0)])
-    text = (GYM / "0.22.0" / "text").glob("*.video000000*.json")
-    for path in text:
+    for path in (GYM / "0.22.0" / "text").glob("*.video000000*.json"):
         name = path.name.replace("0.20545", "0.a")
         shutil.copyfile(path, tmp_path / "run" / name)
     page = write_report(tmp_path / "run", tmp_path / "report")
-    assert names(page.parent) == [
-        "index.html",
-        "videos/0000-script-alert-1-script.json",
-    ]
+    copied = "videos/0000-script-alert-1-script.json"
+    assert names(page.parent) == ["index.html", copied]
     assert "<script>alert" not in page.read_text()
 
 
@@ -189,7 +172,7 @@ def test_what_is_no_report_is_not_replaced(
     assert (tmp_path / mine).read_text() == "mine"
 
 
-def test_a_failed_report_leaves_what_was_there(recordings, tmp_path, monkeypatch):
+def test_a_failed_report_leaves_what_was_there(recordings, tmp_path):
     """And nothing half-written."""
     page = write_report(recordings, tmp_path / "report")
     before = page.read_text()
@@ -204,37 +187,34 @@ def test_a_failed_report_leaves_what_was_there(recordings, tmp_path, monkeypatch
     assert sorted(p.name for p in tmp_path.iterdir()) == ["recordings", "report"]
 
 
-def test_a_single_file_has_everything_in_it(recordings, tmp_path):
-    """Byte for byte; it is replaced as a folder is, and may be in one."""
-    for target in (tmp_path / "one.html", tmp_path / "one.html", tmp_path / "folder"):
-        page = write_report(recordings, target, single_file=True)
-        text = page.read_text()
+IMAGE = "<img[^>]* src=.data:image/jpeg;base64,"
+VIDEO = "<a [^>]*href=.data:video/mp4;base64,"
+
+
+def test_a_single_file_has_as_much_in_it_as_is_allowed(recordings, tmp_path):
+    """Byte for byte; posters come first, then the videos; what is missing is told."""
+
+    def written(name, **options):
+        page = write_report(recordings, tmp_path / name, single_file=True, **options)
+        return page, page.read_text()
+
+    # It is replaced as a folder is, and may be in one.
+    for name in ("one.html", "one.html", "folder"):
+        page, text = written(name)
+        # The two are alike, and each is there once.
         for path in recordings.glob("*.mp4"):
-            assert base64.b64encode(path.read_bytes()).decode() in text
-        assert text.count("data:video/mp4;base64,") == 2
-        assert len(re.findall("<img[^>]* src=.data:image/jpeg;base64,", text)) == 2
+            assert text.count(base64.b64encode(path.read_bytes()).decode()) == 2
+        assert len(re.findall(VIDEO, text)) == len(re.findall(IMAGE, text)) == 2
+        # A link saves a video, for no browser opens a page that is such an address.
+        assert all("download" in link for link in re.findall(VIDEO + "[^>]*", text))
     assert names(tmp_path / "folder") == ["index.html"]
-
-
-def test_a_single_file_is_no_larger_than_allowed(recordings, tmp_path):
-    """Posters come first, then the videos in their order; what is missing is told."""
-    whole = write_report(recordings, tmp_path / "whole.html", single_file=True)
-    most = whole.stat().st_size - 100
-    part = write_report(
-        recordings, tmp_path / "part.html", single_file=True, max_single_file_bytes=most
-    )
+    most = page.stat().st_size - 100
+    part, text = written("part.html", max_single_file_bytes=most)
     assert part.stat().st_size <= most
-    text = part.read_text()
-    assert len(re.findall("<img[^>]* src=.data:image/jpeg;base64,", text)) == 2
-    assert len(re.findall("<a[^>]* href=.data:video/mp4;base64,", text)) == 1
+    assert (len(re.findall(IMAGE, text)), len(re.findall(VIDEO, text))) == (2, 1)
     assert "1 of 2 videos are not embedded" in text
     with pytest.raises(InvalidArgument, match="without any image or video"):
-        write_report(
-            recordings,
-            tmp_path / "tiny.html",
-            single_file=True,
-            max_single_file_bytes=1000,
-        )
+        written("tiny.html", max_single_file_bytes=1000)
     assert not (tmp_path / "tiny.html").exists()
 
 
@@ -242,12 +222,8 @@ def test_replays_stand_beside_the_videos(tmp_path):
     """With `replays` the best, median and worst episode have a page in 3D each."""
     pytest.importorskip("mjviser")
     env = gymnasium.make("Hopper-v5", max_episode_steps=3)
-    record(
-        *(env, tmp_path / "run", 4),
-        height=48,
-        width=64,
-        video_callable=lambda _: True,
-    )
+    always = {"video_callable": lambda _: True}
+    record(env, tmp_path / "run", 4, height=48, width=64, **always)
     page = write_report(tmp_path / "run", tmp_path / "report", replays=True)
     links = re.findall(r'href="\./(replays/[^"]+)"', page.read_text())
     assert len(set(links)) == 3
