@@ -21,7 +21,11 @@ def two(tmp_path):
     b = {WALK: [[500.0, 600, 700, 800]], "Hopper-v5": [[5.0, 6, 7, 8]]}
     return [
         str(write_evaluation(tmp_path / "a", a, policy="mine:old")),
-        str(write_evaluation(tmp_path / "b", b, policy="mine:new")),
+        str(
+            write_evaluation(
+                tmp_path / "b", b, policy="mine:new", policy_kwargs={"gain": 2}
+            )
+        ),
     ]
 
 
@@ -36,6 +40,7 @@ def test_a_table_and_a_sentence(two, tmp_path, capsys):
     assert main(["compare", *two]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert lines[0].endswith("a (policy mine:old)")
+    assert lines[1].endswith("b (policy mine:new, gain=2)")
     (row,) = (line for line in map(str.strip, lines) if line.startswith(WALK))
     figures = ["250", "650", "400", "400", "1"]
     assert row.split()[1:-1] == ["4,", "4", *figures]
@@ -175,3 +180,10 @@ def test_text_of_files_is_no_order_to_the_terminal(tmp_path, capsys):
     assert "\x1b" not in out
     assert "[red]\\x1b[2Jx" in out
     assert "[bold]\\x1b[2J" in out
+
+
+def test_what_a_requirement_of_scores_lacks_is_said(tmp_path, capsys):
+    """The option that gives a task its score range."""
+    a, b = (str(write_evaluation(tmp_path / n, {"x": [[1.0, 2.0]]})) for n in "ab")
+    assert main(["compare", a, b, "--no-worse-than", "A", "--margin", "0.1"]) == 1
+    assert "mjrec evaluate --resume DIR --score-range" in capsys.readouterr().out
