@@ -376,6 +376,22 @@ def kill_worker(once=None):
         os.kill(os.getpid(), signal.SIGKILL)
 
 
+def test_recordings_that_were_left_unfinished_are_finished_later(tmp_path, caplog):
+    """By a resumed evaluation, also if no result is missing; no episode is repeated."""
+    chunk = tmp_path / "e" / PENDULUM / "seed-005-episode-003"
+    blocked = chunk / f"openaigym.trajectories.0.{PENDULUM}-{chunk.name}.h5"
+    policy = Odd(functools.partial(blocked.mkdir, exist_ok=True))
+    options = {"policy": policy, "seeds": [5], "num_seeds": None, "episodes": 4}
+    results = run(tmp_path / "e", **options).results
+    assert blocked.name in caplog.text
+    assert len(results) == 4
+    assert not [*finished_trajectories(chunk)]
+    blocked.rmdir()
+    assert run(tmp_path / "e", **options, resume=True).results == results
+    assert begun(tmp_path / "e") == 4
+    assert len([*finished_trajectories(chunk)]) == 1
+
+
 @pytest.mark.thorough
 def test_a_worker_that_dies_once_costs_nothing(tmp_path, caplog):
     """Its job is begun again, and the results are as if it had lived."""
