@@ -26,7 +26,7 @@ def two(write):
     """Return two evaluations; of the first task the second is better."""
     return [
         write("a", WORSE, policy="mine:old"),
-        write("b", BETTER, policy="mine:new"),
+        write("b", BETTER, policy="mine:new", policy_kwargs={"gain": 2}),
     ]
 
 
@@ -41,6 +41,7 @@ def test_a_table_and_a_sentence(two, write, capsys):
     assert main(["compare", *two]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert lines[0].endswith("a (policy mine:old)")
+    assert lines[1].endswith("b (policy mine:new, gain=2)")
     (row,) = (line for line in map(str.strip, lines) if line.startswith(WALK))
     assert row.split()[1:-1] == ["4,", "4", "250", "650", "400", "400", "1"]
     assert any(line.rstrip().endswith("(1 to 1)") for line in lines)
@@ -172,3 +173,10 @@ def test_text_of_files_is_no_order_to_the_terminal(write, capsys):
     assert "\x1b" not in out
     assert "[red]\\x1b[2Jx" in out
     assert "[bold]\\x1b[2J" in out
+
+
+def test_what_a_requirement_of_scores_lacks_is_said(tmp_path, capsys):
+    """The option that gives a task its score range."""
+    a, b = (str(write_evaluation(tmp_path / n, {"x": [[1.0, 2.0]]})) for n in "ab")
+    assert main(["compare", a, b, "--no-worse-than", "A", "--margin", "0.1"]) == 1
+    assert "mjrec evaluate --resume DIR --score-range" in capsys.readouterr().out

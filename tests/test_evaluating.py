@@ -382,6 +382,27 @@ def kill_worker(once=None):
     return np.full(1, 0.01)
 
 
+def block(path):
+    path.mkdir(exist_ok=True)
+    return np.full(1, 0.01)
+
+
+def test_recordings_that_were_left_unfinished_are_finished_later(tmp_path, caplog):
+    """By a resumed evaluation, also if no result is missing; no episode is repeated."""
+    chunk = tmp_path / "e" / PENDULUM / "seed-005-episode-003"
+    blocked = chunk / f"openaigym.trajectories.0.{PENDULUM}-{chunk.name}.h5"
+    policy = Stumbling({3: functools.partial(block, blocked)})
+    options = {"policy": policy, "seeds": [5], "num_seeds": None, "episodes": 4}
+    results = run(tmp_path / "e", **options).results
+    assert blocked.name in caplog.text
+    assert len(results) == 4
+    assert not [*finished_trajectories(chunk)]
+    blocked.rmdir()
+    assert run(tmp_path / "e", **options, resume=True).results == results
+    assert begun(tmp_path / "e") == 4
+    assert len([*finished_trajectories(chunk)]) == 1
+
+
 # Takes more than five seconds: two evaluations, and a worker that starts again.
 @parametrize("protocol", ["suite", "seeded"])
 def test_a_worker_that_dies_once_costs_nothing(tmp_path, caplog, protocol):

@@ -18,6 +18,7 @@ from evaluations import write_evaluation, write_recorded
 from mjrec.commands import main
 from mjrec.errors import InvalidArgument, UnreadableFile
 from mjrec.evaluation.evaluation import read_results
+from mjrec.evaluation.summaries import AcrossTasks
 from mjrec.formats.monitor_directory import infix_of
 from mjrec.recorder.keep_rules import keep_rule
 from mjrec.reporting.contents import end_times, episodes_with_roles, outcomes
@@ -183,13 +184,28 @@ def test_an_evaluation_has_its_results(tmp_path):
     assert task.failures == {2: "PolicyError: it gave <b>NaN</b>"}
     assert end_times(task.episodes)[1] == 1.79e9 + 2
     assert (task.summary.episodes, task.summary.failed) == (3, 1)
-    assert contents.across.keys() == {str(tmp_path / "e")}
     assert ("Seeds", "0, 7") in task.provenance
     assert ("Versions", "mjrec 9.9, MuJoCo 8.8") in task.provenance
     # One sentence about intervals is true of the whole page.
     assert (contents.bootstrap.seed, contents.bootstrap.resamples) == (3, 100)
     [alone] = gather(tmp_path / "m").tasks
     assert contents.tasks[-1].summary.mean_interval != alone.summary.mean_interval
+
+
+def test_what_was_evaluated_is_told(tmp_path):
+    """The policy with its arguments; scores only where a task has a scale."""
+    write_evaluation(
+        *(tmp_path / "a", {"a/x": [[1.0]]}),
+        policy="mine:Policy",
+        policy_kwargs={"gain": 2.5, "net": "small"},
+        across=AcrossTasks(tasks=(), left_out={"a/x": "no scale"}),
+    )
+    scores = AcrossTasks(tasks=("b/y",))
+    write_evaluation(tmp_path / "b", {"b/y": [[1.0]]}, across=scores)
+    contents = gather([tmp_path / "a", tmp_path / "b"])
+    policy = "mine:Policy, gain=2.5, net='small'"
+    assert ("Policy", policy) in contents.tasks[0].provenance
+    assert contents.across == {str(tmp_path / "b"): scores}
 
 
 def test_videos_of_an_evaluation_know_their_episode(corridor, tmp_path):

@@ -238,7 +238,7 @@ class _Side:
         self.tasks = [task for task in first if all(task in other for other in rest)]
 
     def policies(self) -> str:
-        return _listed(each.plan.policy for each in self.results)
+        return _listed(each.plan.policy_and_kwargs for each in self.results)
 
     def without(self, tasks: Sequence[str]) -> tuple[str, ...]:
         """Return the tasks of this side except the given ones."""

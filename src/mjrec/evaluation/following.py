@@ -25,6 +25,8 @@ from ..recorder.keep_rules import keep_rule
 from ..rendering.chosen_videos import write_choice
 from ..rendering.finish import bring_up_to_date, do_jobs
 from ..rendering.jobs import Progress, RecordingKey, VideoJob
+from ..rendering.leftovers import has_leftovers
+from ..results.monitor_files import monitors_of
 from ..simulation.model_trust import note_models
 from .episode_results import ChunkResults, EpisodeResult, read_chunk
 from .evaluation import ChosenEpisode, Evaluation
@@ -97,6 +99,13 @@ class ChunkRun:
     def is_complete(self) -> bool:
         """Whether all episodes of the chunk have a result."""
         return all(unit in self.known.results for unit in self.chunk)
+
+    @property
+    def is_finished(self) -> bool:
+        """Whether the chunk is complete, and its recordings are finished too."""
+        return self.is_complete and not any(
+            has_leftovers(files) for files in monitors_of(self.folder)
+        )
 
     def result(self, unit: Unit) -> EpisodeResult:
         """Return the result of an episode, which has failed if no result is known."""
@@ -185,6 +194,9 @@ def chunks_in(directory: Path, plan: EvaluationPlan) -> list[ChunkRun]:
 def run_chunks(run: Run, chunks: Sequence[ChunkRun], tell: _Tell) -> EvaluationProgress:
     """Run the missing episodes of all chunks, and return the final progress.
 
+    A killed process may have left all results of a chunk, but its recordings
+    unfinished. Such a chunk is also submitted, because its job finishes them.
+
     Args:
         run: the workers.
         chunks: the chunks, in the order of submission.
@@ -193,7 +205,7 @@ def run_chunks(run: Run, chunks: Sequence[ChunkRun], tell: _Tell) -> EvaluationP
     Raises:
         Error: workers cannot be started, or a journal is damaged.
     """
-    by_key = {_submit(run, each): each for each in chunks if not each.is_complete}
+    by_key = {_submit(run, each): each for each in chunks if not each.is_finished}
     counts_from = 0.0
     progress = _progress(chunks)
     for outcome in run.results(timeout_s=_SECONDS_BETWEEN_REPORTS):
@@ -207,7 +219,7 @@ def run_chunks(run: Run, chunks: Sequence[ChunkRun], tell: _Tell) -> EvaluationP
                 # repeatedly kills its process eventually counts as failed.
                 by_key[_submit(run, each)] = each
                 continue
-            if not each.is_complete:
+            if outcome.failure or not each.is_complete:
                 said = outcome.failure or (
                     f"A worker finished {each.folder}, but the recordings are missing "
                     "there. All machines must see the directory under the same path."

@@ -144,11 +144,21 @@ class EvaluationPlan:
     quality: Annotated[str, one_of(*QUALITIES)] = "full"
     env_kwargs: Mapping[str, Any] = field(default_factory=dict)
 
+    @property
+    def policy_and_kwargs(self) -> str:
+        """The policy and its keyword arguments, as text for people."""
+        return ", ".join([self.policy, *kwargs_as_text(self.policy_kwargs)])
+
     def __iter__(self) -> Iterator[Unit]:
         """Yield the episodes of a task in the order of the results."""
         for seed in self.seeds:
             for number in range(self.episodes):
                 yield seed, number
+
+
+def kwargs_as_text(kwargs: Mapping[str, Any]) -> list[str]:
+    """Return keyword arguments as in a call."""
+    return [f"{name}={value!r}" for name, value in kwargs.items()]
 
 
 def write_plan(directory: Path, plan: EvaluationPlan) -> None:

@@ -19,6 +19,10 @@ _SIGNS: Final[dict[str, Callable[[float, float], bool]]] = {
     "<": operator.lt,
     "<=": operator.le,
 }
+_NO_SCORES: Final = (
+    ", because no task has the same score range in all evaluations: give it with "
+    "mjrec evaluate --resume DIR --score-range TASK=LOW:HIGH"
+)
 _FORM: Final = re.compile(
     r"(?:(?P<task>.+):\s+)?(?P<figure>[^<>=:]+?)(?:\s+(?P<end>low|high))?"
     r"\s*(?P<sign>[<>]=?)\s*(?P<number>[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)(e[+-]?[0-9]+)?)"
@@ -66,7 +70,9 @@ class Requirement:
             value = self._value(figures.get(self.figure))
             what = " ".join(filter(None, [self.figure, self.end]))
             if value is None:
-                yield f"{self.text}: the {what} of {whose} is unknown"
+                needs_scores = self.figure.startswith("IQM") and not comparison.scored
+                why = _NO_SCORES if needs_scores else ""
+                yield f"{self.text}: the {what} of {whose} is unknown{why}"
             elif not _SIGNS[self.sign](value, self.number):
                 yield f"{self.text}: the {what} of {whose} is {value:.4g}"
 

@@ -289,7 +289,7 @@ def _add_evaluation(contents: ReportContents, directory: Path) -> None:
             f"The intervals of {directory} were computed differently: {how.resamples} "
             f"resamples with seed {how.seed}, confidence {how.confidence:g}."
         )
-    if results.across is not None:
+    if results.across is not None and results.across.tasks:
         contents.across[str(directory)] = results.across
     for summary in results.summaries:
         task = summary.task

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from ..errors import UnreadableFile
 from ..evaluation.evaluation import Evaluation
-from ..evaluation.plan import SEEDED
+from ..evaluation.plan import SEEDED, kwargs_as_text
 from ..formats.json_fields import facts_in, field, integer, rate, read_object
 from ..formats.manifest import GYM_VERSION
 from ..formats.monitor_directory import episode_of, view_of
@@ -111,9 +111,8 @@ def pairs_of_results(results: Evaluation, task: str) -> Iterator[tuple[str, str]
     """Yield the provenance of the episodes of one task of an evaluation."""
     plan = results.plan
     yield "Environment", task
-    kwargs = (f"{key}={value!r}" for key, value in plan.env_kwargs.items())
-    yield "Environment arguments", ", ".join(kwargs)
-    yield "Policy", plan.policy + " (an object)" * plan.is_object
+    yield "Environment arguments", ", ".join(kwargs_as_text(plan.env_kwargs))
+    yield "Policy", plan.policy_and_kwargs + " (an object)" * plan.is_object
     seeded = "seeded: episode i of seed s starts from SeedSequence([s, i])"
     suite = "suite: one random stream per task and seed"
     yield "Protocol", seeded if plan.protocol == SEEDED else suite
