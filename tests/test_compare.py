@@ -233,7 +233,7 @@ def test_equal_runs_are_made_again(packed: Path) -> None:
         (
             lambda bag: (bag / "data" / "notes.txt").write_text("best"),
             Topic.FILES,
-            "nothing recreated this file",
+            "this file was not recreated",
         ),
         (
             lambda bag: the(bag, "*video000001.framehash").unlink(),

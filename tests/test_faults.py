@@ -152,7 +152,7 @@ def test_a_dead_encoder(pendulum, out, kill_ffmpeg, caplog):
     assert len(frames_in(out, 1)) == 9
     assert (len(details["videos"]), len(details["mjrec"]["broken"])) == (1, 1)
     assert stats_of(out)["episode_lengths"] == [8, 8]
-    said = [r.levelno for r in caplog.records if "Not completely recorded" in r.message]
+    said = [r.levelno for r in caplog.records if "Incomplete recording" in r.message]
     assert said == [logging.WARNING]
 
 

@@ -141,7 +141,7 @@ def evaluate(
         max_steps: truncate episodes after this many steps. None for the environment's
             limit, or for 1000 steps if it has no limit.
         episode_timeout: maximum duration of an episode in seconds. An episode that
-            takes longer fails, and its worker is ended.
+            takes longer fails, and its worker is terminated.
         camera: the camera for the videos. None for the model's tracking camera, if
             there is one.
         height: height of the videos in pixels. None for the environment's default.

@@ -12,8 +12,9 @@ In a staged monitor directory, whose files are copies or links:
   `<gpu>`, because each identifies a single card;
 - file names that contain the identity in a uid, a camera or a prefix get `user` or
   `host` instead, and references to them are changed to match;
-- sources of models lose their comments, and their images the metadata. No element or
-  attribute changes, so the model compiles to the same result, and names stay;
+- sources of models lose their comments, and their images lose their metadata. No
+  element or attribute changes, so the model compiles to the same result, and names
+  stay;
 - a compiled model that contains the identity is removed. Only its author could have
   loaded it.
 
@@ -80,7 +81,7 @@ _DAMAGE = (zipfile.BadZipFile, zlib.error, struct.error, EOFError, RuntimeError)
 
 
 def make_anonymous(recordings: Path, *, identity: Identity) -> None:
-    """Remove an identity from a monitor directory that is made of copies or links.
+    """Remove an identity from a monitor directory that consists of copies or links.
 
     Nothing is written in place: a file that is a hard link to an original is replaced
     by a new file. After an error the directory is unusable.

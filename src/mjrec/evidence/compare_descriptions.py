@@ -40,7 +40,7 @@ def compare_descriptions(bag: Path) -> Iterator[Same | Difference]:
     there |= {name: bag / name for name in texts if (bag / name).exists()}
     for name in sorted(there.keys() | texts.keys()):
         if name not in texts:
-            yield _difference(name, "nothing recreated this file")
+            yield _difference(name, "this file was not recreated")
         elif name not in there:
             yield _difference(name, "no such file, but one was recreated")
         else:

@@ -2,7 +2,7 @@
 """The result of a verification: findings, excuses and one verdict.
 
 A packed run is recreated from its inputs and compared with the archive, item by item.
-Each finding is about one or several items. Each excuse is a claim in the archive that
+Each finding is about one or more items. Each excuse is a claim in the archive that
 allows some items to differ from the recreated ones.
 """
 

@@ -130,7 +130,8 @@ def shown_times(boxes: Sequence[Box]) -> tuple[int, Fraction] | str:
     If the frames are not shown evenly, return the reason instead.
 
     Raises:
-        ValueError: the tables contradict each other, or are not as mjrec writes them.
+        ValueError: the tables contradict each other, or do not have the form that mjrec
+            writes.
     """
     try:
         duration, offsets = _table(boxes, "stts"), _table(boxes, "ctts")
@@ -139,7 +140,9 @@ def shown_times(boxes: Sequence[Box]) -> tuple[int, Fraction] | str:
         # Only other programs write 64-bit times or several edits.
         edits, _, begin, rate = struct.unpack(">4xIIiI", _one(boxes, "elst").content)
     except (KeyError, struct.error) as error:
-        raise ValueError(f"its tables are not as mjrec writes them: {error}") from error
+        raise ValueError(
+            f"its tables do not have the form that mjrec writes: {error}"
+        ) from error
     if len(set(duration.tolist())) != 1 or edits != 1 or rate != 1 << 16:
         return "its frames are not all shown for the same time"
     each, count = int(duration[0]), len(duration)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reading of a run's inputs from an unpacked, untrusted archive.
+"""Reading a run's inputs from an unpacked, untrusted archive.
 
-It is done in a sandbox, because journals and HDF5 files are parsed.
+This runs in a sandbox, because it parses journals and HDF5 files.
 """
 
 from __future__ import annotations
@@ -175,9 +175,9 @@ class _Journal:
         path: the journal, or None if it is missing.
 
     Attributes:
-        entries: its completed episodes by their numbers.
-        events: its other lines: the number of lines before each, not counting the
-            first, and its kind and facts.
+        entries: its completed episodes, keyed by number.
+        events: its other lines, each as the number of lines before it (not counting the
+            first), its kind and its facts.
     """
 
     def __init__(self, path: Path | None) -> None:
@@ -201,7 +201,7 @@ class _Journal:
         return [f for _, k, f in self.events if k == kind and isinstance(f, dict)]
 
     def of_episodes(self, kind: str) -> dict[int, list[dict[str, Any]]]:
-        """Return the facts of all events of a kind by the number of their episode."""
+        """Return the facts of all events of one kind, keyed by episode number."""
         found: dict[int, list[dict[str, Any]]] = {}
         for facts in self.facts_of(kind):
             if type(number := facts.get("episode_id")) is int:
@@ -278,7 +278,7 @@ def _episodes(
 
 
 def _broken(files: MonitorFiles) -> dict[int, dict[str, list[Any]]]:
-    """Return the inputs `broken` of the episodes that have them, by number."""
+    """Return `EpisodeInputs.broken` by episode number, where there are such videos."""
     found: dict[int, dict[str, list[Any]]] = {}
     details = read_manifest(files.manifest).mjrec if files.manifest else None
     for name in map(base_name, (details or {}).get("broken") or ()):
@@ -354,9 +354,11 @@ def _steps_taken(reader: TrajectoryReader) -> Iterator[tuple[str, NDArray[Any]]]
 
 
 def _of_evaluation(kind: str, facts: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Return the known facts of an evaluation's event."""
+    """Return the recognized keys of an event about an episode of an evaluation."""
     if not all(type(facts.get(name)) is int for name in _UNIT):
-        raise ValueError(f"{facts!r:.200} does not name an evaluation's episode")
+        raise ValueError(
+            f"{facts!r:.200} does not identify an episode of an evaluation"
+        )
     return _known(facts, _UNIT if kind == "begun" else _FAILED)
 
 

@@ -364,8 +364,8 @@ class SpanWriter:
         """Add facts, even after the recording's end. Newer facts replace older ones.
 
         Raises:
-            FileNotWritten: the disk is full; the facts are written before the next
-                line.
+            FileNotWritten: the disk is full; the facts will be written before the
+                journal's next line.
         """
         self.log.journal.note("note", {"name": self._name, "facts": dict(facts)})
 
@@ -373,7 +373,8 @@ class SpanWriter:
         """Record how the recording ended, and close its log if it has its own.
 
         Raises:
-            FileNotWritten: the disk is full; the end is written before the next line.
+            FileNotWritten: the disk is full; the event will be written before the
+                journal's next line.
         """
         said = {"name": self._name, "row": self.log.count, "facts": dict(facts)}
         self.log.journal.note("end", said)
@@ -384,7 +385,8 @@ class SpanWriter:
         """Give up the recording's rows, and remove its log if it has its own.
 
         Raises:
-            FileNotWritten: the disk is full; the event is written before the next line.
+            FileNotWritten: the disk is full; the event will be written before the
+                journal's next line.
         """
         if self.log.is_alone:
             # Remove the log first, because the disk may be full.

@@ -37,7 +37,7 @@ UNKNOWN_ACTION: Final = object()
 
 
 class Recorder:
-    """Drives statistics, journal, trajectories, videos and manifest of one monitor.
+    """Drives the statistics, journal, trajectories, videos and manifest of one monitor.
 
     It is notified of an environment's calls and does not call the environment, except
     for frames and states. For a reset, call `before_reset`, reset the environment
@@ -55,13 +55,15 @@ class Recorder:
     Attributes:
         directory: the monitor directory, absolute.
         infix: the middle part of this monitor's file names.
-        episode_id: the number of the next episode; as in gym, it rises at each reset.
+        episode_id: the number of the next episode; as in gym, it increases at each
+            reset.
         run: the state shared by all recordings.
         stats_recorder: counts steps and rewards.
         closed: whether recording has ended.
         fast: the fast path for the next step; None if the step needs the full path.
-        evaluation_facts: returns the facts about its evaluation for an ended episode's
-            journal line; None if the episode belongs to no evaluation.
+        evaluation_facts: a function that returns, for the journal line of an episode
+            that has ended, the facts about the evaluation it belongs to; None if it
+            belongs to none.
     """
 
     def __init__(
@@ -260,8 +262,8 @@ class Recorder:
             frame: False if the environment has already reset itself, so that its frame
                 belongs to the next episode.
             observation: the observation that the step returned.
-            success: at the end of an episode, whether the environment reports a
-                success; None if it does not report that.
+            success: at the end of an episode, whether the environment reports success;
+                None if it does not report this.
         """
         reward = reward_to_float(reward)
         done = bool(terminated or truncated)
@@ -451,7 +453,7 @@ class Recorder:
         Args:
             facts: the facts about the episode's end.
             failures: collects the errors raised here.
-            success: whether the environment reports a success; None if unknown.
+            success: whether the environment reports success; None if unknown.
             take: takes the episode's last frames.
         """
         recording, is_complete = self._recording, facts["complete"]

@@ -36,9 +36,9 @@ class StateRecorder:
     action looks like and how long a step takes. Frames are taken at steps 0, n, 2n ...,
     where n is the smallest stride that respects `max_fps`, and always at the last step.
 
-    Errors are handled here. If no more frames can be made, the frames end and the
-    states continue. If nothing can be written any more, the recording ends there; this
-    raises an error unless `on_error` lets the simulation continue.
+    Errors are handled here. If no more frames can be taken, only the states are
+    recorded from then on. If nothing can be written any more, the recording ends there;
+    this raises an error unless `on_error` lets the simulation continue.
 
     Args:
         run: the monitored run.

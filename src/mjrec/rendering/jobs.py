@@ -254,7 +254,7 @@ class VideoJob:
 
     @property
     def video_directory(self) -> Path:
-        """The directory of the videos that it writes."""
+        """The directory that the job writes its videos to."""
         return self.directory if self.video is None else self.video.parent
 
     @property

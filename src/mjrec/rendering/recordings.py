@@ -96,7 +96,7 @@ class Recorded:
 
     @property
     def timing(self) -> Mapping[str, Any]:
-        """The facts of the first part that has the duration of a step."""
+        """The facts of the first part that records how long a step takes."""
         known = (facts for facts in self.facts if facts.get("timestep") is not None)
         return next(known, self.facts[0])
 

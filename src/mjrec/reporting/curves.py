@@ -171,7 +171,7 @@ def _drawable(task: ReportTask) -> tuple[NDArray[np.int64], _Floats, _Floats]:
 def _running(
     returns: _Floats, window: int
 ) -> tuple[_Floats, _Floats, _Floats, _Floats]:
-    """Return the centres of running windows, and their 10 %, mean and 90 % values."""
+    """Return the centres of running windows, and their 10%, mean and 90% values."""
     count = max(0, len(returns) - window + 1)
     if not count:
         return (np.empty(0),) * 4

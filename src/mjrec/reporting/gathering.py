@@ -71,7 +71,7 @@ def gather(
     """Return the contents of a report, without copies of the videos.
 
     Args:
-        directories: one or several evaluations, monitor directories, or folders that
+        directories: one or more evaluations, monitor directories, or folders that
             directly contain such directories.
         title: the page's title. None derives it from the recordings.
         verifications: outputs of `mjrec verify --json`, in addition to the

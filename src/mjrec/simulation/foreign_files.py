@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A process with limits that reads untrusted files, and the program that it runs.
+"""A resource-limited process that reads untrusted files, and the program that it runs.
 
 A few kilobytes of HDF5 can claim any amount of memory. The same data under a million
 names can take any amount of time. A damaged file may crash or hang the HDF5 library.
@@ -84,7 +84,7 @@ def open_vetted_trajectory(path: Path) -> TrajectoryReader:
 def compile_sources(
     path: Path, *, compiled_size: int, seconds: float = _COMPILING_SECONDS
 ) -> mujoco.MjModel:
-    """Return the model passed to `write_authored`, compiled by this MuJoCo.
+    """Return the model passed to `write_authored`, compiled by the installed MuJoCo.
 
     Args:
         path: the zip file.

@@ -111,7 +111,7 @@ def write_authored(path: Path, authored: AuthoredModel, model: mujoco.MjModel) -
 
 
 def read_authored(path: Path) -> mujoco.MjModel:
-    """Return the model that was passed to `write_authored`, compiled by this MuJoCo.
+    """Return the model passed to `write_authored`, compiled by the installed MuJoCo.
 
     Use this only in a sandbox, because an untrusted file may take any amount of time
     and memory.

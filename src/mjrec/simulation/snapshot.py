@@ -203,7 +203,7 @@ def _check_paths(model: mujoco.MjModel, data: mujoco.MjData) -> None:
 def scene_difference(
     model: mujoco.MjModel, data: mujoco.MjData, row: Any, view: SceneView
 ) -> str | None:
-    """Return how a frame from a snapshot would differ from one of the live data.
+    """Return how a frame drawn from a snapshot would differ from a live one.
 
     Neither the model nor the data is modified.
 
