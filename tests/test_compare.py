@@ -286,7 +286,7 @@ def test_equal_runs_are_made_again(packed: Path) -> None:
         (
             recorded("*video000000.mp4", lambda path: path.write_bytes(b"x" * 99)),
             Topic.VIDEOS,
-            "a wrong size",
+            "the wrong size",
         ),
         (
             in_text("*video000000.framehash", "0,          3,", "0,          4,"),

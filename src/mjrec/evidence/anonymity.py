@@ -182,7 +182,7 @@ def _make_file_anonymous(path: Path, texts: _Texts, matcher: IdentityMatcher) ->
         except (EOFError, zlib.error) as error:
             raise UnreadableFile(path, f"it is damaged ({error})") from error
         if matcher.found_in_bytes(model):
-            logger.info("Leaving out %s: it names who compiled it.", name)
+            logger.info("Leaving out %s: it contains the identity of its author.", name)
             path.unlink()
 
 
@@ -214,7 +214,7 @@ def _csv_lines(data: bytes, texts: _Texts) -> Iterator[bytes]:
 
 
 def _general(key: str, value: Any) -> Any:
-    """Return the part of a JSON key's value that identifies nobody."""
+    """Return a JSON key's value without what identifies a person or a machine."""
     if key == "provenance" and isinstance(value, dict):
         return {k: _general_provenance(k, item) for k, item in value.items()}
     if key == "gl_device" and isinstance(value, dict):
@@ -272,7 +272,7 @@ def _renamed_infixes(matcher: IdentityMatcher, names: list[str]) -> Mapping[str,
 
 
 def anonymous_sources(content: bytes, matcher: IdentityMatcher) -> bytes:
-    """Return the zip file of a model's sources, without its authors' remarks.
+    """Return the zip file of a model's sources, without comments and metadata.
 
     Comments that mention a licence stay, unless they contain the identity or an email
     address.

@@ -81,8 +81,8 @@ class _Kind(NamedTuple):
     proved: tuple[tuple[Topic, str], ...] = ()
 
 
-# Kinds of files, by the ends of their names, in the order of the comparison. Metadata
-# comes after videos, because it has the hash of the decoded frames.
+# Kinds of files, keyed by the ending of their names, in the order of the comparison.
+# Metadata comes after videos, because it has the hash of the decoded frames.
 _KINDS: Final[Mapping[str, _Kind]] = {
     ".zip": _Kind(Topic.IDENTITY, compare_sources),
     ".mjb.gz": _Kind(
@@ -107,7 +107,7 @@ _KINDS: Final[Mapping[str, _Kind]] = {
     ".json": _Kind(Topic.PICTURES, compare_objects),
     "": _Kind(Topic.FILES, _other_bytes),
 }
-# Kinds of files in a run that was recreated without rendering.
+# The kinds of files in a run that was recreated without rendering.
 _UNDRAWN: Final = (".jsonl", ".stats.json", ".manifest.json", ".h5")
 _MODELS: Final = (".mjb.gz", ".zip")
 # Kinds whose equal items are counted by their comparators.

@@ -27,7 +27,7 @@ from .findings import Topic
 from .zip_contents import open_plain_zip
 
 _MODEL: Final = re.compile(r"openaigym\.model\.[0-9a-f]{16}")
-# Four numbers, the last of which is the version. No real model reaches 1 GiB.
+# Four numbers; the last is the version. No real model reaches 1 GiB.
 _MODEL_HEAD: Final = 16
 _LARGEST_MODEL: Final = 1 << 30
 _SOURCES: Final = "*.model.*.zip"

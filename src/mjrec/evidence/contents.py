@@ -306,13 +306,13 @@ def _add_trajectory(contents: Contents, path: Path) -> None:
     with open_for_rendering(path) as reader:
         model = reader.facts.get("model") or {}
     for name in filter(None, (model.get("mjb"), model.get("xml"))):
-        # Sources may not be recorded, and a compiled model may have been removed.
+        # The sources may be missing, and a compiled model may have been removed.
         if path.with_name(name).exists():
             contents.add(path.with_name(name))
 
 
 def _broken_of(manifest: Manifest) -> Iterator[str]:
-    """Yield the checked names of the metadata of broken videos."""
+    """Yield the names of broken videos' metadata files, each checked."""
     for name in (manifest.mjrec or {}).get("broken") or ():
         yield base_name(name)
 

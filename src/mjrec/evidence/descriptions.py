@@ -173,7 +173,7 @@ def _made_with(session: Session) -> dict[str, Any]:
         "versions": dict(session.versions),
         "provenance": session.provenance or None,
         "pictures": session.different(*frames),
-        # Encoders that differ only in their command lines are the same here.
+        # Encoders that differ only in their command lines count as one here.
         "encoders": [one for n, one in enumerate(encoders) if one not in encoders[:n]],
     }
 
@@ -328,7 +328,7 @@ def _objects(session: Session) -> list[str]:
 
 
 def _release(name: str, version: str) -> str:
-    """Return the page of one version of Python or of a package."""
+    """Return the URL of one version of Python or of a package."""
     if name == "python":
         return f"https://docs.python.org/release/{_quoted(version)}/"
     page = f"https://pypi.org/project/{_quoted(name)}/"

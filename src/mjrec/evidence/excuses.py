@@ -140,7 +140,8 @@ _BY_NAME: Final[Mapping[str, _Rule]] = {
     "unseeded beginning": _Rule(
         ExcuseKind.EVENT, "its initial state is believed", fed=(Topic.BEGINNING,)
     ),
-    # An encoder's death may show only at the end: the keys' order depends on it.
+    # An encoder's death may become visible only at the end, and the order of the keys
+    # depends on when it does.
     "broken video": _Rule(
         ExcuseKind.EVENT,
         "the frame at which it was cut short is believed",
@@ -162,7 +163,7 @@ _ANY_VERSION: Final = _Rule(
 )
 _DESCRIPTIONS: Final = ("README.md", "CITATION.cff", "ro-crate-metadata.json")
 _NOTED: Final = (Aspect.CLAIM, Aspect.STORED, Aspect.ENCODED)
-# How numbers differ that other code has computed.
+# How numbers that other code has computed can differ.
 COMPUTED: Final = (Aspect.STATE, Aspect.VELOCITY, Aspect.DERIVED, Aspect.SUMMED)
 # The aspect whose limit applies if an excuse has none for this one.
 _WIDER: Final = {
@@ -170,7 +171,7 @@ _WIDER: Final = {
     Aspect.SUMMED: Aspect.DERIVED,
     Aspect.OBSERVED: Aspect.DERIVED,
 }
-# Why items are believed that have no tolerance.
+# Why items that have no tolerance are believed.
 _BELIEVED: Final = {
     Aspect.SOLVER: "it is only the solver's starting point, and the result is the same",
     Aspect.MODEL: "it was compiled elsewhere",

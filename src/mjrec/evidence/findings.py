@@ -146,7 +146,7 @@ class Verification:
         level: the level given to `verify`.
         findings: the findings, in the order of the comparison.
         excuses: the excuses that the archive claims.
-        inputs: the inputs that are not the default, by name.
+        inputs: the inputs that are not the default, keyed by name.
         facts: versions, machine, the archive's sha256, the sample and its seed, and
             trusted environments.
     """

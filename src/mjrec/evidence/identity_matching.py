@@ -13,7 +13,7 @@ Matching ignores case. The rules are:
   words. Those of four or five letters: with no letters next to them, or as a word in
   `CamelCase`.
 - Shorter ones, and those that are ordinary words here (`root`, `user`, `hopper`): only
-  as a whole part of a path, before `@` and a host name, or after it. HalfCheetah has
+  as a whole part of a path, before `@` and a host name, or after `@`. HalfCheetah has
   joints called `rootx`, which do not name an account.
 
 In files, archives are opened, compressed files are decompressed, and every name,

@@ -2,8 +2,8 @@
 """The inputs of a run: everything taken from an archive to recreate the run.
 
 The list is complete. Everything else is an output and must be reproduced: states,
-rewards, ends, statistics, frames, videos. The report lists each input that is not the
-default.
+rewards, episode ends, statistics, frames, videos. The report lists each input that is
+not the default.
 """
 
 from __future__ import annotations
@@ -154,7 +154,7 @@ class RecordingInputs:
             evaluation.
         faults: for each fault of the recorder, the number of journal lines before it
             (not counting the first) and its facts.
-        monitor_csv_start: the stated time in Stable-Baselines3's file; None if that
+        monitor_csv_start: the time stated in Stable-Baselines3's file; None if that
             file was not requested.
         provenance: the stated provenance, or None if unknown.
         provenance_after: number of lines in the journal before the provenance, not

@@ -196,7 +196,7 @@ class _Playing:
                 break
 
     def _say_failed(self) -> None:
-        """Note the journal's next events for as long as they are failures."""
+        """Copy the journal's next events for as long as they are failures."""
         while self._events and self._events[0][0] == "failed":
             self._say(*self._events.pop(0))
 
@@ -242,7 +242,7 @@ class _Playing:
             self._recreated.seed(fresh)
             return
         self._recreated.set_random_state(stated)
-        # No belief is needed if the reset reseeds the generator.
+        # Nothing has to be believed if the reset reseeds the generator.
         if seed is None or self._recreated.is_dm_env:
             self._note(
                 episode,
@@ -253,7 +253,7 @@ class _Playing:
 
     @contextlib.contextmanager
     def _set_into_first_state(self, episode: EpisodeInputs) -> Iterator[None]:
-        """Make the reset of an episode end in its recorded first state.
+        """Make the reset of an episode end in its recorded initial state.
 
         This is done only if nothing else reproduces that state: no seed was recorded,
         and the environment has no random generator.
@@ -266,7 +266,7 @@ class _Playing:
         self._note(
             episode,
             "unseeded beginning",
-            "it was started without a seed; its first state is believed",
+            "it was started without a seed; its initial state is believed",
         )
         reset = base.reset
 
@@ -316,7 +316,8 @@ class _Playing:
             return
         if f"{episode.arrays}.controls" not in arrays:
             raise NotRecreated(
-                "wrappers are missing, and the controls they produced are not recorded",
+                "wrappers are missing, and the controls they produced were not "
+                "recorded",
                 excuse="wrappers",
             )
         names = [each.name for each in dataclasses.fields(RecordedSteps)]

@@ -103,8 +103,8 @@ class Session:
         models: the names of the model files that its trajectories refer to and that
             are in the archive.
         videos: the name of each video in the manifest, with its metadata.
-        made_with: the environments' arguments as text, each set once; "" stands for no
-            arguments or unknown ones.
+        made_with: the distinct sets of arguments of the environments, as text; ""
+            stands for no arguments or unknown ones.
         tally: totals over the complete episodes.
         with_states: number of recorded episodes whose states are in the archive.
         with_actions: number of recorded episodes whose actions are in the archive.
@@ -152,12 +152,12 @@ class PackedRun:
 
     @property
     def env_ids(self) -> list[str]:
-        """The ids of the recorded environments, each once."""
+        """The ids of the recorded environments, without duplicates."""
         return list(dict.fromkeys(session.env_id for session in self.sessions))
 
     @property
     def extras(self) -> list[str]:
-        """The extras of mjrec that verifying it needs."""
+        """The extras of mjrec that are needed to verify it."""
         is_of_suite = any(name.startswith("dm_control/") for name in self.env_ids)
         return ["evidence", *(["dm-control"] if is_of_suite else [])]
 

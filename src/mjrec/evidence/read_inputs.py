@@ -42,7 +42,7 @@ _SOURCES = re.compile(r"openaigym\.model\.[0-9a-f]{16}\.zip", re.ASCII)
 _UNREADABLE = "Its inputs cannot be read"
 _LONGEST_HEADER = 10_000
 _MOST_EPISODES = 1_000_000
-# The keys of the journal's events of an evaluation's episodes.
+# The keys of the journal's events about episodes of an evaluation.
 _UNIT = ("seed", "episode")
 _FAILED = (*_UNIT, "episode_id", "failure", "length", "start_time", "seconds")
 # The keys of a provenance that a recorder writes, and those below them if they are
@@ -197,7 +197,7 @@ class _Journal:
                 raise ValueError(f"more than {_MOST_EPISODES} episodes")
 
     def facts_of(self, kind: str) -> list[dict[str, Any]]:
-        """Return the facts of all events of a kind."""
+        """Return the facts of all events of one kind."""
         return [f for _, k, f in self.events if k == kind and isinstance(f, dict)]
 
     def of_episodes(self, kind: str) -> dict[int, list[dict[str, Any]]]:
@@ -287,7 +287,7 @@ def _broken(files: MonitorFiles) -> dict[int, dict[str, list[Any]]]:
             continue
         with unreadable(path):
             said = read_object(path)
-        # A deferred video cannot break off: its states are kept to render it again.
+        # A deferred video is never cut short: its states are kept to render it again.
         if said.get("recording") == LIVE and said.get("broken") is True:
             video = name.removesuffix(".meta.json")
             reason, frames = str(said.get("broken_reason")), said.get("frame_count", 0)

@@ -91,7 +91,7 @@ def shrinking(
     *,
     on_progress: Callable[[Progress], object],
 ) -> Iterator[None]:
-    """Yield each time an archive must be made, with smaller videos until it fits.
+    """Yield each time an archive must be made; its videos shrink until it fits.
 
     Args:
         limit: maximum size of the archive in bytes.
@@ -119,14 +119,14 @@ def shrinking(
             if size <= limit:
                 return
     largest = sorted(_sizes(staged), key=lambda item: (-item[1], item[0]))[:_LARGEST]
-    reason = "This is with videos at a quarter of their width and height."
+    reason = "Its videos already have a quarter of their width and height."
     if not videos:
         reason = (
             "None of its videos can be re-rendered smaller: they have no recorded "
             "states, and encoded videos are never re-encoded."
         )
     elif rest >= limit:
-        reason = f"The files that cannot be made smaller already have {rest} bytes."
+        reason = f"The files that cannot be made smaller already take {rest} bytes."
     raise ArchiveTooLarge(size, limit, largest, reason=reason)
 
 
@@ -194,7 +194,7 @@ def _draw_all(
 
 
 def _amend(video: Path, said: dict[str, Any]) -> None:
-    """Complete a smaller video's metadata with those of the recorded one."""
+    """Complete a smaller video's metadata from that of the recorded one."""
     with unreadable(metadata_path(video)):
         drawn = read_object(metadata_path(video))
     for key in ("frame_count", "frame_steps", "fps"):

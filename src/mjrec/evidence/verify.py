@@ -87,7 +87,7 @@ def verify(
             (rewards, ends, statistics and selection of episodes), `"physics"` (also all
             states) or `"pixels"` (also all frames and files).
         sample: number of frames of each video to check. None means all.
-        seed: seed for choosing these frames. None means random.
+        seed: seed for choosing these frames. None means a random seed.
         trust: ids of environments that may be created although they are not in a
             trusted registry. This runs code that you have installed.
         allow: excuses to accept, by name and value: `"gl=NVIDIA H100"`.
@@ -96,7 +96,7 @@ def verify(
 
     Returns:
         The verdict, PASS, PARTLY or FAIL, with all findings. A difference does not
-            raise.
+        raise an error.
 
     Raises:
         UnreadableArchive: the file is missing, damaged or hostile.
