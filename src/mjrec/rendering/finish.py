@@ -206,7 +206,7 @@ def _result_of(done: JobOutcome, job: VideoJob) -> RenderedVideos:
 
 def environ_for_drawing() -> dict[str, str]:
     """Return environment variables for workers that draw, on any machine."""
-    # In each of several workers, Mesa's rasteriser would start one thread per CPU.
+    # In each of several workers, Mesa's rasterizer would start one thread per CPU.
     environ = {_RASTERISER_THREADS: os.environ.get(_RASTERISER_THREADS, "1")}
     if TRUST_VARIABLE in os.environ:
         # Workers on other machines do not inherit it from this process.

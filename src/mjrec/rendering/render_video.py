@@ -223,7 +223,7 @@ def _metadata(recorded: Recorded) -> dict[str, Any]:
         "content_type": "video/mp4",
         **recording_facts(first, recording="deferred"),
         "rendered_with": dict(versions()),
-        # Software rasterisers round as their CPU does.
+        # Software rasterizers round as their CPU does.
         "machine": dict(machine_fingerprint()),
         "complete": complete,
         "length": last.get("length", recorded.step_count),

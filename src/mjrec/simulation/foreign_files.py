@@ -93,7 +93,7 @@ def compile_sources(
         seconds: the time limit.
 
     Raises:
-        UnreadableFile: the file is damaged or dangerous, this MuJoCo rejects it, or
+        UnreadableFile: the file is damaged or dangerous, MuJoCo rejects it, or
             compiling exceeds the time or memory limit.
     """
     # Imported here, because reading trajectories needs no simulator.
@@ -109,7 +109,7 @@ def compile_sources(
 def _done(
     task: str, path: Path, limits: dict[str, int], seconds: float
 ) -> Iterator[Path]:
-    """Run a task on a file in a process with limits, and yield its output directory.
+    """Run a task on a file in a limited process, and yield its output directory.
 
     Raises:
         UnreadableFile: the task failed or took too long.

@@ -117,7 +117,7 @@ def read_authored(path: Path) -> mujoco.MjModel:
     and memory.
 
     Raises:
-        UnreadableFile: the file is damaged or dangerous, or this MuJoCo rejects it.
+        UnreadableFile: the file is damaged or dangerous, or MuJoCo rejects it.
     """
     sources, fields = {}, {}
     try:

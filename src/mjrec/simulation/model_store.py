@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The models of the recordings in a directory, each of which is stored once.
+"""The models of the recordings in a directory, each stored once.
 
 ::
 
@@ -7,7 +7,7 @@
     ├── openaigym.model.<16 hex digits>.mjb.gz    the compiled model, exactly
     └── openaigym.model.<16 hex digits>.zip       its sources, if known
 
-The digits are the beginning of the compiled model's sha256. Only the MuJoCo version
+The digits are the first ones of the compiled model's sha256. Only the MuJoCo version
 that compiled a model can load it. The zip file is for all other versions, and for all
 users except the one who stored the model (see `model_trust`).
 """
@@ -74,7 +74,7 @@ class ModelStore:
     def add(
         self, model: mujoco.MjModel, authored: AuthoredModel | None = None
     ) -> dict[str, Any]:
-        """Store a model as it is now. It is written on another thread.
+        """Store a model as it is now. Another thread writes it.
 
         Args:
             model: the model; it is not modified, and it is not used after this call.

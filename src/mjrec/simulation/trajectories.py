@@ -215,7 +215,7 @@ class Trajectory:
 
         Args:
             step: the number of steps taken, which matters if the environment changes
-                its model during the episode. Changes made in the reset are included
+                its model during the episode. Changes made by the reset are included
                 from step 0 on.
 
         Raises:
