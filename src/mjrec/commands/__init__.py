@@ -25,7 +25,7 @@ __all__ = ["main"]
 # builtin).
 COMMANDS = {
     "record": ("record", "Record episodes of an environment."),
-    "render": ("render", "Render pending videos, or re-render episodes."),
+    "render": ("render", "Render pending videos, or rerender episodes."),
     "recover": ("recover", "Finish what a killed run left behind."),
     "list": ("list_episodes", "List recorded episodes."),
     "strip": ("strip", "Put frames of an episode side by side."),

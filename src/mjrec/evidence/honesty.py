@@ -280,7 +280,7 @@ def _of_video(said: Mapping[str, Any]) -> Iterator[str]:
         yield f"was rendered during the episode: {said.get('recording_reason')}"
     for key, meaning in (
         ("annotated", "has captions drawn into its frames"),
-        ("packed_smaller", "was re-rendered at a smaller size for packing"),
+        ("packed_smaller", "was rerendered at a smaller size for packing"),
     ):
         if said.get(key):
             yield meaning

@@ -85,10 +85,10 @@ def pack(
         anonymous: remove everything that names a user, a machine or an author, for
             blind review.
         max_size: size limit in bytes, a number or a string such as `"50M"` (50
-            million). If the archive is larger, its videos are re-rendered from the
+            million). If the archive is larger, its videos are rerendered from the
             states at 3/4, 1/2, 3/8 or 1/4 of their width and height, and the archive
             records this.
-        on_progress: called with the progress of re-rendering.
+        on_progress: called with the progress of rerendering.
 
     Returns:
         The path of the archive.

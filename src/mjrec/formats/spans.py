@@ -231,7 +231,7 @@ class _Spans:
 
 
 # Cached because a journal only grows, and recordings are looked up one at a time. Each
-# thread has its own: a shared cache would need a lock, which is bad with fork.
+# thread has its own: a shared cache would need a lock, which is unsafe with fork.
 _known = threading.local()
 _MOST_KNOWN = 64
 

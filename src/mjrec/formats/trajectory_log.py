@@ -182,8 +182,8 @@ def _open_looks(recording: Recording, opened: contextlib.ExitStack) -> BinaryIO 
     try:
         return opened.enter_context(open_regular(recording.log.with_suffix(LOOKS)))
     except FileNotFoundError:
-        # If the log was removed as a whole, this raises: the log is removed before its
-        # looks.
+        # If the whole log was removed, this raises an error: the log is removed before
+        # its looks.
         recording.log.lstat()
         return None
 

@@ -43,7 +43,7 @@ def recording_facts(facts: Mapping[str, Any], *, recording: str) -> dict[str, An
 
     Args:
         facts: the known facts about the recording; for a clip, about its first part.
-        recording: the time when the frames are rendered: "live" or "deferred".
+        recording: when the frames are rendered, "live" or "deferred".
     """
     video = facts.get("video") or {}
     further = {"recording_reason": video.get("reason")} if recording == "live" else {}

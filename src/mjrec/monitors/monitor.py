@@ -68,7 +68,7 @@ def Monitor(  # noqa: N802  named like gym's class
 
     If the state of a MuJoCo environment determines its frames, `step` only saves the
     state, and worker processes render the frames, byte for byte as `env.render()` would
-    at that moment. Any recorded episode can be re-rendered (`mjrec.render`). Other
+    at that moment. Any recorded episode can be rerendered (`mjrec.render`). Other
     environments are rendered in `step`, with their own `render()`.
 
     Args:

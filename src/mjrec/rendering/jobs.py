@@ -82,7 +82,7 @@ class View:
 
 @dataclass(frozen=True, kw_only=True)
 class Variant:
-    """Changes for re-rendering a recording; None means as recorded.
+    """Changes for rerendering a recording; None means as recorded.
 
     Attributes:
         view: the camera, size and quality.

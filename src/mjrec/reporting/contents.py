@@ -56,7 +56,7 @@ class ReportVideo:
         camera: a description of the camera; None if unknown.
         renderer: the OpenGL renderer that drew it; None if unknown.
         sha256: the SHA-256 of the file; None if the metadata lacks it.
-        command: the shell command that re-renders it; None without recorded states.
+        command: the shell command that rerenders it; None without recorded states.
         notes: remarks, for example that the video is incomplete.
         trajectory: the file of the recorded states; None if there are none.
         replay: the address of its 3D page, relative to the report's; empty if there is

@@ -271,7 +271,7 @@ def _video(
 
 
 def _command(path: Path, facts: Mapping[str, Any], trajectory: Path) -> str | None:
-    """Return the shell command that re-renders a video into a new file."""
+    """Return the shell command that rerenders a video into a new file."""
     camera = facts.get("camera")
     options = []
     if view_of(path.name) and "tiled" not in facts:

@@ -238,7 +238,7 @@ class Capture:
             self._store.finish()
 
     def close(self) -> None:
-        """Release the model and data. Idempotent. Models in the queue are still stored."""
+        """Release the model and data. Idempotent. Queued models are still stored."""
         if self._store is not None:
             self._store.leave()
         self._look_closely()
