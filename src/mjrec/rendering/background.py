@@ -311,8 +311,8 @@ def _stop(signum: int, frame: object) -> None:
 
 
 def _leave() -> None:
-    # The signal wakes the main thread, wherever it waits. If that does not exit in
-    # time, the process is ended after this function returns.
+    # The signal wakes the main thread, wherever it waits. If that thread does not exit
+    # in time, the process is terminated after this function returns.
     os.kill(os.getpid(), signal.SIGTERM)
     time.sleep(_SECONDS_TO_LEAVE)
 

@@ -108,7 +108,7 @@ class Variant:
 
 
 def plain_camera(camera: Any) -> PlainCamera:
-    """Return a camera in a JSON-serialisable form.
+    """Return a camera in a JSON-serializable form.
 
     Args:
         camera: a name, a number, a `mujoco.MjvCamera`, or a mapping of its members.

@@ -491,6 +491,6 @@ def _environment(environ: Mapping[str, str], *, alone: bool) -> dict[str, str]:
         del changed["LP_NATIVE_VECTOR_WIDTH"]
     if not alone:
         # In each worker, Mesa's rasterizer would start one thread per CPU. Even a
-        # single extra thread brings nothing: the worker would only wait for it.
+        # single extra thread gains nothing: the worker would only wait for it.
         changed.setdefault("LP_NUM_THREADS", "0")
     return changed

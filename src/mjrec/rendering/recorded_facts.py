@@ -155,8 +155,8 @@ def check_has_frames(reader: TrajectoryReader) -> None:
         "it ended before the first" if facts.get("scene") else "none were recorded"
     )
     raise NoPictures(
-        f"{reader.path} contains no snapshots to draw frames from: {reason}. If it has "
-        "states, mjrec.render_states can draw those."
+        f"{reader.path} contains no snapshots to draw frames from: {reason}. If it "
+        "has states, mjrec.render_states can draw them."
     )
 
 

@@ -93,8 +93,8 @@ def render_video(
         on_frame: called once for every frame of every video.
 
     Returns:
-        The videos. If the recording broke before its first frame, no videos, only the
-        trajectory's name; the metadata then says so.
+        The videos. If the recording stopped before its first frame, there are no
+        videos, only the trajectory's name, and the metadata says so.
 
     Raises:
         NoPictures: the recording has no frames.
