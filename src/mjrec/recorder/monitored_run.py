@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The state that all recordings of a run share: the journal, the logs and facts."""
+"""The state that all recordings of a run share: the journal, the logs and the facts."""
 
 from __future__ import annotations
 

@@ -314,7 +314,7 @@ class Recorder:
         """End the running episode, and wait until all videos are rendered.
 
         Without background rendering, this writes the trajectories in their final form.
-        Call it before `close`, which waits for nothing.
+        Call it before `close`, which does not wait.
 
         Args:
             on_progress: called with the progress while waiting.

@@ -81,7 +81,7 @@ class VideoRecorder:
         facts: function that returns additional metadata. It is called once there is a
             frame.
         strict: whether `close` raises an error if the images show nothing (all black, a
-            single color or no movement). Otherwise it logs a warning.
+            single colour or no movement). Otherwise it logs a warning.
         caption: function that returns the text to write on the current frame, or None.
 
     Raises:
