@@ -42,7 +42,8 @@ def make_dm_control(env_id: str, options: EnvironmentOptions) -> Any:
 
     Raises:
         UnknownName: the domain, task or argument does not exist.
-        MissingDependency: this dm_control does not work with this mujoco.
+        MissingDependency: the installed dm_control does not work with the installed
+            mujoco.
         EnvironmentNotMade: creating the task failed for another reason, which is
             chained.
     """

@@ -87,7 +87,7 @@ class ContextsOnDemand:
 
 
 class _Contexts:
-    """A substitute for a physics's contexts, until something is drawn in them."""
+    """A stand-in for a physics's contexts, until something is drawn in them."""
 
     def __init__(self, physics: Any) -> None:
         self._physics = physics

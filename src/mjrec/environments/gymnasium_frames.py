@@ -94,7 +94,7 @@ def _own_context(env: gymnasium.Env[Any, Any]) -> AbstractContextManager[None]:
 
 @contextlib.contextmanager
 def _current(viewer: Any) -> Iterator[None]:
-    """Make a viewer's context, if any, current in the block."""
+    """Make a viewer's context, if any, current inside the block."""
     from ..simulation.gl_context import collection_paused, context_kept
 
     with context_kept(), collection_paused():

@@ -103,7 +103,7 @@ def mujoco_warnings(env: Any) -> dict[str, int]:
 
 
 def new_warnings(before: Mapping[str, int], env: Any) -> dict[str, int]:
-    """Return MuJoCo's new warnings by kind since `mujoco_warnings` gave `before`."""
+    """Return MuJoCo's warnings by kind since `mujoco_warnings` returned `before`."""
     after = mujoco_warnings(env)
     # MuJoCo may reset an unstable simulation, and the counts with it.
     counts = {name: n - before.get(name, 0) for name, n in after.items()}
