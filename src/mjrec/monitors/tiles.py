@@ -29,7 +29,7 @@ def checked_cameras(camera: Any, *, tiled: bool) -> list[Any]:
     """Return the requested cameras as a list.
 
     Args:
-        camera: a name, a number, an `mujoco.MjvCamera`, None for the environment's own
+        camera: a name, a number, a `mujoco.MjvCamera`, None for the environment's own
             view, or a list of these.
         tiled: whether to put several cameras side by side in one video.
 
