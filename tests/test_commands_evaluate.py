@@ -51,7 +51,7 @@ def test_a_table_says_what_came_of_it(run, tmp_path):
         line for line in out.splitlines() if line.lstrip().startswith(("task ", TASK))
     )
     assert header.split()[0] == "task"
-    assert " 90 % " in header
+    assert " 90% " in header
     assert row.split()[:3] == [TASK, "2", "5"]
     assert "1 video:" in out
     assert str(tmp_path / "e") in out

@@ -50,7 +50,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
 
 
 SAID = {
-    "evaluation": ["<td>episodes</td><td>1</td>", "InvertedPendulum-v5", "95 %"],
+    "evaluation": ["<td>episodes</td><td>1</td>", "InvertedPendulum-v5", "95%"],
     "episode": ["Episode 0", "<td>steps</td><td>2</td>", "truncated"],
     "trajectory": ["InvertedPendulum-v5, episode 0", "<td>return</td><td>2</td>"],
     "rendered": ["1 rendered, 0 failed", "<td>frames</td><td>3</td>", "48x48"],

@@ -160,7 +160,7 @@ def test_why_figures_are_missing_or_made_in_another_way_is_said():
     method = "large-sample normal interval"
     large.summary = replace(large.summary, interval_method=method)
     page = page_of(contents(task("a", few), task("b", few), large, odd))
-    [usual] = re.findall(r"intervals of 95\xa0%: ([^.]*)\.", page)
+    [usual] = re.findall(r"intervals of 95%: ([^.]*)\.", page)
     assert usual.endswith("50 resamples, seed 0")
     notes = re.findall(r"<li><span[^>]*>(\w+)</span>: ([^<]*)\.</li>", page)
     assert notes == [

@@ -175,7 +175,7 @@ def test_a_single_value_has_no_interval():
 
 
 def covered(figure, true, *, times):
-    """Return how often an interval of 95 % holds the true value."""
+    """Return how often an interval of 95% holds the true value."""
     inside = 0
     for k in range(times):
         low, high = ends(figure(k).interval(Bootstrap(resamples=1000, seed=k)))

@@ -292,7 +292,7 @@ def _end_earlier_runs(folder: Path) -> None:
         with contextlib.suppress(OSError), path.open("rb") as file:
             # This raises an error if the driver is alive.
             fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
-            logger.info("The run in %s has no driver, so it was ended.", path.parent)
+            logger.info("The run in %s has no driver, so it was stopped.", path.parent)
             path.unlink()
             _remove(path.parent)
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""An engine for Slurm: arrays of Slurm jobs, each of which does some of a run's jobs.
+"""An engine for Slurm: arrays of Slurm jobs, each for some of a run's jobs.
 
 Outcomes are files in the run's folder, which all machines see, so that nothing depends
 on the life of a single Slurm job. A Slurm job that is requeued does only the jobs that
@@ -476,7 +476,7 @@ def _submitit(cluster: str) -> Any:
 
 
 def _as_from_outside() -> contextlib.AbstractContextManager[None]:
-    """Hide any surrounding Slurm job from commands in the block.
+    """Hide any surrounding Slurm job from commands inside the block.
 
     Otherwise that job's resources (its CPUs and memory) would be mistaken for the
     requested ones.

@@ -51,8 +51,8 @@ logger = logging.getLogger(__name__)
 _WORKER = "mjrec.evaluation.worker:EvaluationWorker"
 _LOCK_NAME = ".mjrec.evaluation.lock"
 
-# By default the number of a library's threads depends on the machine. It would change
-# the order in which numbers are added, and therefore the results. The worker processes
+# By default the number of a library's threads depends on the machine, and so does the
+# order in which numbers are added. That would change the results. The worker processes
 # keep all CPUs busy anyway.
 _ONE_THREAD_EACH = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 

@@ -111,7 +111,7 @@ class Evaluation:
     def _repr_html_(self) -> str:
         """Return HTML for notebooks, with a row per task and the finished videos."""
         facts = {"episodes": len(self.results), "directory": self.directory}
-        level = f"{100 * self.bootstrap.confidence:g} %"
+        level = f"{100 * self.bootstrap.confidence:g}%"
         columns = ("task", "episodes", "mean", level, "IQM", "success", "failed")
         rows = [
             (

@@ -99,7 +99,7 @@ def device_of_gpu(devices: Sequence[EglDevice], gpu: str) -> EglDevice | None:
     Args:
         devices: EGL's devices in a process in which CUDA sees only that GPU. So the
             right device is the only one with a CUDA number, whatever the number is.
-        gpu: an entry of `CUDA_VISIBLE_DEVICES`. CUDA accepts the beginning of a UUID.
+        gpu: an entry of `CUDA_VISIBLE_DEVICES`. CUDA accepts a prefix of a UUID.
     """
     named = [
         device

@@ -95,7 +95,7 @@ class ReportTask:
             seeds. Otherwise they come from monitors, in order of time, as in training.
         summary: the summary of its episodes.
         episodes: `(n,)` of dtype `ROW`, so that a million of them need little memory.
-            Of monitors, `seed` is the index into `runs`, and `start_time` is the time
+            For monitors, `seed` is the index into `runs`, and `start_time` is the time
             of the end.
         runs: the names of the runs, if they are monitors.
         failures: the reasons why episodes failed, by index.

@@ -73,8 +73,10 @@ def learning_curve(task: ReportTask, *, key: str) -> str:
     return _svg(
         panel.elements,
         title=f"Returns of {task.name} over episodes",
-        description=f"{_in_words(task.summary)} Running mean over {window} episodes, "
-        "and the range of the middle 80 %.",
+        description=(
+            f"{_in_words(task.summary)} Running mean over {window} episodes, and the "
+            "range of the middle 80%."
+        ),
         key=key,
     )
 
@@ -114,7 +116,7 @@ def evaluation_curve(task: ReportTask, *, key: str) -> str:
     heights = np.sort(returns)[::-1][_spread(len(returns), _MOST_POINTS)]
     edges = np.linspace(0, 1, len(heights) + 1)
     shares.line(np.repeat(edges, 2)[1:-1], np.repeat(heights, 2), "accent")
-    shares.label("", "Share reaching it", [(0, "0"), (0.5, "50 %"), (1, "100 %")])
+    shares.label("", "Share reaching it", [(0, "0"), (0.5, "50%"), (1, "100%")])
     return _svg(
         dots.elements + shares.elements,
         title=f"Returns of {task.name} by seed",

@@ -186,7 +186,7 @@ def _joined(*texts: Any) -> str:
 def recorded_videos(
     results: MonitorResults, directory: Path, problems: list[str]
 ) -> list[ReportVideo]:
-    """Return the finished videos of a monitor that exist, each once.
+    """Return the existing finished videos of a monitor, without duplicates.
 
     These are the videos that its manifest lists, and those that were finished after the
     manifest was written, from all cameras. Text recordings are included.
@@ -309,7 +309,7 @@ def _notes(facts: Mapping[str, Any]) -> Iterator[str]:
             spaced(selection["rule"][:_LONGEST_TEXT]),
             selection.get("finished"),
         )
-        of = f" among {among} episodes" if type(among) is int else ""
+        of = f" from {among} episodes" if type(among) is int else ""
         if selection.get("decided") is True:
             yield f"Chosen by {rule}{of} after they had ended."
         else:

@@ -181,7 +181,7 @@ class Capture:
         """Write a snapshot, from which the current frame can be drawn, into `out`.
 
         Args:
-            out: the words to write, all of which are set.
+            out: the words to write; all of them are set.
 
         Returns:
             Model and view fields that have changed since the last capture, or since

@@ -47,8 +47,8 @@ _EPOCH = (1980, 1, 1, 0, 0, 0)
 _DIRECTORIES = ("assetdir", "meshdir", "texturedir")
 _XML_ELEMENTS = ("include", "model")
 
-# A path is composed of several attributes, each of which may go up this many levels.
-# The files are compiled deeper than that in an empty directory, so `..` finds nothing.
+# A path is composed of several attributes, and each may go up this many levels. The
+# files are compiled deeper than that in an empty directory, so `..` finds nothing.
 _MOST_UP = 4
 _EMPTY = PurePosixPath(*["x"] * 8 * _MOST_UP)
 
