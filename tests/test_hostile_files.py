@@ -309,7 +309,7 @@ CHANGES = (
 
 
 def with_change(header: str, path: Path) -> None:
-    """Put an array with another header where the changes of a model are."""
+    """Put an array with another header where the changes to a model are."""
     start = b"\x93NUMPY\1\0" + struct.pack("<H", len(header))
     payload = start + header.encode() + bytes(8)
     path.write_bytes(struct.pack("<QqQ", 0, 0, len(payload)) + payload)
@@ -415,7 +415,7 @@ HARMS: list[tuple[str, Harm, str]] = [
     ),
     ("spans", functools.partial(beginning_with, b"[" * 10**7 + b"\n"), "does not give"),
     *(
-        (".looks", functools.partial(with_change, header), "change of the model")
+        (".looks", functools.partial(with_change, header), "change to the model")
         for header in CHANGES
     ),
     *(("mjb.gz", harm, "") for harm in GZIP.values()),

@@ -161,7 +161,7 @@ def test_model_changes_come_back(logs: SpanLogs, path: Path) -> None:
 def test_what_no_file_can_hold_is_refused(
     logs: SpanLogs, path: Path, name: str, values: Any
 ) -> None:
-    """As a change of the model, after which the log goes on, and as a row."""
+    """As a change to the model, after which the log goes on, and as a row."""
     span = write(logs, 3)
     with pytest.raises(InvalidArgument, match="cannot be recorded"):
         span.log.add_change(ModelChange(step=0, fields={name: values}))
@@ -172,7 +172,7 @@ def test_what_no_file_can_hold_is_refused(
 
 
 def test_a_reader_beside_a_writer_sees_whole_recordings(tmp_path: Path) -> None:
-    """With all changes of the model, though the tail wraps with every fourth row."""
+    """With all changes to the model, though the tail wraps with every fourth row."""
     path, enough = episode(tmp_path, 0), tmp_path / "enough"
 
     def record() -> None:

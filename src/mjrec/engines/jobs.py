@@ -248,7 +248,7 @@ class Run:
         task.deaths += 1
         if task.deaths < TRIES:
             logger.warning(
-                "A worker died at the job %s, which will be retried. It %s",
+                "A worker died while doing the job %s, which will be retried. It %s",
                 task.key,
                 how,
             )

@@ -333,7 +333,7 @@ class _PhysicsScene:
 
 
 def _drawn_by_physics(physics: Any, camera: Any, height: int, width: int) -> bool:
-    """Return whether `physics.render()` can draw such frames."""
+    """Return whether `physics.render()` can draw frames with this camera and size."""
     buffer = physics.model.vis.global_
     named = camera is None or isinstance(camera, str | int)
     return bool(named and height <= buffer.offheight and width <= buffer.offwidth)

@@ -318,7 +318,7 @@ def _environment(base: gymnasium.Env[Any, Any]) -> dict[str, Any] | None:
 
 
 def random_state(base: Any) -> Any:
-    """Return the states of an environment's generator and its inner environment's.
+    """Return the states of the generators of an environment and its inner one.
 
     Args:
         base: an environment without its wrappers.

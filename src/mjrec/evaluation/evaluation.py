@@ -308,7 +308,7 @@ class _Selection:
 
 @dataclass(frozen=True, kw_only=True)
 class _ResultsFile:
-    """The content of `results.json`, in its order."""
+    """The content of `results.json`, in the order of the file."""
 
     plan: Annotated[EvaluationPlan, _plan]
     selection: _Selection

@@ -67,7 +67,7 @@ def renamed_models(given: Path, made: Path) -> dict[str, str]:
 
 
 def models_of(recordings: Path) -> dict[str, set[str]]:
-    """Return the names of the model files of each recording, by its infix."""
+    """Return the names of each recording's model files, keyed by infix."""
     found: dict[str, set[str]] = {}
     for path in recordings.glob("openaigym.trajectory.*.h5"):
         # The comparison reports damaged files.

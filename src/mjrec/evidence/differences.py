@@ -82,7 +82,7 @@ class Place:
 
     @property
     def scopes(self) -> tuple[str, ...]:
-        """The names that an excuse can claim it by: episode, recording, file."""
+        """The names by which an excuse can claim the item: episode, recording, file."""
         name = self.file.rpartition("/")[2]
         infix = infix_of(name)
         if infix is None:
@@ -135,7 +135,7 @@ class Difference(Place):
 
 def unlike(given: Any, made: Any) -> str:
     """Return the difference between two values as a clause."""
-    return f"the archive has {short(given)}, the recreated run has {short(made)}"
+    return f"the archive has {short(given)}; the recreated run has {short(made)}"
 
 
 def differs(

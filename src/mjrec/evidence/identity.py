@@ -113,7 +113,7 @@ class Identity:
 def identity_of_user(
     provenance: Iterable[Mapping[str, Any]] = (), authors: Iterable[Author] = ()
 ) -> Identity:
-    """Return the names of this process's user and machine, and of those who recorded.
+    """Return the names of this user and machine, and of the people who recorded.
 
     They come from the system, the environment variables, and git's settings in the
     working directory and in the recorded repositories. No name server is queried.

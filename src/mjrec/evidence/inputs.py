@@ -200,7 +200,7 @@ class RecordingInputs:
         return f"recording {self.infix}"
 
     def item(self, episode: EpisodeInputs) -> str:
-        """Return the name of one of its episodes in findings."""
+        """Return an episode's name in findings."""
         return f"episode {episode.episode_id} of {self.infix}"
 
 

@@ -157,7 +157,7 @@ class PackedRun:
 
     @property
     def extras(self) -> list[str]:
-        """The extras of mjrec that are needed to verify it."""
+        """The extras of mjrec that are needed to verify the run."""
         is_of_suite = any(name.startswith("dm_control/") for name in self.env_ids)
         return ["evidence", *(["dm-control"] if is_of_suite else [])]
 

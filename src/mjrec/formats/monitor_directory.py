@@ -22,7 +22,7 @@
     ├── rl-video-episode-27.side.mp4                    ... and of a further one
     ├── openaigym.states.<infix>.000000.log             rows of recordings in flight
     ├── openaigym.states.<infix>.000000.tail            ... the last of these rows
-    ├── openaigym.states.<infix>.000000.looks           ... changes of the model
+    ├── openaigym.states.<infix>.000000.looks           ... changes to the model
     ├── openaigym.trajectory.<infix>.episode000027.h5   a recorded episode, finished
     ├── openaigym.trajectories.<infix>.h5               ... or many in one file
     ├── openaigym.model.<16 hex digits>.mjb.gz          a compiled model ...

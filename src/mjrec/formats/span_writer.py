@@ -180,7 +180,7 @@ def _begin(
 
 
 class OpenLog(RowLog):
-    """The row log of recordings, with the changes of their model.
+    """A row log of recordings, with the changes to their model.
 
     Attributes:
         number: the log's number.
@@ -189,7 +189,7 @@ class OpenLog(RowLog):
             words, `action` and `observation`. Parts that the rows lack are missing.
         bodies: for each slot, all words after its head.
         is_alone: whether the log is for a single recording and ends with it.
-        look_size: size in bytes of all changes of the model so far.
+        look_size: size in bytes of all changes to the model so far.
         recordings: all recordings that were begun in this log.
     """
 
@@ -233,7 +233,7 @@ class OpenLog(RowLog):
         )
 
     def add_change(self, change: ModelChange) -> None:
-        """Add a change of the model that takes effect at the next row.
+        """Add a change to the model that takes effect at the next row.
 
         Raises:
             InvalidArgument: the change cannot be recorded.

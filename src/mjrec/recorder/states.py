@@ -115,7 +115,7 @@ class StateRecorder:
 
     @property
     def is_there(self) -> bool:
-        """Whether the log has any of its rows."""
+        """Whether the log has any rows of this recording."""
         return self._span is not None
 
     @property
@@ -272,7 +272,7 @@ class StateRecorder:
                 raise
 
     def drop(self) -> None:
-        """Discard its rows, even after the recording has ended.
+        """Discard the rows, even after the recording has ended.
 
         Raises:
             FileNotWritten: the disk is full.

@@ -221,7 +221,7 @@ class VideoRecorder:
         )
 
     def break_off(self, reason: str, *, frames: int) -> None:
-        """Stop after a number of frames. If it is 0, delete the frames so far."""
+        """Stop after the given number of frames. If it is 0, delete all frames."""
         if frames:
             self._breaks_off = frames, reason
         else:

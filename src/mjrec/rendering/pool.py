@@ -451,7 +451,7 @@ class _Worker:
 
     @property
     def may_send(self) -> bool:
-        """Whether it owes a frame, and the buffer has room for one."""
+        """Whether the worker owes a frame and its buffer has room for one."""
         is_full = len(self.arrived) >= _MOST_BUFFERED
         return bool(self.owes) and self.error is None and not is_full
 

@@ -91,7 +91,7 @@ class Recorded:
 
     @property
     def is_clip(self) -> bool:
-        """Whether it is a clip."""
+        """Whether the recording is a clip."""
         return clip_step(self.parts[0].name) is not None
 
     @property

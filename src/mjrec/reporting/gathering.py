@@ -122,7 +122,7 @@ def _find_recordings(directories: Directories) -> list[Path]:
 
 
 def _recordings_in(directory: Path) -> list[Path]:
-    """Return the directory if it has recordings, otherwise its folders that have."""
+    """Return the directory if it has recordings, otherwise its folders with some."""
     if not directory.is_dir():
         what = "is a file" if directory.exists() else "does not exist"
         raise InvalidArgument(
@@ -319,7 +319,7 @@ def _videos_of_task(
     task: str,
     provenance: list[tuple[str, str]],
 ) -> list[ReportVideo]:
-    """Return the videos of a task's episodes, with the indices of these.
+    """Return the videos of a task's episodes, with the indices of the episodes.
 
     Videos without an episode are left out: they come from a batch that was killed and
     repeated.

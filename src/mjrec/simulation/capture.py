@@ -312,7 +312,7 @@ class Capture:
         return changed
 
     def _followed(self) -> tuple[_StoredModel, _Frames]:
-        """Return the stored model and its frames, even after a change of objects."""
+        """Return the stored model and its frames, even if the objects have changed."""
         model, data = self._simulation()
         stored, frames = self._stored, self._frames
         if stored is None or frames is None:

@@ -81,7 +81,7 @@ class Trajectory:
     `mocap_pos`, `mocap_quat` and `userdata`, for environments that use them. An action
     is the input of the environment, which need not be the input of the actuators.
 
-    Snapshots and changes of the model are read on demand, and the rest is in memory.
+    Snapshots and changes to the model are read on demand, and the rest is in memory.
 
     Args:
         reader: the file's reader; it may be closed afterwards.

@@ -51,7 +51,7 @@ class Shape:
 
     @property
     def is_skin(self) -> bool:
-        """Whether bones move its vertices."""
+        """Whether the shape is a skin, whose vertices are moved by bones."""
         return self.geom_type == _SKIN
 
 
