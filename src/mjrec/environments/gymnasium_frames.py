@@ -34,7 +34,7 @@ class EnvironmentFrames:
         return self._env.render_mode
 
     def render(self) -> Any:
-        """Return the current frame, or a list of frames that were not returned yet."""
+        """Return the current frame, or a list of the frames not returned so far."""
         with _own_context(self._env):
             rendered: Any = self._env.render()
         if self._keeps_frames and isinstance(rendered, list):

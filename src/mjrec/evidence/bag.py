@@ -224,7 +224,9 @@ def _said_in(bag: Path, manifest: str, *, is_payload: bool) -> dict[str, str]:
     for number, line in enumerate(_text_of(bag / manifest).splitlines(), 1):
         match = _LINE.fullmatch(line)
         if match is None:
-            raise ValueError(f"{manifest}, line {number}: not a SHA-512 and a name")
+            raise ValueError(
+                f"{manifest}, line {number}: not a SHA-512 digest and a name"
+            )
         name = _ENCODED.sub(lambda found: chr(int(found[1], 16)), match["name"])
         if (portable_parts(name)[0] == PAYLOAD) is not is_payload or name in listed:
             raise ValueError(f"{manifest}, line {number}: {name[:200]!r} is misplaced")

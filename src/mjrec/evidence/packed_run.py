@@ -61,8 +61,8 @@ class Tally:
         episodes: number of episodes.
         steps: number of their steps.
         total_return: sum of their returns.
-        start: the time when the first began, in ISO 8601 in UTC; None if unknown.
-        end: the time when the last ended, in ISO 8601 in UTC; None if unknown.
+        start: the time when the first one began, in ISO 8601 in UTC; None if unknown.
+        end: the time when the last one ended, in ISO 8601 in UTC; None if unknown.
     """
 
     episodes: int = 0

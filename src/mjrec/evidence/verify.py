@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Verification of a packed run: it is recreated from its inputs and compared."""
+"""Verification of a packed run: it is recreated and compared with the archive."""
 
 from __future__ import annotations
 

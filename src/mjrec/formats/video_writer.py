@@ -121,7 +121,7 @@ class VideoWriter:
         self.closed = False
 
     def write(self, frame: Frame) -> None:
-        """Add a `(height, width, 3) uint8` frame; all must have the first one's size.
+        """Add a `(height, width, 3) uint8` frame of the same size as the first one.
 
         The frame is copied. The call waits while the encoder is behind.
 

@@ -88,8 +88,8 @@ def Monitor(  # noqa: N802  named like gym's class
             their episodes independently. `"join"` does not read other monitors' files,
             so it is fast even among thousands of monitors: it recovers nothing, numbers
             episodes from 0, and does not check that the environments are the same.
-        write_upon_reset: write statistics and manifest at every reset, not only at the
-            end. The journal always gets a line when an episode ends.
+        write_upon_reset: write the statistics and manifest at every reset, not only at
+            the end. The journal always gets a line when an episode ends.
         uid: used in file names instead of the process id.
         mode: type of the episodes, "training" or "evaluation".
         fps: frame rate of the video files. None means real time, one frame per step.

@@ -331,7 +331,7 @@ class Recorder:
             self.run.finisher.wait(on_progress)
 
     def close(self) -> None:
-        """End the episode, write statistics and manifest, and close. Idempotent.
+        """End the episode, write the statistics and manifest, and close. Idempotent.
 
         Rendering stops; videos that are not rendered yet stay pending. An unfinished
         episode is left out of the statistics; its video is kept and marked as
@@ -605,7 +605,7 @@ class Recorder:
         self.run.leave()
 
     def _write_results(self) -> int:
-        """Write statistics and manifest; return the number of pending videos."""
+        """Write the statistics and manifest; return the number of pending videos."""
         listing = write_manifest_and_stats(
             self.directory,
             self.run.infix,

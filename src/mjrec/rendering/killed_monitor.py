@@ -2,7 +2,7 @@
 """Finishing the files of a monitor that was killed, or closed without waiting.
 
 Recordings in flight become trajectories, live videos get their final names, missing
-lines are added to the journal, and statistics and manifest are written from it.
+lines are added to the journal, and the statistics and the manifest are written from it.
 Meanwhile the monitor's lock is held, so that the monitor looks open to all other
 processes.
 """
@@ -136,7 +136,7 @@ class _KilledMonitor:
         """Finish the monitor's files. The caller holds the monitor's lock.
 
         Args:
-            is_behind: whether statistics and manifest may be outdated.
+            is_behind: whether the statistics and the manifest may be outdated.
         """
         report = self.report
         for log in logs_left(self._files()):

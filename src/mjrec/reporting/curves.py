@@ -85,8 +85,8 @@ def evaluation_curve(task: ReportTask, *, key: str) -> str:
     """Return a figure of an evaluation's returns, by seed and by share reached.
 
     On the left, each episode is a dot above its seed, each seed's mean is a short line,
-    and the overall mean is a long line with its interval. On the right is, for each
-    return, the share of episodes that reach it.
+    and the overall mean is a long line with its interval. On the right, a curve shows
+    the share of episodes that reach each return.
 
     Args:
         task: a task of an evaluation.
