@@ -215,7 +215,7 @@ def _rule_of(
 
 
 def _repeated(inputs: Inputs, arrays: Mapping[str, NDArray[Any]]) -> Iterator[Finding]:
-    """Yield the groups of identical episodes in all recordings; each counts once."""
+    """Yield the groups of identical episodes in all recordings; a group counts once."""
     found: dict[str, list[str]] = {}
     for recording in inputs.recordings:
         for each in recording.episodes:

@@ -200,7 +200,7 @@ def odd_contents(path: Path) -> Iterator[tuple[str, str, str]]:
 def _is_by_x264(units: bytes) -> bool:
     """Return whether units of a stream are exactly one message of the encoder.
 
-    The message's size is the sum of bytes of 255 and of the first other byte.
+    A message's size is the sum of any bytes of value 255 and of the first other byte.
     """
     sizes = units.removeprefix(_MESSAGE)
     full = len(sizes) - len(sizes.lstrip(b"\xff"))

@@ -90,7 +90,7 @@ class Tally:
 
 @dataclass(frozen=True, kw_only=True)
 class Session:
-    """One monitor's recording, as far as it is in the archive.
+    """One monitor's recording, as far as the archive contains it.
 
     Attributes:
         infix: the infix of its files' names.

@@ -251,7 +251,7 @@ def _metadata(recorded: Recorded) -> dict[str, Any]:
 def _shots(
     recording: Path, facts: Mapping[str, Any], view: View, out: Path | None
 ) -> list[_Shot]:
-    """Return the videos to render, the first camera's last."""
+    """Return the videos to render; the first camera's comes last."""
     video = video_facts(facts)
     label = (facts.get("scene") or {}).get("label")
     further = list(video.get("cameras") or ())[1:]

@@ -264,7 +264,7 @@ def _gathered(main: Path) -> AuthoredModel:
 def _existing(
     bases: Iterable[Path], directories: Iterable[str], reference: str
 ) -> list[Path]:
-    """Return every file that the reference may mean."""
+    """Return every file that the reference may refer to."""
     # MJCF's `strippath` removes the directories from a name.
     names = {reference, PurePosixPath(reference).name}
     candidates = {

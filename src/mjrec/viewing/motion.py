@@ -223,7 +223,7 @@ class Stage:
         )
 
     def _moving_objects(self) -> tuple[list[str], list[tuple[Any, Any, list[int]]]]:
-        """Return names, and the arrays of positions and rotations with own indices.
+        """Return the names, and each kind's positions, rotations and indices.
 
         Cameras come last and have no names.
         """
