@@ -132,9 +132,9 @@ def evaluate(
     view_from = camera_of(camera)
     if isinstance(view_from, dict):
         raise InvalidArgument(
-            "mjrec evaluate needs a camera's name or number. To use a camera at any "
-            "other place, render the episodes afterwards: mjrec render DIR --episode N "
-            f"--camera {shlex.quote(str(camera))}"
+            "mjrec evaluate needs a camera's name or number. To use a camera in any "
+            "other position, render the episodes afterwards: mjrec render DIR "
+            f"--episode N --camera {shlex.quote(str(camera))}"
         )
     least = _by_task("--fail-under", fail_under, _value_of, "TASK=VALUE")
     ranges = _by_task("--score-range", score_range, _range_of, "TASK=LOW:HIGH")

@@ -156,7 +156,7 @@ class Run:
         """Yield outcomes as they arrive, until no jobs are left.
 
         If a job's child dies, the job is retried after the others, up to `TRIES` times
-        in all.
+        in total.
 
         Args:
             timeout_s: yield None whenever no outcome has arrived for this many seconds;

@@ -80,8 +80,8 @@ class SlurmEngine(Executor):
     """An engine that runs jobs in Slurm jobs.
 
     Args:
-        workers: maximum number of workers in all Slurm jobs together. None means 4, or
-            one per usable CPU with `cluster="local"`.
+        workers: maximum total number of workers in all Slurm jobs. None means 4, or one
+            per usable CPU with `cluster="local"`.
         cluster: None means this machine's Slurm cluster. `"local"` uses processes on
             this machine instead of Slurm jobs, so that you can try the engine.
         gpus: number of GPUs for each worker, which may be a fraction: with 0.25, four

@@ -253,7 +253,7 @@ def _session(monitor: MonitorFiles, tally: Tally) -> Session:
     with_states = [each for each in facts if not each.get(STATES_LEFT_OUT)]
     named = [facts_in(each.get("model")) for each in facts]
     models = {n for m in named for n in (m.get("xml"), m.get("mjb")) if n}
-    # An evaluation chooses among all its recordings, whatever each one's schedule.
+    # An evaluation chooses from all its recordings, regardless of their schedules.
     keep = facts_in(details.get("keep"))
     is_of_evaluation = keep.get("scope") == EVALUATION
     chosen_by = keep if is_of_evaluation else facts_in(details.get("schedule"))

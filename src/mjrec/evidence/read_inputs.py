@@ -278,7 +278,7 @@ def _episodes(
 
 
 def _broken(files: MonitorFiles) -> dict[int, dict[str, list[Any]]]:
-    """Return `EpisodeInputs.broken` by episode number, where there are such videos."""
+    """Return each episode's `EpisodeInputs.broken`, if any, keyed by episode number."""
     found: dict[int, dict[str, list[Any]]] = {}
     details = read_manifest(files.manifest).mjrec if files.manifest else None
     for name in map(base_name, (details or {}).get("broken") or ()):

@@ -207,7 +207,7 @@ def _amend(video: Path, said: dict[str, Any]) -> None:
     metadata = {
         **said,
         **drawn,
-        # The renderer does not know the name of a further camera.
+        # The renderer does not know the name of an additional camera.
         "camera": said.get("camera"),
         "packed_smaller": {"from": [said["height"], said["width"]]},
     }

@@ -13,7 +13,7 @@
     ├── openaigym.video.<infix>.video000027.failed.json ... why it is still pending
     ├── openaigym.clip.<infix>.step000000137.failed.json    why a clip is still pending
     ├── openaigym.video.<infix>.video000027.json        a text recording (asciicast)
-    ├── openaigym.video.<infix>.video000027.side.mp4    video of a further camera
+    ├── openaigym.video.<infix>.video000027.side.mp4    video of an additional camera
     ├── openaigym.video.<infix>.video000027.camera2.mp4 ... of a camera without a name
     ├── openaigym.video.<infix>.video000027.tiled.mp4   all sub-environments in one
     ├── openaigym.video.<infix>.video000027.side.640x480.mp4 a rerendered video

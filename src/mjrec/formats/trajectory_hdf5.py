@@ -157,7 +157,7 @@ def _new_file(
     Args:
         path: the path that the file gets at the end of the block.
         on_signal: called immediately if a signal arrives during the block.
-        **options: further options for `h5py.File`.
+        **options: additional options for `h5py.File`.
 
     Raises:
         FileNotWritten: the disk is full, or the directory was removed.

@@ -53,9 +53,9 @@ class StateRecorder:
         is_alone: whether it may be deleted separately; it then gets its own log.
 
     Attributes:
-        early_end: the facts about the error that stopped the recording; None while it
-            goes on.
-        broken_reason: why no more frames are taken; None while they are.
+        early_end: the facts about the error that stopped the recording; None while the
+            recording continues.
+        broken_reason: why no more frames are taken; None while frames are taken.
     """
 
     def __init__(

@@ -54,7 +54,7 @@ class Plan:
     Attributes:
         parts: the paths of its parts, in order. Parts still in a log have no file.
         videos: the videos to render, the first camera's first.
-        frame_count: number of frames to render, in all videos together.
+        frame_count: total number of frames to render in all videos.
         logs: the logs that still contain its rows.
         is_kept: whether the trajectory stays after the video is finished.
         model_file: the model file that rendering needs, if known.
