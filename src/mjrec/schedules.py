@@ -85,7 +85,8 @@ def check_takes_one(function: Callable[..., Any], name: str, what: str) -> None:
     except TypeError as error:
         raise InvalidArgument(
             f"{name} is called with one argument, {what}, but "
-            f"{schedule_name(function)}{signature} cannot be called like this: {error}."
+            f"{schedule_name(function)}{signature} cannot be called this way: "
+            f"{error}."
         ) from error
 
 

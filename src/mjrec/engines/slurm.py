@@ -138,8 +138,8 @@ class SlurmEngine(Executor):
         notice = min(120.0, 60 * time_min / 4) if notice_s is None else notice_s
         if not 0 <= notice < 60 * time_min:
             raise InvalidArgument(
-                f"notice_s must be less than the time limit of {time_min} minutes "
-                f"(time_min), in seconds, but it is {notice_s!r}."
+                "notice_s, in seconds, must be less than the time limit of "
+                f"{time_min} minutes (time_min), but it is {notice_s!r}."
             )
         self._cluster = cluster or "slurm"
         self._submitit = _submitit(self._cluster)

@@ -326,7 +326,7 @@ def _xml(content: bytes, matcher: IdentityMatcher) -> bytes:
     text = content.decode("utf-8")
     new = _BESIDE_THE_MODEL.sub(kept, text)
     if _elements(new) != _elements(text):
-        raise ValueError("removing the comments of its XML would change the model")
+        raise ValueError("removing the comments from its XML would change the model")
     return new.encode()
 
 

@@ -144,7 +144,7 @@ def shown_times(boxes: Sequence[Box]) -> tuple[int, Fraction] | str:
             f"its tables do not have the form that mjrec writes: {error}"
         ) from error
     if len(set(duration.tolist())) != 1 or edits != 1 or rate != 1 << 16:
-        return "its frames are not all shown for equally long"
+        return "its frames are not all shown for the same duration"
     each, count = int(duration[0]), len(duration)
     shown = np.arange(count) * each - begin
     if len(offsets):

@@ -278,7 +278,7 @@ def read_journal(
                 seen[block] = seen.get(block, 0) | 1 << bit
                 yield entry
                 continue
-            reason = "its episode occurred before"
+            reason = "its episode has occurred before"
         skipped += 1
         episode = ""
         if (begin := _BEGIN.match(line)) is not None:

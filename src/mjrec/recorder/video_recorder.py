@@ -291,7 +291,7 @@ class VideoRecorder:
         if path is None:
             return str(Path(tempfile.mkdtemp(prefix="mjrec-")) / f"video{extension}")
         if Path(path).suffix != extension:
-            kind = "text, an asciicast" if self.ansi_mode else "images, an mp4"
+            kind = "text (an asciicast)" if self.ansi_mode else "images (an mp4 file)"
             raise InvalidArgument(
                 f"With render_mode={self.env.render_mode!r} the recording is {kind}, "
                 f"so its path must end in {extension}, but it is {os.fspath(path)!r}."

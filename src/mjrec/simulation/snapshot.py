@@ -194,9 +194,9 @@ def _check_paths(model: mujoco.MjModel, data: mujoco.MjData) -> None:
         )
     if wrapped.size and (wrapped.min() < _PULLEY or wrapped.max() >= model.ngeom):
         raise InvalidArgument(
-            f"The snapshot's wrap_obj must be {_PULLEY} (a pulley), -1 (a site) or at "
-            f"most {model.ngeom - 1} (a geom) for this model, but its values range "
-            f"from {wrapped.min()} to {wrapped.max()}."
+            f"The snapshot's wrap_obj must be {_PULLEY} (a pulley), -1 (a site) or a "
+            f"geom's number up to {model.ngeom - 1} for this model, but its values "
+            f"range from {wrapped.min()} to {wrapped.max()}."
         )
 
 
