@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Packing a monitor directory into one zip file that can be verified.
 
-The archive is built in a hidden folder next to it. Files are hard-linked into the
-folder if possible, so that a run of many gigabytes needs little space. Nothing in it is
-written in place: a changed file is written under a temporary name and renamed.
+The archive is built in a hidden folder next to its final path. Files are hard-linked
+into the folder if possible, so that a run of many gigabytes needs little space. Nothing
+in it is written in place: a changed file is written under a temporary name and renamed.
 """
 
 from __future__ import annotations

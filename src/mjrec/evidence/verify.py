@@ -75,7 +75,7 @@ def verify(
     """Recreate a packed run and compare the result with the archive.
 
     The archive may come from a stranger. Three processes read it, recreate the run and
-    compare the two. Each has limits on memory and time, no network and no home
+    compare the two runs. Each has limits on memory and time, no network and no home
     directory, and sees only what it needs: the second gets only the inputs
     (environment, seeds, actions, options). No code that the archive names is run,
     except environments in `trust`.
