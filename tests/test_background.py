@@ -296,7 +296,7 @@ def test_workers_are_forks_and_one_that_dies_is_replaced(
 def test_a_worker_beside_a_simulation_draws_with_one_thread(
     recorded, others, start, monkeypatch
 ):
-    """Mesa's rasteriser would start as many as there are CPUs, also in the only one."""
+    """Mesa's rasterizer would start as many as there are CPUs, also in the only one."""
     monkeypatch.delenv("LP_NUM_THREADS", raising=False)
     background = start(recorded, in_flight(recorded)[0], workers=1)
     [process] = children() - others

@@ -42,7 +42,7 @@ def test_a_table_says_what_came_of_it(run, tmp_path):
     assert status == 0
     [header] = [line for line in out.splitlines() if line.lstrip().startswith("task ")]
     [row] = [line for line in out.splitlines() if line.lstrip().startswith(TASK)]
-    assert " 90 % " in header
+    assert " 90% " in header
     assert row.split()[:3] == [TASK, "2", "5"]
     assert "1 video:" in out
     assert str(tmp_path / "e") in out

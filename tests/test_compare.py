@@ -192,7 +192,7 @@ EDITS = [
     (in_text("bag-info.txt", NOTED.split("\n")[0], NOTED), Topic.FILES, "line"),
     (
         lambda bag: (bag / "data" / "notes.txt").write_text("best"),
-        *(Topic.FILES, "nothing recreated this file"),
+        *(Topic.FILES, "this file was not recreated"),
     ),
     (removed("*video000001.framehash"), Topic.PICTURES, "no such file"),
     (removed("*episode000001.h5"), Topic.PHYSICS, "no such file"),
@@ -218,7 +218,7 @@ EDITS = [
     (brighter, Topic.PICTURES, "levels in the worst block"),
     (
         lambda bag: the(bag, "*video000000.mp4").write_bytes(b"x" * 99),
-        *(Topic.VIDEOS, "a wrong size"),
+        *(Topic.VIDEOS, "the wrong size"),
     ),
     (
         in_text("*video000000.framehash", "0,          3,", "0,          4,"),

@@ -430,7 +430,7 @@ def test_an_episode_that_kills_its_workers_fails_alone(tmp_path, workers, protoc
     options = {"policy": Stumbling({3: kill_worker}), "protocol": protocol}
     evaluation = run(tmp_path / "e", **options, **SIXTEEN, workers=workers)
     assert [(each.unit, each.failure) for each in evaluation.failed] == [
-        ((5, 3), "3 processes died in it")
+        ((5, 3), "3 processes died while running it")
     ]
     assert {each.unit for each in evaluation.results} == {(5, n) for n in range(16)}
 

@@ -67,7 +67,7 @@ def test_episodes_of_several_directories_are_not_chosen_from(evaluation, tmp_pat
     folders = sorted(evaluation.glob("*/seed-000"))
     for number in range(2):
         shutil.copytree(folders[0], tmp_path / "both" / str(number))
-    with pytest.raises(PackError, match="have files of the same names"):
+    with pytest.raises(PackError, match="contain files with the same names"):
         mjrec.pack(tmp_path / "both", tmp_path / "e.zip")
     manifest = next((tmp_path / "both" / "0").glob("*.manifest.json"))
     manifest.unlink()

@@ -122,7 +122,7 @@ def test_a_dead_encoder(pendulum, out, kill_ffmpeg, caplog):
     details = manifest_of(out)
     assert (len(details["videos"]), len(details["mjrec"]["broken"])) == (1, 1)
     assert stats_of(out)["episode_lengths"] == [8, 8]
-    assert caplog.text.count("Not completely recorded") == 1
+    assert caplog.text.count("Incomplete recording") == 1
 
 
 @both_ways

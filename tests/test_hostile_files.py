@@ -299,7 +299,7 @@ CHANGES = (
 
 
 def with_change(header, path):
-    """Put an array with another header where the changes of a model are."""
+    """Put an array with another header where the changes to the model are."""
     start = b"\x93NUMPY\1\0" + struct.pack("<H", len(header))
     payload = start + header.encode() + bytes(8)
     path.write_bytes(struct.pack("<QqQ", 0, 0, len(payload)) + payload)
@@ -396,7 +396,7 @@ HARMS = [
     *(("h5", partial(in_hdf5, change), said) for change, said in HDF5),
     *(("spans", partial(beginning_with, head(r)), said) for said, r in ROWS.items()),
     ("spans", partial(beginning_with, b"[" * 10**7 + b"\n"), "does not give"),
-    *((".looks", partial(with_change, h), "change of the model") for h in CHANGES),
+    *((".looks", partial(with_change, h), "change to the model") for h in CHANGES),
     *(("mjb.gz", harm, "") for harm in GZIP),
     *(("zip", partial(put_zip, {**SOUND_ZIP, **m}), said) for said, m in ZIP.items()),
     ("zip", partial(put_zip, SOUND_ZIP, again=MAIN), "is not XML"),

@@ -116,7 +116,9 @@ def test_what_is_no_control_is_refused(write, action):
     """MuJoCo would go on with other controls, or raise something obscure."""
     env = MjcfEnvironment(write())
     env.reset()
-    with pytest.raises(mjrec.InvalidArgument, match=r"finite numbers of shape \(2,\)"):
+    with pytest.raises(
+        mjrec.InvalidArgument, match=r"finite numbers with the shape \(2,\)"
+    ):
         env.step(action)
 
 

@@ -273,7 +273,7 @@ def test_a_bomb_of_a_compiled_model_is_not_unpacked(directory):
     """It is read up to the size that was recorded."""
     facts = stored(directory, sphere())
     (directory / facts["mjb"]).write_bytes(gzip.compress(bytes(1 << 20)))
-    with pytest.raises(UnreadableFile, match="it contains more, not the recorded"):
+    with pytest.raises(UnreadableFile, match="it contains more than the recorded"):
         load_model(directory, facts)
     with pytest.raises(UnreadableFile, match="recorded size is"):
         load_model(directory, {**facts, "bytes": 1 << 50})

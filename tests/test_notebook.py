@@ -45,7 +45,7 @@ def recorded(tmp_path_factory):
 @pytest.mark.parametrize(
     ("kind", "said"),
     [
-        ("evaluation", ["<td>episodes</td><td>1</td>", "InvertedPendulum-v5", "95 %"]),
+        ("evaluation", ["<td>episodes</td><td>1</td>", "InvertedPendulum-v5", "95%"]),
         ("episode", ["Episode 0", "<td>steps</td><td>2</td>", "truncated"]),
         (
             "trajectory",

@@ -286,11 +286,11 @@ def test_the_readme_leads_a_stranger(infix, recorded, bag):
         "capped_cubic_video_schedule",
         f"openaigym.video.{infix}.video000001.mp4",
         "| OpenGL | ",
-        "a view of the recorded states, not evidence of its own",
+        "a view of the recorded states, not separate evidence",
         f"| {infix} | InvertedPendulum-v5 | 3 | {sum(returns) / 3:.6g} | ",
     ):
         assert part in text
-    assert "has chosen" not in text
+    assert "The author chose" not in text
 
 
 def test_the_readme_says_what_environments_were_made_with(tmp_path):
@@ -362,7 +362,7 @@ def test_actions_of_all_episodes_stay(recorded, infix, one_chosen):
     assert held in text
     assert held in entities["./"]["description"]
     assert held in entities["recordings/"]["description"]
-    assert "has chosen some" in text
+    assert "The author chose some" in text
     assert "as it was recorded" not in text
 
 

@@ -125,7 +125,7 @@ def test_what_the_figures_do_not_say_is_said_beside_them():
     large.summary = replace(large.summary, interval_method=method)
     scores = AcrossTasks(tasks=("a",), left_out={"b": "no episode was completed"})
     page = page_of(contents(first, second, large, odd, across={"one": scores}))
-    [said] = re.findall(r"intervals of 95\xa0%: ([^.]*)\.", page)
+    [said] = re.findall(r"intervals of 95%: ([^.]*)\.", page)
     assert said.endswith("50 resamples, seed 0")
     notes = re.findall(r"<li><span[^>]*>(\w+)</span>: ([^<]*)\.</li>", page)
     assert notes == [

@@ -145,7 +145,7 @@ def test_the_next_driver_ends_what_a_killed_one_has_left(tmp_path):
         ({"cpus_per_worker": 0}, "cpus_per_worker must be"),
         ({"workers_per_job": 1.5}, "workers_per_job must be"),
         ({"time_min": 0}, "time_min must be"),
-        ({"time_min": 1, "notice_s": 60}, "notice_s must be less than"),
+        ({"time_min": 1, "notice_s": 60}, "notice_s, in seconds, must be less than"),
         ({"mem_gb": 0}, "mem_gb must be more than 0"),
         ({"gpus": -1}, "gpus must be the number"),
     ],

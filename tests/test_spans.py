@@ -131,7 +131,7 @@ def test_model_changes_come_back(logs, path):
 
 
 def test_a_reader_beside_a_writer_sees_whole_recordings(tmp_path):
-    """With all changes of the model, though the tail wraps with every fourth row."""
+    """With all changes to the model, though the tail wraps with every fourth row."""
     path, enough = episode(tmp_path, 0), tmp_path / "enough"
 
     def record():

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Atomic writes: of a file, or of a piece at its end, all appears or nothing does.
+"""Atomic writes: a file, or a piece appended to one, appears whole or not at all.
 
 A file is written under a temporary name in its own directory and then renamed, so an
 incomplete file never has the final name. The temporary name starts with a dot and ends
@@ -35,7 +35,7 @@ def temporary_path(path: Path) -> Path:
 
 @contextlib.contextmanager
 def writing(path: Path, **advice: str) -> Iterator[None]:
-    """Turn any other `OSError` in the block into `FileNotWritten`.
+    """Turn any other `OSError` raised in the block into `FileNotWritten`.
 
     Args:
         path: the file that the block writes.

@@ -25,7 +25,7 @@ _STEP = 16
 
 
 class BlankFrames:
-    """A check for whether the frames of a video show anything.
+    """A check whether the frames of a video show anything.
 
     Checking stops once there has been a frame that is not black, a frame with two
     colours, and a frame that differs from the first. Only frames that could be blank

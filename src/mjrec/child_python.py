@@ -441,7 +441,7 @@ def _is_of_main(entry: str) -> bool:
 
 @contextlib.contextmanager
 def changed_environ(changes: Mapping[str, str | None]) -> Iterator[None]:
-    """Set or, for None, remove environment variables in the block.
+    """Set or, for None, remove environment variables inside the block.
 
     Afterwards all variables are restored, including those that the block itself set.
     """

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Provenance of a recording: packages, machine, variables, command line and code.
 
-Collecting it takes a third of a second or more, most of which is spent in other
-processes. A thread collects it once, and it is read when a manifest is written.
+Collecting it takes a third of a second or more, mostly in other processes. A thread
+collects it once, and it is read when a manifest is written.
 
 Reading the files of a hundred packages keeps Python busy for a fifth of a second. On a
 thread of the simulating process, this would cost even more: whenever a step releases

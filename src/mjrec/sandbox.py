@@ -64,7 +64,7 @@ class Sandbox(Child):
         request: the JSON request for the module.
         place: an empty folder, which is the process's working directory and holds its
             temporary files.
-        limits: resource limits, by their names in `resource`.
+        limits: resource limits, keyed by their names in `resource`.
         more_environ: environment variables in addition to this process's.
         readable: if given, the process can read only Python, the system and these
             paths, can write only to `place`, and has no network or home folder, if

@@ -57,10 +57,10 @@ def to_schedule(video_callable: object) -> Schedule:
     if isinstance(video_callable, Number | np.bool_) and not video_callable:
         return disable_videos
     raise InvalidArgument(
-        "video_callable must be a function from an episode's number to a bool, None "
-        "(the cubes 0, 1, 8, 27 ... and every 1000th) or False (no videos), not "
-        f"{type(video_callable).__name__}: {video_callable!r}. For a video of every "
-        "episode, use video_callable=lambda episode_id: True."
+        "video_callable must be a function that takes an episode number and returns "
+        "a bool, None (the cubes 0, 1, 8, 27 ... and every 1000th) or False (no "
+        f"videos), not {type(video_callable).__name__}: {video_callable!r}. For a "
+        "video of every episode, use video_callable=lambda episode_id: True."
     )
 
 
@@ -85,7 +85,8 @@ def check_takes_one(function: Callable[..., Any], name: str, what: str) -> None:
     except TypeError as error:
         raise InvalidArgument(
             f"{name} is called with one argument, {what}, but "
-            f"{schedule_name(function)}{signature} cannot be called like this: {error}."
+            f"{schedule_name(function)}{signature} cannot be called this way: "
+            f"{error}."
         ) from error
 
 

@@ -51,7 +51,7 @@ class Session:
         policy_kwargs: extra arguments for the policy.
         schedule: the episodes that get a video: `cubic`, `all`, `none`, `every:N` or
             `at:0,5,9`. None means `cubic`, unless `monitor` has a `keep`.
-        placed_camera: members of an `mujoco.MjvCamera` by name, to be used instead of
+        placed_camera: members of a `mujoco.MjvCamera` by name, to be used instead of
             `made.camera`. Only workers can draw from it.
         further_cameras: cameras for additional videos of the same episodes.
         made: options for creating the environment; the session sets `frames` and

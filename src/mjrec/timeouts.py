@@ -33,7 +33,7 @@ def timeout_s() -> float:
     if not 0 < seconds < math.inf:
         raise InvalidArgument(
             f"{_ENVIRONMENT_VARIABLE} is {text!r}. It must be the number of seconds "
-            "after which a process without progress is ended, such as "
+            "after which a process without progress is killed, such as "
             f"{_DEFAULT_S:g}."
         )
     return seconds

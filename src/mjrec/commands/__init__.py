@@ -25,7 +25,7 @@ __all__ = ["main"]
 # builtin).
 COMMANDS = {
     "record": ("record", "Record episodes of an environment."),
-    "render": ("render", "Render pending videos, or re-render episodes."),
+    "render": ("render", "Render pending videos, or rerender episodes."),
     "recover": ("recover", "Finish what a killed run left behind."),
     "list": ("list_episodes", "List recorded episodes."),
     "strip": ("strip", "Put frames of an episode side by side."),
@@ -99,7 +99,7 @@ class _Parser(argparse.ArgumentParser):
 
 
 def _arguments(argv: Sequence[str] | None) -> Sequence[str]:
-    """Return the arguments, the first of which is a command.
+    """Return the arguments; the first one is a command.
 
     Raises:
         SystemExit: the command is unknown, it or its arguments are missing, or help or

@@ -152,7 +152,7 @@ def _cell(name: str, estimate: Estimate | None) -> str:
 
 
 def _lines_after(comparison: Comparison) -> Iterator[str]:
-    percent = f"{comparison.bootstrap.confidence * 100:g} %"
+    percent = f"{comparison.bootstrap.confidence * 100:g}%"
     yield (
         f"In brackets: {percent} intervals over {comparison.unit}. Ties count as half "
         "in the probability of improvement; p-values are Holm-adjusted."

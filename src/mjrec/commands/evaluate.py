@@ -80,7 +80,7 @@ def evaluate(
     as_json: AsJson = False,
     engine_options: Engine = NO_ENGINE,
 ) -> int:
-    """Evaluate a policy: run episodes of each task and summarise the returns.
+    """Evaluate a policy: run episodes of each task and summarize the returns.
 
     The exit status is 1 if an episode failed (the policy or the environment raised an
     exception, or an action was NaN or had the wrong shape), if a return is NaN or
@@ -132,9 +132,9 @@ def evaluate(
     view_from = camera_of(camera)
     if isinstance(view_from, dict):
         raise InvalidArgument(
-            "mjrec evaluate needs a camera's name or number. To use a camera at any "
-            "other place, render the episodes afterwards: mjrec render DIR --episode N "
-            f"--camera {shlex.quote(str(camera))}"
+            "mjrec evaluate needs a camera's name or number. To use a camera in any "
+            "other position, render the episodes afterwards: mjrec render DIR "
+            f"--episode N --camera {shlex.quote(str(camera))}"
         )
     least = _by_task("--fail-under", fail_under, _value_of, "TASK=VALUE")
     ranges = _by_task("--score-range", score_range, _range_of, "TASK=LOW:HIGH")
@@ -194,7 +194,7 @@ def evaluate(
 def _shown_progress(
     show: ShowProgress, console: rich.console.Console
 ) -> Callable[[EvaluationProgress], None]:
-    """Return a callback that shows a bar or, in a log, prints a line every 10 %."""
+    """Return a callback that shows a bar or, in a log, prints a line every 10%."""
     said = 0
 
     def tell(progress: EvaluationProgress) -> None:
@@ -310,7 +310,7 @@ def _shortfalls(
 
 
 def _table(evaluation: Evaluation) -> rich.table.Table:
-    percent = f"{100 * evaluation.bootstrap.confidence:g} %"
+    percent = f"{100 * evaluation.bootstrap.confidence:g}%"
     made = table(["task", "episodes", "mean", percent, *_COLUMNS])
     for each in evaluation.summaries:
         failed = f"[bold red]{each.failed}[/]" if each.failed else "0"
@@ -322,7 +322,7 @@ def _table(evaluation: Evaluation) -> rich.table.Table:
             _number(each.iqm),
             _number(each.median),
             _extent(each),
-            "" if each.success_rate is None else f"{100 * each.success_rate:.0f} %",
+            "" if each.success_rate is None else f"{100 * each.success_rate:.0f}%",
             failed,
         )
     return made

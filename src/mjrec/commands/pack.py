@@ -49,7 +49,7 @@ def pack(
         anonymous: remove everything that names a user, a machine or an author.
         episodes: pack videos and states of these episodes only, such as 0,8,27. The
             archive says so.
-        max_size: size limit, such as 50M. If needed, videos are re-rendered at a
+        max_size: size limit, such as 50M. If needed, videos are rerendered at a
             smaller size.
     """
     console = rich.console.Console(stderr=True)

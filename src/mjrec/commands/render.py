@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`mjrec render`: render pending videos, or re-render recorded episodes."""
+"""`mjrec render`: render pending videos, or rerender recorded episodes."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def render(
     as_json: AsJson = False,
     engine_options: Engine = NO_ENGINE,
 ) -> int:
-    """Render pending videos, or re-render recorded episodes.
+    """Render pending videos, or rerender recorded episodes.
 
     Without options, all pending videos of the directory are rendered as planned.
     Several such commands running on one directory share the work.

@@ -41,10 +41,10 @@ def verify(
 ) -> int:
     """Re-run a packed run from its seeds and actions, and compare the results.
 
-    The archive may come from a stranger: it is read, run and compared in processes with
-    limits, without network or home directory, and no code that it names is executed.
-    The exit status is 0 (PASS: all equal), 3 (PARTLY: nothing contradicts the archive,
-    but something had to be taken on trust) or 1 (FAIL).
+    The archive may come from a stranger: it is read, run and compared in
+    resource-limited processes without network or home directory, and no code that it
+    names is executed. The exit status is 0 (PASS: all equal), 3 (PARTLY: nothing
+    contradicts the archive, but something had to be taken on trust) or 1 (FAIL).
 
     Args:
         path: an archive made by mjrec pack, an unpacked one, a monitor directory, or a
@@ -67,7 +67,7 @@ def verify(
 
         def show_progress(now: VerificationProgress) -> None:
             total = max(1, now.total)
-            show(now.phase, now.done, total, f"{100 * now.done // total} %")
+            show(now.phase, now.done, total, f"{100 * now.done // total}%")
 
         verification = verify_archive(
             path,

@@ -156,7 +156,7 @@ class Run:
         """Yield outcomes as they arrive, until no jobs are left.
 
         If a job's child dies, the job is retried after the others, up to `TRIES` times
-        in all.
+        in total.
 
         Args:
             timeout_s: yield None whenever no outcome has arrived for this many seconds;
@@ -248,7 +248,7 @@ class Run:
         task.deaths += 1
         if task.deaths < TRIES:
             logger.warning(
-                "A worker died at the job %s, which will be retried. It %s",
+                "A worker died while doing the job %s, which will be retried. It %s",
                 task.key,
                 how,
             )
@@ -292,7 +292,7 @@ def _end_earlier_runs(folder: Path) -> None:
         with contextlib.suppress(OSError), path.open("rb") as file:
             # This raises an error if the driver is alive.
             fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
-            logger.info("The run in %s has no driver, so it was ended.", path.parent)
+            logger.info("The run in %s has no driver, so it was stopped.", path.parent)
             path.unlink()
             _remove(path.parent)
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""An engine for Slurm: arrays of Slurm jobs, each of which does some of a run's jobs.
+"""An engine for Slurm: arrays of Slurm jobs, each for some of a run's jobs.
 
 Outcomes are files in the run's folder, which all machines see, so that nothing depends
 on the life of a single Slurm job. A Slurm job that is requeued does only the jobs that
@@ -80,8 +80,8 @@ class SlurmEngine(Executor):
     """An engine that runs jobs in Slurm jobs.
 
     Args:
-        workers: maximum number of workers in all Slurm jobs together. None means 4, or
-            one per usable CPU with `cluster="local"`.
+        workers: maximum total number of workers in all Slurm jobs. None means 4, or one
+            per usable CPU with `cluster="local"`.
         cluster: None means this machine's Slurm cluster. `"local"` uses processes on
             this machine instead of Slurm jobs, so that you can try the engine.
         gpus: number of GPUs for each worker, which may be a fraction: with 0.25, four
@@ -138,8 +138,8 @@ class SlurmEngine(Executor):
         notice = min(120.0, 60 * time_min / 4) if notice_s is None else notice_s
         if not 0 <= notice < 60 * time_min:
             raise InvalidArgument(
-                f"notice_s must be less than the time limit of {time_min} minutes "
-                f"(time_min), in seconds, but it is {notice_s!r}."
+                "notice_s, in seconds, must be less than the time limit of "
+                f"{time_min} minutes (time_min), but it is {notice_s!r}."
             )
         self._cluster = cluster or "slurm"
         self._submitit = _submitit(self._cluster)
@@ -476,7 +476,7 @@ def _submitit(cluster: str) -> Any:
 
 
 def _as_from_outside() -> contextlib.AbstractContextManager[None]:
-    """Hide any surrounding Slurm job from commands in the block.
+    """Hide any surrounding Slurm job from commands inside the block.
 
     Otherwise that job's resources (its CPUs and memory) would be mistaken for the
     requested ones.

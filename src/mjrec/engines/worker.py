@@ -2,9 +2,9 @@
 """The function that executors call to do a job in a child process.
 
 A child stays for later jobs of its run, so that a policy is loaded only once per child.
-The child is ended when its run is over. Every machine can see this, because the file
-`work.json` in the run's folder is then removed. The child also ends if the process that
-started it ends.
+The child is terminated when its run is over. Every machine can see this, because the
+file `work.json` in the run's folder is then removed. The child also ends if the process
+that started it ends.
 """
 
 from __future__ import annotations

@@ -42,7 +42,8 @@ def make_dm_control(env_id: str, options: EnvironmentOptions) -> Any:
 
     Raises:
         UnknownName: the domain, task or argument does not exist.
-        MissingDependency: this dm_control does not work with this mujoco.
+        MissingDependency: the installed dm_control does not work with the installed
+            mujoco.
         EnvironmentNotMade: creating the task failed for another reason, which is
             chained.
     """
@@ -132,9 +133,9 @@ class DmControlEnvironment(NamedEnvironment):
         from one `RandomState`. It is seeded in place, because other objects share it. A
         monitor gets the seed for its metadata.
 
-        If the environment was created with this seed and never reset, it is used just
-        as `suite.load(..., task_kwargs={"random": seed})` created it. The random
-        choices made at that time are kept, and no seed is set for this episode.
+        If the environment was created with this seed and never reset, it is used
+        exactly as `suite.load(..., task_kwargs={"random": seed})` created it. The
+        random choices made at that time are kept, and no seed is set for this episode.
         """
         if not self._was_reset and seed == self._made_with:
             seed = None

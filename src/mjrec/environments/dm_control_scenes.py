@@ -59,9 +59,9 @@ class ContextsOnDemand:
     def resetting(self) -> Iterator[None]:
         """Return a context manager for resetting the environment.
 
-        In the block, a physics without contexts has a substitute, which creates real
-        contexts as soon as anything is drawn. After the block, even if it raised an
-        error, the physics is as it was before.
+        Inside the block, a physics that has no contexts gets a stand-in for them, which
+        creates real contexts as soon as anything is drawn. After the block, even if it
+        raised an error, the physics is as it was before.
         """
         self._is_resetting = True
         # If the reset compiles a new physics, this hook gets it in time.
@@ -87,7 +87,7 @@ class ContextsOnDemand:
 
 
 class _Contexts:
-    """A substitute for a physics's contexts, until something is drawn in them."""
+    """A stand-in for a physics's contexts, until something is drawn in them."""
 
     def __init__(self, physics: Any) -> None:
         self._physics = physics
@@ -151,8 +151,8 @@ def dm_control_scenes(
     """Return how the states of a dm_control environment are recorded.
 
     The frames are those of `physics.render()`. It cannot draw frames that are larger
-    than the model's offscreen buffer or come from an `MjvCamera`: these are other
-    frames of the same scene, which are not drawn live.
+    than the model's offscreen buffer or come from an `MjvCamera`: those are rendered
+    separately from the same scene, never live.
 
     Args:
         env: an environment with dm_control's `physics`.
@@ -199,7 +199,7 @@ def dm_control_scenes(
 
 
 def generator_of(env: Any) -> Any:
-    """Return the generator of an environment's random numbers, or None."""
+    """Return an environment's random number generator, or None."""
     # The suite's tasks use the first place, and composer's environments the second.
     for holder, name in ((getattr(env, "task", None), "random"), (env, "random_state")):
         found = getattr(holder, name, None)
@@ -252,10 +252,10 @@ def _own_context(physics: Any) -> Iterator[Any]:
     """Make the context that dm_control draws with current, and yield its executor.
 
     dm_control remembers which context it made current last. If another library has
-    changed that, it would draw in no context. Its context must not stay current either:
-    when a `mujoco.Renderer` is closed or collected, it frees those objects in the
-    current context that have the same numbers as its own. In both cases,
-    `physics.render()` would return arbitrary memory.
+    since changed the current context, dm_control would draw without one. Its context
+    must not stay current either: when a `mujoco.Renderer` is closed or collected, it
+    frees those objects in the current context that have the same numbers as its own. In
+    both cases, `physics.render()` would return arbitrary memory.
     """
     with context_kept(or_none=True), collection_paused():
         gl = physics.contexts.gl
@@ -309,10 +309,10 @@ class _PhysicsScene:
         capture()
 
     def is_unmoved(self) -> bool:
-        """Return quickly whether the view is certainly the same as at the last frame.
+        """Check quickly whether the view is certainly the same as for the last frame.
 
-        Changes in the model, the camera and the option are not checked. The result is
-        True if the simulation is the same as when the view was last requested.
+        Changes to the model, the camera and the option are not checked for. The result
+        is True if the simulation is the same as when the view was last requested.
         """
         return self._is_placed and _DATA(self._env) is self._data
 
@@ -333,7 +333,7 @@ class _PhysicsScene:
 
 
 def _drawn_by_physics(physics: Any, camera: Any, height: int, width: int) -> bool:
-    """Return whether `physics.render()` can draw such frames."""
+    """Return whether `physics.render()` can draw frames with this camera and size."""
     buffer = physics.model.vis.global_
     named = camera is None or isinstance(camera, str | int)
     return bool(named and height <= buffer.offheight and width <= buffer.offwidth)

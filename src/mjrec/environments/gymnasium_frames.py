@@ -34,7 +34,7 @@ class EnvironmentFrames:
         return self._env.render_mode
 
     def render(self) -> Any:
-        """Return the current frame, or a list of frames that were not returned yet."""
+        """Return the current frame, or a list of the frames not returned so far."""
         with _own_context(self._env):
             rendered: Any = self._env.render()
         if self._keeps_frames and isinstance(rendered, list):
@@ -94,7 +94,7 @@ def _own_context(env: gymnasium.Env[Any, Any]) -> AbstractContextManager[None]:
 
 @contextlib.contextmanager
 def _current(viewer: Any) -> Iterator[None]:
-    """Make a viewer's context, if any, current in the block."""
+    """Make a viewer's context, if any, current inside the block."""
     from ..simulation.gl_context import collection_paused, context_kept
 
     with context_kept(), collection_paused():

@@ -290,7 +290,7 @@ def frame_moment(drawn: Any) -> Callable[[Callable[[], None]], None] | None:
 
 @contextlib.contextmanager
 def _drawing_instead(renderer: Any, capture: Callable[[], None]) -> Iterator[None]:
-    """Make `renderer.render` call `capture` in the block, and draw nothing."""
+    """Make `renderer.render` call `capture` inside the block, and draw nothing."""
     # The attribute of the instance hides the class's method until it is deleted.
     renderer.render = lambda *_args, **_kwargs: capture()
     try:
@@ -318,7 +318,7 @@ def _environment(base: gymnasium.Env[Any, Any]) -> dict[str, Any] | None:
 
 
 def random_state(base: Any) -> Any:
-    """Return the states of an environment's generator and its inner environment's.
+    """Return the states of the generators of an environment and its inner one.
 
     Args:
         base: an environment without its wrappers.

@@ -36,8 +36,8 @@ def suite_tasks(tag: str) -> tuple[str, ...]:
         tag: `benchmarking`, `easy`, `hard`, `extra`, or `all`.
 
     Raises:
-        MissingDependency: dm_control is not installed, or does not work with this
-            mujoco.
+        MissingDependency: dm_control is not installed, or does not work with the
+            installed mujoco.
         EnvironmentNotMade: importing dm_control failed for another reason.
     """
     answer = _ask(_SUITE, tag)
@@ -75,7 +75,7 @@ def mujoco_ids() -> tuple[str, ...]:
 
 
 def newest_versions(env_ids: Iterable[str]) -> dict[str, str]:
-    """Return the newest version of each id, by the id without its version.
+    """Return the newest version of each id, keyed by the id without its version.
 
     An id without a version is kept only if it has no versioned sibling.
     """

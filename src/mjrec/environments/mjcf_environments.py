@@ -45,7 +45,7 @@ def make_mjcf(
     """
     if options.kwargs:
         raise InvalidArgument(
-            "An MJCF file takes no more arguments, but these were given: "
+            "An MJCF file takes no other arguments, but these were given: "
             f"{dict(options.kwargs)}. The file itself defines the whole simulation."
         )
     environment = MjcfEnvironment(
@@ -229,7 +229,8 @@ class MjcfEnvironment(gymnasium.Env[NDArray[np.float64], NDArray[np.float64]]):
         shape = self.action_space.shape
         if ctrl.shape != shape or not np.isfinite(ctrl).all():
             raise InvalidArgument(
-                f"An action must be finite numbers of shape {shape}, not {action!r}."
+                "An action must be an array of finite numbers with the shape "
+                f"{shape}, not {action!r}."
             )
         return ctrl
 

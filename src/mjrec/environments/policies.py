@@ -96,7 +96,7 @@ class _ForeignPolicy(Policy):
             self._choose = chosen
         else:
             raise PolicyError(
-                f"The policy {name} is {chosen!r}, which is neither callable nor has "
+                f"The policy {name} is {chosen!r}, which is not callable and has no "
                 "predict()."
             )
 

@@ -29,7 +29,7 @@ from ..errors import MissingDependency, PolicyError, UnknownName
 
 
 def file_of_policy(text: str) -> Path | None:
-    """Return the file that a policy's name refers to, or None if it is no file name.
+    """Return the file that a policy's name refers to, or None if it is not one.
 
     Raises:
         UnknownName: the name is a file name, but the file does not exist.

@@ -154,7 +154,7 @@ class Recreated:
             enter_state(simulated.model, simulated.data, parts, row)
 
     def turns_by_rk4(self) -> bool:
-        """Return whether MuJoCo 4 deliberately steps the model unlike MuJoCo 3."""
+        """Return whether MuJoCo 4 steps the model differently by design."""
         from ..simulation.states import turns_by_rk4  # This loads MuJoCo.
 
         simulated = simulation_below(self.environment)

@@ -103,7 +103,7 @@ def mujoco_warnings(env: Any) -> dict[str, int]:
 
 
 def new_warnings(before: Mapping[str, int], env: Any) -> dict[str, int]:
-    """Return MuJoCo's new warnings by kind since `mujoco_warnings` gave `before`."""
+    """Return MuJoCo's warnings by kind since `mujoco_warnings` returned `before`."""
     after = mujoco_warnings(env)
     # MuJoCo may reset an unstable simulation, and the counts with it.
     counts = {name: n - before.get(name, 0) for name, n in after.items()}
@@ -137,8 +137,8 @@ def has_own_method(instance: Any, name: str) -> bool:
     """Return whether an object has its own method in place of its class's.
 
     This function does not use `__dict__`: in CPython 3.11 and 3.12, reading it once
-    makes every later access to the object's attributes several times slower. That adds
-    2 % to the instructions of a HalfCheetah step.
+    makes every later access to the object's attributes several times slower. That
+    increases the instruction count of a HalfCheetah step by 2%.
     """
     own = getattr(instance, name, None)
     of_class = getattr(instance.__class__, name, None)

@@ -106,11 +106,11 @@ class ViewerScene:
         self._start()
 
     def is_unmoved(self) -> bool:
-        """Return quickly whether the view is certainly the same as at the last frame.
+        """Check quickly whether the view is certainly the same as for the last frame.
 
-        Changes in the model, the camera and the option are not checked. The result is
-        True if the simulation is the same as when the view was returned, and there is
-        no viewer that the user could have changed.
+        Changes to the model, the camera and the option are not checked for. The result
+        is True if the simulation is the same as when the view was returned, and there
+        is no viewer that the user could have changed.
         """
         unmoved = self._unmoved
         return unmoved is not None and unmoved == (

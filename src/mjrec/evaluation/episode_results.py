@@ -53,7 +53,7 @@ class EpisodeResult:
         terminated: whether the task ended the episode; None if the episode failed.
         truncated: whether a limit outside the task ended the episode; None if the
             episode failed.
-        success: whether the environment reported a success; None if it reported neither
+        success: whether the environment reported success; None if it reported neither
             success nor failure.
         failure: the reason why the episode could not be completed, as a single line;
             None if it was completed.

@@ -51,8 +51,8 @@ logger = logging.getLogger(__name__)
 _WORKER = "mjrec.evaluation.worker:EvaluationWorker"
 _LOCK_NAME = ".mjrec.evaluation.lock"
 
-# By default the number of a library's threads depends on the machine. It would change
-# the order in which numbers are added, and therefore the results. The worker processes
+# By default the number of a library's threads depends on the machine, and so does the
+# order in which numbers are added. That would change the results. The worker processes
 # keep all CPUs busy anyway.
 _ONE_THREAD_EACH = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
@@ -141,7 +141,7 @@ def evaluate(
         max_steps: truncate episodes after this many steps. None for the environment's
             limit, or for 1000 steps if it has no limit.
         episode_timeout: maximum duration of an episode in seconds. An episode that
-            takes longer fails, and its worker is ended.
+            takes longer fails, and its worker is terminated.
         camera: the camera for the videos. None for the model's tracking camera, if
             there is one.
         height: height of the videos in pixels. None for the environment's default.

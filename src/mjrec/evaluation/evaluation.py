@@ -111,7 +111,7 @@ class Evaluation:
     def _repr_html_(self) -> str:
         """Return HTML for notebooks, with a row per task and the finished videos."""
         facts = {"episodes": len(self.results), "directory": self.directory}
-        level = f"{100 * self.bootstrap.confidence:g} %"
+        level = f"{100 * self.bootstrap.confidence:g}%"
         columns = ("task", "episodes", "mean", level, "IQM", "success", "failed")
         rows = [
             (
@@ -308,7 +308,7 @@ class _Selection:
 
 @dataclass(frozen=True, kw_only=True)
 class _ResultsFile:
-    """The content of `results.json`, in its order."""
+    """The content of `results.json`, in the order of the file."""
 
     plan: Annotated[EvaluationPlan, _plan]
     selection: _Selection

@@ -210,7 +210,7 @@ def _seeds(seeds: Iterable[int] | None, num_seeds: int | None) -> tuple[int, ...
         episode_seeds(seed, 0)
     if not given or len(set(given)) < len(given):
         raise InvalidArgument(
-            f"seeds must not be empty or contain duplicates, but it is {list(given)}."
+            f"seeds must not be empty or contain duplicates, got {list(given)}."
         )
     return tuple(map(int, given))
 

@@ -218,7 +218,7 @@ def interquartile_mean(samples: Iterable[FloatArray]) -> Figure:
         return np.asarray(_stats().trim_mean(pooled, 0.25, axis=-1))
 
     def error() -> FloatArray:
-        # The variance of the winsorised values within each stratum.
+        # The variance of the winsorized values within each stratum.
         values = np.sort(np.concatenate(strata))
         first = len(values) // 4
         low, high = values[first], values[-1 - first]

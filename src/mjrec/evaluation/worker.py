@@ -279,7 +279,7 @@ class _ChunkRun:
         with self._open:
             for unit in missing:
                 if deaths[unit] >= TRIES:
-                    why = f"{TRIES} processes died in it"
+                    why = f"{TRIES} processes died while running it"
                     self._monitored(unit).recorder.run.note(
                         "failed", _failed(unit, why)
                     )

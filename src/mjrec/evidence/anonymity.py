@@ -12,8 +12,9 @@ In a staged monitor directory, whose files are copies or links:
   `<gpu>`, because each identifies a single card;
 - file names that contain the identity in a uid, a camera or a prefix get `user` or
   `host` instead, and references to them are changed to match;
-- sources of models lose their comments, and their images the metadata. No element or
-  attribute changes, so the model compiles to the same result, and names stay;
+- sources of models lose their comments, and their images lose their metadata. No
+  element or attribute changes, so the model compiles to the same result, and names
+  stay;
 - a compiled model that contains the identity is removed. Only its author could have
   loaded it.
 
@@ -80,7 +81,7 @@ _DAMAGE = (zipfile.BadZipFile, zlib.error, struct.error, EOFError, RuntimeError)
 
 
 def make_anonymous(recordings: Path, *, identity: Identity) -> None:
-    """Remove an identity from a monitor directory that is made of copies or links.
+    """Remove an identity from a monitor directory that consists of copies or links.
 
     Nothing is written in place: a file that is a hard link to an original is replaced
     by a new file. After an error the directory is unusable.
@@ -181,7 +182,7 @@ def _make_file_anonymous(path: Path, texts: _Texts, matcher: IdentityMatcher) ->
         except (EOFError, zlib.error) as error:
             raise UnreadableFile(path, f"it is damaged ({error})") from error
         if matcher.found_in_bytes(model):
-            logger.info("Leaving out %s: it names who compiled it.", name)
+            logger.info("Leaving out %s: it contains the identity of its author.", name)
             path.unlink()
 
 
@@ -213,7 +214,7 @@ def _csv_lines(data: bytes, texts: _Texts) -> Iterator[bytes]:
 
 
 def _general(key: str, value: Any) -> Any:
-    """Return the part of a JSON key's value that identifies nobody."""
+    """Return a JSON key's value without what identifies a person or a machine."""
     if key == "provenance" and isinstance(value, dict):
         return {k: _general_provenance(k, item) for k, item in value.items()}
     if key == "gl_device" and isinstance(value, dict):
@@ -271,7 +272,7 @@ def _renamed_infixes(matcher: IdentityMatcher, names: list[str]) -> Mapping[str,
 
 
 def anonymous_sources(content: bytes, matcher: IdentityMatcher) -> bytes:
-    """Return the zip file of a model's sources, without its authors' remarks.
+    """Return the zip file of a model's sources, without comments and metadata.
 
     Comments that mention a licence stay, unless they contain the identity or an email
     address.
@@ -325,7 +326,7 @@ def _xml(content: bytes, matcher: IdentityMatcher) -> bytes:
     text = content.decode("utf-8")
     new = _BESIDE_THE_MODEL.sub(kept, text)
     if _elements(new) != _elements(text):
-        raise ValueError("removing the comments of its XML would change the model")
+        raise ValueError("removing the comments from its XML would change the model")
     return new.encode()
 
 

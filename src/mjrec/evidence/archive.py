@@ -133,9 +133,9 @@ def _bag_in(path: Path) -> Path | None:
 
 
 def _files_below(folder: Path) -> list[Path]:
-    """Return all files below a folder, which has only files and folders with files.
+    """Return all files below a folder; reject links and empty folders.
 
-    The manifests of a bag list only files.
+    The manifests of a bag list only files, so an empty folder could not be checked.
     """
     found: list[Path] = []
     for entry in folder.iterdir():

@@ -2,8 +2,8 @@
 """BagIt bags (RFC 8493): writing and checking them, and packing a folder as a zip file.
 
 The bag's files are written here because `bagit.make_bag` writes version 0.97, in
-directory order, and changes the working directory of the whole process. The tests let
-that package validate them.
+directory order, and changes the working directory of the whole process. The tests
+validate them with that package.
 
 The zip file is reproducible byte for byte: its order, times, modes and system are
 fixed, and owners are left out. Files that are compressed already are stored; the others
@@ -139,8 +139,8 @@ def check_bag(bag: Path, on_progress: _OnProgress) -> Iterator[Finding]:
 
 
 def unchanged(bag: Path) -> Finding:
-    """Return the finding for a bag without objections."""
-    reason = "the files and their SHA-512 are those that the bag lists"
+    """Return the finding for a bag that is intact."""
+    reason = "the files and their SHA-512 digests are those that the bag lists"
     count = len(_files(bag))
     return Finding(Topic.FILES, "", Outcome.NOTED, reason, count=count)
 
@@ -171,7 +171,8 @@ def _add(archive: zipfile.ZipFile, source: Path, name: str) -> None:
     info.file_size = source.stat().st_size
     stored = source.name.endswith(STORED)
     info.compress_type = zipfile.ZIP_STORED if stored else zipfile.ZIP_DEFLATED
-    # Public only since Python 3.13, as `compress_level`; `open` reads it in all.
+    # Public only since Python 3.13, as `compress_level`; `open` reads it in all
+    # versions.
     info._compresslevel = None if stored else _LEVEL  # type: ignore[attr-defined]  # see above
     with source.open("rb") as file, archive.open(info, "w") as entry:
         shutil.copyfileobj(file, entry, _BLOCK)
@@ -223,7 +224,9 @@ def _said_in(bag: Path, manifest: str, *, is_payload: bool) -> dict[str, str]:
     for number, line in enumerate(_text_of(bag / manifest).splitlines(), 1):
         match = _LINE.fullmatch(line)
         if match is None:
-            raise ValueError(f"{manifest}, line {number}: not a SHA-512 and a name")
+            raise ValueError(
+                f"{manifest}, line {number}: not a SHA-512 digest and a name"
+            )
         name = _ENCODED.sub(lambda found: chr(int(found[1], 16)), match["name"])
         if (portable_parts(name)[0] == PAYLOAD) is not is_payload or name in listed:
             raise ValueError(f"{manifest}, line {number}: {name[:200]!r} is misplaced")

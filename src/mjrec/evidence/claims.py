@@ -34,7 +34,7 @@ VERSION: Final = re.compile(r"[\w.+-]{1,40}", re.ASCII)
 _PACKAGES: Final = frozenset(("python", *PACKAGES, "zlib"))
 _RECORDING: Final = "recording "
 _METADATA: Final = ".meta.json"
-# By name, the value to compare and the one to show, which may be the same.
+# For each name, the value to compare and the one to show, which may be the same.
 _Stated: TypeAlias = Mapping[str, tuple[str, ...]]
 _NONE: Final = ("none",)
 _GL: Final = ("gl_vendor", "gl_renderer", "gl_version")
@@ -119,6 +119,6 @@ def _versions(said: Any) -> _Stated:
 
 
 def _machine(facts: Mapping[str, Any]) -> tuple[str]:
-    # The beginning is enough to distinguish the flags of CPUs.
+    # A prefix is enough to tell the flags of different CPUs apart.
     values = facts_in(facts.get("machine")).values()
     return (" ".join(str(value)[:16] for value in values).strip(),)

@@ -3,7 +3,8 @@
 
 Files with equal bytes need no further check. Otherwise a comparator for each kind of
 file finds the differences, and an excuse may allow them. A file that only one run has
-is a difference. Memory is independent of the number of episodes; time is proportional.
+is a difference. Memory use does not depend on the number of episodes; time is
+proportional to it.
 """
 
 from __future__ import annotations
@@ -47,7 +48,7 @@ _Found: TypeAlias = Iterator[Same | Difference]
 # Keys of a manifest that rendering changes.
 _DRAWN_KEYS: Final = frozenset(("videos", "pending", "broken"))
 _NO_DIFFERENCES: Final = (Aspect.CLAIM, Aspect.STATEMENT)
-_NOT_MADE: Final = "nothing recreated this file"
+_NOT_MADE: Final = "this file was not recreated"
 
 
 def _compare_manifests(given: Path, made: Path, rules: Rules) -> _Found:
@@ -80,8 +81,8 @@ class _Kind(NamedTuple):
     proved: tuple[tuple[Topic, str], ...] = ()
 
 
-# Kinds of files, by the ends of their names, in the order of the comparison. Metadata
-# comes after videos, because it has the hash of the decoded frames.
+# Kinds of files, keyed by the ending of their names, in the order of the comparison.
+# Metadata comes after videos, because it has the hash of the decoded frames.
 _KINDS: Final[Mapping[str, _Kind]] = {
     ".zip": _Kind(Topic.IDENTITY, compare_sources),
     ".mjb.gz": _Kind(
@@ -106,7 +107,7 @@ _KINDS: Final[Mapping[str, _Kind]] = {
     ".json": _Kind(Topic.PICTURES, compare_objects),
     "": _Kind(Topic.FILES, _other_bytes),
 }
-# Kinds of files in a run that was recreated without rendering.
+# The kinds of files in a run that was recreated without rendering.
 _UNDRAWN: Final = (".jsonl", ".stats.json", ".manifest.json", ".h5")
 _MODELS: Final = (".mjb.gz", ".zip")
 # Kinds whose equal items are counted by their comparators.
@@ -221,7 +222,9 @@ class Comparison:
             file=file,
             # A missing compiled model is not excused as compiled elsewhere.
             aspect=Aspect.MODEL if ending == ".mjb.gz" and is_given else Aspect.EXACT,
-            how=_NOT_MADE if is_given else "no such file, but one was recreated",
+            how=_NOT_MADE
+            if is_given
+            else "the archive has no such file, but one was recreated",
         )
 
     def _is_unplayed(self, model: str) -> bool:
@@ -230,7 +233,7 @@ class Comparison:
 
     @functools.cached_property
     def _played_models(self) -> set[str]:
-        """The models of recreated recordings; all trajectories are opened for them."""
+        """The models of recreated recordings. Finding them opens all trajectories."""
         models = models_of(self._given / RECORDINGS).items()
         played = (m for i, m in models if f"recording {i}" not in self._unplayed)
         return {model_name(file) for files in played for file in files}
@@ -287,7 +290,7 @@ class Comparison:
             reason = "frames were not rerendered"
             if drawn:
                 missed = f"{1 - drawn / frames:.0%}"
-                reason += f"; the chance of missing a single changed one is {missed}"
+                reason += f"; the chance of missing a single changed frame is {missed}"
             yield _believed(Topic.PICTURES, reason, frames - drawn, "frame")
         if self._level is Level.STATS:
             undone = "states were not compared (--level stats)"
@@ -299,7 +302,7 @@ def _order(file: str) -> tuple[int, str]:
 
 
 def _ending(file: str) -> str:
-    """Return the end of a file's name that states its kind; "" if it is unknown."""
+    """Return the ending of a file name that identifies its kind; "" if unknown."""
     if not file.startswith(f"{RECORDINGS}/openaigym."):
         return ""
     return next(end for end in _KINDS if file.endswith(end))
@@ -333,7 +336,7 @@ def _other_choice(given: set[int], made: set[int]) -> Difference:
     return Difference(
         Topic.SELECTION,
         where="episodes with a video",
-        how=f"only the archive has {one}, only the recreated run has {other}",
+        how=f"only the archive has {one}; only the recreated run has {other}",
     )
 
 

@@ -40,9 +40,11 @@ def compare_descriptions(bag: Path) -> Iterator[Same | Difference]:
     there |= {name: bag / name for name in texts if (bag / name).exists()}
     for name in sorted(there.keys() | texts.keys()):
         if name not in texts:
-            yield _difference(name, "nothing recreated this file")
+            yield _difference(name, "this file was not recreated")
         elif name not in there:
-            yield _difference(name, "no such file, but one was recreated")
+            yield _difference(
+                name, "the archive has no such file, but one was recreated"
+            )
         else:
             yield _compare(name, there[name], texts[name])
 
@@ -57,7 +59,7 @@ def written_again(bag: Path) -> dict[str, str]:
     with unreadable(path):
         recorded = read_object(path).get("packed_with")
         if not isinstance(recorded, dict):
-            raise ValueError("it lacks the versions that packed it")
+            raise ValueError("it lacks the versions of the software that packed it")
         options = packing_options(recorded.get("options") or {})
     run = read_run(recordings, options=options)
     texts = descriptions(run, recordings, packed_with=_claimed(recorded))
@@ -65,7 +67,7 @@ def written_again(bag: Path) -> dict[str, str]:
 
 
 def _claimed(recorded: dict[str, Any]) -> dict[str, str]:
-    """Return the claimed versions of the packages that packed the run."""
+    """Return the claimed versions of the software that packed the run."""
     claimed = {name: str(recorded.get(name)) for name in packed_with()}
     return {n: v for n, v in claimed.items() if VERSION.fullmatch(v)}
 
@@ -88,7 +90,7 @@ def _compare(name: str, path: Path, text: str) -> Same | Difference:
 
 
 def _first_more(lines: list[str], others: list[str]) -> tuple[int, str] | None:
-    """Return the first line, with its number, that occurs less often in the others."""
+    """Return the first line that the others contain less often, with its number."""
     more = Counter(lines) - Counter(others)
     found = (
         (number, line)

@@ -71,7 +71,7 @@ class Rules:
     decoded: dict[Path, str] = field(default_factory=dict)
 
     def translated(self, text: bytes) -> bytes:
-        """Return bytes of the archive with the names of the recreated files."""
+        """Return bytes of the archive, with names replaced by the recreated files'."""
         for name, again in self.renamed.items():
             text = text.replace(name.encode(), again.encode())
         return text
@@ -88,7 +88,7 @@ _GL: Final = Rule(Topic.PICTURES, Aspect.CLAIM, "gl")
 _FFMPEG: Final = Rule(Topic.VIDEOS, Aspect.CLAIM, "ffmpeg")
 _MODEL: Final = Rule(Topic.IDENTITY, Aspect.MODEL)
 
-# For all files: a key means the same everywhere, and so does everything below it.
+# For all files: a key means the same thing everywhere, and so do the keys below it.
 _KEYS: Final[Mapping[str, Rule]] = {
     **dict.fromkeys(("reward", "episode_rewards", "reward_before"), _RETURN),
     **dict.fromkeys(("length", "episode_lengths", "terminated", "truncated"), _END),
@@ -113,7 +113,7 @@ _KEYS: Final[Mapping[str, Rule]] = {
 _VERSIONS: Final = frozenset(("versions", "rendered_with"))
 # The program's name and version. Its other arguments are not claims.
 _ENCODER: Final = ("encoder_version.version", "encoder_version.cmdline[0]")
-# The one of several similar devices that rendered. EGL numbers them; other APIs do not.
+# Which of several similar devices rendered. EGL numbers them; other APIs do not.
 _DEVICE: Final = {
     "file": re.compile(r"/dev/[\w/-]{1,80}", re.ASCII),
     "uuid": re.compile(r"GPU-[0-9a-f-]{36}", re.ASCII),
@@ -276,8 +276,8 @@ def _leaf(
         aspect is Aspect.CLAIM and rule.claim != "machine"
     )
     if (is_gone and not may_be_gone) or (aspect is Aspect.SUMMED and size is None):
-        # No version turns a non-number into a number, or omits a key. But a package or
-        # OpenGL's names may be missing here.
+        # Another version never turns a non-number into a number, or omits a key. But a
+        # package, or OpenGL's names, may be missing on this machine.
         aspect = Aspect.EXACT
     return Difference(
         rule.topic,
@@ -292,7 +292,7 @@ def _leaf(
 
 
 def lines_of(file: BinaryIO) -> Iterator[bytes]:
-    """Yield the lines of a file with a limited length."""
+    """Yield the lines of a file, and raise an error if one is too long."""
     while line := file.readline(_LONGEST_LINE):
         if len(line) >= _LONGEST_LINE:
             raise ValueError("a line is too long")
@@ -304,5 +304,5 @@ def _without_rows(file: BinaryIO) -> Iterator[bytes]:
 
 
 def video_of(metadata: Path) -> Path:
-    """Return the path of the video with a metadata file."""
+    """Return the path of the video that a metadata file describes."""
     return metadata.with_name(f"{metadata.name.removesuffix('.meta.json')}.mp4")

@@ -27,7 +27,7 @@ from .findings import Topic
 from .zip_contents import open_plain_zip
 
 _MODEL: Final = re.compile(r"openaigym\.model\.[0-9a-f]{16}")
-# Four numbers, the last of which is the version. No real model reaches 1 GiB.
+# Four numbers; the last is the version. No real model reaches 1 GiB.
 _MODEL_HEAD: Final = 16
 _LARGEST_MODEL: Final = 1 << 30
 _SOURCES: Final = "*.model.*.zip"
@@ -67,7 +67,7 @@ def renamed_models(given: Path, made: Path) -> dict[str, str]:
 
 
 def models_of(recordings: Path) -> dict[str, set[str]]:
-    """Return the names of the model files of each recording, by its infix."""
+    """Return the names of each recording's model files, keyed by infix."""
     found: dict[str, set[str]] = {}
     for path in recordings.glob("openaigym.trajectory.*.h5"):
         # The comparison reports damaged files.

@@ -194,7 +194,7 @@ def _same(name: str, item: Any, worst: Mapping[_Key, Difference]) -> Iterator[Sa
 class _Rows:
     """The rows of a dataset that differ.
 
-    The first state is counted separately: it is the episode's beginning.
+    The first state is counted separately: it is the episode's initial state.
 
     Args:
         name: the dataset's name.
@@ -212,7 +212,7 @@ class _Rows:
         self.worst: dict[_Key, Difference] = {}
 
     def add(self, start: int, a: NDArray[Any], b: NDArray[Any]) -> None:
-        """Add a block of rows that differ, the first of which has the index `start`."""
+        """Add a block of rows that differ; the first has the index `start`."""
         if start == 0 and self._name in ("states", "observations"):
             self._add(Topic.BEGINNING, 0, a[:1], b[:1])
             start, a, b = 1, a[1:], b[1:]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The files of monitor directories to pack: those that their manifests vouch for.
+"""The files to pack from monitor directories: those that their manifests vouch for.
 
 For each monitor, these are the manifest and the files that it names (statistics,
 finished and broken videos), the journal, the frame hashes, the trajectories and their
@@ -83,7 +83,7 @@ class Contents:
     Attributes:
         directory: the directory, as given.
         packed_episodes: the numbers of the chosen episodes. None if all are packed.
-        files: how to write each packed file to a path, by name.
+        files: for each packed file, keyed by name, a function that writes it to a path.
         provenance: the provenance in each manifest.
     """
 
@@ -97,7 +97,7 @@ class Contents:
         return self.packed_episodes is None or episode_of(name) in self.packed_episodes
 
     def add(self, path: Path, *, of: str | None = None) -> None:
-        """Add a file, which the file named `of` refers to."""
+        """Add a file. If `of` is given, it names the file that refers to this one."""
         try:
             with unreadable(path):
                 source = regular_path(path)
@@ -112,7 +112,7 @@ class Contents:
         self.put(path, functools.partial(write, source))
 
     def put(self, path: Path, write: Callable[[Path], object]) -> None:
-        """Let `write` write the packed file of a path.
+        """Use `write` to write the packed copy of the file at `path`.
 
         Raises:
             PackError: the name is not valid on all systems.
@@ -128,7 +128,7 @@ class Contents:
 
 
 def look_for_contents(directory: Path, episodes: Iterable[int] | None) -> Contents:
-    """Return the files of a monitor directory to pack.
+    """Return the files to pack from a monitor directory.
 
     Args:
         directory: the monitor directory, or one that contains several, such as an
@@ -142,8 +142,8 @@ def look_for_contents(directory: Path, episodes: Iterable[int] | None) -> Conten
         UnknownName: an episode does not exist.
         DirectoryInUse: a monitor is open, or another process is rendering.
         UnfinishedRecordings: videos are pending, or a monitor was killed.
-        PackError: a file is missing, two directories have files of the same names, or a
-            file's name is not portable.
+        PackError: a file is missing, two directories have files with the same names, or
+            a file's name is not portable.
         UnreadableFile: a file is damaged, or is a link that leads out of the directory.
     """
     places = recording_directories(directory)
@@ -178,8 +178,8 @@ def _add_all(contents: Contents, place: Path, infixes: dict[str, Path]) -> None:
             continue
         if (other := infixes.setdefault(monitor.infix, place)) != place:
             raise PackError(
-                f"{other} and {place} have files of the same names, with "
-                f"{monitor.infix} in them. Pack each directory separately."
+                f"{other} and {place} contain files with the same names (infix "
+                f"{monitor.infix}). Pack each directory separately."
             )
         _add_monitor(contents, monitor.manifest, _visible(monitor))
 
@@ -283,8 +283,8 @@ def _add_manifest(contents: Contents, path: Path, manifest: Manifest) -> None:
         return
     if details is None:
         raise InvalidArgument(
-            f"{path.name} is gym's own manifest, whose videos do not state their "
-            "episodes, so none can be chosen. Pack all episodes."
+            f"{path.name} is gym's own manifest, which does not say which episode "
+            "each video shows, so episodes cannot be chosen. Pack all episodes."
         )
     details = {**details, PACKED_EPISODES: list(contents.packed_episodes)}
     if "broken" in details:
@@ -306,13 +306,13 @@ def _add_trajectory(contents: Contents, path: Path) -> None:
     with open_for_rendering(path) as reader:
         model = reader.facts.get("model") or {}
     for name in filter(None, (model.get("mjb"), model.get("xml"))):
-        # Sources may not be recorded, and a compiled model may have been removed.
+        # The sources may be missing, and a compiled model may have been removed.
         if path.with_name(name).exists():
             contents.add(path.with_name(name))
 
 
 def _broken_of(manifest: Manifest) -> Iterator[str]:
-    """Yield the checked names of the metadata of broken videos."""
+    """Yield the names of broken videos' metadata files, each checked."""
     for name in (manifest.mjrec or {}).get("broken") or ():
         yield base_name(name)
 
@@ -348,7 +348,7 @@ def _write_without_states(source: Path, target: Path) -> None:
 
 
 def link_or_copy(source: Path, target: Path) -> None:
-    """Make a file with the same content, if possible a second name of it."""
+    """Create a file with the same content, as a hard link if possible."""
     try:
         os.link(source, target, follow_symlinks=False)
     except OSError:

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Descriptions of a packed run: table, JSON, README, citation and crate.
 
-The crate is an RO-Crate 1.1 with the profile Process Run Crate 0.5. Each monitor is a
-`CreateAction`: its instruments are the recording software, its objects the environment,
-the models and the policy, and its results the monitor's files.
+The crate is an RO-Crate 1.1 that conforms to the Process Run Crate 0.5 profile. Each
+monitor is a `CreateAction`: its instruments are the recording software, its objects the
+environment, the models and the policy, and its results the monitor's files.
 """
 
 from __future__ import annotations
@@ -87,7 +87,7 @@ def descriptions(
     Args:
         run: the packed run to describe.
         recordings: the folder of the packed recordings.
-        packed_with: the versions of the packages that pack it.
+        packed_with: the versions of the software that packs it.
 
     Raises:
         UnreadableFile: a file is damaged.
@@ -118,7 +118,7 @@ def descriptions(
 
 
 def packed_with() -> dict[str, str]:
-    """Return the versions of the packages that pack a run here."""
+    """Return the versions of the software that packs runs on this machine."""
     return {
         "mjrec": importlib.metadata.version("mjrec"),
         "python": platform.python_version(),
@@ -148,10 +148,10 @@ def _environment(run: PackedRun, packed_with: Mapping[str, str]) -> dict[str, An
     """Return the content of `environment.json`.
 
     Returns:
-        `recordings`: for each monitor, by its infix, `env_id`, `versions`,
-        `provenance` (null if not recorded), and `pictures` and `encoders`, the distinct
-        renderers and encoders of its videos. `packed_with`: the versions of the
-        packages that packed the archive, and the options of packing.
+        `recordings`: for each monitor, by its infix, `env_id`, `versions`, `provenance`
+        (null if not recorded), and `pictures` and `encoders`, the distinct renderers
+        and encoders of its videos. `packed_with`: the versions of the software that
+        packed the archive, and the packing options.
     """
     return {
         "recordings": {session.infix: _made_with(session) for session in run.sessions},
@@ -173,7 +173,7 @@ def _made_with(session: Session) -> dict[str, Any]:
         "versions": dict(session.versions),
         "provenance": session.provenance or None,
         "pictures": session.different(*frames),
-        # Encoders that differ only in their command lines are the same here.
+        # Encoders that differ only in their command lines count as one here.
         "encoders": [one for n, one in enumerate(encoders) if one not in encoders[:n]],
     }
 
@@ -328,7 +328,7 @@ def _objects(session: Session) -> list[str]:
 
 
 def _release(name: str, version: str) -> str:
-    """Return the page of one version of Python or of a package."""
+    """Return the URL of one version of Python or of a package."""
     if name == "python":
         return f"https://docs.python.org/release/{_quoted(version)}/"
     page = f"https://pypi.org/project/{_quoted(name)}/"
@@ -367,6 +367,6 @@ def _quoted(text: str) -> str:
 
 
 def _references(ids: Iterable[str]) -> Any:
-    """Return references to entities: a list, a single one without it, or None."""
+    """Return references to entities: a list, a single reference on its own, or None."""
     references = [{"@id": one} for one in ids]
     return references[0] if len(references) == 1 else references or None

@@ -29,16 +29,16 @@ class Aspect(enum.Enum):
         STATE: numbers of the simulation.
         VELOCITY: velocities of the simulation.
         DERIVED: numbers that the environment computes from states.
-        SUMMED: sums of such numbers, the returns.
-        OBSERVED: other outputs of the environment or a wrapper than rewards and ends:
-            observations, success.
+        SUMMED: sums of such numbers: the returns.
+        OBSERVED: outputs of the environment or a wrapper other than rewards and episode
+            ends: observations, success.
         SOLVER: the warm start, which only the solver uses.
         MODEL: the compiled model.
         PICTURE: a frame's pixels, as decoded from the file.
         HASH: a frame's hash, which follows from its pixels.
-        ENCODED: bytes of the encoder that show nothing on their own.
+        ENCODED: bytes from the encoder that prove nothing on their own.
         STORED: the contents are equal, but not the bytes that store them.
-        CLAIM: a version, or a name of hardware.
+        CLAIM: a version, or the name of hardware.
         STATEMENT: a value that cannot be recreated, or that follows from a file of the
             archive itself and is right for that file. It is not reported.
     """
@@ -82,7 +82,7 @@ class Place:
 
     @property
     def scopes(self) -> tuple[str, ...]:
-        """The names by which an excuse can reach it: episode, recording, file."""
+        """The names by which an excuse can claim the item: episode, recording, file."""
         name = self.file.rpartition("/")[2]
         infix = infix_of(name)
         if infix is None:
@@ -102,7 +102,7 @@ class Place:
 
 @dataclass(frozen=True)
 class Same(Place):
-    """Something that is equal, bit for bit."""
+    """An item that is equal, bit for bit."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -116,7 +116,8 @@ class Difference(Place):
         size: the largest `abs(x - y) / (1 + abs(x))` for numbers. None if the
             difference has no size.
         claim: the name of the excuse for a CLAIM: "mujoco", "gl", "ffmpeg", "machine".
-        figures: more numbers by name, such as `psnr`, `ssim` and `block` for PICTURE.
+        figures: further numbers, keyed by name, such as `psnr`, `ssim` and `block` for
+            PICTURE.
     """
 
     aspect: Aspect = Aspect.EXACT
@@ -134,7 +135,7 @@ class Difference(Place):
 
 def unlike(given: Any, made: Any) -> str:
     """Return the difference between two values as a clause."""
-    return f"the archive has {short(given)}, the recreated run has {short(made)}"
+    return f"the archive has {short(given)}; the recreated run has {short(made)}"
 
 
 def differs(
@@ -150,7 +151,7 @@ STORED_DIFFERENTLY: Final = Difference(
 
 
 def only_in(is_given: bool, value: Any) -> str:
-    """Return a clause that only one of the two runs has a value."""
+    """Return a clause that says which one of the two runs has a value."""
     who = "the archive" if is_given else "the recreated run"
     return f"only {who} has it: {short(value)}"
 

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Recreation of the choice among the episodes of an evaluation.
 
-An evaluation chooses videos among the episodes of all recordings of an environment. If
-the archive contains all of these, the rule is applied again. If some are missing, or
+An evaluation chooses its videos from the episodes of all recordings of an environment.
+If the archive contains all of these, the rule is applied again. If some are missing, or
 the evaluation was extended, the choice is believed.
 """
 
@@ -33,7 +33,7 @@ class _Ended(NamedTuple):
     success: bool | None
 
 
-# The chosen episodes with their roles, by the number of episodes to choose from.
+# The chosen episodes with their roles, keyed by the number of episodes to choose from.
 _Choices = dict[int, dict[RecordingKey, list[str]]]
 
 
@@ -70,7 +70,7 @@ def _choose(
         among = " and later ".join(map(str, sorted(choices)))
         here = counted(sum(len(each.episodes) for each in group), "episode")
         reason = (
-            f"its videos were chosen among {among} episodes of an evaluation, but the "
+            f"its videos were chosen from {among} episodes of an evaluation, but the "
             f"archive has {here}: the choice by the rule {rule!r:.80} is believed"
         )
         count = sum(map(len, choices.values()))
@@ -103,7 +103,7 @@ def _stated(group: Iterable[RecordingInputs]) -> _Choices:
 def _made_again(
     group: Iterable[RecordingInputs], rule: str, directory: Path
 ) -> _Choices:
-    """Return the rule's choice among the replayed episodes."""
+    """Return the episodes that the rule chooses from the replayed ones."""
     ended: dict[tuple[Any, Any], _Ended | None] = {}
     for recording in group:
         for facts in recording.failed:

@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Excuses: claims that allow certain differences, and tests of these claims.
 
-The exact comparison always comes first. An excuse applies to the recordings, episodes
-or files that it is claimed for, as its rule below defines: it widens a finite
-tolerance, or excludes an item, which is then believed. If the claimed difference should
-be visible but nothing differs, the claim is refuted.
+The exact comparison always comes first. Each excuse applies to the recordings, episodes
+or files that it is claimed for. As its rule below specifies, it either widens a finite
+tolerance or exempts an item from comparison; the archive's version of that item is then
+taken on trust ("believed"). If the claimed difference should be visible but nothing
+differs, the claim is refuted.
 """
 
 from __future__ import annotations
@@ -53,7 +54,7 @@ class _Rule:
 
     Attributes:
         kind: the kind of the excuse.
-        costs: what the excuse weakens, as a clause.
+        costs: how the excuse weakens the comparison, as a clause.
         allows: the largest allowed differences, by aspect.
         fed: topics whose values were copied from the archive into the recreated run.
             Equality proves nothing there, and a difference is not excused.
@@ -109,17 +110,17 @@ _BY_NAME: Final[Mapping[str, _Rule]] = {
         ("numpy", "gymnasium", "gymnasium-robotics", "dm-control"),
         _Rule(
             ExcuseKind.VERSION,
-            "beginnings and rewards are compared within a tolerance",
+            "initial states and rewards are compared within a tolerance",
             {**_ROUNDED, **_RESTORED},
         ),
     ),
     "mjrec": _Rule(ExcuseKind.VERSION, "descriptions are believed", _RESTORED),
     _ENVIRONMENT: _Rule(
-        ExcuseKind.CODE, "its beginning, physics, rewards and videos are believed"
+        ExcuseKind.CODE, "its initial state, physics, rewards and videos are believed"
     ),
     "wrappers": _Rule(
         ExcuseKind.CODE,
-        "its changes to actions, rewards and ends are believed",
+        "its changes to actions, rewards and episode ends are believed",
         {Aspect.OBSERVED: math.inf},
         fed=(Topic.REWARDS,),
     ),
@@ -133,16 +134,17 @@ _BY_NAME: Final[Mapping[str, _Rule]] = {
     ),
     "actions not kept": _Rule(
         ExcuseKind.EVENT,
-        "returns and ends are believed",
+        "returns and episode ends are believed",
         fed=(Topic.REWARDS, Topic.BEGINNING, Topic.PHYSICS),
     ),
     "unseeded beginning": _Rule(
         ExcuseKind.EVENT, "its initial state is believed", fed=(Topic.BEGINNING,)
     ),
-    # An encoder's death may show only at the end: the keys' order depends on it.
+    # An encoder's death may become visible only at the end, and the order of the keys
+    # depends on when it does.
     "broken video": _Rule(
         ExcuseKind.EVENT,
-        "where it breaks off is believed",
+        "the frame at which it was cut short is believed",
         _RESTORED,
         fed=(Topic.VIDEOS,),
     ),
@@ -161,7 +163,7 @@ _ANY_VERSION: Final = _Rule(
 )
 _DESCRIPTIONS: Final = ("README.md", "CITATION.cff", "ro-crate-metadata.json")
 _NOTED: Final = (Aspect.CLAIM, Aspect.STORED, Aspect.ENCODED)
-# How numbers differ that other code has computed.
+# How numbers that other code has computed can differ.
 COMPUTED: Final = (Aspect.STATE, Aspect.VELOCITY, Aspect.DERIVED, Aspect.SUMMED)
 # The aspect whose limit applies if an excuse has none for this one.
 _WIDER: Final = {
@@ -169,9 +171,9 @@ _WIDER: Final = {
     Aspect.SUMMED: Aspect.DERIVED,
     Aspect.OBSERVED: Aspect.DERIVED,
 }
-# Why items are believed that have no tolerance.
+# Why items that have no tolerance are believed.
 _BELIEVED: Final = {
-    Aspect.SOLVER: "it only starts the solver, which reaches the same result",
+    Aspect.SOLVER: "it is only the solver's starting point, and the result is the same",
     Aspect.MODEL: "it was compiled elsewhere",
     Aspect.HASH: "they were rendered elsewhere",
 }
@@ -181,7 +183,7 @@ _NOTES: Final = "maker.json"
 
 
 def excuse_of(name: str, claimed: str, here: str = "", *items: str) -> Excuse:
-    """Return the excuse with a name.
+    """Return the excuse with the given name.
 
     Args:
         name: the name of a rule, or of a package without its own rule.
@@ -234,13 +236,13 @@ def noted_excuse(note: Finding) -> Excuse:
 
 
 def is_fed(excuse: str, topic: Topic | None = None) -> bool:
-    """Return whether values (of a topic) were copied from the archive."""
+    """Return whether an excuse covers values copied from the archive (of `topic`)."""
     fed = _rule(excuse).fed
     return bool(fed) if topic is None else topic in fed
 
 
 def merged(excuses: Iterable[Excuse]) -> tuple[Excuse, ...]:
-    """Merge excuses with the same name and values into one for all their items."""
+    """Merge excuses with the same name and values into one for all of their items."""
     groups: dict[tuple[str, str, str], list[Excuse]] = {}
     for each in excuses:
         groups.setdefault((each.name, each.claimed, each.here), []).append(each)
@@ -255,7 +257,7 @@ def _merged(same: list[Excuse]) -> Excuse:
 
 
 def applicable(excuses: Iterable[Excuse]) -> tuple[Excuse, ...]:
-    """Return excuses without those that require a different major MuJoCo."""
+    """Drop excuses that need two major versions of MuJoCo where there is only one."""
     known = tuple(excuses)
     others = {
         item
@@ -267,7 +269,7 @@ def applicable(excuses: Iterable[Excuse]) -> tuple[Excuse, ...]:
 
 
 def with_allowed(excuses: Iterable[Excuse], allow: Iterable[str]) -> tuple[Excuse, ...]:
-    """Return excuses, with those that the reader accepts marked as allowed.
+    """Return the excuses, with those that the reader accepts marked as allowed.
 
     Args:
         excuses: the claimed excuses.
@@ -327,7 +329,7 @@ def outcome_under(excuse: Excuse, found: Difference) -> Outcome | None:
 def finding_under(
     excuse: Excuse | None, found: Difference, outcome: Outcome
 ) -> Finding:
-    """Return the finding for a difference with an outcome."""
+    """Return the finding for a difference with the given outcome."""
     figures, reason = dict(found.figures), found.reason
     if outcome is not Outcome.BELIEVED:
         if found.size is not None:
@@ -347,7 +349,7 @@ def finding_under(
 
 
 def is_same_family(excuse: Excuse) -> bool:
-    """Return whether two renderers are of the same vendor."""
+    """Return whether the claimed renderer and the reader's are from the same vendor."""
     return _family(excuse.claimed) == _family(excuse.here)
 
 

@@ -2,7 +2,7 @@
 """The result of a verification: findings, excuses and one verdict.
 
 A packed run is recreated from its inputs and compared with the archive, item by item.
-Each finding is about one or several items. Each excuse is a claim in the archive that
+Each finding is about one or more items. Each excuse is a claim in the archive that
 allows some items to differ from the recreated ones.
 """
 
@@ -146,7 +146,7 @@ class Verification:
         level: the level given to `verify`.
         findings: the findings, in the order of the comparison.
         excuses: the excuses that the archive claims.
-        inputs: the inputs that are not the default, by name.
+        inputs: the inputs that are not the default, keyed by name.
         facts: versions, machine, the archive's sha256, the sample and its seed, and
             trusted environments.
     """

@@ -60,7 +60,7 @@ class Similarity(NamedTuple):
             100 if the frames are equal.
         ssim: structural similarity of luma, the mean over blocks of 8x8 pixels.
         block: the largest root mean square difference of any block of 8x8 pixels, in
-            levels (0 to 255). A change of a few pixels hardly moves the other two.
+            levels (0 to 255). A change of a few pixels hardly affects the other two.
     """
 
     psnr: float
@@ -96,7 +96,7 @@ class Limits:
 # against the rendered ones. Two encodings of them differ by at most twice the noise.
 # Painting over a square of 2x2 pixels gives 21 levels or more.
 OTHER_ENCODER: Final = Limits(psnr=32.0, ssim=0.97, block=20.0)
-# The same rasteriser and ffmpeg on a different CPU. llvmpipe renders the same on all
+# The same rasterizer and ffmpeg on a different CPU. llvmpipe renders the same on all
 # CPUs with AVX. Without AVX (128 bits instead of 256), five of six videos had no equal
 # frame: Gymnasium's HalfCheetah, Humanoid, Ant, Hopper, Pusher and Swimmer, from 64x64
 # to 480x480, had 41.7 dB, 0.998 and 9.4 levels at worst, apart from shadows in 0.14
@@ -105,12 +105,12 @@ OTHER_CPU: Final = Limits(psnr=38.0, ssim=0.985, block=14.0, shadow=0.01)
 # A different build of llvmpipe: its name includes the vector width in bits and the
 # version of LLVM.
 OTHER_BUILD: Final = Limits(psnr=32.0, ssim=0.97, block=20.0, shadow=0.01)
-# A different rasteriser as well, in the same scenes: Mesa's softpipe, which does not
-# antialias, against llvmpipe gave 29.3 dB (32x32; 35.5 from 120x160 on), 0.903 and 34
-# levels at worst. An NVIDIA H100 (driver 580.159) against llvmpipe, in 31 videos of
-# 23 scenes, gave 31.2 dB, 0.932 and 25 levels, apart from shadows. These limits detect
-# 5x5 pixels that are painted over, and a frame that is one step off if limbs move fast
-# (80 levels), but not if they creep.
+# A different rasterizer as well, in the same scenes: Mesa's softpipe, which does not
+# antialias, against llvmpipe gave 29.3 dB (32x32; 35.5 from 120x160 up), 0.903 and 34
+# levels at worst. An NVIDIA H100 (driver 580.159) against llvmpipe, in 31 videos of 23
+# scenes, gave 31.2 dB, 0.932 and 25 levels, apart from shadows. These limits detect 5x5
+# pixels that are painted over, and a frame that is one step off if limbs move fast (80
+# levels), but not if they creep.
 #
 # Whether a large floor casts shadows on itself in MuJoCo depends on rounding: at
 # 480x480, llvmpipe drew patches of them far away in one of five frames of HalfCheetah

@@ -215,7 +215,7 @@ def _rule_of(
 
 
 def _repeated(inputs: Inputs, arrays: Mapping[str, NDArray[Any]]) -> Iterator[Finding]:
-    """Yield the groups of identical episodes in all recordings; each counts once."""
+    """Yield the groups of identical episodes in all recordings; a group counts once."""
     found: dict[str, list[str]] = {}
     for recording in inputs.recordings:
         for each in recording.episodes:
@@ -229,7 +229,7 @@ def _repeated(inputs: Inputs, arrays: Mapping[str, NDArray[Any]]) -> Iterator[Fi
     for items in found.values():
         if len(items) > 1:
             reason = (
-                "the same episode, with the same beginning and actions: "
+                "the same episode, with the same initial state and actions: "
                 f"{listed(sorted(items), _MOST_SHOWN)}; it counts once"
             )
             yield _headline(items[0], reason, Outcome.BELIEVED, len(items) - 1)
@@ -265,9 +265,9 @@ def _of_video(said: Mapping[str, Any]) -> Iterator[str]:
     if isinstance(speed, int | float) and abs(speed - 1) > 1e-9:
         yield f"plays at {speed:g} times real time"
     elif speed is None and said.get("content_type") == "video/mp4":
-        yield "does not state its playback speed: the length of a step is unknown"
+        yield "does not state its playback speed: the duration of a step is unknown"
     if said.get("broken"):
-        yield f"broke off: {said.get('broken_reason')}"
+        yield f"was cut short: {said.get('broken_reason')}"
     elif said.get("complete") is False:
         yield f"shows an incomplete episode: {said.get('reason')}"
     if "first_step" in said:
@@ -275,12 +275,12 @@ def _of_video(said: Mapping[str, Any]) -> Iterator[str]:
     elif (runs := said.get("frame_steps")) and not _is_whole(runs, said.get("length")):
         yield "does not show the whole episode, from the reset to the last step"
     if said.get("first_video"):
-        yield "shows a further camera"
+        yield "shows an additional camera"
     if said.get("recording") == "live":
         yield f"was rendered during the episode: {said.get('recording_reason')}"
     for key, meaning in (
         ("annotated", "has captions drawn into its frames"),
-        ("packed_smaller", "was re-rendered at a smaller size for packing"),
+        ("packed_smaller", "was rerendered at a smaller size for packing"),
     ):
         if said.get(key):
             yield meaning

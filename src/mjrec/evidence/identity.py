@@ -42,7 +42,8 @@ _REPOSITORY = re.compile(
     r"(?P<path>(?P<owner>[^/]+)/.+?)(?:\.git)?/*"
 )
 _AFFILIATION = re.compile(r"\s*[(\[].*?[)\]]")
-# Directories that identify nobody. Below _SHARED are programs, the same for all users.
+# Directories that do not identify a person. Below _SHARED are programs, the same for
+# all users.
 _EVERYBODYS = frozenset(
     ("/", "/tmp", "/var/tmp", "/home", "/Users", "/usr", "/opt", "/var", "/dev/shm")
 )
@@ -59,7 +60,7 @@ class Identity:
         addresses: email addresses and ORCIDs.
         hosts: host names, with and without their domain.
         homes: absolute paths of home directories.
-        directories: absolute paths of the work: working directories, roots of
+        directories: absolute paths of the user's work: working directories, roots of
             repositories, directories of policies and programs.
         remotes: URLs of git repositories, and their `owner/name`.
     """
@@ -112,7 +113,7 @@ class Identity:
 def identity_of_user(
     provenance: Iterable[Mapping[str, Any]] = (), authors: Iterable[Author] = ()
 ) -> Identity:
-    """Return the names of this process's user and machine, and of those who recorded.
+    """Return the names of this user and machine, and of the people who recorded.
 
     They come from the system, the environment variables, and git's settings in the
     working directory and in the recorded repositories. No name server is queried.

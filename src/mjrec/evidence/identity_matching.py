@@ -4,8 +4,8 @@
 Matching ignores case. The rules are:
 
 - Repository URLs, email addresses and ORCIDs: anywhere.
-- Paths of homes and working directories: with everything that begins with them. Any
-  `/home/<name>` or `/Users/<name>` matches too.
+- Paths of homes and working directories: together with the rest of any path that begins
+  with them. Any `/home/<name>` or `/Users/<name>` matches too.
 - Full names: their words in this order or with the last one first, joined by a space,
   a dot, a comma, a hyphen, an underscore or nothing. The last word matches alone if it
   has at least six letters and no letters next to it.
@@ -13,7 +13,7 @@ Matching ignores case. The rules are:
   words. Those of four or five letters: with no letters next to them, or as a word in
   `CamelCase`.
 - Shorter ones, and those that are ordinary words here (`root`, `user`, `hopper`): only
-  as a whole part of a path, before `@` and a host name, or after it. HalfCheetah has
+  as a whole part of a path, before `@` and a host name, or after `@`. HalfCheetah has
   joints called `rootx`, which do not name an account.
 
 In files, archives are opened, compressed files are decompressed, and every name,
@@ -123,15 +123,15 @@ class IdentityMatcher:
         return self._names.sub(_placeholder, name)
 
     def found_in(self, text: str) -> list[str]:
-        """Return the parts of the identity in a string, each once."""
+        """Return the parts of the identity found in a string, without duplicates."""
         return _unique(match[0] for match in self._texts.finditer(text))
 
     def found_in_name(self, name: str) -> list[str]:
-        """Return the parts of the identity in a file name, each once."""
+        """Return the parts of the identity found in a file name, without duplicates."""
         return _unique(match[0] for match in self._names.finditer(name))
 
     def found_in_bytes(self, content: bytes, *, by_chance: bool = False) -> list[str]:
-        r"""Return the parts of the identity in bytes, as UTF-8 or UTF-16, each once.
+        r"""Return the parts of the identity in UTF-8 or UTF-16 bytes, once each.
 
         The bytes may be text or contain some. In binary data, matches of fewer than six
         letters count only in a run of at least twelve characters, because they occur
@@ -261,8 +261,8 @@ def remaining_identity(stage: Path, identity: Identity) -> list[tuple[str, str]]
         identity: the identity to look for.
 
     Returns:
-        Pairs of a place and the string found there, each once, sorted. A place is a
-        file's path relative to `stage`, followed by the place inside the file.
+        Sorted pairs of a place and the string found there, without duplicates. A place
+        is a file's path relative to `stage`, followed by the place inside the file.
 
     Raises:
         UnreadableFile: a file cannot be unpacked.

@@ -2,8 +2,8 @@
 """The inputs of a run: everything taken from an archive to recreate the run.
 
 The list is complete. Everything else is an output and must be reproduced: states,
-rewards, ends, statistics, frames, videos. The report lists each input that is not the
-default.
+rewards, episode ends, statistics, frames, videos. The report lists each input that is
+not the default.
 """
 
 from __future__ import annotations
@@ -76,26 +76,27 @@ class EpisodeInputs:
         type: "t" or "e".
         seed: the seed given to the reset.
         options: the options given to the reset.
-        random_state: the archive's state of the environment's random generators just
-            before the reset. It is used only if no seed leads to it.
+        random_state: the state of the environment's random generators just before the
+            reset, according to the archive. It is used only if no seed produces it.
         steps: number of steps taken.
         arrays: the name of its arrays; None if it has no trajectory. The array with
-            this name has the actions that are regular. `<name>.state` is the state
-            after the reset; it is used only if neither a seed nor a random state leads
-            there. `<name>.states` are all states if the archive claims a different
-            MuJoCo or machine: each step then starts from the recorded state before it,
-            so that differences in the last bits do not grow. `<name>.<part>` are the
-            parts of `RecordedSteps` if the environment has wrappers.
+            this name contains the regular actions. `<name>.state` is the state after
+            the reset; it is used only if neither a seed nor a random state reproduces
+            it. `<name>.states` contains all states if the archive claims a different
+            MuJoCo version or machine: each step then starts from the recorded state
+            before it, so that differences in the last bits do not grow. `<name>.<part>`
+            are the parts of `RecordedSteps` if the environment has wrappers.
         has_actions: whether the actions were kept, in the array or as irregular ones.
         action_dtypes: pairs of a step and the dtype of the actions from that step on.
-        action_parts: names and shapes of a dictionary's arrays; None for plain arrays.
+        action_parts: names and shapes of the arrays in a dictionary action; None if
+            actions are plain arrays.
         irregular: `step`, `value` and, for an array, `dtype` of each action that does
             not fit into the array.
         cut: the reason why the episode is not in the statistics (`reset`, `close`,
             `killed` ...); None for a complete episode.
         exception: the exception, if one cut the episode off.
-        broken: for each live video that broke off, by its name without extension, the
-            reason and the number of frames kept.
+        broken: for each live video that was cut short, the reason and the number of
+            frames kept; keyed by the video's name without extension.
         has_trajectory: whether its trajectory was kept.
         is_chosen: whether its video was chosen.
         start_time: the stated start time.
@@ -147,13 +148,13 @@ class RecordingInputs:
         kept: the episodes that the rule chose in the end.
         clip_starts: the numbers of the steps at which a trigger started clips.
         episodes: the episodes, in order.
-        evaluation_events: kind and facts of the journal's events of an evaluation's
-            episodes ("begun" or "failed"), in the journal's order.
+        evaluation_events: the journal's events ("begun" or "failed") about episodes of
+            an evaluation, each as its kind and facts, in the journal's order.
         evaluation_keeps: the facts of each choice among all recordings of an
             evaluation.
-        faults: the facts of each fault of the recorder, after the number of lines in
-            the journal before it, not counting the first.
-        monitor_csv_start: the stated time in Stable-Baselines3's file; None if that
+        faults: for each fault of the recorder, the number of journal lines before it
+            (not counting the first) and its facts.
+        monitor_csv_start: the time stated in Stable-Baselines3's file; None if that
             file was not requested.
         provenance: the stated provenance, or None if unknown.
         provenance_after: number of lines in the journal before the provenance, not
@@ -184,7 +185,7 @@ class RecordingInputs:
 
     @property
     def is_evaluation(self) -> bool:
-        """Whether the recording has an evaluation's episodes."""
+        """Whether the recording contains episodes of an evaluation."""
         return bool(self.evaluation_events)
 
     @property
@@ -199,7 +200,7 @@ class RecordingInputs:
         return f"recording {self.infix}"
 
     def item(self, episode: EpisodeInputs) -> str:
-        """Return the name of one of its episodes in findings."""
+        """Return an episode's name in findings."""
         return f"episode {episode.episode_id} of {self.infix}"
 
 
@@ -253,7 +254,7 @@ def given_actions(
 
     Args:
         episode: the episode's inputs.
-        arrays: recorded actions by the names in the inputs.
+        arrays: the recorded actions, keyed by their names in the inputs.
     """
     irregular = {int(each["step"]): each for each in episode.irregular}
     recorded = arrays.get(episode.arrays or "")

@@ -53,11 +53,11 @@ _MODES = {"e": "evaluation"}
 
 @dataclass(frozen=True, kw_only=True)
 class Making:
-    """The facts shared by all recordings of a run that is recreated.
+    """The facts shared by all recordings of the run that is being recreated.
 
     Attributes:
         directory: the monitor directory.
-        arrays: the arrays of episodes by the names in the inputs.
+        arrays: the episodes' arrays, keyed by their names in the inputs.
         trust: ids of environments that may be created in addition to those in the
             registries.
         sources: the folder with the sources of the author's models.
@@ -74,7 +74,7 @@ class Making:
 
 
 def play_recording(recording: RecordingInputs, making: Making) -> None:
-    """Replay a recording into a monitor directory, with pending videos.
+    """Replay a recording into a monitor directory, and leave its videos pending.
 
     Raises:
         NotRecreated: the environment cannot be created here, or the recording cannot
@@ -178,7 +178,7 @@ class _Playing:
             self._note(
                 None,
                 "kill",
-                "it was killed before the first step of an episode, which is believed",
+                "it was killed before the first step of an episode; this is believed",
             )
         if self._recording.has_sources:
             recorder.finish_models()
@@ -188,7 +188,7 @@ class _Playing:
         self._monitor.close()
 
     def _say_begun(self, episode: EpisodeInputs) -> None:
-        """Note the journal's events of an evaluation until this episode begins."""
+        """Copy the journal's evaluation events up to the beginning of this episode."""
         while self._events:
             kind, facts = self._events.pop(0)
             self._say(kind, facts)
@@ -196,7 +196,7 @@ class _Playing:
                 break
 
     def _say_failed(self) -> None:
-        """Note the journal's next events for as long as they are failures."""
+        """Copy the journal's next events for as long as they are failures."""
         while self._events and self._events[0][0] == "failed":
             self._say(*self._events.pop(0))
 
@@ -242,21 +242,21 @@ class _Playing:
             self._recreated.seed(fresh)
             return
         self._recreated.set_random_state(stated)
-        # No belief is needed if the reset reseeds the generator.
+        # Nothing has to be believed if the reset reseeds the generator.
         if seed is None or self._recreated.is_dm_env:
             self._note(
                 episode,
                 "unseeded beginning",
-                "no seed leads to its beginning; the state of the random generator "
-                "before its reset is believed",
+                "no seed reproduces its initial state; the state of the random "
+                "generator before the reset is believed",
             )
 
     @contextlib.contextmanager
     def _set_into_first_state(self, episode: EpisodeInputs) -> Iterator[None]:
-        """Make the reset of an episode end in its recorded first state.
+        """Make the reset of an episode end in its recorded initial state.
 
-        This happens only if nothing leads there: no seed was recorded and the
-        environment has no random generator.
+        This is done only if nothing else reproduces that state: no seed was recorded,
+        and the environment has no random generator.
         """
         known = self._making.arrays.get(f"{episode.arrays}.state")
         base = getattr(self._recreated.environment, "unwrapped", None)
@@ -266,7 +266,7 @@ class _Playing:
         self._note(
             episode,
             "unseeded beginning",
-            "it was started without a seed; its first state is believed",
+            "it was started without a seed; its initial state is believed",
         )
         reset = base.reset
 
@@ -296,7 +296,7 @@ class _Playing:
         self._note_stand_in(episode)
 
     def _break_videos(self, episode: EpisodeInputs) -> None:
-        """Make the live videos that broke off do so again."""
+        """Cut short the live videos that were cut short in the original run."""
         for video in self._monitor.recorder.live_videos:
             name = Path(video.path).stem
             if name not in episode.broken:
@@ -306,8 +306,8 @@ class _Playing:
             self._note(
                 episode,
                 "broken video",
-                f"{name} broke off after {counted(frames, 'frame')}, according to its "
-                f"author: {reason:.200}",
+                f"{name} was cut short after {counted(frames, 'frame')}, according to "
+                f"its author: {reason:.200}",
             )
 
     def _begin_stand_in(self, episode: EpisodeInputs) -> None:
@@ -316,7 +316,8 @@ class _Playing:
             return
         if f"{episode.arrays}.controls" not in arrays:
             raise NotRecreated(
-                "wrappers are missing, and the controls they produced are not recorded",
+                "wrappers are missing, and the controls they produced were not "
+                "recorded",
                 excuse="wrappers",
             )
         names = [each.name for each in dataclasses.fields(RecordedSteps)]
@@ -332,19 +333,20 @@ class _Playing:
         for steps, claim in (
             (
                 stand_in.differing,
-                "the rewards or the end of {} of its steps differ; they are believed",
+                "the rewards or end flags of {} of its steps differ; the archive's "
+                "are believed",
             ),
             (
                 stand_in.translated,
-                "the actions of {} of its steps are not its controls; that they led to "
-                "these is believed",
+                "in {} of its steps, the actions differ from the controls; that the "
+                "wrappers turned the one into the other is believed",
             ),
         ):
             if steps:
                 self._note(episode, "wrappers", f"{without} {claim.format(steps)}")
 
     def _believe(self, episode: EpisodeInputs) -> None:
-        """Record an episode without actions from its length, return and end."""
+        """Record an episode without its actions, from its length, return and end."""
         self._note(
             episode,
             "actions not kept",
@@ -364,7 +366,9 @@ class _Playing:
         """Note a cut-off from outside, and record the exception that caused it."""
         if (excuse := _EVENTS.get(episode.cut or "")) is not None:
             self._note(
-                episode, excuse, "it was cut off; that it ended there is believed"
+                episode,
+                excuse,
+                "it was cut off; the step at which it ended is believed",
             )
         if episode.cut not in (EXCEPTION, INTERRUPT):
             return
@@ -382,7 +386,7 @@ class _Playing:
 
 
 def _exception_kind(name: str) -> type[BaseException]:
-    """Return a new exception class that files record by this name; import nothing."""
+    """Return a new exception class that is recorded under this name; import nothing."""
     module, _, qualified = name.rpartition(".")
     return type(qualified, (Exception,), {"__module__": module or "builtins"})
 

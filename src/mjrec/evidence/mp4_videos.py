@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reading of an archive's mp4 file: its boxes, its stream, and its decoded frames.
+"""Reading an archive's mp4 file: its boxes, its stream, and its decoded frames.
 
 Players follow the boxes, whatever the frames are: a second track on top, an edit list
 that skips the end, non-square pixels. So the boxes are compared as well as the frames.
@@ -110,13 +110,13 @@ def _boxes(file: BinaryIO, start: int, end: int, outer: str) -> Iterator[Box]:
             size, head_size = int.from_bytes(head[8:]), 16
         name = head[4:8].decode("ascii", "backslashreplace").replace("/", "\\")
         if not head_size <= size <= end - start:
-            raise ValueError(f"the box {name!r} has a wrong size")
+            raise ValueError(f"the box {name!r} has the wrong size")
         path = f"{outer}/{name}" if outer else name
         own = _CONTAINERS.get(name, size - head_size)
         if name == _MEDIA:
             own = 0
         if own > min(size - head_size, _LARGEST_BOX):
-            raise ValueError(f"the box {name!r} has a wrong size")
+            raise ValueError(f"the box {name!r} has the wrong size")
         file.seek(start + head_size)
         yield Box(path, file.read(own), size - head_size)
         if name in _CONTAINERS:
@@ -130,7 +130,8 @@ def shown_times(boxes: Sequence[Box]) -> tuple[int, Fraction] | str:
     If the frames are not shown evenly, return the reason instead.
 
     Raises:
-        ValueError: the tables contradict each other, or are not as mjrec writes them.
+        ValueError: the tables contradict each other, or do not have the form that mjrec
+            writes.
     """
     try:
         duration, offsets = _table(boxes, "stts"), _table(boxes, "ctts")
@@ -139,9 +140,11 @@ def shown_times(boxes: Sequence[Box]) -> tuple[int, Fraction] | str:
         # Only other programs write 64-bit times or several edits.
         edits, _, begin, rate = struct.unpack(">4xIIiI", _one(boxes, "elst").content)
     except (KeyError, struct.error) as error:
-        raise ValueError(f"its tables are not as mjrec writes them: {error}") from error
+        raise ValueError(
+            f"its tables do not have the form that mjrec writes: {error}"
+        ) from error
     if len(set(duration.tolist())) != 1 or edits != 1 or rate != 1 << 16:
-        return "its frames are not all shown for the same time"
+        return "its frames are not all shown for the same duration"
     each, count = int(duration[0]), len(duration)
     shown = np.arange(count) * each - begin
     if len(offsets):
@@ -149,7 +152,7 @@ def shown_times(boxes: Sequence[Box]) -> tuple[int, Fraction] | str:
             raise ValueError("its tables have different numbers of frames")
         shown = shown + offsets
     if not each or not np.array_equal(np.sort(shown), np.arange(count) * each):
-        return "its frames are not evenly spaced from the beginning"
+        return "its frames are not evenly spaced from the start"
     if int(sizes.sum()) != sum(box.size for box in boxes if box.name == _MEDIA):
         return "it contains more than its frames"
     return count, Fraction(each, scale)
@@ -197,7 +200,7 @@ def odd_contents(path: Path) -> Iterator[tuple[str, str, str]]:
 def _is_by_x264(units: bytes) -> bool:
     """Return whether units of a stream are exactly one message of the encoder.
 
-    The message's size is the sum of bytes of 255 and of the first other byte.
+    A message's size is the sum of any bytes of value 255 and of the first other byte.
     """
     sizes = units.removeprefix(_MESSAGE)
     full = len(sizes) - len(sizes.lstrip(b"\xff"))

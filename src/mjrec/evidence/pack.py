@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Packing of a monitor directory into one zip file that can be verified.
+"""Packing a monitor directory into one zip file that can be verified.
 
-The archive is built in a hidden folder next to it. Files are hard-linked into the
-folder if possible, so that a run of many gigabytes needs little space. Nothing in it is
-written in place: a changed file is written under a temporary name and renamed.
+The archive is built in a hidden folder next to its final path. Files are hard-linked
+into the folder if possible, so that a run of many gigabytes needs little space. Nothing
+in it is written in place: a changed file is written under a temporary name and renamed.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ def pack(
 
     Args:
         directory: the monitor directory, or a folder of several, such as an
-            evaluation's; with closed monitors and rendered videos.
+            evaluation's. Its monitors must be closed and its videos rendered.
         path: the archive, a new file that ends in `.zip`.
         title: the run's title. None generates one from the recorded environments.
         authors: each "Name", "Name <address>" or "Name <ORCID>".
@@ -85,10 +85,10 @@ def pack(
         anonymous: remove everything that names a user, a machine or an author, for
             blind review.
         max_size: size limit in bytes, a number or a string such as `"50M"` (50
-            million). If the archive is larger, its videos are re-rendered from the
+            million). If the archive is larger, its videos are rerendered from the
             states at 3/4, 1/2, 3/8 or 1/4 of their width and height, and the archive
-            records that.
-        on_progress: called with the progress of re-rendering.
+            records this.
+        on_progress: called with the progress of rerendering.
 
     Returns:
         The path of the archive.
@@ -150,7 +150,7 @@ def pack(
 
 
 def pack_folder(directory: Path, folder: Path, options: PackingOptions) -> None:
-    """Pack a monitor directory into a new folder with the content of the archive.
+    """Pack a monitor directory into a new folder, with the content of an archive.
 
     If the archive is anonymous, no names are searched for, because the recordings
     contain none.

@@ -61,8 +61,8 @@ class Tally:
         episodes: number of episodes.
         steps: number of their steps.
         total_return: sum of their returns.
-        start: the time when the first began, in ISO 8601 in UTC; None if unknown.
-        end: the time when the last ended, in ISO 8601 in UTC; None if unknown.
+        start: the time when the first one began, in ISO 8601 in UTC; None if unknown.
+        end: the time when the last one ended, in ISO 8601 in UTC; None if unknown.
     """
 
     episodes: int = 0
@@ -90,7 +90,7 @@ class Tally:
 
 @dataclass(frozen=True, kw_only=True)
 class Session:
-    """One monitor's recording, as far as it is in the archive.
+    """One monitor's recording, as far as the archive contains it.
 
     Attributes:
         infix: the infix of its files' names.
@@ -103,8 +103,8 @@ class Session:
         models: the names of the model files that its trajectories refer to and that
             are in the archive.
         videos: the name of each video in the manifest, with its metadata.
-        made_with: the environments' arguments as text, each set once; "" stands for no
-            arguments or unknown ones.
+        made_with: the distinct sets of arguments of the environments, as text; ""
+            stands for no arguments or unknown ones.
         tally: totals over the complete episodes.
         with_states: number of recorded episodes whose states are in the archive.
         with_actions: number of recorded episodes whose actions are in the archive.
@@ -152,12 +152,12 @@ class PackedRun:
 
     @property
     def env_ids(self) -> list[str]:
-        """The ids of the recorded environments, each once."""
+        """The ids of the recorded environments, without duplicates."""
         return list(dict.fromkeys(session.env_id for session in self.sessions))
 
     @property
     def extras(self) -> list[str]:
-        """The extras of mjrec that verifying it needs."""
+        """The extras of mjrec that are needed to verify the run."""
         is_of_suite = any(name.startswith("dm_control/") for name in self.env_ids)
         return ["evidence", *(["dm-control"] if is_of_suite else [])]
 
@@ -253,7 +253,7 @@ def _session(monitor: MonitorFiles, tally: Tally) -> Session:
     with_states = [each for each in facts if not each.get(STATES_LEFT_OUT)]
     named = [facts_in(each.get("model")) for each in facts]
     models = {n for m in named for n in (m.get("xml"), m.get("mjb")) if n}
-    # An evaluation chooses among all its recordings, whatever each one's schedule.
+    # An evaluation chooses from all its recordings, regardless of their schedules.
     keep = facts_in(details.get("keep"))
     is_of_evaluation = keep.get("scope") == EVALUATION
     chosen_by = keep if is_of_evaluation else facts_in(details.get("schedule"))

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reading of a run's inputs from an unpacked, untrusted archive.
+"""Reading a run's inputs from an unpacked, untrusted archive.
 
-It is done in a sandbox, because journals and HDF5 files are parsed.
+This runs in a sandbox, because it parses journals and HDF5 files.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ _SOURCES = re.compile(r"openaigym\.model\.[0-9a-f]{16}\.zip", re.ASCII)
 _UNREADABLE = "Its inputs cannot be read"
 _LONGEST_HEADER = 10_000
 _MOST_EPISODES = 1_000_000
-# The keys of the journal's events of an evaluation's episodes.
+# The keys of the journal's events about episodes of an evaluation.
 _UNIT = ("seed", "episode")
 _FAILED = (*_UNIT, "episode_id", "failure", "length", "start_time", "seconds")
 # The keys of a provenance that a recorder writes, and those below them if they are
@@ -175,9 +175,9 @@ class _Journal:
         path: the journal, or None if it is missing.
 
     Attributes:
-        entries: its completed episodes by their numbers.
-        events: its other lines: the number of lines before each, not counting the
-            first, and its kind and facts.
+        entries: its completed episodes, keyed by number.
+        events: its other lines, each as the number of lines before it (not counting the
+            first), its kind and its facts.
     """
 
     def __init__(self, path: Path | None) -> None:
@@ -197,11 +197,11 @@ class _Journal:
                 raise ValueError(f"more than {_MOST_EPISODES} episodes")
 
     def facts_of(self, kind: str) -> list[dict[str, Any]]:
-        """Return the facts of all events of a kind."""
+        """Return the facts of all events of one kind."""
         return [f for _, k, f in self.events if k == kind and isinstance(f, dict)]
 
     def of_episodes(self, kind: str) -> dict[int, list[dict[str, Any]]]:
-        """Return the facts of all events of a kind by the number of their episode."""
+        """Return the facts of all events of one kind, keyed by episode number."""
         found: dict[int, list[dict[str, Any]]] = {}
         for facts in self.facts_of(kind):
             if type(number := facts.get("episode_id")) is int:
@@ -278,7 +278,7 @@ def _episodes(
 
 
 def _broken(files: MonitorFiles) -> dict[int, dict[str, list[Any]]]:
-    """Return the inputs `broken` of the episodes that have them, by number."""
+    """Return each episode's `EpisodeInputs.broken`, if any, keyed by episode number."""
     found: dict[int, dict[str, list[Any]]] = {}
     details = read_manifest(files.manifest).mjrec if files.manifest else None
     for name in map(base_name, (details or {}).get("broken") or ()):
@@ -287,7 +287,7 @@ def _broken(files: MonitorFiles) -> dict[int, dict[str, list[Any]]]:
             continue
         with unreadable(path):
             said = read_object(path)
-        # A deferred video cannot break off: its states are kept to render it again.
+        # A deferred video is never cut short: its states are kept to render it again.
         if said.get("recording") == LIVE and said.get("broken") is True:
             video = name.removesuffix(".meta.json")
             reason, frames = str(said.get("broken_reason")), said.get("frame_count", 0)
@@ -354,9 +354,11 @@ def _steps_taken(reader: TrajectoryReader) -> Iterator[tuple[str, NDArray[Any]]]
 
 
 def _of_evaluation(kind: str, facts: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Return the known facts of an evaluation's event."""
+    """Return the recognized keys of an event about an episode of an evaluation."""
     if not all(type(facts.get(name)) is int for name in _UNIT):
-        raise ValueError(f"{facts!r:.200} does not name an evaluation's episode")
+        raise ValueError(
+            f"{facts!r:.200} does not identify an episode of an evaluation"
+        )
     return _known(facts, _UNIT if kind == "begun" else _FAILED)
 
 

@@ -23,7 +23,7 @@ from .excuses import note
 from .findings import Finding
 from .inputs import RecordingInputs
 
-# mjrec's own schedules by their names in a journal. They choose episodes again.
+# mjrec's own schedules, keyed by their names in a journal. They are applied again.
 _SCHEDULES = {
     "capped_cubic_video_schedule": "cubic",
     "record_all": "all",

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Size limits for archives: videos are re-rendered smaller until the archive fits.
+"""Size limits for archives: videos are rerendered smaller until the archive fits.
 
 All their frames are rendered from the recorded states, and the new videos get their own
 metadata and hashes. An encoded video is never re-encoded: videos that were rendered
@@ -38,7 +38,7 @@ _LARGEST = 10
 _SIZE = re.compile(r"(\d{1,15}(?:\.\d{1,6})?)\s*(?:([KMGT])(i?))?B?", re.IGNORECASE)
 _UNITS = ("", "K", "M", "G", "T")
 
-# A video that can be re-rendered: its file, its states and its metadata.
+# A video that can be rerendered: its file, its states and its metadata.
 _Redrawable = tuple[Path, Path, dict[str, Any]]
 
 
@@ -91,17 +91,17 @@ def shrinking(
     *,
     on_progress: Callable[[Progress], object],
 ) -> Iterator[None]:
-    """Yield each time an archive must be made, with smaller videos until it fits.
+    """Yield each time an archive must be made; its videos shrink until it fits.
 
     Args:
         limit: maximum size of the archive in bytes.
         staged: the folder with the recordings to pack.
         archive: the archive to make of them.
-        on_progress: called with the progress of re-rendering.
+        on_progress: called with the progress of rerendering.
 
     Raises:
         ArchiveTooLarge: even the smallest archive is too large.
-        PackError: a re-rendered video has different frames from the recorded one.
+        PackError: a rerendered video has different frames from the recorded one.
     """
     size = yield from _attempt(limit, staged, archive)
     if size <= limit:
@@ -119,14 +119,14 @@ def shrinking(
             if size <= limit:
                 return
     largest = sorted(_sizes(staged), key=lambda item: (-item[1], item[0]))[:_LARGEST]
-    reason = "This is with videos at a quarter of their width and height."
+    reason = "Its videos already have a quarter of their width and height."
     if not videos:
         reason = (
-            "None of its videos can be re-rendered smaller: they have no recorded "
+            "None of its videos can be rerendered smaller: they have no recorded "
             "states, and encoded videos are never re-encoded."
         )
     elif rest >= limit:
-        reason = f"The files that cannot be made smaller already have {rest} bytes."
+        reason = f"The files that cannot be made smaller already take {rest} bytes."
     raise ArchiveTooLarge(size, limit, largest, reason=reason)
 
 
@@ -145,7 +145,7 @@ def _sizes(staged: Path) -> list[tuple[str, int]]:
 
 
 def _redrawable(staged: Path) -> list[_Redrawable]:
-    """Return the videos that can be re-rendered from recorded states."""
+    """Return the videos that can be rerendered from recorded states."""
     found = []
     manifests = [path for path in sorted(staged.iterdir()) if is_manifest(path.name)]
     videos = [pair for path in manifests for pair in read_manifest(path).videos]
@@ -194,20 +194,20 @@ def _draw_all(
 
 
 def _amend(video: Path, said: dict[str, Any]) -> None:
-    """Complete a smaller video's metadata with those of the recorded one."""
+    """Complete a smaller video's metadata from that of the recorded one."""
     with unreadable(metadata_path(video)):
         drawn = read_object(metadata_path(video))
     for key in ("frame_count", "frame_steps", "fps"):
         if drawn.get(key) != said.get(key):
             raise PackError(
-                f"{video.name} changed when it was re-rendered smaller: its "
+                f"{video.name} changed when it was rerendered smaller: its "
                 f"{key} was {said.get(key)!r:.100} and is {drawn.get(key)!r:.100}. "
                 "Allow a larger archive."
             )
     metadata = {
         **said,
         **drawn,
-        # The renderer does not know the name of a further camera.
+        # The renderer does not know the name of an additional camera.
         "camera": said.get("camera"),
         "packed_smaller": {"from": [said["height"], said["width"]]},
     }

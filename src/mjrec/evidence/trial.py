@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Judging of all equal and different items by the excuses, and their totals."""
+"""Judging all equal and different items by the excuses, and the totals."""
 
 from __future__ import annotations
 

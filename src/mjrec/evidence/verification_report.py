@@ -23,9 +23,9 @@ _TEMPLATE: Final = "verification_report.html.jinja"
 
 _MEANINGS: Final = {
     Topic.IDENTITY: "The environment and the model match their names.",
-    Topic.BEGINNING: "Seeds and options lead to each episode's first state.",
-    Topic.PHYSICS: "Actions lead from each state to the next.",
-    Topic.REWARDS: "Actions produce the rewards and ends, and these the statistics.",
+    Topic.BEGINNING: "Seeds and options reproduce each episode's initial state.",
+    Topic.PHYSICS: "The actions lead from each state to the next.",
+    Topic.REWARDS: "Actions produce the rewards and ends, and so the statistics.",
     Topic.SELECTION: "The stated rule chooses the episodes that have a video.",
     Topic.VIDEOS: "Each video has the size, speed, length and camera that it states.",
     Topic.PICTURES: "The states produce the frames of the videos.",
@@ -103,7 +103,7 @@ def _row(finding: Finding) -> dict[str, str]:
     return {
         "outcome": str(finding.outcome),
         "topic": str(finding.topic),
-        "subject": finding.item or "the whole",
+        "subject": finding.item or "the whole run",
         "extent": counted(finding.count, finding.unit),
         "reason": finding.reason,
     }

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Verification of a packed run: it is recreated from its inputs and compared."""
+"""Verification of a packed run: it is recreated and compared with the archive."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def verify(
     """Recreate a packed run and compare the result with the archive.
 
     The archive may come from a stranger. Three processes read it, recreate the run and
-    compare the two. Each has limits on memory and time, no network and no home
+    compare the two runs. Each has limits on memory and time, no network and no home
     directory, and sees only what it needs: the second gets only the inputs
     (environment, seeds, actions, options). No code that the archive names is run,
     except environments in `trust`.
@@ -87,7 +87,7 @@ def verify(
             (rewards, ends, statistics and selection of episodes), `"physics"` (also all
             states) or `"pixels"` (also all frames and files).
         sample: number of frames of each video to check. None means all.
-        seed: seed for choosing these frames. None means random.
+        seed: seed for choosing these frames. None means a random seed.
         trust: ids of environments that may be created although they are not in a
             trusted registry. This runs code that you have installed.
         allow: excuses to accept, by name and value: `"gl=NVIDIA H100"`.
@@ -96,7 +96,7 @@ def verify(
 
     Returns:
         The verdict, PASS, PARTLY or FAIL, with all findings. A difference does not
-            raise.
+        raise an error.
 
     Raises:
         UnreadableArchive: the file is missing, damaged or hostile.

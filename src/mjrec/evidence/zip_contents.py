@@ -3,8 +3,9 @@
 
 Only plain archives are accepted: files and folders below one folder, one after another
 from the first byte to the table of contents, which ends the file. Some programs see
-anything more (a comment, bytes before, between or after entries, two entries over the
-same bytes) and others do not, so that two readers would check different things.
+anything else in the file (a comment, bytes before, between or after entries, two
+entries over the same bytes) and others do not, so that two readers would check
+different things.
 """
 
 from __future__ import annotations

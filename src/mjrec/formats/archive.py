@@ -104,7 +104,9 @@ def _objections(pairs: Sequence[_Pair]) -> Iterator[str]:
         if video.name.lower() == _MANIFEST:
             yield f"{video.name!r} is the name of the archive's manifest. Rename it."
         if not _METADATA_NAME.fullmatch(metadata.name):
-            yield f"{metadata.name!r} is not a metadata name: {plain} .meta.json."
+            yield (
+                f"{metadata.name!r} is not a metadata file's name: {plain} .meta.json."
+            )
 
 
 def _pack(pairs: Sequence[_Pair], whole: IO[bytes]) -> None:

@@ -144,7 +144,7 @@ def unfinished_recording(path: Path) -> tuple[Fraction, list[str]]:
                 except (AttributeError, TypeError, RecursionError, ValueError):
                     break
         if not frames or not isinstance(delay, float | int) or not 0 < delay < 1e6:
-            raise ValueError("it holds no text frame")
+            raise ValueError("it contains no text frames")
         return rate_from_timestep(delay), frames
 
 

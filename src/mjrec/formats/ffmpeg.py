@@ -224,8 +224,8 @@ class FfmpegProcess:
                     stderr=stderr,
                     bufsize=0,
                     start_new_session=True,
-                    # ffmpeg inherits that Python ignores SIGXFSZ, so it reports a file
-                    # size limit as an error instead of being killed.
+                    # ffmpeg ignores SIGXFSZ, as Python does, so it reports a file size
+                    # limit as an error instead of being killed.
                     restore_signals=False,
                     pass_fds=() if keeps is None else (keeps,),
                 )

@@ -52,7 +52,7 @@ MOST_EPISODES = 10**15
 # of the statistics; a finished clip; an action that does not fit into rows; an episode
 # whose video is dropped while its trajectory stays; a failure to record something; the
 # videos that were kept; the end of the run; the recovery of the directory by another
-# process; the beginning of an evaluation's episode; the failure of such an episode.
+# process; the beginning of an episode of an evaluation; the failure of such an episode.
 EVENTS = (
     *("run", "provenance", "cut", "clip", "action", "dropped"),
     *("fault", "keep", "closed", "recovered", "begun", "failed"),
@@ -84,8 +84,8 @@ class JournalEntry:
         options: the options given to `reset`.
         terminated: whether the task ended the episode.
         truncated: whether a limit outside the task ended the episode.
-        success: whether the environment reported a success; None if it did not report
-            either way.
+        success: whether the environment reported success; None if it reported neither
+            success nor failure.
         chosen: whether the schedule chose the episode.
         recording: `"live"` or `"deferred"`; None if the episode has no video of its
             own.
@@ -278,7 +278,7 @@ def read_journal(
                 seen[block] = seen.get(block, 0) | 1 << bit
                 yield entry
                 continue
-            reason = "its episode occurred before"
+            reason = "its episode has occurred before"
         skipped += 1
         episode = ""
         if (begin := _BEGIN.match(line)) is not None:

@@ -51,7 +51,7 @@ _KINDS = {
 
 @contextlib.contextmanager
 def unreadable(path: Path) -> Iterator[None]:
-    """Turn errors in the block about a file's content into `UnreadableFile`."""
+    """Turn errors about a file's content, inside the block, into `UnreadableFile`."""
     try:
         yield
     except OSError as error:

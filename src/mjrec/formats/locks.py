@@ -3,8 +3,8 @@
 
 An open monitor keeps `.openaigym.<infix>.lock` locked (with `flock`). The kernel drops
 the lock however the process ends, so a lock file that no process holds was left by a
-dead monitor. A process id would not show this, because ids are reused, and in
-containers all the time.
+dead monitor. A process id would not show this, because process ids are reused, and very
+often in containers.
 
 A monitor's lock is never reused, because its name belongs to that monitor alone. The
 other locks (for rendering a video, using a CPU or rewriting a manifest) are reused, and

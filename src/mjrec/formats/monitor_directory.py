@@ -13,7 +13,7 @@
     ├── openaigym.video.<infix>.video000027.failed.json ... why it is still pending
     ├── openaigym.clip.<infix>.step000000137.failed.json    why a clip is still pending
     ├── openaigym.video.<infix>.video000027.json        a text recording (asciicast)
-    ├── openaigym.video.<infix>.video000027.side.mp4    video of a further camera
+    ├── openaigym.video.<infix>.video000027.side.mp4    video of an additional camera
     ├── openaigym.video.<infix>.video000027.camera2.mp4 ... of a camera without a name
     ├── openaigym.video.<infix>.video000027.tiled.mp4   all sub-environments in one
     ├── openaigym.video.<infix>.video000027.side.640x480.mp4 a rerendered video
@@ -22,7 +22,7 @@
     ├── rl-video-episode-27.side.mp4                    ... and of a further one
     ├── openaigym.states.<infix>.000000.log             rows of recordings in flight
     ├── openaigym.states.<infix>.000000.tail            ... the last of these rows
-    ├── openaigym.states.<infix>.000000.looks           ... changes of the model
+    ├── openaigym.states.<infix>.000000.looks           ... changes to the model
     ├── openaigym.trajectory.<infix>.episode000027.h5   a recorded episode, finished
     ├── openaigym.trajectories.<infix>.h5               ... or many in one file
     ├── openaigym.model.<16 hex digits>.mjb.gz          a compiled model ...

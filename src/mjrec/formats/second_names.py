@@ -3,8 +3,8 @@
 
 The metadata of an episode's first video contains its second name (`also_named`). The
 name is a link in the same directory. It is created last, so that it never refers to an
-incomplete video. The episode's further videos, and the metadata of each video, get
-second names too.
+incomplete video. The episode's other videos, and the metadata of each video, get second
+names too.
 
 If a different file has such a name, it belongs to another program, and is neither
 replaced nor removed.
@@ -47,7 +47,7 @@ def give_second_names(video: Path) -> None:
     If another file has such a name, or a link cannot be created, a warning is logged.
 
     Args:
-        video: the first video of an episode. Further videos have no second name of
+        video: the first video of an episode. Its other videos have no second name of
             their own.
     """
     for file, link in _second_names(video):

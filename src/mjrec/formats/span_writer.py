@@ -180,7 +180,7 @@ def _begin(
 
 
 class OpenLog(RowLog):
-    """The row log of recordings, with the changes of their model.
+    """A row log of recordings, with the changes to their model.
 
     Attributes:
         number: the log's number.
@@ -189,7 +189,7 @@ class OpenLog(RowLog):
             words, `action` and `observation`. Parts that the rows lack are missing.
         bodies: for each slot, all words after its head.
         is_alone: whether the log is for a single recording and ends with it.
-        look_size: size in bytes of all changes of the model so far.
+        look_size: size in bytes of all changes to the model so far.
         recordings: all recordings that were begun in this log.
     """
 
@@ -233,7 +233,7 @@ class OpenLog(RowLog):
         )
 
     def add_change(self, change: ModelChange) -> None:
-        """Add a change of the model that takes effect at the next row.
+        """Add a change to the model that takes effect at the next row.
 
         Raises:
             InvalidArgument: the change cannot be recorded.
@@ -364,8 +364,8 @@ class SpanWriter:
         """Add facts, even after the recording's end. Newer facts replace older ones.
 
         Raises:
-            FileNotWritten: the disk is full; the facts are written before the next
-                line.
+            FileNotWritten: the disk is full; the facts will be written before the
+                journal's next line.
         """
         self.log.journal.note("note", {"name": self._name, "facts": dict(facts)})
 
@@ -373,7 +373,8 @@ class SpanWriter:
         """Record how the recording ended, and close its log if it has its own.
 
         Raises:
-            FileNotWritten: the disk is full; the end is written before the next line.
+            FileNotWritten: the disk is full; the event will be written before the
+                journal's next line.
         """
         said = {"name": self._name, "row": self.log.count, "facts": dict(facts)}
         self.log.journal.note("end", said)
@@ -384,7 +385,8 @@ class SpanWriter:
         """Give up the recording's rows, and remove its log if it has its own.
 
         Raises:
-            FileNotWritten: the disk is full; the event is written before the next line.
+            FileNotWritten: the disk is full; the event will be written before the
+                journal's next line.
         """
         if self.log.is_alone:
             # Remove the log first, because the disk may be full.

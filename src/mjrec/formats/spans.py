@@ -16,7 +16,7 @@ episode. The journal has a line for each event::
 `rows` gives the layout of rows, and the facts that all recordings with this layout
 share unless `begin` overrides them or lists them in `without`. A span without an end
 extends to the last row. Log 3 is `openaigym.states.<infix>.000003.log`; the `.looks`
-file next to it contains the changes of the model. These files are removed once every
+file next to it contains the changes to the model. These files are removed once every
 recording in them has been dropped or exists in its final form: an episode as a
 trajectory, or only as a video if its trajectory is not kept.
 
@@ -74,7 +74,7 @@ class Recording:
         rows: the journal's `rows` event for its rows.
         facts: all known facts.
         row: the number of its first row.
-        look: offset of its changes of the model in the `.looks` file.
+        look: offset of its changes to the model in the `.looks` file.
         stop: one more than the number of its last row; None if it has not ended.
         following: the first row of the next recording in the log; None if there is
             none.
@@ -231,7 +231,7 @@ class _Spans:
 
 
 # Cached because a journal only grows, and recordings are looked up one at a time. Each
-# thread has its own: a shared cache would need a lock, which is bad with fork.
+# thread has its own: a shared cache would need a lock, which is unsafe with fork.
 _known = threading.local()
 _MOST_KNOWN = 64
 

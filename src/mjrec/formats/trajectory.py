@@ -2,7 +2,7 @@
 """The content of a trajectory, however it is stored.
 
 A recorded episode is first a span of the monitor's row log (`trajectory_log`), and then
-an HDF5 file (`trajectory_hdf5`). Both contain facts, rows and changes of the model. A
+an HDF5 file (`trajectory_hdf5`). Both contain facts, rows and changes to the model. A
 NumPy structured dtype describes a row. `docs/reference/trajectories.md` describes the
 file.
 """
@@ -187,10 +187,10 @@ class TrajectoryReader:
         terminated: `(T,) bool`.
         truncated: `(T,) bool`.
         frame_steps: `(F,) int64`, the step after which each snapshot was taken.
-        change_count: number of changes of the model.
+        change_count: number of changes to the model.
         dropped: number of incomplete or damaged rows at the end of the log.
         read: a function that returns one of the `PARTS` for a range of rows.
-        read_change: a function that returns a change of the model by its number.
+        read_change: a function that returns a change to the model by its number.
         release: a function that closes the files.
         is_closed: whether the reader was closed.
     """
@@ -266,7 +266,7 @@ class TrajectoryReader:
         return np.empty(stop - start, []) if rows is None else rows
 
     def iter_model_changes(self) -> Iterator[ModelChange]:
-        """Yield the changes of the model in the order of their steps."""
+        """Yield the changes to the model in the order of their steps."""
         for index in range(self.change_count):
             self._check_open()
             yield self.read_change(index)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Access to recorded episodes in flight, in HDF5 files and in bundles."""
+"""Access to recorded episodes, whether in flight, in HDF5 files or in bundles."""
 
 from __future__ import annotations
 

@@ -66,7 +66,7 @@ _COLUMNS = {
 _NO_STATE = np.dtype(("<f8", (0,)))
 
 _CHUNK_BYTES = 1 << 18
-# For snapshots. Few rows per chunk, so that reading a frame does not read most others.
+# For snapshots. Few rows per chunk, so that reading a frame does not read many others.
 _ROWS_IN_CHUNK = 32
 # Number of bytes that are buffered while writing.
 _BUFFER_BYTES = 1 << 22
@@ -157,7 +157,7 @@ def _new_file(
     Args:
         path: the path that the file gets at the end of the block.
         on_signal: called immediately if a signal arrives during the block.
-        **options: further options for `h5py.File`.
+        **options: additional options for `h5py.File`.
 
     Raises:
         FileNotWritten: the disk is full, or the directory was removed.
@@ -175,7 +175,7 @@ def _new_file(
             yield file, unfailing
         if unfailing.error is not None:
             raise unfailing.error
-        # The log is removed next, so the data must not be in a cache only.
+        # The log is removed next, so the data must not be only in a cache.
         os.fsync(output.fileno())
 
 

@@ -39,7 +39,7 @@ _KINDS = STEP | FRAME
 # Number of bytes read at once when scanning the rows.
 _CHUNK_BYTES = 1 << 22
 
-# The header of a change of the model: the row from which it applies, its step, and the
+# The header of a change to the model: the row from which it applies, its step, and the
 # length of the record after it.
 _CHANGE = struct.Struct("<QqQ")
 _LONGEST_HEADER = 1 << 16
@@ -182,8 +182,8 @@ def _open_looks(recording: Recording, opened: contextlib.ExitStack) -> BinaryIO 
     try:
         return opened.enter_context(open_regular(recording.log.with_suffix(LOOKS)))
     except FileNotFoundError:
-        # If the log was removed as a whole, this raises: the log is removed before its
-        # looks.
+        # If the whole log was removed, this raises an error: the log is removed before
+        # its looks.
         recording.log.lstat()
         return None
 
@@ -228,7 +228,7 @@ def pack_change(row: int, change: ModelChange) -> bytes:
     packed = file.getvalue()
     if len(packed) > _LARGEST_CHANGE:
         raise InvalidArgument(
-            f"A change of a model may have at most {_LARGEST_CHANGE} bytes, but this "
+            f"A change to a model may have at most {_LARGEST_CHANGE} bytes, but this "
             f"one has {len(packed)}."
         )
     return _CHANGE.pack(row, change.step, len(packed)) + packed
@@ -244,4 +244,4 @@ def _unpack_fields(packed: bytes) -> dict[str, NDArray[Any]]:
         return {name: record[name].copy() for name in record.dtype.names or ()}
     # NumPy parses the header as Python code, which may raise any error.
     except Exception as error:
-        raise ValueError(f"a change of the model is damaged ({error})") from error
+        raise ValueError(f"a change to the model is damaged ({error})") from error

@@ -43,7 +43,7 @@ def recording_facts(facts: Mapping[str, Any], *, recording: str) -> dict[str, An
 
     Args:
         facts: the known facts about the recording; for a clip, about its first part.
-        recording: the time when the frames are rendered: "live" or "deferred".
+        recording: when the frames are rendered, "live" or "deferred".
     """
     video = facts.get("video") or {}
     further = {"recording_reason": video.get("reason")} if recording == "live" else {}
@@ -161,8 +161,8 @@ def finished_videos(video: Path) -> list[tuple[str, str]]:
     """Return the names of an episode's finished videos and of their metadata files.
 
     The first video comes first; it must exist. Its metadata, which is written last,
-    lists the videos of further cameras (`further_videos`). The list is untrusted, so
-    only names that belong to this episode are accepted.
+    lists the videos from additional cameras (`further_videos`). The list is untrusted,
+    so only names that belong to this episode are accepted.
 
     Args:
         video: the first video.
@@ -178,7 +178,7 @@ def finished_videos(video: Path) -> list[tuple[str, str]]:
 
 
 def further_live_videos(video: Path) -> list[str]:
-    """Return the names of an episode's live videos from further cameras.
+    """Return the names of an episode's live videos from additional cameras.
 
     This is for readers that have nothing but these files. Videos that were rendered
     from a trajectory are excluded, because their metadata does not say "live".

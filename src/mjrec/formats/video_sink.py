@@ -48,7 +48,7 @@ class VideoSink:
 
     Attributes:
         path: the video.
-        blank: the check for whether the frames show anything.
+        blank: the check whether the frames show anything.
     """
 
     def __init__(

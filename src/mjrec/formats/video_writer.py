@@ -121,7 +121,7 @@ class VideoWriter:
         self.closed = False
 
     def write(self, frame: Frame) -> None:
-        """Add a `(height, width, 3) uint8` frame; all must have the first one's size.
+        """Add a `(height, width, 3) uint8` frame of the same size as the first one.
 
         The frame is copied. The call waits while the encoder is behind.
 
@@ -288,12 +288,13 @@ def save_video(
     Args:
         frames: `(height, width, 3) uint8` arrays.
         video_folder: the directory, which is created if necessary.
-        episode_trigger: a function from an episode's number to whether the episode gets
-            a video. If both triggers are None, episodes 0, 1, 8, 27 ... 729 and every
-            1000th episode get one.
-        step_trigger: a function from a step's number to whether a video starts there.
+        episode_trigger: a function that takes an episode's number and returns whether
+            the episode gets a video. If both triggers are None, episodes 0, 1, 8, 27
+            ... 729 and every 1000th episode get one.
+        step_trigger: a function that takes a step's number and returns whether a video
+            starts at that step.
         video_length: maximum number of frames in a video; None for no limit.
-        name_prefix: the beginning of the file names.
+        name_prefix: the prefix of the file names.
         episode_index: the episode's number.
         step_starting_index: the number of the episode's first step.
         **kwargs: `fps`, which is required, and other options of `VideoWriter`.

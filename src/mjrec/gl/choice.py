@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Choice of this process's OpenGL backend, by tests in child processes.
+"""Choice of this process's OpenGL backend, based on tests in child processes.
 
-Such a process may crash or hang.
+A child is used because a driver may crash or hang.
 """
 
 from __future__ import annotations

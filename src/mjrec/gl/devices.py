@@ -4,10 +4,10 @@
 Schedulers assign GPUs with `CUDA_VISIBLE_DEVICES`, which EGL ignores: by default, all
 workers on a machine render on the same GPU, the first one. The EGL device of the
 assigned GPU cannot be computed, because three numberings are involved. The scheduler's
-entry is CUDA's number or a UUID. EGL has its own order. `MUJOCO_EGL_DEVICE_ID` counts
-EGL's devices in mujoco 3, but CUDA's devices, if possible, in mujoco 4. So a child
-process that sees only the assigned GPU asks the driver which EGL device has a CUDA
-number. Another child process then renders, and its driver reports the device.
+entry is CUDA's number or a UUID. EGL has its own order. `MUJOCO_EGL_DEVICE_ID` is an
+index into EGL's devices in mujoco 3, but into CUDA's devices, if possible, in mujoco 4.
+So a child process that sees only the assigned GPU asks the driver which EGL device has
+a CUDA number. Another child process then renders, and its driver reports the device.
 """
 
 from __future__ import annotations
@@ -99,7 +99,7 @@ def device_of_gpu(devices: Sequence[EglDevice], gpu: str) -> EglDevice | None:
     Args:
         devices: EGL's devices in a process in which CUDA sees only that GPU. So the
             right device is the only one with a CUDA number, whatever the number is.
-        gpu: an entry of `CUDA_VISIBLE_DEVICES`. CUDA accepts the beginning of a UUID.
+        gpu: an entry of `CUDA_VISIBLE_DEVICES`. CUDA accepts a prefix of a UUID.
     """
     named = [
         device

@@ -68,7 +68,7 @@ def Monitor(  # noqa: N802  named like gym's class
 
     If the state of a MuJoCo environment determines its frames, `step` only saves the
     state, and worker processes render the frames, byte for byte as `env.render()` would
-    at that moment. Any recorded episode can be re-rendered (`mjrec.render`). Other
+    at that moment. Any recorded episode can be rerendered (`mjrec.render`). Other
     environments are rendered in `step`, with their own `render()`.
 
     Args:
@@ -77,8 +77,9 @@ def Monitor(  # noqa: N802  named like gym's class
             needs `render_mode="rgb_array"` (or `"rgb_array_list"`, `"ansi"`); deferred
             rendering needs no `render_mode`, and no OpenGL in this process.
         directory: the monitor directory. It is created if needed.
-        video_callable: maps an episode number (from 0) to whether it gets a video. None
-            means `capped_cubic_video_schedule`, False means no videos.
+        video_callable: a function that takes an episode number (from 0) and returns
+            whether the episode gets a video. None means `capped_cubic_video_schedule`,
+            False means no videos.
         force: delete the monitor files in the directory first. Overrides `resume`.
         resume: add to existing recordings. Killed monitors are recovered first, as by
             `mjrec.recover`. Episode numbers continue from the highest number of all
@@ -87,12 +88,12 @@ def Monitor(  # noqa: N802  named like gym's class
             their episodes independently. `"join"` does not read other monitors' files,
             so it is fast even among thousands of monitors: it recovers nothing, numbers
             episodes from 0, and does not check that the environments are the same.
-        write_upon_reset: write statistics and manifest at every reset, not only at the
-            end. The journal always gets a line when an episode ends.
+        write_upon_reset: write the statistics and manifest at every reset, not only at
+            the end. The journal always gets a line when an episode ends.
         uid: used in file names instead of the process id.
         mode: type of the episodes, "training" or "evaluation".
         fps: frame rate of the video files. None means real time, one frame per step.
-        camera: a camera's name or number, or an `mujoco.MjvCamera`. None means the
+        camera: a camera's name or number, or a `mujoco.MjvCamera`. None means the
             environment's own view. A list gives a video per camera:
             `....video000027.mp4` for the first, `....video000027.<camera>.mp4` for the
             others. Live frames come from the environment's `render()`, so with
@@ -110,10 +111,10 @@ def Monitor(  # noqa: N802  named like gym's class
         workers: number of processes that render deferred frames. None means one per
             usable CPU, shared by all monitors of a directory. 0 renders nothing now and
             leaves the videos pending for `mjrec render DIR`.
-        trajectory_callable: maps an episode number to whether its trajectory is kept.
-            True keeps all. False keeps none, and a video's trajectory is removed once
-            the video exists. None keeps those of evaluation episodes and of episodes
-            with a video.
+        trajectory_callable: a function that takes an episode number and returns whether
+            the trajectory is kept. True keeps all. False keeps none, and a video's
+            trajectory is removed once the video exists. None keeps those of evaluation
+            episodes and of episodes with a video.
         observations: record observations in trajectories too.
         allow_early_reset: allow resets during an episode. An interrupted episode is not
             included in the statistics, and its video is marked incomplete. None follows
@@ -131,18 +132,18 @@ def Monitor(  # noqa: N802  named like gym's class
         keep: choose the videos after episodes have ended, instead of with
             `video_callable`: "best:3" or "worst:3" (by return), "failures" or
             "failures:20" (the first 20), "median", several of these separated by
-            commas, or a function from the finished episodes
-            (`mjrec.trackers.FinishedEpisode`) to the numbers to keep. An episode failed
-            if `info["is_success"]` or `info["success"]` is false in its last step or,
-            without either, if it terminated. Other episodes are deleted as soon as the
-            rule allows; "median" and functions keep all states on disk until `close`.
-            Incomplete episodes are never chosen. Trajectories that are kept for another
-            reason remain, without their video. The manifest and metadata name the rule.
-            After a kill, all candidates are pending. If the function raises or names
-            unknown episodes, `close` reports it and keeps all.
-        step_trigger: maps the number of steps so far, before each step, to whether a
-            clip starts. Replaces `video_callable`. A clip's first frame is the one
-            before the step.
+            commas, or a function that takes the finished episodes
+            (`mjrec.trackers.FinishedEpisode`) and returns the numbers of those to keep.
+            An episode failed if `info["is_success"]` or `info["success"]` is false in
+            its last step or, without either, if it terminated. Other episodes are
+            deleted as soon as the rule allows; "median" and functions keep all states
+            on disk until `close`. Incomplete episodes are never chosen. Trajectories
+            that are kept for another reason remain, without their video. The manifest
+            and metadata name the rule. After a kill, all candidates are pending. If the
+            function raises or names unknown episodes, `close` reports it and keeps all.
+        step_trigger: a function that is called before each step with the number of
+            steps so far, and returns whether a clip starts. Replaces `video_callable`.
+            A clip's first frame is the one before the step.
         video_length: number of steps in a clip after its first frame, across resets.
             None means until the end of the episode.
         name_prefix: also link finished videos under Gymnasium's names:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Progress of long operations: bars on a terminal, now and then a line in a log."""
+"""Progress of long operations: bars on a terminal, or an occasional line in a log."""
 
 from __future__ import annotations
 

@@ -29,7 +29,7 @@ def checked_cameras(camera: Any, *, tiled: bool) -> list[Any]:
     """Return the requested cameras as a list.
 
     Args:
-        camera: a name, a number, an `mujoco.MjvCamera`, None for the environment's own
+        camera: a name, a number, a `mujoco.MjvCamera`, None for the environment's own
             view, or a list of these.
         tiled: whether to put several cameras side by side in one video.
 
@@ -184,9 +184,9 @@ def vector_tiles(
     tiles = Tiles([gymnasium_scenes(each, **view).frames for each in envs])
     if tiles.render_mode is None:
         raise NoPictures(
-            "tiled=True was requested, and a tiled video needs the frames of all "
-            "environments while they step: create them with "
-            'render_mode="rgb_array", and with the required camera and size.'
+            "tiled=True was requested, but a tiled video needs the frames of all "
+            "environments at every step. Create the environments with "
+            'render_mode="rgb_array" and with the required camera and size.'
         )
     return tiles
 

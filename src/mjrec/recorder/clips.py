@@ -35,7 +35,7 @@ class Clips:
 
     No clip begins while another clip is being recorded. A clip consists of a first
     frame and the frames of exactly `video_length` steps. It continues across resets,
-    each of which adds a frame. If no length is set, the clip ends with the episode.
+    and each reset adds a frame. If no length is set, the clip ends with the episode.
 
     Args:
         run: the monitored run. Two of its options define the clips. `video_length` is

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reasons why an episode ended early, and a guard that closes at the latest at exit."""
+"""Reasons why an episode ended early, and a guard that closes no later than at exit."""
 
 from __future__ import annotations
 

@@ -307,7 +307,7 @@ class Selection:
         return sorted(self._chosen)
 
     def close(self) -> None:
-        """Decide about all candidates at the end of the run. Idempotent.
+        """Decide on all candidates at the end of the run. Idempotent.
 
         Raises:
             InvalidArgument: the user's function raised an exception or did not return

@@ -220,7 +220,7 @@ def live_recorder(
         base_path: path of the video, without the extension.
         frames: the source of the frames.
         caption: returns the text to write on the current frame, or None.
-        **facts: further facts for the metadata.
+        **facts: additional facts for the metadata.
     """
     return VideoRecorder(
         frames,

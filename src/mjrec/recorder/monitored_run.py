@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The state that all recordings of a run share: the journal, the logs and facts."""
+"""The state that all recordings of a run share: the journal, the logs and the facts."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ What = Literal["video", "trajectory", "statistics", "journal", "model", "tracker
 
 
 class MonitoredRun:
-    """The state that all recordings of a run share, and their facts for files.
+    """What all recordings of a run share: its state, and the facts for their files.
 
     It writes the run's journal. With `on_error="raise"`, the caller raises an error for
     each fault. With `on_error="warn"`, a fault is logged once and listed in the
@@ -268,7 +268,7 @@ class MonitoredRun:
         is_warned = self.options.on_error == WARN
         if is_warned and self.note_fault(what, str(error), episode_id=episode_id):
             of = "" if episode_id is None else f" of episode {episode_id}"
-            logger.warning("Not completely recorded: %s%s. %s", what, of, error)
+            logger.warning("Incomplete recording: %s%s. %s", what, of, error)
         return is_warned
 
     def ask(self, what: What, choose: Callable[..., Any], *about: Any) -> bool:
@@ -318,11 +318,11 @@ class MonitoredRun:
             self.finisher.submit(recording)
 
     def retry_at_close(self, do: Callable[[], None]) -> None:
-        """Delay a function until `close_logs`, because the disk is full now."""
+        """Postpone a call until `close_logs`, because the disk is full."""
         self._late.append(do)
 
     def close_logs(self) -> None:
-        """Write all remaining rows and facts to the logs, and call delayed functions.
+        """Write the remaining rows and facts to the logs, and make the postponed calls.
 
         Raises:
             FileNotWritten: the disk is full. The next call tries again.
@@ -416,7 +416,7 @@ class MonitoredRun:
 
         Args:
             name: the video's file name without the extension.
-            recording: the time when the video is drawn, `DEFERRED` or `LIVE`.
+            recording: when the video is drawn, `DEFERRED` or `LIVE`.
             is_only_possible: whether the video is not planned.
         """
         options, env = self.options, self.env

@@ -37,7 +37,7 @@ UNKNOWN_ACTION: Final = object()
 
 
 class Recorder:
-    """Drives statistics, journal, trajectories, videos and manifest of one monitor.
+    """Drives the statistics, journal, trajectories, videos and manifest of one monitor.
 
     It is notified of an environment's calls and does not call the environment, except
     for frames and states. For a reset, call `before_reset`, reset the environment
@@ -55,13 +55,15 @@ class Recorder:
     Attributes:
         directory: the monitor directory, absolute.
         infix: the middle part of this monitor's file names.
-        episode_id: the number of the next episode; as in gym, it rises at each reset.
+        episode_id: the number of the next episode; as in gym, it increases at each
+            reset.
         run: the state shared by all recordings.
         stats_recorder: counts steps and rewards.
         closed: whether recording has ended.
         fast: the fast path for the next step; None if the step needs the full path.
-        evaluation_facts: returns the facts about its evaluation for an ended episode's
-            journal line; None if the episode belongs to no evaluation.
+        evaluation_facts: a function that returns, for the journal line of an episode
+            that has ended, the facts about the evaluation it belongs to; None if it
+            belongs to none.
     """
 
     def __init__(
@@ -260,8 +262,8 @@ class Recorder:
             frame: False if the environment has already reset itself, so that its frame
                 belongs to the next episode.
             observation: the observation that the step returned.
-            success: at the end of an episode, whether the environment reports a
-                success; None if it does not report that.
+            success: at the end of an episode, whether the environment reports success;
+                None if it does not report this.
         """
         reward = reward_to_float(reward)
         done = bool(terminated or truncated)
@@ -312,7 +314,7 @@ class Recorder:
         """End the running episode, and wait until all videos are rendered.
 
         Without background rendering, this writes the trajectories in their final form.
-        Call it before `close`, which waits for nothing.
+        Call it before `close`, which does not wait.
 
         Args:
             on_progress: called with the progress while waiting.
@@ -329,7 +331,7 @@ class Recorder:
             self.run.finisher.wait(on_progress)
 
     def close(self) -> None:
-        """End the episode, write statistics and manifest, and close. Idempotent.
+        """End the episode, write the statistics and manifest, and close. Idempotent.
 
         Rendering stops; videos that are not rendered yet stay pending. An unfinished
         episode is left out of the statistics; its video is kept and marked as
@@ -451,7 +453,7 @@ class Recorder:
         Args:
             facts: the facts about the episode's end.
             failures: collects the errors raised here.
-            success: whether the environment reports a success; None if unknown.
+            success: whether the environment reports success; None if unknown.
             take: takes the episode's last frames.
         """
         recording, is_complete = self._recording, facts["complete"]
@@ -603,7 +605,7 @@ class Recorder:
         self.run.leave()
 
     def _write_results(self) -> int:
-        """Write statistics and manifest; return the number of pending videos."""
+        """Write the statistics and manifest; return the number of pending videos."""
         listing = write_manifest_and_stats(
             self.directory,
             self.run.infix,

@@ -278,7 +278,7 @@ class KeptVideos:
             self._hand_on(list(self.held))
 
     def decide(self) -> None:
-        """Decide about all held recordings at the end of the run.
+        """Decide on all held recordings at the end of the run.
 
         Raises:
             InvalidArgument: the user's function could not choose. All held episodes are

@@ -36,9 +36,9 @@ class StateRecorder:
     action looks like and how long a step takes. Frames are taken at steps 0, n, 2n ...,
     where n is the smallest stride that respects `max_fps`, and always at the last step.
 
-    Errors are handled here. If no more frames can be made, the frames end and the
-    states continue. If nothing can be written any more, the recording ends there; this
-    raises an error unless `on_error` lets the simulation continue.
+    Errors are handled here. If no more frames can be taken, only the states are
+    recorded from then on. If nothing can be written any more, the recording ends there;
+    this raises an error unless `on_error` lets the simulation continue.
 
     Args:
         run: the monitored run.
@@ -53,9 +53,9 @@ class StateRecorder:
         is_alone: whether it may be deleted separately; it then gets its own log.
 
     Attributes:
-        early_end: the facts about the error that stopped the recording; None while it
-            goes on.
-        broken_reason: why no more frames are taken; None while they are.
+        early_end: the facts about the error that stopped the recording; None while the
+            recording continues.
+        broken_reason: why no more frames are taken; None while frames are taken.
     """
 
     def __init__(
@@ -115,7 +115,7 @@ class StateRecorder:
 
     @property
     def is_there(self) -> bool:
-        """Whether the log has any of its rows."""
+        """Whether the log has any rows of this recording."""
         return self._span is not None
 
     @property
@@ -272,7 +272,7 @@ class StateRecorder:
                 raise
 
     def drop(self) -> None:
-        """Discard its rows, even after the recording has ended.
+        """Discard the rows, even after the recording has ended.
 
         Raises:
             FileNotWritten: the disk is full.

@@ -81,7 +81,7 @@ class VideoRecorder:
         facts: function that returns additional metadata. It is called once there is a
             frame.
         strict: whether `close` raises an error if the images show nothing (all black, a
-            single color or no movement). Otherwise it logs a warning.
+            single colour or no movement). Otherwise it logs a warning.
         caption: function that returns the text to write on the current frame, or None.
 
     Raises:
@@ -221,7 +221,7 @@ class VideoRecorder:
         )
 
     def break_off(self, reason: str, *, frames: int) -> None:
-        """Stop after a number of frames. If it is 0, delete the frames so far."""
+        """Stop after the given number of frames. If it is 0, delete all frames."""
         if frames:
             self._breaks_off = frames, reason
         else:
@@ -291,7 +291,7 @@ class VideoRecorder:
         if path is None:
             return str(Path(tempfile.mkdtemp(prefix="mjrec-")) / f"video{extension}")
         if Path(path).suffix != extension:
-            kind = "text, an asciicast" if self.ansi_mode else "images, an mp4"
+            kind = "text (an asciicast)" if self.ansi_mode else "images (an mp4 file)"
             raise InvalidArgument(
                 f"With render_mode={self.env.render_mode!r} the recording is {kind}, "
                 f"so its path must end in {extension}, but it is {os.fspath(path)!r}."

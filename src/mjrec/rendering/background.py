@@ -8,7 +8,7 @@ no thread, no simulator and no OpenGL. It starts the process that does the work,
     {"expected": "<name>"|null}     a video will have to be rendered; the name is that
                                     of the recording that begins now, if there is one
     {"recording": "<name>"}         an ended trajectory, or the first part of a clip
-    {"waited_for": true}            nothing more comes for now
+    {"waited_for": true}            nothing more will come for now
 
 The process sends::
 
@@ -16,7 +16,8 @@ The process sends::
     {"done": "<recording>", "failures": {"<video or trajectory>": "..."}}
     {"log": ["mjrec.x", 30, "..."]}
 
-When the simulation's process ends, it ends at once and leaves the rest as it is.
+When the simulation's process ends, this process exits at once and leaves the rest
+unfinished.
 """
 
 from __future__ import annotations
@@ -62,7 +63,7 @@ class Background:
     `expect`, or the first recording, starts the process that does the work. It stays
     with its workers until `stop`. If it dies, a second process continues; if that one
     dies too, the rest stays pending. A process that hangs while `wait` waits for it is
-    ended and counts as dead. The process belongs to the one that created this object.
+    killed and counts as dead. The process belongs to the one that created this object.
 
     Args:
         directory: the monitor directory.
@@ -158,13 +159,13 @@ class Background:
             elif not has_news and timeout.is_over:
                 logger.error(
                     "The process that renders the videos of %s has shown no activity "
-                    "for %g seconds and is being ended. Its threads' stacks:\n%s",
+                    "for %g seconds and is being killed. Its threads' stacks:\n%s",
                     self._directory,
                     timeout.seconds,
                     child.stacks(),
                 )
                 child.kill()
-                self._replace(f"it hung for {timeout.seconds:g} seconds and was ended")
+                self._replace(f"it hung for {timeout.seconds:g} seconds and was killed")
                 timeout.renew()
         on_progress(self._progress)
         if self.waiting:
@@ -279,7 +280,7 @@ class _Stopped(BaseException):
 
 
 def main() -> None:
-    """Finish the recordings that the simulation's process names, until that ends."""
+    """Finish the recordings that the simulation's process names until it ends."""
     # Not imported at the top: the simulation's process does not need it.
     from .pool import WorkerPool
 
@@ -310,8 +311,8 @@ def _stop(signum: int, frame: object) -> None:
 
 
 def _leave() -> None:
-    # The signal wakes the main thread, wherever it waits. If that does not exit in
-    # time, the process is ended after this function returns.
+    # The signal wakes the main thread, wherever it waits. If that thread does not exit
+    # in time, the process is terminated after this function returns.
     os.kill(os.getpid(), signal.SIGTERM)
     time.sleep(_SECONDS_TO_LEAVE)
 
@@ -337,7 +338,7 @@ class _Work:
     last_report: float = 0.0
 
     def do(self, first: Mapping[str, Any]) -> None:
-        """Handle the parent's messages and send it the results, without returning.
+        """Handle the parent's messages and send it the results. Never returns.
 
         Args:
             first: the first message.

@@ -9,7 +9,7 @@ monitor had made it. `finish` renders these videos, and `mjrec render` any that 
 Episodes that can only be recorded live already have videos; those that were not chosen
 are removed.
 
-The process may be killed at any point, and all of this repeated.
+The process may be killed at any point, and all of this may be repeated.
 """
 
 from __future__ import annotations
@@ -39,13 +39,13 @@ def write_choice(
 ) -> set[RecordingKey]:
     """Write down which episodes of a chunk get a video. Idempotent.
 
-    An episode that was chosen earlier, among fewer episodes, keeps its video.
+    An episode that was chosen earlier, from fewer episodes, keeps its video.
 
     Args:
         folder: the chunk's monitor directory. Its monitors must be closed.
         chosen: the chosen episodes and their roles.
         rule: the rule that chose them.
-        finished: number of finished episodes among which they were chosen.
+        finished: number of finished episodes from which they were chosen.
         among: the monitor's infix, if other monitors in the directory do not belong to
             the chunk.
 
@@ -72,7 +72,7 @@ def write_choice(
         }
         filmed = {key for key in selections if key.number in live}
         for key, selection in selections.items():
-            # Recorded live, or chosen earlier among fewer episodes.
+            # Recorded live, or chosen earlier from fewer episodes.
             video = folder / key.video_name
             if metadata_path(video).exists():
                 amend_metadata(video, {"selection": selection})
@@ -101,7 +101,7 @@ def write_choice(
 def _promise_videos(
     folder: Path, selections: Mapping[RecordingKey, Mapping[str, Any]]
 ) -> set[RecordingKey]:
-    """Mark videos as pending in trajectories; return the episodes with a possible one.
+    """Mark videos as pending in trajectories; return the episodes that can have one.
 
     Episodes that are not in a finished trajectory are included.
     """

@@ -53,7 +53,7 @@ def finish(
 ) -> Iterator[RenderedVideos]:
     """Finish what is pending in a directory, and yield the result of each recording.
 
-    Recordings that need nothing yield no result. Recordings that another process is
+    Recordings that need no work yield no result. Recordings that another process is
     working on are left to it.
 
     Args:
@@ -118,12 +118,12 @@ def do_jobs(
     engine: Executor | None = None,
     on_progress: _OnProgress = lambda _: None,
 ) -> Iterator[RenderedVideos]:
-    """Do jobs and yield the result of each, unless it needed nothing.
+    """Do jobs and yield the result of each, unless there was nothing to do.
 
     With an engine, results are yielded in the order in which the jobs end.
 
     Args:
-        jobs: the jobs to do, with an engine in directories that all its workers see.
+        jobs: the jobs to do. All workers of an engine must see their directories.
         directory: the directory whose CPU locks are used if `workers` is None.
         workers: number of processes that draw. None means one for each free CPU.
         engine: an engine whose workers do the work instead.
@@ -206,7 +206,7 @@ def _result_of(done: JobOutcome, job: VideoJob) -> RenderedVideos:
 
 def environ_for_drawing() -> dict[str, str]:
     """Return environment variables for workers that draw, on any machine."""
-    # In each of several workers, Mesa's rasteriser would start one thread per CPU.
+    # In each of several workers, Mesa's rasterizer would start one thread per CPU.
     environ = {_RASTERISER_THREADS: os.environ.get(_RASTERISER_THREADS, "1")}
     if TRUST_VARIABLE in os.environ:
         # Workers on other machines do not inherit it from this process.

@@ -42,7 +42,7 @@ def note_failure(directory: Path, name: str, reason: str) -> None:
 
 
 class Finisher:
-    """Does the jobs that are added to it, in order, with one worker pool.
+    """Does the jobs added to it, in order, with one worker pool.
 
     Args:
         pool: the worker pool; `close` closes it.
@@ -95,7 +95,7 @@ class Finisher:
     def do_next(self) -> tuple[VideoJob, RenderedVideos]:
         """Do the next job, and return it with its result."""
         job, plan = self._waiting.pop(next(iter(self._waiting)))
-        # Count the frames that will not be drawn, too: they will not come any more.
+        # Also count the frames that will never be drawn.
         frames_done = self.progress.frames_done + plan.frame_count
         result = self._do(job)
         if plan.videos:

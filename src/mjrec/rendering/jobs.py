@@ -82,7 +82,7 @@ class View:
 
 @dataclass(frozen=True, kw_only=True)
 class Variant:
-    """Changes for re-rendering a recording; None means as recorded.
+    """Changes for rerendering a recording; None means as recorded.
 
     Attributes:
         view: the camera, size and quality.
@@ -108,7 +108,7 @@ class Variant:
 
 
 def plain_camera(camera: Any) -> PlainCamera:
-    """Return a camera in a JSON-serialisable form.
+    """Return a camera in a JSON-serializable form.
 
     Args:
         camera: a name, a number, a `mujoco.MjvCamera`, or a mapping of its members.
@@ -199,12 +199,12 @@ class RecordingKey:
 
     @property
     def shown_name(self) -> str:
-        """The name to show for it when only the key is known."""
+        """The name to show for the recording when only its key is known."""
         return self.name if self.is_clip else self.video_name
 
     @property
     def lock_name(self) -> str:
-        """The name of the file that the process working on it locks."""
+        """The name of the lock file for the process that works on the recording."""
         prefix_of = clip_prefix if self.is_clip else video_prefix
         return f".{prefix_of(self.infix, self.number)}.lock"
 
@@ -249,17 +249,17 @@ class VideoJob:
 
     @property
     def shown_name(self) -> str:
-        """The name to show for it before it is known which videos it writes."""
+        """The name to show for the job before its videos are known."""
         return self.key.shown_name if self.video is None else self.video.name
 
     @property
     def video_directory(self) -> Path:
-        """The directory of the videos that it writes."""
+        """The directory that the job writes its videos to."""
         return self.directory if self.video is None else self.video.parent
 
     @property
     def key(self) -> RecordingKey:
-        """The key of the recording that it finishes."""
+        """The key of the recording that the job finishes."""
         key = key_of(self.recording)
         assert key is not None
         return key

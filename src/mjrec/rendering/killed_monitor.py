@@ -2,7 +2,7 @@
 """Finishing the files of a monitor that was killed, or closed without waiting.
 
 Recordings in flight become trajectories, live videos get their final names, missing
-lines are added to the journal, and statistics and manifest are written from it.
+lines are added to the journal, and the statistics and the manifest are written from it.
 Meanwhile the monitor's lock is held, so that the monitor looks open to all other
 processes.
 """
@@ -57,7 +57,7 @@ class Report:
     failures: list[RecoveredFile] = field(default_factory=list)
 
     def note(self, name: str, what: str) -> None:
-        """Note what was done about a file."""
+        """Note what was done with a file."""
         self.files.append(RecoveredFile(name, what))
 
     @contextlib.contextmanager
@@ -86,7 +86,7 @@ class Report:
 def finish_killed_monitor(
     directory: Path, infix: str, report: Report, *, bundles: bool
 ) -> None:
-    """Finish everything of one monitor except pending videos, unless it is open.
+    """Finish all files of one monitor except pending videos, unless it is still open.
 
     Args:
         directory: the directory that it recorded into.
@@ -136,7 +136,7 @@ class _KilledMonitor:
         """Finish the monitor's files. The caller holds the monitor's lock.
 
         Args:
-            is_behind: whether statistics and manifest may be outdated.
+            is_behind: whether the statistics and the manifest may be outdated.
         """
         report = self.report
         for log in logs_left(self._files()):
@@ -220,7 +220,7 @@ class _KilledMonitor:
 
     @functools.cached_property
     def _entries(self) -> dict[int, journal.JournalEntry | None]:
-        """Journal entries of the episodes with files; None for an episode cut off.
+        """Journal entries of the episodes that have files; None where one was cut off.
 
         Episodes without files are left out: there may be millions.
         """

@@ -46,7 +46,8 @@ from ..plain_text import counted
 # Only the metadata of clips has this key.
 _FIRST_STEP = "first_step"
 _BROKEN = (
-    "the recording process was killed, and its encoder before it had finished the file"
+    "the recording process was killed, and so was its encoder, before the file was "
+    "finished"
 )
 
 

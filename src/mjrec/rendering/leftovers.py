@@ -100,7 +100,7 @@ def _has_work(log: Path) -> bool:
 
 
 def _kind_of(path: Path, files: MonitorFiles) -> Kind | None:
-    """Return the kind of a leftover file; None if nothing must be done about it."""
+    """Return the kind of a leftover file; None if nothing has to be done with it."""
     if path.suffix == ".lock" and path != files.lock:
         return None if is_locked(path) else "stale"
     final = final_name(path.name)

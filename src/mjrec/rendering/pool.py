@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """A pool of processes that draw frames, in order, for one caller.
 
-All processes that render into one directory share the machine's CPUs. Each CPU is a
-lock file, `.openaigym.render.<number>.lock`, and the process that holds it may keep one
-worker busy. If eight processes record into one directory on a machine with two CPUs,
-two workers are busy, not sixteen.
+All processes that render into one directory share the machine's CPUs. Each CPU is
+represented by a lock file, `.openaigym.render.<number>.lock`, and the process that
+holds it may keep one worker busy. If eight processes record into one directory on a
+machine with two CPUs, two workers are busy, not sixteen.
 """
 
 from __future__ import annotations
@@ -57,11 +57,11 @@ class WorkerPool:
     its pipe. At most two frames per worker are buffered here. A worker that dies is
     restarted at the frame that it owes; if it dies twice at the same frame, that is an
     error. A worker that sends nothing for `timeout_s` while the pool waits for it is
-    ended and counts as dead; the log shows where it hung.
+    killed and counts as dead; the log shows where it hung.
 
     The processes start when needed, or with `start`, and stay until `close`, garbage
     collection or the end of this process. Only a worker whose job is abandoned midway
-    is ended, and restarted for the next job.
+    is terminated, and it is restarted for the next job.
 
     Workers use the backend that `MUJOCO_GL` names. If it names none, or turns rendering
     off (which applies to the simulation), each starts with EGL and checks a test frame
@@ -77,8 +77,8 @@ class WorkerPool:
                 ...
 
     Args:
-        workers: number of processes. If there are several, each uses one CPU. None is
-            one for each CPU of the directory that is free when a job begins.
+        workers: number of processes. If there are several, each uses one CPU. None
+            means one for each of the directory's CPUs that is free when a job begins.
         directory: the directory whose CPU locks are used.
         trust_models: whether workers load compiled models from untrusted sources. They
             do so in any case if `MJREC_TRUST_MODELS` allows it here.
@@ -168,8 +168,8 @@ class WorkerPool:
             trajectory: the trajectory's file.
             indices: the numbers of the frames, from 0, in ascending order.
             view: the camera, size and quality; None means as recorded.
-            cameras: cameras that replace that of the view; None among them is as
-                recorded. Each frame is then a grid of their frames.
+            cameras: the cameras to use in place of the view's; None in the list stands
+                for the recorded camera. Each frame is then a grid of their frames.
 
         Raises:
             UnreadableFile: the trajectory or its model cannot be read.
@@ -322,7 +322,7 @@ class WorkerPool:
         worker.child.send(drawing=job.drawing, indices=indices)
 
     def _wait_for_news(self, job: _Job) -> None:
-        """Wait until a worker sends something; end workers that exceed the timeout."""
+        """Wait until a worker sends something; kill workers that exceed the timeout."""
         hungry = [worker for worker in job.workers if worker.may_send]
         for worker in hungry:
             if worker.child is None:
@@ -387,13 +387,13 @@ class WorkerPool:
         seconds = self._timeout.seconds
         logger.error(
             "A render worker hangs: it has drawn nothing for %g seconds and is being "
-            "ended. Its threads' stacks:\n%s",
+            "killed. Its threads' stacks:\n%s",
             seconds,
             worker.child.stacks(),
         )
         worker.child.kill()
         how = (
-            f"it drew nothing for {seconds:g} seconds and was ended; the log shows "
+            f"it drew nothing for {seconds:g} seconds and was killed; the log shows "
             "where it hung"
         )
         self._lose(worker, job, "hung", how)
@@ -433,7 +433,7 @@ class _Worker:
     Attributes:
         child: the process; None if it is not running.
         shape: the shape of its frames.
-        arrived: the frames that it has sent and that were not taken yet.
+        arrived: the frames that it has sent and that have not been taken yet.
         owes: the positions of the frames that it still has to send.
         error: the error that replaces the next frame.
         lost_at: the position at which a process was last lost.
@@ -451,7 +451,7 @@ class _Worker:
 
     @property
     def may_send(self) -> bool:
-        """Whether it owes a frame, and the buffer has room for one."""
+        """Whether the worker owes a frame and its buffer has room for one."""
         is_full = len(self.arrived) >= _MOST_BUFFERED
         return bool(self.owes) and self.error is None and not is_full
 
@@ -490,7 +490,7 @@ def _environment(environ: Mapping[str, str], *, alone: bool) -> dict[str, str]:
         )
         del changed["LP_NATIVE_VECTOR_WIDTH"]
     if not alone:
-        # In each worker, Mesa's rasteriser would start one thread per CPU. Even a
-        # single extra thread brings nothing: the worker would only wait for it.
+        # In each worker, Mesa's rasterizer would start one thread per CPU. Even a
+        # single extra thread gains nothing: the worker would only wait for it.
         changed.setdefault("LP_NUM_THREADS", "0")
     return changed

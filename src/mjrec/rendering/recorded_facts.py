@@ -155,8 +155,8 @@ def check_has_frames(reader: TrajectoryReader) -> None:
         "it ended before the first" if facts.get("scene") else "none were recorded"
     )
     raise NoPictures(
-        f"{reader.path} contains no snapshots to draw frames from: {reason}. If it has "
-        "states, mjrec.render_states can draw those."
+        f"{reader.path} contains no snapshots to draw frames from: {reason}. If it "
+        "has states, mjrec.render_states can draw them."
     )
 
 
@@ -198,7 +198,7 @@ def chosen_frames(
         elif count > 1:
             raise InvalidArgument(
                 "max_fps needs the number of control steps per second, but this "
-                "recording ended before that was written. Omit max_fps."
+                "recording ended before the number was known. Omit max_fps."
             )
     last = [count - 1] if count else []
     return ChosenFrames([*range(0, count - 1, every), *last], every)

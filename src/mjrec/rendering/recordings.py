@@ -54,7 +54,7 @@ class Plan:
     Attributes:
         parts: the paths of its parts, in order. Parts still in a log have no file.
         videos: the videos to render, the first camera's first.
-        frame_count: number of frames to render, in all videos together.
+        frame_count: total number of frames to render in all videos.
         logs: the logs that still contain its rows.
         is_kept: whether the trajectory stays after the video is finished.
         model_file: the model file that rendering needs, if known.
@@ -91,12 +91,12 @@ class Recorded:
 
     @property
     def is_clip(self) -> bool:
-        """Whether it is a clip."""
+        """Whether the recording is a clip."""
         return clip_step(self.parts[0].name) is not None
 
     @property
     def timing(self) -> Mapping[str, Any]:
-        """The facts of the first part that has the duration of a step."""
+        """The facts of the first part that records how long a step takes."""
         known = (facts for facts in self.facts if facts.get("timestep") is not None)
         return next(known, self.facts[0])
 

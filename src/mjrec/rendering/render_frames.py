@@ -123,11 +123,11 @@ def render_states(
     Args:
         model: a `mujoco.MjModel`, or dm_control's wrapper of one.
         states: `(n, size)`, a row per frame.
-        spec: the components of a row, a combination of `mujoco.mjtState`. All other
-            components are as in a new `MjData`.
+        spec: the components of a row, a combination of `mujoco.mjtState` flags. All
+            other components are as in a new `MjData`.
         height: height in pixels.
         width: width in pixels.
-        camera: name or number of one of the model's cameras, -1 for the free camera, an
+        camera: name or number of one of the model's cameras, -1 for the free camera, a
             `mujoco.MjvCamera`, or a mapping of its members.
         quality: `"full"` or `"draft"`.
         workers: number of worker processes.

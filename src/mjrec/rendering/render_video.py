@@ -93,8 +93,8 @@ def render_video(
         on_frame: called once for every frame of every video.
 
     Returns:
-        The videos. If the recording broke before its first frame, no videos, only the
-        trajectory's name; the metadata then says so.
+        The videos. If the recording stopped before its first frame, there are no
+        videos, only the trajectory's name, and the metadata says so.
 
     Raises:
         NoPictures: the recording has no frames.
@@ -223,7 +223,7 @@ def _metadata(recorded: Recorded) -> dict[str, Any]:
         "content_type": "video/mp4",
         **recording_facts(first, recording="deferred"),
         "rendered_with": dict(versions()),
-        # Software rasterisers round as their CPU does.
+        # Software rasterizers round as their CPU does.
         "machine": dict(machine_fingerprint()),
         "complete": complete,
         "length": last.get("length", recorded.step_count),
@@ -251,7 +251,7 @@ def _metadata(recorded: Recorded) -> dict[str, Any]:
 def _shots(
     recording: Path, facts: Mapping[str, Any], view: View, out: Path | None
 ) -> list[_Shot]:
-    """Return the videos to render, the first camera's last."""
+    """Return the videos to render; the first camera's comes last."""
     video = video_facts(facts)
     label = (facts.get("scene") or {}).get("label")
     further = list(video.get("cameras") or ())[1:]

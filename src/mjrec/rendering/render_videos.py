@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rendering a directory's pending videos, or re-rendering recorded episodes."""
+"""Rendering a directory's pending videos, or rerendering recorded episodes."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def render_videos(
     engine: Executor | str | None = None,
     on_progress: _OnProgress | None = None,
 ) -> RenderedVideos:
-    """Render the pending videos of a directory, or re-render recorded episodes.
+    """Render the pending videos of a directory, or rerender recorded episodes.
 
     Without options, pending videos are rendered as planned. Several calls, in any
     processes, share the work of a directory. With `camera`, `height`, `width`,
@@ -240,7 +240,7 @@ def _variant_jobs(
     *,
     strict: bool,
 ) -> list[VideoJob]:
-    """Return the jobs that re-render episodes with changes.
+    """Return the jobs that rerender episodes with changes.
 
     Raises:
         InvalidArgument: there are no trajectories, or `out` is given for several

@@ -133,8 +133,8 @@ def trajectory_drawing(
     Args:
         path: the trajectory; its model is expected next to it.
         view: changes from the recording.
-        cameras: cameras that replace that of the view; None among them means as
-            recorded. Each frame is then a grid of their frames.
+        cameras: the cameras to use in place of the view's; None in the list stands for
+            the recorded camera. Each frame is then a grid of their frames.
         canvas: the canvas to draw with; None creates a new one.
 
     Raises:

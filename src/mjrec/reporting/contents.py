@@ -56,7 +56,7 @@ class ReportVideo:
         camera: a description of the camera; None if unknown.
         renderer: the OpenGL renderer that drew it; None if unknown.
         sha256: the SHA-256 of the file; None if the metadata lacks it.
-        command: the shell command that re-renders it; None without recorded states.
+        command: the shell command that rerenders it; None without recorded states.
         notes: remarks, for example that the video is incomplete.
         trajectory: the file of the recorded states; None if there are none.
         replay: the address of its 3D page, relative to the report's; empty if there is
@@ -95,7 +95,7 @@ class ReportTask:
             seeds. Otherwise they come from monitors, in order of time, as in training.
         summary: the summary of its episodes.
         episodes: `(n,)` of dtype `ROW`, so that a million of them need little memory.
-            Of monitors, `seed` is the index into `runs`, and `start_time` is the time
+            For monitors, `seed` is the index into `runs`, and `start_time` is the time
             of the end.
         runs: the names of the runs, if they are monitors.
         failures: the reasons why episodes failed, by index.

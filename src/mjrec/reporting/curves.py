@@ -73,8 +73,10 @@ def learning_curve(task: ReportTask, *, key: str) -> str:
     return _svg(
         panel.elements,
         title=f"Returns of {task.name} over episodes",
-        description=f"{_in_words(task.summary)} Running mean over {window} episodes, "
-        "and the range of the middle 80 %.",
+        description=(
+            f"{_in_words(task.summary)} Running mean over {window} episodes, and the "
+            "range of the middle 80%."
+        ),
         key=key,
     )
 
@@ -83,8 +85,8 @@ def evaluation_curve(task: ReportTask, *, key: str) -> str:
     """Return a figure of an evaluation's returns, by seed and by share reached.
 
     On the left, each episode is a dot above its seed, each seed's mean is a short line,
-    and the overall mean is a long line with its interval. On the right is, for each
-    return, the share of episodes that reach it.
+    and the overall mean is a long line with its interval. On the right, a curve shows
+    the share of episodes that reach each return.
 
     Args:
         task: a task of an evaluation.
@@ -114,7 +116,7 @@ def evaluation_curve(task: ReportTask, *, key: str) -> str:
     heights = np.sort(returns)[::-1][_spread(len(returns), _MOST_POINTS)]
     edges = np.linspace(0, 1, len(heights) + 1)
     shares.line(np.repeat(edges, 2)[1:-1], np.repeat(heights, 2), "accent")
-    shares.label("", "Share reaching it", [(0, "0"), (0.5, "50 %"), (1, "100 %")])
+    shares.label("", "Share reaching it", [(0, "0"), (0.5, "50%"), (1, "100%")])
     return _svg(
         dots.elements + shares.elements,
         title=f"Returns of {task.name} by seed",
@@ -171,7 +173,7 @@ def _drawable(task: ReportTask) -> tuple[NDArray[np.int64], _Floats, _Floats]:
 def _running(
     returns: _Floats, window: int
 ) -> tuple[_Floats, _Floats, _Floats, _Floats]:
-    """Return the centres of running windows, and their 10 %, mean and 90 % values."""
+    """Return the centres of running windows, and their 10%, mean and 90% values."""
     count = max(0, len(returns) - window + 1)
     if not count:
         return (np.empty(0),) * 4

@@ -71,7 +71,7 @@ def gather(
     """Return the contents of a report, without copies of the videos.
 
     Args:
-        directories: one or several evaluations, monitor directories, or folders that
+        directories: one or more evaluations, monitor directories, or folders that
             directly contain such directories.
         title: the page's title. None derives it from the recordings.
         verifications: outputs of `mjrec verify --json`, in addition to the
@@ -106,7 +106,7 @@ def gather(
 
 
 def _find_recordings(directories: Directories) -> list[Path]:
-    """Return the directories that have recordings, each once, in the given order."""
+    """Return the directories that have recordings, in order, without duplicates."""
     if isinstance(directories, str | os.PathLike):
         directories = [directories]
     found: dict[str, Path] = {}
@@ -122,7 +122,7 @@ def _find_recordings(directories: Directories) -> list[Path]:
 
 
 def _recordings_in(directory: Path) -> list[Path]:
-    """Return the directory if it has recordings, otherwise its folders that have."""
+    """Return the directory if it has recordings, otherwise its folders with some."""
     if not directory.is_dir():
         what = "is a file" if directory.exists() else "does not exist"
         raise InvalidArgument(
@@ -167,7 +167,7 @@ def _has_episodes(files: MonitorFiles) -> bool:
 class _Recorded:
     """The recordings of one environment by all monitors, in compact form."""
 
-    # Each different pair once, in order: there may be thousands of monitors.
+    # Distinct pairs only, in order: there may be thousands of monitors.
     provenance: dict[tuple[str, str], None] = field(default_factory=dict)
     videos: list[ReportVideo] = field(default_factory=list)
     runs: list[str] = field(default_factory=list)
@@ -196,7 +196,7 @@ def _add_monitors(
         recorded.rows.append(rows_of_monitor(episodes, run=len(recorded.runs)))
         recorded.runs.append(monitor.files.infix)
         recorded.provenance |= dict.fromkeys(monitor_facts.pairs_of_monitor(monitor))
-    # Monitors of which nothing could be read are not an environment.
+    # Monitors that could not be read at all are not an environment.
     unknown = by_name.get(_UNKNOWN_ENVIRONMENT)
     if unknown and not unknown.videos and not any(map(len, unknown.rows)):
         del by_name[_UNKNOWN_ENVIRONMENT]
@@ -319,7 +319,7 @@ def _videos_of_task(
     task: str,
     provenance: list[tuple[str, str]],
 ) -> list[ReportVideo]:
-    """Return the videos of a task's episodes, with the indices of these.
+    """Return the videos of a task's episodes, with the indices of the episodes.
 
     Videos without an episode are left out: they come from a batch that was killed and
     repeated.

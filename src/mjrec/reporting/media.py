@@ -66,7 +66,7 @@ def is_own_name(name: str) -> bool:
 
 
 def add_images(contents: ReportContents, on_progress: OnProgress) -> None:
-    """Set the image of each video, except of text recordings and broken videos.
+    """Set the image of each video, except for text recordings and broken videos.
 
     Missing durations of videos are filled in. Videos that cannot be decoded are added
     to the problems.

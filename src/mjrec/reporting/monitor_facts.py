@@ -185,7 +185,7 @@ def _joined(*texts: Any) -> str:
 def recorded_videos(
     results: MonitorResults, directory: Path, problems: list[str]
 ) -> list[ReportVideo]:
-    """Return the finished videos of a monitor that exist, each once.
+    """Return the existing finished videos of a monitor, without duplicates.
 
     These are the videos that its manifest lists, and those that were finished after the
     manifest was written, from all cameras. Text recordings are included.
@@ -270,7 +270,7 @@ def _video(
 
 
 def _command(path: Path, facts: Mapping[str, Any], trajectory: Path) -> str | None:
-    """Return the shell command that re-renders a video into a new file."""
+    """Return the shell command that rerenders a video into a new file."""
     camera = facts.get("camera")
     options = []
     if view_of(path.name) and "tiled" not in facts:
@@ -308,7 +308,7 @@ def _notes(facts: Mapping[str, Any]) -> Iterator[str]:
             spaced(selection["rule"][:_LONGEST_TEXT]),
             selection.get("finished"),
         )
-        of = f" among {among} episodes" if type(among) is int else ""
+        of = f" from {among} episodes" if type(among) is int else ""
         if selection.get("decided") is True:
             yield f"Chosen by {rule}{of} after they had ended."
         else:

@@ -84,7 +84,7 @@ def page_of(contents: ReportContents) -> str:
         bars=[_bar(task.summary) for task in contents.tasks],
         intervals=intervals,
         notes=_notes(contents.tasks, methods, intervals),
-        percent=f"{how.confidence * 100:.4g}\N{NO-BREAK SPACE}%",
+        percent=f"{how.confidence * 100:.4g}%",
         num_series=SERIES,
         method_of=lambda scores: _in_words(scores.interval_method, how),
         profile=_profile(contents),
@@ -142,9 +142,7 @@ def _environment() -> Any:
         address=lambda path: escape(address(path)),
         number=number,
         interval=interval_text,
-        share=lambda value: (
-            NOTHING if value is None else f"{value * 100:.0f}\N{NO-BREAK SPACE}%"
-        ),
+        share=lambda value: NOTHING if value is None else f"{value * 100:.0f}%",
         sorted_by=lambda v: "" if v is None or math.isnan(v) else repr(float(v)),
     )
     environment.globals.update(decimals_of=_decimals_of, counted=counted)

@@ -33,7 +33,7 @@ def decimals_for(values: Iterable[float | None]) -> int:
 def number(value: float | None, decimals: int) -> str:
     """Return a number as a string; a dash for None and NaN.
 
-    From 10 000 on, thousands are separated.
+    From 10,000 up, digits are grouped in thousands.
     """
     if value is None or math.isnan(value):
         return NOTHING

@@ -60,7 +60,7 @@ def write_report(
     MuJoCo or OpenGL. Unreadable files are named on the page.
 
     Args:
-        directories: one or several evaluations, monitor directories, or folders that
+        directories: one or more evaluations, monitor directories, or folders that
             contain them.
         path: the folder to write. An existing report is replaced; any other non-empty
             folder is left alone. With `single_file` it may end in `.html`, and is then

@@ -40,7 +40,7 @@ class Episode:
         trajectory: the episode's trajectory, if it has one. The file may not exist yet:
             `load_trajectory` then reads the monitor's log.
         pending: whether the video must still be rendered (`mjrec render`).
-        success: whether the environment reported a success.
+        success: whether the environment reported success.
         evaluation: for an episode of an evaluation, its `seed`, its number there
             (`episode`), and MuJoCo's `warnings`.
     """

@@ -75,7 +75,7 @@ class MonitorResults:
 
     @functools.cached_property
     def run(self) -> Run:
-        """The run from the journal, or from the manifest if the journal lost its start.
+        """The run, from the journal or, if that lacks its start, from the manifest.
 
         Raises:
             UnreadableFile: the journal cannot be read, and there are no statistics.

@@ -225,7 +225,7 @@ def finished_and_broken(
 ) -> tuple[list[tuple[str, str]], list[str]]:
     """Return finished videos with their metadata, and the metadata of broken videos.
 
-    Videos from further cameras exist once the first camera's video does, because its
+    Videos from additional cameras exist once the first camera's video does, because its
     metadata is written last. A vector environment's tiled video is independent of that.
     """
     names = {f"{video_prefix(infix, number)}.mp4" for number in run.filmed}

@@ -27,7 +27,7 @@ _KEYS = (
 
 
 class MergedStats(NamedTuple):
-    """The episodes of several statistics files, ordered by their ends.
+    """The episodes of several statistics files, ordered by end time.
 
     Attributes:
         data_sources: index of each episode's file, which is also an index into
@@ -101,7 +101,7 @@ def load_results(directory: str | os.PathLike[str]) -> dict[str, Any] | None:
 
 
 def merge_stats_files(paths: Iterable[str | os.PathLike[str]]) -> MergedStats:
-    """Return the episodes of statistics files, ordered by their ends.
+    """Return the episodes of statistics files, ordered by end time.
 
     Raises:
         UnreadableFile: a file is missing or damaged.

@@ -31,7 +31,7 @@ class Run:
     Attributes:
         facts: the facts in the journal's first line: `env_info`, `schedule` (its name),
             `keep` (`rule`), `first_episode_id`, `versions`, and `views` (the parts
-            before the ending in the names of further cameras' videos).
+            before the ending in the names of additional cameras' videos).
         provenance: the run's provenance; None if unknown.
         count: number of completed episodes.
         last_episode_id: the highest number of a started episode; -1 if there is none.

@@ -181,7 +181,7 @@ class Capture:
         """Write a snapshot, from which the current frame can be drawn, into `out`.
 
         Args:
-            out: the words to write, all of which are set.
+            out: the words to write; all of them are set.
 
         Returns:
             Model and view fields that have changed since the last capture, or since
@@ -238,7 +238,7 @@ class Capture:
             self._store.finish()
 
     def close(self) -> None:
-        """Release the model and data. Idempotent. Waiting models are still stored."""
+        """Release the model and data. Idempotent. Queued models are still stored."""
         if self._store is not None:
             self._store.leave()
         self._look_closely()
@@ -248,7 +248,7 @@ class Capture:
     def _stored_model(
         self, model: mujoco.MjModel
     ) -> tuple[_StoredModel, dict[str, NDArray[Any]]]:
-        """Return the stored model, and the fields that have changed since then."""
+        """Return the stored model, and the fields changed since it was stored."""
         if self._stored is not None and self._stored.looks.is_of(model):
             fields = self._stored.looks.since_stored()
             if all(map(is_settable, fields)):
@@ -306,13 +306,13 @@ class Capture:
         fixed = [name for name in changed or () if not is_settable(name)]
         if fixed:
             raise _differs(
-                f"{', '.join(fixed)} of the model changed during the episode, and with "
-                "it the model's structure"
+                f"{', '.join(fixed)} of the model changed during the episode, and so "
+                "did the model's structure"
             )
         return changed
 
     def _followed(self) -> tuple[_StoredModel, _Frames]:
-        """Return the stored model and its frames, even if other objects hold them."""
+        """Return the stored model and its frames, even if the objects have changed."""
         model, data = self._simulation()
         stored, frames = self._stored, self._frames
         if stored is None or frames is None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A process with limits that reads untrusted files, and the program that it runs.
+"""A resource-limited process that reads untrusted files, and the program that it runs.
 
 A few kilobytes of HDF5 can claim any amount of memory. The same data under a million
 names can take any amount of time. A damaged file may crash or hang the HDF5 library.
@@ -84,7 +84,7 @@ def open_vetted_trajectory(path: Path) -> TrajectoryReader:
 def compile_sources(
     path: Path, *, compiled_size: int, seconds: float = _COMPILING_SECONDS
 ) -> mujoco.MjModel:
-    """Return the model passed to `write_authored`, compiled by this MuJoCo.
+    """Return the model passed to `write_authored`, compiled by the installed MuJoCo.
 
     Args:
         path: the zip file.
@@ -93,7 +93,7 @@ def compile_sources(
         seconds: the time limit.
 
     Raises:
-        UnreadableFile: the file is damaged or dangerous, this MuJoCo rejects it, or
+        UnreadableFile: the file is damaged or dangerous, MuJoCo rejects it, or
             compiling exceeds the time or memory limit.
     """
     # Imported here, because reading trajectories needs no simulator.
@@ -109,7 +109,7 @@ def compile_sources(
 def _done(
     task: str, path: Path, limits: dict[str, int], seconds: float
 ) -> Iterator[Path]:
-    """Run a task on a file in a process with limits, and yield its output directory.
+    """Run a task on a file in a limited process, and yield its output directory.
 
     Raises:
         UnreadableFile: the task failed or took too long.

@@ -159,7 +159,7 @@ def context_kept(*, or_none: bool = False) -> Iterator[None]:
 
 @contextlib.contextmanager
 def collection_paused() -> Iterator[None]:
-    """Pause the garbage collector in the block.
+    """Pause the garbage collector inside the block.
 
     When mujoco's renderers are collected, they free their OpenGL objects in whichever
     context is current. A frame that is drawn there then contains arbitrary memory.

@@ -107,10 +107,10 @@ class Looks:
         """Return the watched fields that have changed since the last look.
 
         Args:
-            anything: whether to compare textures, meshes and the like too.
+            anything: whether to compare textures, meshes and so on too.
 
         Returns:
-            Copies by name, or None if nothing has changed, which is found out in less
+            Copies by name, or None if nothing has changed; finding that out takes less
             than a microsecond.
         """
         if not anything and self.seen == self.present:

@@ -47,8 +47,8 @@ _EPOCH = (1980, 1, 1, 0, 0, 0)
 _DIRECTORIES = ("assetdir", "meshdir", "texturedir")
 _XML_ELEMENTS = ("include", "model")
 
-# A path is composed of several attributes, each of which may go up this many levels.
-# The files are compiled deeper than that in an empty directory, so `..` finds nothing.
+# A path is composed of several attributes, and each may go up this many levels. The
+# files are compiled deeper than that in an empty directory, so `..` finds nothing.
 _MOST_UP = 4
 _EMPTY = PurePosixPath(*["x"] * 8 * _MOST_UP)
 
@@ -111,13 +111,13 @@ def write_authored(path: Path, authored: AuthoredModel, model: mujoco.MjModel) -
 
 
 def read_authored(path: Path) -> mujoco.MjModel:
-    """Return the model that was passed to `write_authored`, compiled by this MuJoCo.
+    """Return the model passed to `write_authored`, compiled by the installed MuJoCo.
 
     Use this only in a sandbox, because an untrusted file may take any amount of time
     and memory.
 
     Raises:
-        UnreadableFile: the file is damaged or dangerous, or this MuJoCo rejects it.
+        UnreadableFile: the file is damaged or dangerous, or MuJoCo rejects it.
     """
     sources, fields = {}, {}
     try:
@@ -264,7 +264,7 @@ def _gathered(main: Path) -> AuthoredModel:
 def _existing(
     bases: Iterable[Path], directories: Iterable[str], reference: str
 ) -> list[Path]:
-    """Return every file that the reference may mean."""
+    """Return every file that the reference may refer to."""
     # MJCF's `strippath` removes the directories from a name.
     names = {reference, PurePosixPath(reference).name}
     candidates = {

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The models of the recordings in a directory, each of which is stored once.
+"""The models of the recordings in a directory, each stored once.
 
 ::
 
@@ -7,7 +7,7 @@
     ├── openaigym.model.<16 hex digits>.mjb.gz    the compiled model, exactly
     └── openaigym.model.<16 hex digits>.zip       its sources, if known
 
-The digits are the beginning of the compiled model's sha256. Only the MuJoCo version
+The digits are the first ones of the compiled model's sha256. Only the MuJoCo version
 that compiled a model can load it. The zip file is for all other versions, and for all
 users except the one who stored the model (see `model_trust`).
 """
@@ -74,7 +74,7 @@ class ModelStore:
     def add(
         self, model: mujoco.MjModel, authored: AuthoredModel | None = None
     ) -> dict[str, Any]:
-        """Store a model as it is now. It is written on another thread.
+        """Store a model as it is now. Another thread writes it.
 
         Args:
             model: the model; it is not modified, and it is not used after this call.
@@ -83,7 +83,7 @@ class ModelStore:
                 sources are not stored, and the file named by `xml` will not exist.
 
         Returns:
-            The facts with which `load_model` finds the model: its `sha256`, its size
+            The facts that `load_model` needs to find the model: its `sha256`, its size
             in `bytes`, the base names of its files `mjb` and `xml` (which may be None),
             and the `mujoco` version.
         """
@@ -141,7 +141,7 @@ class ModelStore:
                 path = path.with_name(f"{job.stem}.zip")
                 _write(path, lambda part: write_authored(part, authored, model))
         except ValueError as error:
-            logger.debug("%s is not stored: %s", path.name, error)
+            logger.debug("%s was not stored: %s", path.name, error)
         except OSError as error:
             failure = FileNotWritten(path, error.strerror or error)
             self._failed.append((job, failure))
@@ -174,7 +174,7 @@ def load_model(
         if source is None:
             raise
         objection = error
-    logger.info("%s The model is compiled from %s.", objection, source.name)
+    logger.info("%s Compiling the model from %s instead.", objection, source.name)
     # Imported here, because it loads h5py, which recording does not need.
     from .foreign_files import compile_sources
 
@@ -221,7 +221,8 @@ def _path(directory: Path, name: object) -> Path | None:
     if not isinstance(name, str) or not _NAME.fullmatch(name):
         raise UnreadableFile(
             directory,
-            f"a recording in it names a model {name!r:.200}, which is not a valid name",
+            f"a recording in it refers to a model by {name!r:.200}, which is not a "
+            "valid name",
         )
     return directory / name if (directory / name).exists() else None
 
@@ -253,7 +254,7 @@ def _recorded_size(path: Path, facts: Mapping[str, Any]) -> int:
 
 
 def _read_gzip(path: Path, size: int) -> bytes:
-    """Decompress a file that must contain `size` bytes, and never more than that."""
+    """Decompress a file of exactly `size` bytes; never decompress more than that."""
     with unreadable(path), open_regular(path) as file:
         # The gzip module would parse a header of any length, and any number of empty
         # streams, byte by byte in Python.
@@ -263,8 +264,9 @@ def _read_gzip(path: Path, size: int) -> bytes:
         except zlib.error as error:
             raise ValueError(f"it is damaged ({error})") from error
         if len(content) != size or not stream.eof or stream.unused_data:
-            there = "more" if len(content) >= size else f"{len(content)} bytes"
-            raise ValueError(f"it contains {there}, not the recorded {size} bytes")
+            is_short = len(content) < size
+            there = f"{len(content)} bytes, not" if is_short else "more than"
+            raise ValueError(f"it contains {there} the recorded {size} bytes")
         return content
 
 

@@ -91,7 +91,7 @@ def note_models(digests: Iterable[str]) -> None:
 
 @contextlib.contextmanager
 def noting_models() -> Iterator[list[str]]:
-    """Yield a list that collects the hashes of all models stored in the block."""
+    """Yield a list that collects the hashes of all models stored inside the block."""
     noted: list[str] = []
     token = _noting.set(noted)
     try:
@@ -147,7 +147,7 @@ def is_trusted() -> bool:
 
 @contextlib.contextmanager
 def trusting_models() -> Iterator[None]:
-    """Allow this process, and those that it starts in the block, to load all models.
+    """Allow this process, and those that it starts in the block, to load any model.
 
     Use this only in a program's own main thread, because environment variables are
     global.

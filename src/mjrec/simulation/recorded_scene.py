@@ -121,22 +121,23 @@ class RecordedScene:
 
 
 def check_states(model: Any, states: ArrayLike, spec: int) -> NDArray[np.float64]:
-    """Return `states` as `(n, size) float64`.
+    """Return `states` as an `(n, size)` array of float64.
 
     Args:
         model: a `mujoco.MjModel`, or dm_control's wrapper of one.
         states: one row per state.
-        spec: the components of a row, a combination of `mujoco.mjtState`.
+        spec: the components of a row, a combination of `mujoco.mjtState` flags.
 
     Raises:
-        InvalidArgument: `spec` is not a combination of states, or `states` has the
-            wrong type or shape.
+        InvalidArgument: `spec` is not a combination of `mujoco.mjtState` flags, or
+            `states` has the wrong type or shape.
     """
     try:
         size = int(mujoco.mj_stateSize(raw_model(model), int(spec)))
     except (TypeError, ValueError, mujoco.FatalError) as error:
         raise InvalidArgument(
-            f"spec must be a combination of mujoco.mjtState, not {spec!r}: {error}."
+            f"spec must be a combination of mujoco.mjtState flags, not {spec!r}: "
+            f"{error}."
         ) from error
     rows = np.asarray(states)
     if rows.dtype.kind not in "iuf":

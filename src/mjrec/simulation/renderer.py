@@ -166,7 +166,7 @@ class Canvas:
             yield
 
     def _load(self, model: mujoco.MjModel) -> None:
-        """Copy the parts of a model that the context keeps to the context."""
+        """Copy into the context the parts of a model that it keeps."""
         height, width = self._rectangle.height, self._rectangle.width
         with self._current():
             # The longest side that the driver can draw.

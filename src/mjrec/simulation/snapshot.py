@@ -194,16 +194,16 @@ def _check_paths(model: mujoco.MjModel, data: mujoco.MjData) -> None:
         )
     if wrapped.size and (wrapped.min() < _PULLEY or wrapped.max() >= model.ngeom):
         raise InvalidArgument(
-            f"The snapshot's wrap_obj must be from {_PULLEY} (a pulley) and -1 (a "
-            f"site) to {model.ngeom - 1} for this model, but its values range from "
-            f"{wrapped.min()} to {wrapped.max()}."
+            f"The snapshot's wrap_obj must be {_PULLEY} (a pulley), -1 (a site) or a "
+            f"geom's number up to {model.ngeom - 1} for this model, but its values "
+            f"range from {wrapped.min()} to {wrapped.max()}."
         )
 
 
 def scene_difference(
     model: mujoco.MjModel, data: mujoco.MjData, row: Any, view: SceneView
 ) -> str | None:
-    """Return how a frame from a snapshot would differ from one of the live data.
+    """Return how a frame drawn from a snapshot would differ from a live one.
 
     Neither the model nor the data is modified.
 

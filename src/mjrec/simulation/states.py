@@ -103,7 +103,7 @@ def _time(data: mujoco.MjData) -> NDArray[np.float64]:
 
 @functools.cache
 def _time_offset() -> int:
-    """Find the offset of the time from its neighbor, by setting the time."""
+    """Find the offset of the time from its neighbour, by setting the time."""
     data = mujoco.MjData(mujoco.MjModel.from_xml_string("<mujoco/>"))
     start = address_of(getattr(data, _NEIGHBOUR)) - _REACH
     near = np.frombuffer(memoryview(raw_memory(start, 3 * _REACH)), np.float64)
@@ -209,7 +209,7 @@ def turns_by_rk4(model: mujoco.MjModel) -> bool:
 
 
 class PreservedState:
-    """The state of a simulation, which is preserved over a block.
+    """A simulation's state, preserved across a block.
 
     After the block, all of the data is restored, and so are the positions, sizes and
     colours of the model's sites, geoms and bodies. The arrays keep their addresses.
@@ -221,7 +221,7 @@ class PreservedState:
 
     @contextlib.contextmanager
     def around(self, model: mujoco.MjModel, data: mujoco.MjData) -> Iterator[None]:
-        """Preserve `model` and `data` over the block, even if it raises an error.
+        """Preserve `model` and `data` across the block, even if it raises an error.
 
         Not reentrant.
         """

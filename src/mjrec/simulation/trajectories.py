@@ -81,7 +81,7 @@ class Trajectory:
     `mocap_pos`, `mocap_quat` and `userdata`, for environments that use them. An action
     is the input of the environment, which need not be the input of the actuators.
 
-    Snapshots and changes of the model are read on demand, and the rest is in memory.
+    Snapshots and changes to the model are read on demand, and the rest is in memory.
 
     Args:
         reader: the file's reader; it may be closed afterwards.
@@ -215,7 +215,7 @@ class Trajectory:
 
         Args:
             step: the number of steps taken, which matters if the environment changes
-                its model during the episode. Changes made in the reset are included
+                its model during the episode. Changes made by the reset are included
                 from step 0 on.
 
         Raises:

@@ -113,7 +113,7 @@ def place_viewer_camera(
     config: Mapping[str, Any] | None,
     camera: mujoco.MjvCamera,
 ) -> None:
-    """Move a camera to where a viewer that Gymnasium created now would put its camera.
+    """Place a camera where a viewer that Gymnasium created now would place its own.
 
     The camera looks at the median of the current geom positions and stays there. So a
     viewer that is created later shows a different frame of the same state.

@@ -45,6 +45,6 @@ def scalars_of(episode: FinishedEpisode) -> dict[str, float]:
 def name_of(video: FinishedVideo) -> str:
     """Return the part of a tag after the slash.
 
-    This is `video`, or `video_<view>` for a further camera or a tiled video.
+    This is `video`, or `video_<view>` for an additional camera or a tiled video.
     """
     return f"video_{video.view}" if video.view else "video"

@@ -19,7 +19,7 @@ _SHOWN = 10
 def recorded_episodes(directory: Path) -> list[Path]:
     """Return a directory's trajectories, finished or in flight.
 
-    They are grouped by monitor, the one that was written last at the end, and sorted by
+    They are grouped by monitor, with the most recently written one last, and sorted by
     episode number.
 
     Args:

@@ -3,7 +3,7 @@
 
 mjviser creates the meshes of primitives, height fields and sites. This module adds the
 rest: normals and texture coordinates of meshes, cube textures, planes of the model's
-size, and colours as mixed by MuJoCo's visualiser.
+size, and colours as mixed by MuJoCo's visualizer.
 """
 
 from __future__ import annotations

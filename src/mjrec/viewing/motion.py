@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The motion of all drawn shapes: poses and colours in each recorded state.
 
-MuJoCo's own visualiser selects the shapes, with the recorded environment's options. So
+MuJoCo's own visualizer selects the shapes, with the recorded environment's options. So
 the same groups, tendons and sites are hidden as in its videos.
 """
 
@@ -40,7 +40,7 @@ class Shape:
         object_type: the object's `mjtObj`, such as a geom, site or tendon.
         object_id: the object's id in the model.
         geom_type: the shape's `mjtGeom`.
-        rgba: colour from MuJoCo's visualiser, materials included.
+        rgba: colour from MuJoCo's visualizer, materials included.
     """
 
     name: str
@@ -51,7 +51,7 @@ class Shape:
 
     @property
     def is_skin(self) -> bool:
-        """Whether bones move its vertices."""
+        """Whether the shape is a skin, whose vertices are moved by bones."""
         return self.geom_type == _SKIN
 
 
@@ -223,7 +223,7 @@ class Stage:
         )
 
     def _moving_objects(self) -> tuple[list[str], list[tuple[Any, Any, list[int]]]]:
-        """Return names, and the arrays of positions and rotations with own indices.
+        """Return the names, and each kind's positions, rotations and indices.
 
         Cameras come last and have no names.
         """
