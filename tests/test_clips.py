@@ -144,7 +144,7 @@ def test_frames_are_those_that_were_drawn_live(make, steps, options, tmp_path):
         # Two steps, a reset and three steps, a reset and a step, and the first frame.
         ({"camera": ["track", -1]}, "step", 9, "125"),
         # The rate is that of the file, whichever frames `max_fps` leaves.
-        ({"fps": 12, "max_fps": 62.5}, "step", 6, "12"),
+        ({"fps": 12, "max_fps": 62.5}, "step", 5, "12"),
         # One that begins with an episode has its name.
         (
             {"step_trigger": None, "video_callable": lambda episode: episode == 1},

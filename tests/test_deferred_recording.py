@@ -78,7 +78,7 @@ def test_close_leaves_a_rendered_directory(tmp_path):
         steps(env, 3)
         video = env.video_recorder
         assert (video.enabled, video.functional, video.empty) == (True, True, False)
-        assert (video.frame_count, video.finished) == (3, False)
+        assert (video.frame_count, video.finished) == (4, False)
     assert video.finished
     assert Path(video.path).exists()
     assert not [*tmp_path.glob(".*"), *in_flight(tmp_path)]

@@ -16,7 +16,7 @@ OF_EPISODES = [
         f"{VIDEO}.mp4",
         f"{VIDEO}.meta.json",
         f".{VIDEO}.lock",
-        f".{VIDEO}.mp4.01ef.part",
+        f".{VIDEO}.mp4.0123abcd.part",
     ),
     "openaigym.trajectory.0.1.episode000027.h5",
 ]
@@ -29,7 +29,7 @@ OF_MONITORS = [
     ".openaigym.0.1.lock",
     ".openaigym.manifest.0.1.lock",
     ".openaigym.clip.0.1.step000000137.lock",
-    ".openaigym.manifest.0.1.manifest.json.01ef.part",
+    ".openaigym.manifest.0.1.manifest.json.0123abcd.part",
 ]
 OF_ALL = ["openaigym.model.0123456789abcdef.zip", ".openaigym.render.3.lock"]
 FOREIGN = [

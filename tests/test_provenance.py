@@ -11,11 +11,13 @@ from other_python import run_python
 from recordings import manifest_of
 
 import mjrec
+from mjrec import provenance
 from mjrec.machine import machine_fingerprint
 from mjrec.provenance import Provenance, installed_packages
 
 PROGRAM = """
-import gymnasium, mjrec
+import gymnasium, mjrec, mjrec.provenance
+mjrec.provenance._SECONDS_AT_THE_END = 60
 env = gymnasium.make("InvertedPendulum-v5")
 with mjrec.Monitor(env, "out", render="off", policy_file="policy.bin") as env:
     env.reset(seed=0)
@@ -28,7 +30,7 @@ def git(directory, *arguments):
     return subprocess.check_output(command, cwd=directory, text=True).strip()
 
 
-def test_a_program_in_a_repository(tmp_path, tmp_path_factory):
+def test_a_program_in_a_repository(tmp_path, tmp_path_factory, monkeypatch):
     """Its command, packages, variables, commit and policy are in the manifest."""
     (tmp_path / "train.py").write_text(PROGRAM)
     git(tmp_path, "init", "-q")
@@ -56,6 +58,8 @@ def test_a_program_in_a_repository(tmp_path, tmp_path_factory):
         "sha256": hashlib.sha256(b"weights").hexdigest(),
     }
     (tmp_path / "train.py").write_text("pass\n")
+    # A busy machine takes longer than a monitor waits.
+    monkeypatch.setattr(provenance, "_SECONDS_AT_THE_END", 60)
     assert Provenance(tmp_path).found(wait=True)["code"]["dirty"] is True
     elsewhere = tmp_path_factory.mktemp("none")
     assert Provenance(elsewhere).found(wait=True)["code"] is None

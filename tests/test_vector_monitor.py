@@ -80,7 +80,7 @@ def test_every_sub_environment_has_whole_videos(
             if episode == 0:
                 assert said["seed"] == (8 if where == "one object" else 8 + index)
     messages = [r.message for r in caplog.records if "last frame" in r.message]
-    of_all = ["Monitor inside each of the functions" in each for each in messages]
+    of_all = ["functions that create them" in each for each in messages]
     assert of_all == [True] * is_hidden
 
 
