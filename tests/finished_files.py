@@ -1,21 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Finished recordings, and what a tracker is told of them."""
 
-from __future__ import annotations
-
 import time
-from dataclasses import dataclass
+import types
 
 import mjrec
 from mjrec.trackers import FinishedEpisode, FinishedVideo, Run
-
-
-@dataclass(frozen=True)
-class Finished:
-    """A recording of one episode."""
-
-    run: Run
-    video: FinishedVideo
 
 
 def episode(number=0, **facts):
@@ -39,18 +29,14 @@ def episode(number=0, **facts):
 
 
 def record(directory, env, play):
-    """Record an episode, and return it with its video."""
-    with mjrec.Monitor(
-        env, directory, video_callable=lambda n: n == 0, env_id="Corridor-v0"
-    ) as monitor:
+    """Record an episode; return its run and its video."""
+    options = {"video_callable": lambda n: n == 0, "env_id": "Corridor-v0"}
+    with mjrec.Monitor(env, directory, **options) as monitor:
         play(monitor, 1)
     [path] = directory.glob("*.mp4")
-    return Finished(
-        run=Run(directory=directory, infix="0.4711", env_id="Corridor-v0"),
-        video=FinishedVideo(
-            path=path,
-            metadata_path=path.with_suffix(".meta.json"),
-            episode_id=0,
-            episode=episode(),
-        ),
+    metadata = path.with_suffix(".meta.json")
+    video = FinishedVideo(
+        path=path, metadata_path=metadata, episode_id=0, episode=episode()
     )
+    run = Run(directory=directory, infix="0.4711", env_id="Corridor-v0")
+    return types.SimpleNamespace(run=run, video=video)

@@ -279,13 +279,33 @@ ENDLESS = """
 """
 
 
-def test_own_model_over_an_infinite_plane(workers, tmp_path):
-    """It is drawn around the camera of the frame before; and a tendon is taut."""
+@pytest.fixture
+def endless(tmp_path):
     path = tmp_path / "endless.xml"
     path.write_text(ENDLESS)
     options = EnvironmentOptions(**SIZE, max_steps=STEPS)
-    env = environment_from_name(str(path), options).environment
-    check_frames(tmp_path / "out", record(env, tmp_path / "out"), workers)
+    return environment_from_name(str(path), options).environment
+
+
+def test_own_model_over_an_infinite_plane(endless, workers, tmp_path):
+    """It is drawn around the camera of the frame before; and a tendon is taut."""
+    check_frames(tmp_path / "out", record(endless, tmp_path / "out"), workers)
+
+
+def test_an_episode_may_forget_the_frames_before(endless, tmp_path):
+    """Cameras are where they are in a new simulation then."""
+    directory, previous = tmp_path / "out", []
+    with monitored(endless, directory) as monitor:
+        for number in range(3):
+            if number == 2:
+                monitor.forget_frames()
+            monitor.reset(seed=0)
+            monitor.step(np.zeros(1))
+        monitor.close(wait=False)
+    for path in in_flight(directory):
+        with open_trajectory(path) as reader:
+            previous.append(reader.facts["scene"]["previous_cameras"])
+    assert [each is None for each in previous] == [True, False, True]
 
 
 class Negative(InvertedPendulumEnv):

@@ -1,7 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
 """The bounded worker thread; what else it promises is seen in `test_video_writer`."""
 
+import pytest
 from other_python import run_python
+
+from mjrec.worker_thread import WorkerThread
+
+
+@pytest.mark.parametrize("end", [WorkerThread.close, WorkerThread.abort])
+def test_an_end_on_the_thread_itself_waits_for_nothing(end):
+    """As when the consumer's garbage collection ends the worker's owner."""
+    ended = []
+    worker = WorkerThread(lambda _: ended.append(end(worker)), capacity=5, name="w")
+    worker.put(1)
+    worker.close()
+    assert ended == [None]
 
 
 def test_neither_forks_nor_the_interpreter_wait_for_the_thread():
