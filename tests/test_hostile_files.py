@@ -5,7 +5,6 @@ Each is read in a fork with a gigabyte of memory (`hostile_reading`).
 """
 
 import contextlib
-import functools
 import gzip
 import hashlib
 import json
@@ -16,13 +15,14 @@ import struct
 import zipfile
 import zlib
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import h5py
 import mujoco
 import numpy as np
 import pytest
-from hostile_reading import SECONDS, Inspector
+from hostile_reading import Inspector
 from random_rows import DTYPE
 from sound_files import (
     FILES,
@@ -164,9 +164,7 @@ def test_other_content_is_refused(inspector, directory, kind, spoil):
     # MuJoCo reads what the user has named as it likes.
     may_be_read = {"mjcf", "spans"} if "hole" in spoil else set()
     if kind in {"journal", ".log", ".tail", ".looks"} | may_be_read:
-        outcome = inspector.read(reader, path)
-        assert outcome.kind in ("value", "refused"), outcome
-        assert outcome.seconds < SECONDS / 2, outcome
+        assert inspector.read(reader, path).kind in ("value", "refused")
     else:
         inspector.refuses(reader, path)
 
@@ -218,19 +216,15 @@ def overflowing_frames(file):
     replaced("snapshots", data=np.zeros(5, file["snapshots"].dtype))(file)
 
 
-def change_of(file, name, **options):
+def change_of(file):
     group = file["model_changes"].create_group("0")
     group.attrs["step"] = np.int64(0)
-    if options:
-        group.create_dataset(name, **options)
     return group
 
 
-ZEROS = {"data": np.zeros(4 << 20), "compression": 9, "chunks": (4 << 20,)}
-
-
 def one_change_by_many_names(file):
-    group = change_of(file, "geom_rgba", **ZEROS)
+    zeros, group = np.zeros(4 << 20), change_of(file)
+    group.create_dataset("geom_rgba", data=zeros, compression=9, chunks=zeros.shape)
     for index in range(1, 5000):
         file["model_changes"][str(index)] = group
 
@@ -250,11 +244,12 @@ def gigabytes_of_observations(file):
 
 
 def linked_field(file):
-    change_of(file, "")["geom_rgba"] = h5py.ExternalLink("/etc/passwd", "/x")
+    change_of(file)["geom_rgba"] = h5py.ExternalLink("/etc/passwd", "/x")
 
 
 def object_field(file):
-    change_of(file, "x", data=[b"cos\nsystem"], dtype=h5py.string_dtype())
+    texts = {"data": [b"cos\nsystem"], "dtype": h5py.string_dtype()}
+    change_of(file).create_dataset("x", **texts)
 
 
 # Of one the process is ended when it has had its CPU time, which takes a while.
@@ -313,10 +308,6 @@ def with_change(header, path):
 # --- models --------------------------------------------------------------------------
 
 
-def facts_of(directory):
-    return json.loads((directory / "facts.json").read_text())
-
-
 def put_compiled(content, packed, path, **facts):
     """Put bytes in place of a compiled model, with facts that are true."""
     digest = hashlib.sha256(content).hexdigest()
@@ -331,32 +322,33 @@ CONTENT = bytes(1000)
 SOUND = gzip.compress(CONTENT)
 NOISE = np.random.default_rng(1).bytes(10_000)
 BOMB = gzip.compress(bytes(1 << 28))
-GZIP = {
-    "no model": lambda path: put_compiled(NOISE, gzip.compress(NOISE), path),
-    "a bomb": functools.partial(put_compiled, CONTENT, BOMB),
-    "a true bomb": lambda path: put_compiled(CONTENT, BOMB, path, bytes=(1 << 31) - 1),
-    **{
-        name: functools.partial(put_compiled, CONTENT, packed)
-        for name, packed in {
-            "two": SOUND + gzip.compress(b"more"),
-            "many": gzip.compress(b"") * 100_000 + SOUND,
-            "endless name": SOUND[:10].replace(b"\0", b"\x08", 1) + b"x" * 30_000_000,
-            "cut off": SOUND[:-1],
-            "wrong checksum": SOUND[:-8] + bytes(8),
-            "tail": SOUND + b"tail",
-        }.items()
-    },
-}
+GZIP = [
+    # No model, a bomb, and one that says how large it is.
+    lambda path: put_compiled(NOISE, gzip.compress(NOISE), path),
+    partial(put_compiled, CONTENT, BOMB),
+    partial(put_compiled, CONTENT, BOMB, bytes=(1 << 31) - 1),
+    *(
+        partial(put_compiled, CONTENT, packed)
+        for packed in (
+            SOUND + gzip.compress(b"more"),
+            gzip.compress(b"") * 100_000 + SOUND,
+            # An endless name.
+            SOUND[:10].replace(b"\0", b"\x08", 1) + b"x" * 30_000_000,
+            # Cut off, a wrong checksum, bytes at the end.
+            *(SOUND[:-1], SOUND[:-8] + bytes(8), SOUND + b"tail"),
+        )
+    ),
+]
 
 
-def put_zip(members, path, *, again=()):
+def put_zip(members, path, *, again=None):
     contents = b'{"format": 1, "main": "main.xml"}'
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
         for name, content in {"contents.json": contents, **members}.items():
             archive.writestr(name, content)
-        for name in again:
+        if again is not None:
             with pytest.warns(UserWarning, match="Duplicate"):
-                archive.writestr(name, b"other")
+                archive.writestr(again, b"other")
 
 
 def npy(header):
@@ -365,6 +357,7 @@ def npy(header):
 
 
 MAIN = "source/main.xml"
+SOUND_ZIP = {MAIN: SPHERE.encode()}
 HUGE = npy("{'descr': '<f8', 'fortran_order': False, 'shape': (1099511627776,)}")
 ZIP = {
     "more memory than": {"fields/geom_rgba.npy": HUGE},
@@ -397,30 +390,17 @@ MJCF = (
 # The kind of file, what is done to it, and what is said of it.
 HARMS = [
     *(
-        ("manifest", functools.partial(Path.write_bytes, data=data), said)
-        for said, data in JSON.items()
+        ("manifest", partial(Path.write_bytes, data=d), said)
+        for said, d in JSON.items()
     ),
-    *(("h5", functools.partial(in_hdf5, change), said) for change, said in HDF5),
-    *(
-        ("spans", functools.partial(beginning_with, head(rows)), said)
-        for said, rows in ROWS.items()
-    ),
-    ("spans", functools.partial(beginning_with, b"[" * 10**7 + b"\n"), "does not give"),
-    *(
-        (".looks", functools.partial(with_change, header), "change of the model")
-        for header in CHANGES
-    ),
-    *(("mjb.gz", harm, "") for harm in GZIP.values()),
-    *(
-        ("zip", functools.partial(put_zip, {MAIN: SPHERE.encode(), **members}), said)
-        for said, members in ZIP.items()
-    ),
-    (
-        "zip",
-        lambda path: put_zip({MAIN: SPHERE.encode()}, path, again=(MAIN,)),
-        "is not XML",
-    ),
-    *(("zip", functools.partial(put_zip, {MAIN: xml.encode()}), "") for xml in MJCF),
+    *(("h5", partial(in_hdf5, change), said) for change, said in HDF5),
+    *(("spans", partial(beginning_with, head(r)), said) for said, r in ROWS.items()),
+    ("spans", partial(beginning_with, b"[" * 10**7 + b"\n"), "does not give"),
+    *((".looks", partial(with_change, h), "change of the model") for h in CHANGES),
+    *(("mjb.gz", harm, "") for harm in GZIP),
+    *(("zip", partial(put_zip, {**SOUND_ZIP, **m}), said) for said, m in ZIP.items()),
+    ("zip", partial(put_zip, SOUND_ZIP, again=MAIN), "is not XML"),
+    *(("zip", partial(put_zip, {MAIN: xml.encode()}), "") for xml in MJCF),
 ]
 
 
@@ -438,13 +418,15 @@ def test_harm_is_one_error(inspector, directory, kind, harm, said):
     assert re.search(said, inspector.refuses(reader, path))
 
 
+NOTE = b'{"note": {"name": "%s", "facts": {"a": %%s}}}\n' % NAME.encode()
+
+
 @pytest.mark.parametrize(
     "lines",
     [
         b"[" * 1_000_000,
-        b'{"note": {"name": "%s", "facts": {"a": 1, "a": 2}}}\n' % NAME.encode(),
-        b'{"note": {"name": "%s", "facts": {"a": "%s"}}}\n'
-        % (NAME.encode(), b"a" * (30 << 20)),
+        NOTE % b'1, "a": 2',
+        NOTE % (b'"%s"' % (b"a" * (30 << 20))),
         b"a" * (200 << 20),
         b"{\n" * 50_000,
     ],
@@ -557,8 +539,8 @@ def test_a_compiled_model_has_the_name_of_its_content(inspector, directory):
     """So that one file cannot stand for two models."""
     path = FILES["mjb.gz"][1](directory)
     other = path.rename(path.with_name("openaigym.model.0123456789abcdef.mjb.gz"))
-    facts = {**facts_of(directory), "mjb": other.name}
-    (directory / "facts.json").write_text(json.dumps(facts))
+    facts = directory / "facts.json"
+    facts.write_text(json.dumps({**json.loads(facts.read_text()), "mjb": other.name}))
     assert "not the recorded model" in inspector.refuses("model", other)
 
 
