@@ -44,13 +44,12 @@ def frame(psnr, block, *, shadow=0.0):
     )
 
 
-REWARD = {"topic": Topic.REWARDS}
-WITHIN, BELIEVED, NOTED, DIFFERENT = (
-    Outcome.WITHIN_TOLERANCE,
-    Outcome.BELIEVED,
-    Outcome.NOTED,
-    Outcome.DIFFERENT,
-)
+WITHIN, BELIEVED = Outcome.WITHIN_TOLERANCE, Outcome.BELIEVED
+NOTED, DIFFERENT = Outcome.NOTED, Outcome.DIFFERENT
+
+
+def reward(aspect, size=None):
+    return difference(aspect, size, topic=Topic.REWARDS)
 
 
 @pytest.mark.parametrize(
@@ -61,18 +60,18 @@ WITHIN, BELIEVED, NOTED, DIFFERENT = (
         ("mujoco", difference(Aspect.SOLVER, 1.0), BELIEVED),
         ("mujoco", difference(Aspect.EXACT), DIFFERENT),
         ("major", difference(Aspect.STATE, 5e-3), WITHIN),
-        ("major", difference(Aspect.SUMMED, 5e-3, **REWARD), WITHIN),
+        ("major", reward(Aspect.SUMMED, 5e-3), WITHIN),
         ("rk4", difference(Aspect.STATE, 0.2), DIFFERENT),
         ("rk4", difference(Aspect.VELOCITY, 0.5), WITHIN),
         # A step's reward, which contacts may change, and a return, which adds them up.
-        ("rk4", difference(Aspect.DERIVED, 0.06, **REWARD), WITHIN),
-        ("rk4", difference(Aspect.DERIVED, 0.2, **REWARD), DIFFERENT),
-        ("rk4", difference(Aspect.SUMMED, 0.06, **REWARD), DIFFERENT),
+        ("rk4", reward(Aspect.DERIVED, 0.06), WITHIN),
+        ("rk4", reward(Aspect.DERIVED, 0.2), DIFFERENT),
+        ("rk4", reward(Aspect.SUMMED, 0.06), DIFFERENT),
         # A reward of one that is doubled.
-        ("major", difference(Aspect.DERIVED, 0.5, **REWARD), DIFFERENT),
-        ("machine", difference(Aspect.DERIVED, 0.5, **REWARD), DIFFERENT),
-        ("gymnasium", difference(Aspect.DERIVED, 0.5, **REWARD), DIFFERENT),
-        ("gymnasium", difference(Aspect.DERIVED, 1e-9, **REWARD), WITHIN),
+        ("major", reward(Aspect.DERIVED, 0.5), DIFFERENT),
+        ("machine", reward(Aspect.DERIVED, 0.5), DIFFERENT),
+        ("gymnasium", reward(Aspect.DERIVED, 0.5), DIFFERENT),
+        ("gymnasium", reward(Aspect.DERIVED, 1e-9), WITHIN),
         ("numpy", difference(Aspect.STATE, 1e-7), DIFFERENT),
         ("python", difference(Aspect.STATE, 1e-12), DIFFERENT),
         ("python", difference(Aspect.CLAIM, claim="python"), NOTED),
@@ -90,10 +89,10 @@ WITHIN, BELIEVED, NOTED, DIFFERENT = (
         # Frames are hashed before they are encoded.
         ("ffmpeg", difference(Aspect.HASH, topic=Topic.PICTURES), DIFFERENT),
         # Its rewards were fed to the maker: nothing makes them differ.
-        ("wrappers", difference(Aspect.EXACT, **REWARD), DIFFERENT),
-        ("wrappers", difference(Aspect.OBSERVED, **REWARD), BELIEVED),
-        ("machine", difference(Aspect.OBSERVED, 1e-6, **REWARD), WITHIN),
-        ("machine", difference(Aspect.OBSERVED, 0.5, **REWARD), DIFFERENT),
+        ("wrappers", reward(Aspect.EXACT), DIFFERENT),
+        ("wrappers", reward(Aspect.OBSERVED), BELIEVED),
+        ("machine", reward(Aspect.OBSERVED, 1e-6), WITHIN),
+        ("machine", reward(Aspect.OBSERVED, 0.5), DIFFERENT),
         ("wrappers", frame(36.0, 12.0), DIFFERENT),
         ("beginning", difference(Aspect.STATE, 1.0, topic=Topic.BEGINNING), DIFFERENT),
         ("environment", difference(Aspect.EXACT), BELIEVED),
@@ -105,24 +104,16 @@ WITHIN, BELIEVED, NOTED, DIFFERENT = (
 )
 def test_an_excuse_allows_what_it_states(name, found, outcome):
     """In its own items, up to its tolerance, and nothing else."""
-    finding = Trial([excuse_of(*EXCUSES[name])]).judge(found)
-    assert finding is not None
-    assert finding.outcome is outcome
+    assert Trial([excuse_of(*EXCUSES[name])]).judge(found).outcome is outcome
 
 
 def test_the_widest_excuse_decides():
-    """Each is asked, whatever the order."""
-    excuses = [excuse_of(*EXCUSES[name]) for name in ("numpy", "python", "mujoco")]
-    finding = Trial(excuses).judge(difference(Aspect.STATE, 1e-7))
-    assert finding is not None
-    assert (finding.outcome, finding.excuse) == (WITHIN, "mujoco")
-
-
-def test_excuses_that_nothing_needed_are_told_apart():
-    """Other versions that change nothing cost nothing."""
-    trial = Trial([excuse_of(*EXCUSES["python"]), excuse_of(*EXCUSES["mujoco"])])
+    """Each is asked, whatever the order; those that nothing needed are told apart."""
+    trial = Trial([excuse_of(*EXCUSES[n]) for n in ("numpy", "python", "mujoco")])
     trial.judge(difference(Aspect.CLAIM, claim="python"))
-    assert [each.is_needed for each in trial.excuses] == [False, False]
+    assert [each.is_needed for each in trial.excuses] == [False] * 3
+    finding = trial.judge(difference(Aspect.STATE, 1e-7))
+    assert (finding.outcome, finding.excuse) == (WITHIN, "mujoco")
 
 
 def test_turns_by_rk4_differ_between_major_versions_only():

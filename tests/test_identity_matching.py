@@ -74,15 +74,10 @@ def test_few_letters_amid_numbers_are_chance():
     assert matcher.found_in_bytes(b"\xffmbrunelli\xff") == ["mbrunelli"]
 
 
-def test_letters_are_found_that_json_escapes():
-    """As they are in every JSON file here, and in the facts of a trajectory."""
-    matcher = IdentityMatcher(Identity(users={"joséphine"}))
-    assert matcher.found_in_bytes(b'{"by": "Jos\\u00e9phine"}') == ["Joséphine"]
-
-
 def test_names_of_other_alphabets_are_found_amid_bytes():
-    """Also where neither encoding can be read as a whole."""
-    matcher = IdentityMatcher(Identity(people={"Łukasz Wąs"}))
+    """As JSON escapes them, and where neither encoding can be read as a whole."""
+    matcher = IdentityMatcher(Identity(users={"joséphine"}, people={"Łukasz Wąs"}))
+    assert matcher.found_in_bytes(b'{"by": "Jos\\u00e9phine"}') == ["Joséphine"]
     for encoding in ("utf-8", "utf-16-le"):
         content = b"\xff\xfe\xff" + "Łukasz Wąs".encode(encoding) + b"\xff"
         assert matcher.found_in_bytes(content) == ["Łukasz Wąs"]
@@ -90,24 +85,19 @@ def test_names_of_other_alphabets_are_found_amid_bytes():
 
 def test_who_recorded_is_known_from_the_recording():
     """On another machine, paths, the repository and variables tell it."""
-    identity = identity_of_user(
-        [
-            {
-                "command": ["python", "/home/ada/gait/train.py"],
-                "working_directory": "/home/ada/gait",
-                "code": {
-                    "root": "/home/ada/gait",
-                    "remote": "https://git.example/lab7/gait",
-                },
-                "variables": {"LD_LIBRARY_PATH": "/home/charles/lib"},
-                "policy": {"file": "/scratch/p7/policy.pt"},
-            }
-        ]
-    )
+    remote, root = "https://git.example/lab7/gait", "/home/ada/gait"
+    provenance = {
+        "command": ["python", f"{root}/train.py"],
+        "working_directory": root,
+        "code": {"root": root, "remote": remote},
+        "variables": {"LD_LIBRARY_PATH": "/home/charles/lib"},
+        "policy": {"file": "/scratch/p7/policy.pt"},
+    }
+    identity = identity_of_user([provenance])
     assert {"ada", "charles", "lab7"} <= identity.users
     assert "/home/ada" in identity.homes
-    assert {"/home/ada/gait", "/scratch/p7"} <= identity.directories
-    assert "https://git.example/lab7/gait" in identity.remotes
+    assert {root, "/scratch/p7"} <= identity.directories
+    assert remote in identity.remotes
 
 
 def test_who_packs_is_known_from_the_system(tmp_path, monkeypatch):
@@ -116,12 +106,10 @@ def test_who_packs_is_known_from_the_system(tmp_path, monkeypatch):
     monkeypatch.setenv("HOME", str(tmp_path))
     monkeypatch.chdir(tmp_path)
     said = ["Margherita Brunelli (MIT) <mb@uni.example>", "C D <0000-0002-1825-0097>"]
-    identity = identity_of_user(
-        authors=state(title=None, authors=said, license=None).authors
-    )
+    stated = state(title=None, authors=said, license=None)
+    identity = identity_of_user(authors=stated.authors)
     assert "mbrunelli" in identity.users
-    assert str(tmp_path) in identity.homes
-    assert str(tmp_path) in identity.directories
+    assert str(tmp_path) in identity.homes & identity.directories
     assert os.uname().nodename in identity.hosts
     assert "Margherita Brunelli" in identity.people
     assert {"mb@uni.example", "0000-0002-1825-0097"} <= identity.addresses

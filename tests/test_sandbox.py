@@ -22,15 +22,6 @@ _FOR_EVER = (
 )
 
 
-def sources(directory, xml="<mujoco/>"):
-    """Write what a model is compiled from."""
-    path = directory / "openaigym.model.0123456789abcdef.zip"
-    with zipfile.ZipFile(path, "w") as archive:
-        archive.writestr("contents.json", '{"format": 1, "main": "main.xml"}')
-        archive.writestr("source/main.xml", xml)
-    return path
-
-
 def compiling(parent):
     """Return the process that compiles; importing mujoco starts others."""
     return [pid for pid in children(parent) if f"-m\0{_COMPILER}" in command_of(pid)]
@@ -53,7 +44,10 @@ def test_a_death_is_told_with_its_last_words(tmp_path):
 
 def test_it_ends_with_its_parent_whatever_it_is_at(tmp_path):
     """Nobody would wait for it, or stop it, for days."""
-    path = sources(tmp_path, _FOR_EVER)
+    path = tmp_path / "openaigym.model.0123456789abcdef.zip"
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("contents.json", '{"format": 1, "main": "main.xml"}')
+        archive.writestr("source/main.xml", _FOR_EVER)
     program = (
         "from pathlib import Path\n"
         "from mjrec.simulation.foreign_files import compile_sources\n"
